@@ -1,0 +1,1 @@
+"""Run time against error, printed by ``touchcell bench NAME``."""

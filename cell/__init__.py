@@ -1,0 +1,1 @@
+"""Configuration, composition, run loop, recording and the command line."""

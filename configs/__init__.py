@@ -1,0 +1,1 @@
+"""Cell files that ship with touchcell."""

@@ -1,0 +1,1 @@
+"""Typed device drivers: lifecycle, capabilities, stamped samples, commands that expire, and a registry."""

@@ -1,0 +1,116 @@
+"""Which drivers exist and what each can do, known without connecting and without any vendor SDK installed."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from drivers.clock import Clock
+from drivers.device import Device
+from drivers.errors import ConfigError
+
+GROUP = "touchcell.drivers"
+
+
+class DriverConfig(BaseModel):
+    """Base of every driver's configuration: unknown keys refused, values frozen, units in the names."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Capabilities:
+    """What a driver promises, as data. The conformance suite holds it to every entry.
+
+    Attributes:
+        kind: "arm" or "camera".
+        abilities: names of the Protocols in ``drivers.abilities`` that its devices satisfy.
+        state_rate_hz: rate at which new samples appear.
+        min_command_rate_hz: slowest stream of twists that keeps it moving smoothly; 0 for devices without commands.
+        command_latency_s: typical time from call to wire.
+        stop_categories: IEC 60204-1 categories it can do in software.
+        max_watchdog_s: longest silence after which the device stops by itself; None when only the host's time-to-live
+            stops it.
+        twist_axes: which of [vx vy vz wx wy wz] it can follow.
+        has_brakes: whether it stays up without power.
+        falls_on_power_loss: whether power loss lets it sink.
+        seen_on_metal: False while the driver has only met emulators.
+    """
+
+    kind: Literal["arm", "camera"]
+    abilities: frozenset[str]
+    state_rate_hz: float
+    min_command_rate_hz: float = 0.0
+    command_latency_s: float = 0.0
+    stop_categories: frozenset[int] = frozenset()
+    max_watchdog_s: float | None = None
+    twist_axes: tuple[bool, bool, bool, bool, bool, bool] = (True, True, True, True, True, True)
+    has_brakes: bool = False
+    falls_on_power_loss: bool = False
+    seen_on_metal: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class DriverContext:
+    """What a driver may need beyond its own configuration.
+
+    Attributes:
+        clock: injected time.
+        devices: devices of the cell that are built already, by name.
+        scene: the simulated scene, for simulated devices; None in a real cell.
+        seed: seed of everything random.
+    """
+
+    clock: Clock
+    devices: Mapping[str, Device] = field(default_factory=dict)
+    scene: Any = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class DriverSpec:
+    """A driver's entry point. Its module imports no SDK: that happens when a device is opened.
+
+    Attributes:
+        name: the word in the cell file.
+        summary: one line for ``touchcell list``.
+        config: pydantic model of its configuration.
+        capabilities: the static record.
+        build: makes a DISCONNECTED device from name, configuration and context.
+        extra: the optional extra that brings its SDK, or None.
+    """
+
+    name: str
+    summary: str
+    config: type[DriverConfig]
+    capabilities: Capabilities
+    build: Callable[[str, Any, DriverContext], Device]
+    extra: str | None = None
+
+
+def installed() -> dict[str, EntryPoint]:
+    """Entry points of all installed drivers by name; nothing is imported."""
+    return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def spec(name: str) -> DriverSpec:
+    """The spec of driver ``name``. Raises ConfigError with a suggestion for an unknown one."""
+    points = installed()
+    if name not in points:
+        near = difflib.get_close_matches(name, points, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"known drivers: {', '.join(sorted(points))}"
+        raise ConfigError(f"unknown driver {name!r}", key="driver", value=name, hint=hint)
+    found = points[name].load()
+    if not isinstance(found, DriverSpec):
+        raise ConfigError(
+            f"entry point {points[name].value!r} is no DriverSpec",
+            key=name,
+            value=points[name].value,
+            hint="point it at the module's SPEC",
+        )
+    return found
