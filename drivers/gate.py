@@ -67,9 +67,8 @@ class TwistGate:
         wanted = in_base_axes(command, T_base_tcp)
         adjustments: list[Adjustment] = []
         # After a silence longer than the time-to-live the arm stands: limit from zero.
-        silent = self._last_ns is None or now_ns - self._last_ns > self._max_ttl_s * 1e9
-        previous = np.zeros(6) if silent else self._last
-        dt_s = min(command.ttl_s, (now_ns - self._last_ns) * 1e-9) if self._last_ns is not None else command.ttl_s
+        previous = self._last if now_ns <= self._expires_ns else np.zeros(6)
+        dt_s = min(command.ttl_s, (now_ns - self._last_ns) * 1e-9)
         limits = self._limits
         allowed = np.concatenate(
             [
