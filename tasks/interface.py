@@ -1,7 +1,7 @@
 """Between a task and the cell that runs it: what the task sees each cycle and what it asks for.
 
-A task never touches a device. The run loop reads the devices, hands over an ``Observation``, puts the ``Action`` through
-the supervisor, and sends what is left of it. So every task is tested with plain data and an injected clock.
+A task never touches a device. The run loop reads the devices, hands over an ``Observation``, puts the ``Action``
+through the supervisor, and sends what is left. So every task is tested with plain data and an injected clock.
 """
 
 from __future__ import annotations
