@@ -1,0 +1,1 @@
+"""One rig per driver."""
