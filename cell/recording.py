@@ -1,0 +1,148 @@
+"""MCAP recordings that survive a kill: small chunks, flushed as they close, and a reader that takes what is whole.
+
+Messages are JSON with a JSON schema, so that Foxglove and the ``mcap`` command line read them without touchcell.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader
+from mcap.writer import CompressionType, Writer
+
+from cell.errors import RecordingError
+
+# A kill loses the open chunk at most: 16 KiB is a fraction of a second of a cell's usual 100 kB/s.
+CHUNK_BYTES = 16 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One recorded message."""
+
+    topic: str
+    t_ns: int
+    data: dict[str, Any]
+
+
+class Recorder:
+    """Writes one recording.
+
+    Args:
+        path: the file, made anew.
+        stream: where to write instead of opening ``path``; the recorder closes it.
+
+    Raises:
+        RecordingError: from any method, when the disk is full or gone. Nothing more is written after the first.
+    """
+
+    def __init__(self, path: Path, *, stream: IO[bytes] | None = None) -> None:
+        self.path = path
+        self._channels: dict[str, int] = {}
+        self._failed = False
+        try:
+            # Unbuffered: a chunk that is complete has left the process.
+            self._stream: IO[bytes] = stream if stream is not None else path.open("wb", buffering=0)
+            self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
+            self._writer.start(profile="", library="touchcell")
+        except OSError as error:
+            raise self._failure(error) from None
+
+    def write(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
+        """Append one message; numpy values become lists, and what is not finite becomes null."""
+        if self._failed:
+            raise RecordingError(self.path, "was closed by an earlier failure")
+        try:
+            channel = self._channels.get(topic)
+            if channel is None:
+                channel = self._register(topic)
+            self._writer.add_message(channel, t_ns, _encode(data), t_ns)
+        except OSError as error:
+            raise self._failure(error) from None
+
+    def close(self) -> None:
+        """Finish the file with its index."""
+        if self._failed:
+            return
+        try:
+            self._writer.finish()
+            self._stream.close()
+        except OSError as error:
+            raise self._failure(error) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _register(self, topic: str) -> int:
+        schema = self._writer.register_schema(topic.strip("/").replace("/", "."), "jsonschema", b'{"type":"object"}')
+        self._channels[topic] = self._writer.register_channel(topic, "json", schema)
+        return self._channels[topic]
+
+    def _failure(self, error: OSError) -> RecordingError:
+        self._failed = True
+        return RecordingError(
+            self.path, f"cannot be written: {error.strerror}", hint="free some space; what was recorded is readable"
+        )
+
+
+def read(path: Path) -> Iterator[Message]:
+    """All whole messages of a recording in file order, also of one whose writer was killed.
+
+    Raises:
+        RecordingError: ``path`` is missing or no MCAP file at all.
+    """
+    try:
+        stream = path.open("rb")
+    except OSError as error:
+        raise RecordingError(path, f"cannot be read: {error.strerror}") from None
+    with stream:
+        if stream.read(8) != b"\x89MCAP0\r\n":
+            raise RecordingError(path, "is no MCAP file")
+        stream.seek(0)
+        messages = NonSeekingReader(stream, validate_crcs=False).iter_messages(log_time_order=False)
+        while True:
+            try:
+                _, channel, message = next(messages)
+            except (StopIteration, McapError, EOFError, ValueError, RuntimeError, struct.error):
+                # A truncated last chunk ends the file; everything before it has been delivered.
+                return
+            yield Message(channel.topic, message.log_time, json.loads(message.data))
+
+
+def _encode(data: Mapping[str, Any]) -> bytes:
+    try:
+        text = json.dumps(data, default=_plain, separators=(",", ":"), allow_nan=False)
+    except ValueError:
+        text = json.dumps(_finite(data), default=_plain, separators=(",", ":"))
+    return text.encode()
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} cannot be recorded")
+
+
+def _finite(value: Any) -> Any:
+    """The same with None for what JSON cannot say."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
