@@ -50,8 +50,7 @@ class Recorder:
         self._channels: dict[str, int] = {}
         self._failed = False
         try:
-            # Unbuffered: a chunk that is complete has left the process.
-            self._stream: IO[bytes] = stream if stream is not None else path.open("wb", buffering=0)
+            self._stream: IO[bytes] = stream if stream is not None else path.open("wb")
             self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
             self._writer.start(profile="", library="touchcell")
         except OSError as error:
@@ -66,6 +65,8 @@ class Recorder:
             if channel is None:
                 channel = self._register(topic)
             self._writer.add_message(channel, t_ns, _encode(data), t_ns)
+            # A chunk that is complete leaves the process at once; between chunks this finds nothing to do.
+            self._stream.flush()
         except OSError as error:
             raise self._failure(error) from None
 
