@@ -40,6 +40,7 @@ class Capabilities:
         has_brakes: whether it stays up without power.
         falls_on_power_loss: whether power loss lets it sink.
         seen_on_metal: False while the driver has only met emulators.
+        virtual_time: whether it runs on an injected clock; real hardware does not.
     """
 
     kind: Literal["arm", "camera"]
@@ -53,6 +54,7 @@ class Capabilities:
     has_brakes: bool = False
     falls_on_power_loss: bool = False
     seen_on_metal: bool = False
+    virtual_time: bool = False
 
 
 @dataclass(frozen=True, slots=True)

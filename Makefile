@@ -1,0 +1,35 @@
+# Everything lives in .venv beside this file. `make demo` installs what a running cell needs; `make test` adds the tools.
+PYTHON ?= python3
+TORCH ?= torch==2.13.0
+BIN := .venv/bin
+SOURCES := pyproject.toml geometry/_se3c.c
+
+.PHONY: demo test check fast clean
+
+demo: .venv/core
+	$(BIN)/touchcell run configs/surface_follow_sim.yaml
+
+test: check
+	$(BIN)/python -m pytest
+
+fast: .venv/dev
+	$(BIN)/python -m pytest -m "not slow"
+
+check: .venv/dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+.venv/core: $(SOURCES)
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --editable .
+	touch $@
+
+.venv/dev: .venv/core
+	$(BIN)/python -m pip install --quiet "$(TORCH)"
+	$(BIN)/python -m pip install --quiet --editable ".[train,dev]"
+	touch $@
+
+clean:
+	rm -rf .venv build *.egg-info geometry/*.so

@@ -1,0 +1,320 @@
+"""The cell file: what it may say, and the plan that comes of it. Nothing is connected here, and no SDK is imported.
+
+A plan holds every device, interlock and task of the file with its own validated configuration, proves that devices and
+task fit, and says which devices the task does not need, so that they are not even built.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+
+from cell.yaml_file import InvalidCell, KeyPath, YamlFile, load, suggest
+from control.interlocks import InterlockConfig, interlock_models
+from drivers import registry as driver_registry
+from drivers.device import DeactivatePolicy
+from drivers.errors import ConfigError
+from drivers.registry import DriverConfig, DriverSpec
+from tasks import registry as task_registry
+from tasks.interface import TaskConfig, TaskSpec
+
+M = TypeVar("M", bound=BaseModel)
+Six = tuple[float, float, float, float, float, float]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class _OpenSection(BaseModel):
+    """A section whose other keys belong to the driver or task that it names."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
+
+
+class FilterSection(_Section):
+    """The SE(3) Bayesian filter: how fast certainty is lost when no frame comes (slip, curvature)."""
+
+    drift_mm_per_sqrt_s: PositiveFloat
+    drift_deg_per_sqrt_s: PositiveFloat
+
+
+class GateSection(_Section):
+    """The contact gate: mean marker-image change, in per cent, that begins and ends a contact."""
+
+    touch_percent: PositiveFloat
+    release_percent: PositiveFloat
+
+
+class NetworkEstimator(_Section):
+    """Image -> network -> filter."""
+
+    kind: Literal["network"]
+    model: str
+    gate: GateSection | None = None
+    filter: FilterSection | None = None
+
+
+class TrueContact(_Section):
+    """The simulator's own contact state, to see control error apart from estimation error."""
+
+    kind: Literal["true_contact"]
+
+
+EstimatorSection = Annotated[NetworkEstimator | TrueContact, Field(discriminator="kind")]
+
+
+class ArmSection(_OpenSection):
+    """An arm: its driver, what happens when it is deactivated, and the driver's own keys."""
+
+    driver: str
+    deactivate: DeactivatePolicy
+
+
+class SensorSection(_OpenSection):
+    """A tactile sensor: its camera's driver, where it sits, and how frames become contacts."""
+
+    driver: str
+    mounted_on: str | None = None
+    tcp_to_sensor_mm_deg: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    estimator: EstimatorSection
+
+
+class TaskSection(_OpenSection):
+    """The task, which arms and sensors play its roles, and the task's own keys."""
+
+    name: str
+    arms: dict[str, str] = {}
+    sensors: dict[str, str] = {}
+
+
+class RecordingSection(_Section):
+    """What is kept of a run besides numbers."""
+
+    frames: Literal["none", "jpeg", "png"] = "none"
+
+
+class CellFile(_Section):
+    """A whole cell file."""
+
+    schema_: Literal[1] = Field(alias="schema")
+    name: str
+    time: Literal["simulated", "real"]
+    rate_hz: Annotated[float, Field(gt=0, le=1000)]
+    seed: int = 0
+    max_duration_s: PositiveFloat = 3600.0
+    scene: dict[str, Any] | None = None
+    arms: dict[str, ArmSection] = {}
+    sensors: dict[str, SensorSection] = {}
+    interlocks: dict[str, Any] = {}
+    task: TaskSection
+    recording: RecordingSection = RecordingSection()
+
+
+@dataclass(frozen=True, slots=True)
+class DevicePlan:
+    """A device that will be built: its section, spec and validated configuration."""
+
+    name: str
+    spec: DriverSpec
+    config: DriverConfig
+
+
+@dataclass(frozen=True)
+class CellPlan:
+    """A cell file that makes sense.
+
+    Attributes:
+        file: where it came from.
+        cell: the file's own sections.
+        arms, sensors: devices that the task needs, by name in the cell.
+        arm_roles, sensor_roles: role in the task -> name in the cell.
+        interlocks: validated configuration by name.
+        task: the task's spec.
+        task_config: its validated parameters.
+        skipped: devices of the file that this task does not need and that are not built.
+    """
+
+    file: Path
+    cell: CellFile
+    arms: Mapping[str, DevicePlan]
+    sensors: Mapping[str, DevicePlan]
+    arm_roles: Mapping[str, str]
+    sensor_roles: Mapping[str, str]
+    interlocks: Mapping[str, InterlockConfig]
+    task: TaskSpec
+    task_config: TaskConfig
+    skipped: tuple[str, ...]
+
+
+def plan_cell(path: Path, overrides: Mapping[str, Any] | None = None) -> CellPlan:
+    """Read and check a cell file without connecting anything.
+
+    Args:
+        path: the YAML file.
+        overrides: driver keys set from the command line (``--data``), for every device whose driver has such a key.
+
+    Raises:
+        ConfigError: with file, line, key, value and remedy; InvalidCell for several at once.
+    """
+    return _Planner(load(path), overrides or {}).plan()
+
+
+class _Planner:
+    def __init__(self, file: YamlFile, overrides: Mapping[str, Any]) -> None:
+        self._file = file
+        self._overrides = overrides
+        self._problems: list[ConfigError] = []
+
+    def plan(self) -> CellPlan:
+        file = self._file
+        cell = file.validate(CellFile, file.data)
+        self._require_scene_fits(cell)
+        task, task_config = self._task(cell)
+        arm_roles = self._roles(cell, "arms", task.arms, cell.arms) if task else {}
+        sensor_roles = self._roles(cell, "sensors", task.sensors, cell.sensors) if task else {}
+        needed_sensors = set(sensor_roles.values())
+        mounts = {cell.sensors[name].mounted_on for name in needed_sensors} - {None}
+        needed_arms = set(arm_roles.values()) | mounts
+        arms = {name: plan for name in cell.arms if (plan := self._arm(cell, name)) and name in needed_arms}
+        sensors = {name: plan for name in cell.sensors if (plan := self._sensor(cell, name)) and name in needed_sensors}
+        interlocks = self._interlocks(cell)
+        if task:
+            self._require_abilities(task, arm_roles, arms)
+        if self._problems:
+            raise InvalidCell(self._problems)
+        assert task is not None
+        assert task_config is not None
+        skipped = sorted((set(cell.arms) - set(arms)) | (set(cell.sensors) - set(sensors)))
+        return CellPlan(
+            file.path, cell, arms, sensors, arm_roles, sensor_roles, interlocks, task, task_config, tuple(skipped)
+        )
+
+    @cached_property
+    def _scene_model(self) -> type[BaseModel]:
+        from drivers.simulation.scene import SceneConfig
+
+        return SceneConfig
+
+    def _require_scene_fits(self, cell: CellFile) -> None:
+        if cell.scene is not None:
+            self._validated(self._scene_model, cell.scene, ("scene",))
+
+    def _task(self, cell: CellFile) -> tuple[TaskSpec | None, TaskConfig | None]:
+        try:
+            spec = task_registry.spec(cell.task.name)
+        except ConfigError as error:
+            self._add(("task", "name"), error.reason, value=cell.task.name, hint=error.hint)
+            return None, None
+        return spec, self._validated(spec.config, cell.task.model_extra or {}, ("task",))
+
+    def _roles(
+        self, cell: CellFile, kind: str, roles: Any, devices: Mapping[str, ArmSection] | Mapping[str, SensorSection]
+    ) -> dict[str, str]:
+        """Role -> device name. A role that the file does not assign goes to the device of the same name."""
+        assigned: dict[str, str] = getattr(cell.task, kind)
+        for role in assigned.keys() - set(roles):
+            self._add(("task", kind, role), f"{cell.task.name} has no such role", hint=suggest(role, sorted(roles)))
+        found = {}
+        for role in roles:
+            name = assigned.get(role, role)
+            if name in devices:
+                found[role] = name
+            else:
+                self._add(
+                    ("task", kind, role),
+                    f"the role {role!r} needs one of `{kind}:`, and {name!r} is not there",
+                    value=name,
+                    hint=suggest(name, sorted(devices)) if devices else f"add `{kind}:`",
+                )
+        return found
+
+    def _arm(self, cell: CellFile, name: str) -> DevicePlan | None:
+        section = cell.arms[name]
+        return self._device(cell, ("arms", name), section, {"deactivate": section.deactivate}, "arm")
+
+    def _sensor(self, cell: CellFile, name: str) -> DevicePlan | None:
+        section = cell.sensors[name]
+        if section.mounted_on is not None and section.mounted_on not in cell.arms:
+            self._add(
+                ("sensors", name, "mounted_on"),
+                f"there is no arm {section.mounted_on!r}",
+                value=section.mounted_on,
+                hint=suggest(section.mounted_on, sorted(cell.arms)),
+            )
+        if section.estimator.kind == "true_contact" and cell.scene is None:
+            self._add(("sensors", name, "estimator"), "true_contact needs a `scene:`", hint="use kind: network")
+        shared = {"mounted_on": section.mounted_on, "tcp_to_sensor_mm_deg": section.tcp_to_sensor_mm_deg}
+        return self._device(cell, ("sensors", name), section, shared, "camera")
+
+    def _device(
+        self,
+        cell: CellFile,
+        at: tuple[str, str],
+        section: ArmSection | SensorSection,
+        shared: Mapping[str, Any],
+        kind: str,
+    ) -> DevicePlan | None:
+        try:
+            spec = driver_registry.spec(section.driver)
+        except ConfigError as error:
+            self._add((*at, "driver"), error.reason, value=section.driver, hint=error.hint)
+            return None
+        if spec.capabilities.kind != kind:
+            self._add(
+                (*at, "driver"),
+                f"{spec.name} drives a {spec.capabilities.kind}, not a {kind}",
+                value=section.driver,
+                hint="`touchcell list` tells which drivers there are",
+            )
+        if cell.time == "simulated" and not spec.capabilities.virtual_time:
+            self._add(
+                (*at, "driver"), f"{spec.name} cannot run in simulated time", value=spec.name, hint="set `time: real`"
+            )
+        fields = spec.config.model_fields
+        settings = {key: value for key, value in {**shared, **self._overrides}.items() if key in fields}
+        config = self._validated(spec.config, {**(section.model_extra or {}), **settings}, at)
+        return DevicePlan(at[1], spec, config) if config is not None else None
+
+    def _interlocks(self, cell: CellFile) -> dict[str, InterlockConfig]:
+        models = interlock_models()
+        found = {}
+        for name, data in cell.interlocks.items():
+            if name not in models:
+                self._add(("interlocks", name), "unknown interlock", value=name, hint=suggest(name, sorted(models)))
+                continue
+            config = self._validated(models[name], data or {}, ("interlocks", name))
+            if config is not None:
+                found[name] = config
+        return found
+
+    def _require_abilities(
+        self, task: TaskSpec, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]
+    ) -> None:
+        for role, abilities in task.arms.items():
+            name = arm_roles.get(role)
+            if name is None or name not in arms:
+                continue
+            missing = abilities - arms[name].spec.capabilities.abilities
+            if missing:
+                self._add(
+                    ("arms", name, "driver"),
+                    f"{arms[name].spec.name} lacks {', '.join(sorted(missing))}, which {task.name} needs",
+                    value=arms[name].spec.name,
+                    hint="choose another driver; `touchcell list` shows abilities",
+                )
+
+    def _validated(self, model: type[M], data: Any, at: KeyPath) -> M | None:
+        try:
+            return self._file.validate(model, data, at)
+        except InvalidCell as error:
+            self._problems.extend(error.problems)
+            return None
+
+    def _add(self, path: tuple[str, ...], reason: str, *, value: Any = None, hint: str = "") -> None:
+        self._problems.append(self._file.problem(path, reason, value=value, hint=hint))
