@@ -77,7 +77,9 @@ class TactileServo:
         elif self._t_ns is None or t_ns > self._t_ns:
             E = self._error_pose(T_s_f)
             dt_s = self._period_s if self._t_ns is None else (t_ns - self._t_ns) * 1e-9
-            V_s = self._pid.step(se3.log(E), se3.adjoint(E) @ V_ff, dt_s)
+            with np.errstate(invalid="ignore"):  # the controller refuses what is not finite, by name
+                V_ff_s = se3.adjoint(E) @ V_ff
+            V_s = self._pid.step(se3.log(E), V_ff_s, dt_s)
             self._V_tcp = self._Ad_tcp_sensor @ V_s
             self._t_ns = t_ns
         return self._V_tcp.copy()
