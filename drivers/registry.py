@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
+from drivers import entry_points
 from drivers.clock import Clock
 from drivers.device import Device
-from drivers.errors import ConfigError
 
 GROUP = "touchcell.drivers"
 
@@ -97,22 +96,9 @@ class DriverSpec:
 
 def installed() -> dict[str, EntryPoint]:
     """Entry points of all installed drivers by name; nothing is imported."""
-    return {point.name: point for point in entry_points(group=GROUP)}
+    return entry_points.installed(GROUP)
 
 
 def spec(name: str) -> DriverSpec:
     """The spec of driver ``name``. Raises ConfigError with a suggestion for an unknown one."""
-    points = installed()
-    if name not in points:
-        near = difflib.get_close_matches(name, points, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"known drivers: {', '.join(sorted(points))}"
-        raise ConfigError(f"unknown driver {name!r}", key="driver", value=name, hint=hint)
-    found = points[name].load()
-    if not isinstance(found, DriverSpec):
-        raise ConfigError(
-            f"entry point {points[name].value!r} is no DriverSpec",
-            key=name,
-            value=points[name].value,
-            hint="point it at the module's SPEC",
-        )
-    return found
+    return entry_points.load(GROUP, "driver", name, DriverSpec)

@@ -1,0 +1,356 @@
+"""Interlocks: pure rules over a ``CellView``, and the section of the cell file that sets their limits.
+
+Each rule is a small frozen dataclass with a ``check``; each is configured by a model whose keys carry their units.
+None of them changes a command: that is the work of the arm's gate. They say when motion has to end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Annotated, Any, Final, Literal, Protocol
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, TypeAdapter, ValidationError, model_validator
+
+from control.view import CellView
+from control.violation import Severity, Violation
+from drivers.errors import ConfigError
+from geometry.types import Array
+
+
+class Interlock(Protocol):
+    """A rule. ``check`` is a pure function of the view; what it raises counts as a fault."""
+
+    @property
+    def name(self) -> str:
+        """Its name in the cell file."""
+        ...
+
+    @property
+    def severity(self) -> Severity:
+        """What a violation asks for."""
+        ...
+
+    def check(self, view: CellView) -> Violation | None:
+        """The worst violation in ``view``, or None."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Finite:
+    """Every number in the view and in the commands is finite. Always on, and asked before all others."""
+
+    name: str = "finite"
+    severity: Severity = Severity.FAULT
+
+    def check(self, view: CellView) -> Violation | None:
+        for role, frame_seq, what, value in self._numbers(view):
+            if not np.isfinite(value).all():
+                reason = f"{what} is not finite"
+                return Violation(self.name, self.severity, role, reason, view.now_ns, frame_seq=frame_seq)
+        return None
+
+    def _numbers(self, view: CellView) -> Iterator[tuple[str, int | None, str, Any]]:
+        for role, arm in view.arms.items():
+            if arm.command is not None:
+                yield role, None, "commanded twist", arm.command.twist
+                yield role, None, "commanded time-to-live", arm.command.ttl_s
+            yield role, None, "measured pose", arm.state.value.T_base_tcp
+            yield role, None, "measured twist", arm.state.value.twist
+        for role, sensor in view.sensors.items():
+            for what, value in (
+                ("depth", sensor.depth_m),
+                ("depth deviation", sensor.sigma_depth_m),
+                ("innovation", sensor.nis),
+            ):
+                if value is not None:
+                    yield role, sensor.seq, what, value
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Workspace:
+    """A point of an arm's tool stays inside a box along the axes of the arm's base.
+
+    Attributes:
+        arm: role of the arm.
+        T_tcp_point: pose (4, 4) of the guarded point in the tool frame: the sensor's, or the identity.
+        min_m: lower corner (3,).
+        max_m: upper corner (3,).
+    """
+
+    name: str
+    severity: Severity
+    arm: str
+    T_tcp_point: Array
+    min_m: Array
+    max_m: Array
+
+    def check(self, view: CellView) -> Violation | None:
+        T_base_tcp = view.arms[self.arm].state.value.T_base_tcp
+        p = (T_base_tcp @ self.T_tcp_point)[:3, 3]
+        excess = np.maximum(self.min_m - p, p - self.max_m)
+        axis = int(np.argmax(excess))
+        if excess[axis] <= 0.0:
+            return None
+        limit = self.max_m[axis] if p[axis] > self.max_m[axis] else self.min_m[axis]
+        reason = f"{'xyz'[axis]} = {1e3 * p[axis]:.1f} mm is outside the box, limit {1e3 * limit:g} mm"
+        return Violation(
+            self.name, self.severity, self.arm, reason, view.now_ns, value=float(p[axis]), limit=float(limit), unit="m"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class TcpSpeed:
+    """No tool centre point moves, or is told to move, faster than the limits."""
+
+    name: str
+    severity: Severity
+    limit_m_s: float
+    limit_rad_s: float
+
+    def check(self, view: CellView) -> Violation | None:
+        worst: Violation | None = None
+        worst_ratio = 1.0
+        for role, arm in view.arms.items():
+            twists = {"measured": arm.state.value.twist}
+            if arm.command is not None:
+                twists["commanded"] = arm.command.twist
+            for source, twist in twists.items():
+                for part, limit, unit in ((twist[:3], self.limit_m_s, "m/s"), (twist[3:], self.limit_rad_s, "rad/s")):
+                    speed = math.sqrt(float(part @ part))
+                    if speed > limit * worst_ratio:
+                        worst_ratio = speed / limit
+                        reason = f"{source} speed is {speed:.4g} {unit}, limit {limit:g} {unit}"
+                        worst = Violation(
+                            self.name, self.severity, role, reason, view.now_ns, value=speed, limit=limit, unit=unit
+                        )
+        return worst
+
+
+@dataclass(frozen=True, slots=True)
+class Depth:
+    """No sensor is pressed in deeper than the limit."""
+
+    name: str
+    severity: Severity
+    limit_m: float
+
+    def check(self, view: CellView) -> Violation | None:
+        depths = {role: s.depth_m for role, s in view.sensors.items() if s.depth_m is not None}
+        role = max(depths, key=lambda r: depths[r], default=None)
+        if role is None or depths[role] <= self.limit_m:
+            return None
+        return Violation(
+            self.name,
+            self.severity,
+            role,
+            f"pressed in by {1e3 * depths[role]:.2f} mm, limit {1e3 * self.limit_m:g} mm",
+            view.now_ns,
+            value=depths[role],
+            limit=self.limit_m,
+            unit="m",
+            frame_seq=view.sensors[role].seq,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAge:
+    """Every sensor's newest frame is younger than the limit, and none comes from the future."""
+
+    name: str
+    severity: Severity
+    limit_s: float
+
+    def check(self, view: CellView) -> Violation | None:
+        stamps = {role: (sensor.t_frame_ns, sensor.seq) for role, sensor in view.sensors.items()}
+        return _check_ages(self, "newest frame", stamps, view.now_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class ArmStateAge:
+    """Every arm's newest state is younger than the limit, and none comes from the future."""
+
+    name: str
+    severity: Severity
+    limit_s: float
+
+    def check(self, view: CellView) -> Violation | None:
+        stamps = {role: (arm.state.t_ns, None) for role, arm in view.arms.items()}
+        return _check_ages(self, "newest state", stamps, view.now_ns)
+
+
+def _check_ages(
+    rule: FrameAge | ArmStateAge, what: str, stamps: Mapping[str, tuple[int, int | None]], now_ns: int
+) -> Violation | None:
+    """The oldest of ``stamps`` (time and frame number by role) if it is too old, or one that lies in the future."""
+    for role, (t_ns, seq) in sorted(stamps.items(), key=lambda item: item[1][0]):
+        age_s = (now_ns - t_ns) * 1e-9
+        if not 0.0 <= age_s <= rule.limit_s:
+            reason = f"{what} is {1e3 * age_s:.1f} ms old, limit {1e3 * rule.limit_s:g} ms"
+            return Violation(
+                rule.name,
+                rule.severity,
+                role,
+                reason,
+                now_ns,
+                value=age_s,
+                limit=rule.limit_s,
+                unit="s",
+                frame_seq=seq,
+            )
+    return None
+
+
+class _Settings(BaseModel):
+    """Base of the settings: unknown keys refused, no limit has a default."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    severity: Literal["trip", "fault"] = "trip"
+
+    @property
+    def _severity(self) -> Severity:
+        return Severity[self.severity.upper()]
+
+
+class WorkspaceConfig(_Settings):
+    """Box for a sensor, or for the tool centre point of an arm without one, along the axes of the arm's base."""
+
+    kind: Literal["workspace"]
+    arm: str
+    sensor: str | None = None
+    min_mm: tuple[float, float, float]
+    max_mm: tuple[float, float, float]
+
+    @model_validator(mode="after")
+    def _corners_in_order(self) -> WorkspaceConfig:
+        if not all(low < high for low, high in zip(self.min_mm, self.max_mm, strict=True)):
+            raise ValueError(f"min_mm {list(self.min_mm)} is not below max_mm {list(self.max_mm)} in every axis")
+        return self
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
+        """The rule. Raises ConfigError for a sensor that the cell does not have."""
+        if self.sensor is not None and self.sensor not in T_tcp_sensor:
+            raise ConfigError(
+                f"the task has no sensor {self.sensor!r}",
+                key=f"interlocks.{name}.sensor",
+                value=self.sensor,
+                hint=f"sensors: {', '.join(sorted(T_tcp_sensor)) or 'none'}",
+            )
+        T_tcp_point = np.eye(4) if self.sensor is None else T_tcp_sensor[self.sensor]
+        min_m, max_m = 1e-3 * np.array(self.min_mm), 1e-3 * np.array(self.max_mm)
+        return Workspace(name, self._severity, self.arm, T_tcp_point, min_m, max_m)
+
+
+class TcpSpeedConfig(_Settings):
+    """Largest speeds of any tool centre point."""
+
+    kind: Literal["tcp_speed"]
+    limit_m_s: PositiveFloat
+    limit_rad_s: PositiveFloat
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
+        """The rule."""
+        return TcpSpeed(name, self._severity, self.limit_m_s, self.limit_rad_s)
+
+
+class DepthConfig(_Settings):
+    """Deepest indentation of any sensor."""
+
+    kind: Literal["depth"]
+    limit_mm: PositiveFloat
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
+        """The rule."""
+        return Depth(name, self._severity, 1e-3 * self.limit_mm)
+
+
+class FrameAgeConfig(_Settings):
+    """Oldest tactile frame."""
+
+    kind: Literal["frame_age"]
+    limit_ms: PositiveFloat
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
+        """The rule."""
+        return FrameAge(name, self._severity, 1e-3 * self.limit_ms)
+
+
+class ArmStateAgeConfig(_Settings):
+    """Oldest arm state."""
+
+    kind: Literal["arm_state_age"]
+    limit_ms: PositiveFloat
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
+        """The rule."""
+        return ArmStateAge(name, self._severity, 1e-3 * self.limit_ms)
+
+
+InterlockConfig = Annotated[
+    WorkspaceConfig | TcpSpeedConfig | DepthConfig | FrameAgeConfig | ArmStateAgeConfig, Field(discriminator="kind")
+]
+"""One entry of the ``interlocks:`` section; ``kind`` says which."""
+
+InterlocksConfig = dict[str, InterlockConfig]
+"""The ``interlocks:`` section: settings by a name that people choose."""
+
+
+@dataclass(frozen=True, slots=True)
+class InterlockSpec:
+    """One kind of interlock, for ``touchcell list``.
+
+    Attributes:
+        kind: the word in the cell file.
+        summary: one line.
+        config: its settings; None for what is always on.
+    """
+
+    kind: str
+    summary: str
+    config: type[BaseModel] | None
+
+
+INTERLOCKS: Final[Mapping[str, InterlockSpec]] = MappingProxyType(
+    {
+        spec.kind: spec
+        for spec in (
+            InterlockSpec("finite", "every number is finite; always on, asked before all others", None),
+            InterlockSpec("workspace", "sensor or tool stays inside a box in the arm's base frame", WorkspaceConfig),
+            InterlockSpec("tcp_speed", "measured and commanded tool speed stay below limits", TcpSpeedConfig),
+            InterlockSpec("depth", "no sensor is pressed in too deep", DepthConfig),
+            InterlockSpec("frame_age", "tactile frames are fresh", FrameAgeConfig),
+            InterlockSpec("arm_state_age", "arm states are fresh", ArmStateAgeConfig),
+        )
+    }
+)
+
+
+def parse_interlocks(section: Mapping[str, Any]) -> dict[str, InterlockConfig]:
+    """The ``interlocks:`` section as settings.
+
+    Raises:
+        ConfigError: for the first entry that is unknown, incomplete, not positive or inverted, with its key.
+    """
+    try:
+        return TypeAdapter(InterlocksConfig).validate_python(dict(section))
+    except ValidationError as error:
+        first = error.errors()[0]
+        # pydantic puts the discriminator's value between the name and the key.
+        path = [str(part) for i, part in enumerate(first["loc"]) if i != 1]
+        raise ConfigError(
+            first["msg"],
+            key=".".join(["interlocks", *path]),
+            value=first.get("input"),
+            hint=f"kinds: {', '.join(kind for kind, spec in INTERLOCKS.items() if spec.config)}",
+        ) from None
+
+
+def build_interlocks(
+    settings: Mapping[str, InterlockConfig], T_tcp_sensor: Mapping[str, Array]
+) -> tuple[Interlock, ...]:
+    """The rules of a cell whose sensors sit at ``T_tcp_sensor``, (4, 4) by role. Raises ConfigError."""
+    return tuple(config.build(name, T_tcp_sensor) for name, config in settings.items())
