@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
 from cell.yaml_file import InvalidCell, KeyPath, YamlFile, load, suggest
-from control.interlocks import InterlockConfig, interlock_models
+from control.interlocks import INTERLOCKS, InterlocksConfig
 from drivers import registry as driver_registry
 from drivers.device import DeactivatePolicy
 from drivers.errors import ConfigError
@@ -111,7 +111,7 @@ class CellFile(_Section):
     scene: dict[str, Any] | None = None
     arms: dict[str, ArmSection] = {}
     sensors: dict[str, SensorSection] = {}
-    interlocks: dict[str, Any] = {}
+    interlocks: InterlocksConfig = {}
     task: TaskSection
     recording: RecordingSection = RecordingSection()
 
@@ -134,7 +134,6 @@ class CellPlan:
         cell: the file's own sections.
         arms, sensors: devices that the task needs, by name in the cell.
         arm_roles, sensor_roles: role in the task -> name in the cell.
-        interlocks: validated configuration by name.
         task: the task's spec.
         task_config: its validated parameters.
         skipped: devices of the file that this task does not need and that are not built.
@@ -146,7 +145,6 @@ class CellPlan:
     sensors: Mapping[str, DevicePlan]
     arm_roles: Mapping[str, str]
     sensor_roles: Mapping[str, str]
-    interlocks: Mapping[str, InterlockConfig]
     task: TaskSpec
     task_config: TaskConfig
     skipped: tuple[str, ...]
@@ -183,17 +181,15 @@ class _Planner:
         needed_arms = set(arm_roles.values()) | mounts
         arms = {name: plan for name in cell.arms if (plan := self._arm(cell, name)) and name in needed_arms}
         sensors = {name: plan for name in cell.sensors if (plan := self._sensor(cell, name)) and name in needed_sensors}
-        interlocks = self._interlocks(cell)
         if task:
             self._require_abilities(task, arm_roles, arms)
+            self._require_interlocks(cell, task)
         if self._problems:
             raise InvalidCell(self._problems)
         assert task is not None
         assert task_config is not None
         skipped = sorted((set(cell.arms) - set(arms)) | (set(cell.sensors) - set(sensors)))
-        return CellPlan(
-            file.path, cell, arms, sensors, arm_roles, sensor_roles, interlocks, task, task_config, tuple(skipped)
-        )
+        return CellPlan(file.path, cell, arms, sensors, arm_roles, sensor_roles, task, task_config, tuple(skipped))
 
     @cached_property
     def _scene_model(self) -> type[BaseModel]:
@@ -281,21 +277,20 @@ class _Planner:
         config = self._validated(spec.config, {**(section.model_extra or {}), **settings}, at)
         return DevicePlan(at[1], spec, config) if config is not None else None
 
-    def _interlocks(self, cell: CellFile) -> dict[str, InterlockConfig]:
-        models = interlock_models()
-        found = {}
-        for name, data in cell.interlocks.items():
-            if name not in models:
-                self._add(("interlocks", name), "unknown interlock", value=name, hint=suggest(name, sorted(models)))
-                continue
-            config = self._validated(models[name], data or {}, ("interlocks", name))
-            if config is not None:
-                found[name] = config
-        return found
+    def _require_interlocks(self, cell: CellFile, task: TaskSpec) -> None:
+        """What moves must be bounded; limits have no defaults, so the file has to name them."""
+        moves = any("TwistSink" in abilities for abilities in task.arms.values())
+        required = {"workspace", "tcp_speed", "arm_state_age"} if moves else set()
+        if moves and task.sensors:
+            required |= {"depth", "frame_age"}
+        for kind in sorted(required - {entry.kind for entry in cell.interlocks.values()}):
+            self._add(
+                ("interlocks",),
+                f"no interlock of kind {kind!r}, which a task that moves an arm must have",
+                hint=f"add one: {INTERLOCKS[kind].summary}",
+            )
 
-    def _require_abilities(
-        self, task: TaskSpec, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]
-    ) -> None:
+    def _require_abilities(self, task: TaskSpec, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]) -> None:
         for role, abilities in task.arms.items():
             name = arm_roles.get(role)
             if name is None or name not in arms:

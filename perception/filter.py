@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from geometry.gaussian import PoseGaussian
 
 from geometry import gaussian, se3
-from geometry.gaussian import PoseGaussian
 from geometry.types import Array
 
 

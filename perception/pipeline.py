@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from geometry.gaussian import PoseGaussian
 
 from drivers.abilities import FrameSource
 from drivers.errors import EndOfStream
 from drivers.samples import Frame, Stamped
 from geometry import gaussian
-from geometry.gaussian import PoseGaussian
 from geometry.types import Array
 from perception.contact_gate import ContactGate
 from perception.estimate import ContactEstimate
@@ -148,9 +148,7 @@ class ContactPipeline:
             state = self._filter.update(observed, self._sensor_pose(frame.t_ns), frame.t_ns)
             belief, nis = state.belief, state.nis
         self.times = StageTimes(read_ns, preprocess_ns, infer_ns, self._timer() - start)
-        return ContactEstimate(
-            True, belief, frame.t_ns, frame.seq, frame.t_ns, in_range=prediction.in_range, nis=nis
-        )
+        return ContactEstimate(True, belief, frame.t_ns, frame.seq, frame.t_ns, in_range=prediction.in_range, nis=nis)
 
     def _replayed(self, estimate: ContactEstimate, now_ns: int) -> ContactEstimate:
         """The estimate carried from its frame to now by the sensor's own motion since."""
