@@ -56,6 +56,11 @@ class Recorder:
         except OSError as error:
             raise self._failure(error) from None
 
+    @property
+    def failed(self) -> bool:
+        """Whether a write has failed; nothing more is written then."""
+        return self._failed
+
     def write(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
         """Append one message; numpy values become lists, and what is not finite becomes null."""
         if self._failed:

@@ -1,0 +1,258 @@
+"""From a plan to running devices: builds only what the task needs, in the order in which things depend on each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Protocol, Self, cast
+
+import numpy as np
+
+from cell.config import CellPlan, NetworkEstimator, SensorSection
+from cell.messages import belief_message, pose_message
+from control.interlocks import build_interlocks
+from control.latch import Latch
+from control.supervisor import Supervisor
+from drivers.abilities import FrameSource, TcpSource
+from drivers.arm import Arm
+from drivers.clock import Clock, MonotonicClock, VirtualClock
+from drivers.device import Device
+from drivers.registry import DriverContext
+from geometry import se3
+from geometry.types import Array
+from perception.pipeline import ContactPipeline, ContactSource
+from tasks.interface import Task, TaskContext
+
+if TYPE_CHECKING:
+    from drivers.simulation.scene import Scene
+
+BUILTIN = "builtin:"
+MODELS = Path(__file__).parent.parent / "perception" / "models"
+
+
+class PoseDevice(TcpSource, Protocol):
+    """A device that tells where its tool is: an arm, or the replay of one."""
+
+
+@dataclass
+class Sensor:
+    """One tactile sensor in a running cell.
+
+    Attributes:
+        source: tells its contact.
+        arm_role: role of the arm that carries it, None where nothing moves it.
+        T_tcp_sensor: (4, 4) its pose in that arm's tool frame.
+        truth: the simulator's own contact state, where there is one.
+        frames: how images are recorded.
+    """
+
+    source: ContactSource
+    arm_role: str | None
+    T_tcp_sensor: Array
+    truth: ContactSource | None = None
+    frames: str = "none"
+    _recorded_seq: int = field(default=-1, init=False)
+
+    def stage_times(self) -> dict[str, int]:
+        """Nanoseconds of each perception stage in this cycle; empty for a source that has none."""
+        if not isinstance(self.source, ContactPipeline):
+            return {}
+        times = self.source.times
+        return {
+            "read frame": times.read_ns,
+            "preprocess": times.preprocess_ns,
+            "infer": times.infer_ns,
+            "filter": times.filter_ns,
+        }
+
+    def extra_messages(self, now_ns: int) -> Iterator[tuple[str, int, dict[str, Any]]]:
+        """What else is recorded of this sensor in this cycle: the frame's own measurement, its image, the truth."""
+        if isinstance(self.source, ContactPipeline):
+            measured = self.source.measurement
+            if measured is not None and measured.belief is not None:
+                yield "measurement", measured.t_ns, {"seq": measured.seq, **belief_message(measured.belief)}
+            frame = self.source.frame
+            if self.frames != "none" and frame is not None and frame.seq != self._recorded_seq:
+                self._recorded_seq = frame.seq
+                yield "image", frame.t_ns, _image_message(frame.value.image, self.frames, frame.seq, frame.t_ns)
+        if self.truth is not None:
+            true = self.truth.update(now_ns)
+            if true is not None:
+                message: dict[str, Any] = {"in_contact": true.in_contact}
+                if true.belief is not None:
+                    message |= pose_message(se3.inverse(true.belief.mean))
+                yield "truth", true.t_ns, message
+
+
+@dataclass
+class Cell:
+    """A cell that is built. As a context manager it is connected and activated, and given back at the end.
+
+    Attributes:
+        plan: where it came from.
+        clock: its time.
+        arms: by role in the task, and those that only carry a sensor by their own name.
+        sensors: by role.
+    """
+
+    plan: CellPlan
+    clock: Clock
+    arms: Mapping[str, Any]
+    cameras: Mapping[str, Device]
+    sensors: Mapping[str, Sensor]
+    supervisor: Supervisor
+    task: Task
+    start_ns: int = 0
+    _exit: ExitStack = field(default_factory=ExitStack, init=False)
+
+    @property
+    def rate_hz(self) -> float:
+        """Control cycles per second."""
+        return self.plan.cell.rate_hz
+
+    @property
+    def max_duration_s(self) -> float:
+        """Longest run."""
+        return self.plan.cell.max_duration_s
+
+    @property
+    def task_name(self) -> str:
+        """The task's name, which owns the arms' leases."""
+        return self.plan.task.name
+
+    def __enter__(self) -> Self:
+        with self._exit:
+            for device in self._devices():
+                self._exit.enter_context(device)
+                device.configure()
+            # Every device must answer before the first one is energised.
+            for device in self._devices():
+                device.activate()
+                self._exit.callback(self._deactivate, device)
+            self.start_ns = self.clock.now_ns()
+            self._exit = self._exit.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._exit.close()
+
+    def _devices(self) -> list[Device]:
+        unique = {id(device): device for device in [*self.arms.values(), *self.cameras.values()]}
+        return list(unique.values())
+
+    def _deactivate(self, device: Device) -> None:
+        section = self.plan.cell.arms.get(device.name)
+        if device.state.value == "active":
+            device.deactivate(section.deactivate) if section is not None else device.deactivate()
+
+
+def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
+    """Build everything that ``plan`` needs; nothing is connected yet.
+
+    Args:
+        plan: a checked cell file.
+        clock: in place of the one that the file asks for.
+
+    Raises:
+        ConfigError: an interlock names what is not there.
+        ModelError: a model file cannot be used.
+    """
+    cell_clock: Clock = clock or (VirtualClock() if plan.cell.time == "simulated" else MonotonicClock())
+    scene = _scene(plan, cell_clock)
+    devices: dict[str, Device] = {}
+    context = DriverContext(cell_clock, devices, scene, plan.cell.seed)
+    for device_plan in [*plan.arms.values(), *plan.sensors.values()]:
+        devices[device_plan.name] = device_plan.spec.build(device_plan.name, device_plan.config, context)
+    arm_of = {name: role for role, name in plan.arm_roles.items()}
+    arm_of |= {name: name for name in plan.arms if name not in arm_of}
+    sensors = {role: _sensor(plan, name, devices, scene, arm_of) for role, name in plan.sensor_roles.items()}
+    poses = {role: sensor.T_tcp_sensor for role, sensor in sensors.items()}
+    supervisor = Supervisor(build_interlocks(plan.cell.interlocks, poses), Latch())
+    task = plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses))
+    return Cell(
+        plan=plan,
+        clock=cell_clock,
+        arms={role: cast(Arm, devices[name]) for name, role in arm_of.items()},
+        cameras={name: devices[name] for name in plan.sensors},
+        sensors=sensors,
+        supervisor=supervisor,
+        task=task,
+    )
+
+
+def model_path(name: str) -> Path:
+    """The file behind a cell file's ``model:``: a path, or ``builtin:NAME`` for one that ships with touchcell."""
+    return MODELS / f"{name.removeprefix(BUILTIN)}.safetensors" if name.startswith(BUILTIN) else Path(name)
+
+
+def _scene(plan: CellPlan, clock: Clock) -> Scene | None:
+    if plan.cell.scene is None:
+        return None
+    from drivers.simulation.scene import Scene, SceneConfig
+
+    return Scene.build(SceneConfig.model_validate(plan.cell.scene), clock)
+
+
+def _sensor(
+    plan: CellPlan, name: str, devices: Mapping[str, Device], scene: Scene | None, arm_of: Mapping[str, str]
+) -> Sensor:
+    section = plan.cell.sensors[name]
+    truth = None
+    if scene is not None:
+        from cell.truth import TrueContactSource
+
+        truth = TrueContactSource(scene, name)
+    source: ContactSource
+    if isinstance(section.estimator, NetworkEstimator):
+        source = _pipeline(section, section.estimator, devices[name])
+    else:
+        assert truth is not None
+        source = truth
+    return Sensor(
+        source=source,
+        arm_role=arm_of[section.mounted_on] if section.mounted_on else None,
+        T_tcp_sensor=se3.from_euler_mm_deg(np.array(section.tcp_to_sensor_mm_deg)),
+        truth=truth,
+        frames=plan.cell.recording.frames,
+    )
+
+
+def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Device) -> ContactPipeline:
+    from perception.contact_gate import ContactGate
+    from perception.inference import ContactModel
+
+    from perception.filter import PoseFilter, isotropic_noise
+
+    model = ContactModel.load(model_path(estimator.model))
+    settings = estimator.filter
+    pose_filter = (
+        PoseFilter(isotropic_noise(1e-3 * settings.drift_mm_per_sqrt_s, np.deg2rad(settings.drift_deg_per_sqrt_s)))
+        if settings
+        else None
+    )
+    gate = estimator.gate
+    contact_gate = (
+        ContactGate(model.reference, touch=gate.touch_percent / 100, release=gate.release_percent / 100)
+        if gate
+        else None
+    )
+    return ContactPipeline(cast(FrameSource, camera), model, contact_gate=contact_gate, pose_filter=pose_filter)
+
+
+def _image_message(image: Any, kind: str, seq: int, t_ns: int) -> dict[str, Any]:
+    import base64
+
+    import cv2
+
+    encoded = cv2.imencode(".jpg" if kind == "jpeg" else ".png", image)[1].tobytes()
+    return {
+        "timestamp": {"sec": t_ns // 10**9, "nsec": t_ns % 10**9},
+        "frame_id": str(seq),
+        "format": kind,
+        "data": base64.b64encode(encoded).decode(),
+    }
