@@ -1,4 +1,4 @@
-"""From a plan to running devices: builds only what the task needs, in the order in which things depend on each other."""
+"""From a plan to running devices: builds only what the task needs, each thing after those that it depends on."""
 
 from __future__ import annotations
 

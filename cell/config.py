@@ -150,17 +150,23 @@ class CellPlan:
     skipped: tuple[str, ...]
 
 
-def plan_cell(path: Path, overrides: Mapping[str, Any] | None = None) -> CellPlan:
+def plan_cell(path: Path, overrides: Mapping[str, Any] | None = None, *, model: str | None = None) -> CellPlan:
     """Read and check a cell file without connecting anything.
 
     Args:
         path: the YAML file.
         overrides: driver keys set from the command line (``--data``), for every device whose driver has such a key.
+        model: network model in place of the one that the file names.
 
     Raises:
         ConfigError: with file, line, key, value and remedy; InvalidCell for several at once.
     """
-    return _Planner(load(path), overrides or {}).plan()
+    file = load(path)
+    if model is not None:
+        for sensor in file.data.get("sensors", {}).values():
+            if sensor.get("estimator", {}).get("kind") == "network":
+                sensor["estimator"]["model"] = model
+    return _Planner(file, overrides or {}).plan()
 
 
 class _Planner:

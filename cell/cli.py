@@ -1,0 +1,192 @@
+"""``touchcell``: the command line. Each command imports what it needs when it runs, so that none pays for another."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from geometry.errors import TouchcellError
+
+EXIT_OK = 0
+EXIT_TASK_FAILED = 1
+EXIT_BAD_INPUT = 2
+EXIT_TRIPPED = 3
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code: 0 done, 1 the task failed, 2 bad input, 3 an interlock tripped."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words[:1] == ["emulate"]:
+        from drivers.emulators.launcher import main as emulate
+
+        return emulate(words[1:])
+    options = _parser().parse_args(words)
+    try:
+        code: int = options.run(options)
+        return code
+    except TouchcellError as error:
+        print(f"touchcell: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        print("touchcell: interrupted", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("touchcell", description="Robot cells that feel.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="run a cell's task and report on it")
+    run.add_argument("cell", type=Path)
+    run.add_argument("--data", type=Path, help="data set folder for drivers that replay one")
+    run.add_argument("--model", help="model file in place of the one that the cell names")
+    run.add_argument("--out", type=Path, help="run folder (default: runs/NAME-TIME)")
+    run.add_argument("--quiet", action="store_true", help="no live progress line")
+    run.set_defaults(run=_run)
+
+    check = commands.add_parser("check", help="validate a cell file without connecting anything")
+    check.add_argument("cell", type=Path)
+    check.add_argument("--data", type=Path, help=argparse.SUPPRESS)
+    check.set_defaults(run=_check)
+
+    listing = commands.add_parser("list", help="known drivers, tasks, interlocks, emulators, benchmarks and cells")
+    listing.set_defaults(run=_list)
+
+    train = commands.add_parser("train", help="train an estimator on labelled images")
+    train.add_argument("--data", type=Path, required=True, help="data set folder with train/ and val/")
+    train.add_argument("--out", type=Path, required=True, help="model file to write (.safetensors)")
+    train.add_argument("--kind", choices=("gdn", "cnn"), default="gdn", help="Gaussian-density network or regression")
+    train.add_argument("--epochs", type=int)
+    train.add_argument("--seed", type=int, default=0)
+    train.add_argument("--fresh", action="store_true", help="start again instead of resuming")
+    train.set_defaults(run=_train)
+
+    train_sim = commands.add_parser("train-sim", help="train the estimator that ships, on simulated images")
+    train_sim.add_argument("--out", type=Path, required=True, help="model file to write (.safetensors)")
+    train_sim.add_argument("--samples", type=int, default=12_000)
+    train_sim.add_argument("--epochs", type=int)
+    train_sim.add_argument("--seed", type=int, default=0)
+    train_sim.set_defaults(run=_train_sim)
+
+    evaluate = commands.add_parser("evaluate", help="error, likelihood, calibration and latency on labelled images")
+    evaluate.add_argument("--data", type=Path, required=True)
+    evaluate.add_argument("--split", default="val", help="train, val or test")
+    evaluate.add_argument("--model", type=Path, required=True)
+    evaluate.add_argument("--json", type=Path, help="also write the figures there")
+    evaluate.set_defaults(run=_evaluate)
+
+    report = commands.add_parser("report", help="make a run's summary and plots again from its recording")
+    report.add_argument("folder", type=Path)
+    report.set_defaults(run=_report)
+
+    bench = commands.add_parser("bench", help="run time against error")
+    bench.add_argument("name", nargs="?", help="which; `touchcell list` names them")
+    bench.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for tables and plots")
+    bench.add_argument("rest", nargs=argparse.REMAINDER, help="arguments of the benchmark")
+    bench.set_defaults(run=_bench)
+
+    commands.add_parser("emulate", help="emulate a device on the wire", add_help=False)
+    return parser
+
+
+def _run(options: argparse.Namespace) -> int:
+    from cell.run import run_cell
+
+    return run_cell(
+        find_cell(options.cell),
+        data=options.data,
+        model=options.model,
+        out=options.out,
+        live=not options.quiet and sys.stdout.isatty(),
+    )
+
+
+def _check(options: argparse.Namespace) -> int:
+    from cell.config import plan_cell
+
+    plan = plan_cell(find_cell(options.cell), _overrides(options.data))
+    print(f"{options.cell}: {plan.cell.name} is valid")
+    print(f"  task     {plan.task.name}: {plan.task.summary}")
+    for device in [*plan.arms.values(), *plan.sensors.values()]:
+        print(f"  {device.spec.capabilities.kind:<8} {device.name}: {device.spec.name}, {device.spec.summary}")
+    for name, interlock in plan.cell.interlocks.items():
+        print(f"  interlock {name}: {interlock.kind}")
+    if plan.skipped:
+        print(f"  not needed by this task and not built: {', '.join(plan.skipped)}")
+    return EXIT_OK
+
+
+def _list(options: argparse.Namespace) -> int:
+    from cell.listing import listing
+
+    for title, rows in listing().items():
+        print(title)
+        for name, summary in rows:
+            print(f"  {name:<22} {summary}")
+    return EXIT_OK
+
+
+def _train(options: argparse.Namespace) -> int:
+    from perception.training import train
+
+    train(
+        options.data,
+        options.out,
+        kind=options.kind,
+        epochs=options.epochs,
+        seed=options.seed,
+        resume=not options.fresh,
+    )
+    return EXIT_OK
+
+
+def _train_sim(options: argparse.Namespace) -> int:
+    from cell.train_sim import train_on_simulation
+
+    train_on_simulation(options.out, samples=options.samples, epochs=options.epochs, seed=options.seed)
+    return EXIT_OK
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    from perception.evaluate import evaluate, print_table
+
+    result = evaluate(options.data, options.split, options.model)
+    print_table(result)
+    if options.json is not None:
+        options.json.write_text(result.to_json() + "\n")
+    return EXIT_OK
+
+
+def _report(options: argparse.Namespace) -> int:
+    from cell.report import write_report
+
+    print(write_report(options.folder))
+    return EXIT_OK
+
+
+def _bench(options: argparse.Namespace) -> int:
+    from drivers import entry_points
+
+    known = entry_points.installed("touchcell.benchmarks")
+    if options.name not in known:
+        print(f"benchmarks: {', '.join(sorted(known))}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    options.out.mkdir(parents=True, exist_ok=True)
+    known[options.name].load()(options.rest, options.out)
+    return EXIT_OK
+
+
+def find_cell(path: Path) -> Path:
+    """``path`` itself, or the cell file of that name that ships with touchcell."""
+    shipped = Path(__file__).parent.parent / "configs" / path.name
+    return path if path.exists() or not shipped.exists() else shipped
+
+
+def _overrides(data: Path | None) -> dict[str, Path]:
+    return {} if data is None else {"data": data}
+
+
+if __name__ == "__main__":
+    sys.exit(main())
