@@ -1,8 +1,8 @@
 """What every arm has in common: one lease, one gate, and rest whenever either is given up.
 
 A driver fills in ``tcp``, ``at_rest``, ``_stream_twist`` and ``_begin_stop`` besides the hooks of ``Device``
-(``_after_rest`` in place of ``_deactivate``). It never sees a command that is not finite, in base axes, owned, fresh and
-within the limits.
+(``_after_rest`` in place of ``_deactivate``). It never sees a command that is not finite, along base axes, owned, fresh
+and within the limits.
 """
 
 from __future__ import annotations
