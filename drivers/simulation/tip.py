@@ -1,7 +1,7 @@
 """The TacTip's skin: where its 331 markers go in a contact, and where the camera sees them.
 
-The deformation is a sum of smooth fields around the contact axis, which is the inward normal through the sphere's centre;
-psi is a marker's angle from it. Forms and the first defaults: SIMULATION part 5 (a fit to public images of one sensor).
+The deformation is a sum of smooth fields around the contact axis, which is the inward normal through the sphere's
+centre; psi is a marker's angle from it. The forms are those that SIMULATION part 5 found necessary on real images.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ class TipParameters:
         focal_px: focal length.
         centre_px: (u, v) of the optical axis in the 640x480 frame; pixel centres are whole numbers.
         image_rotation_rad: turn from sensor axes to image axes about z.
+        disc_radius_px: of the markers in the image.
         follow: share of the shear that contacted markers follow.
         rim_follow: share of the shear at the far rim.
         shear_width_rad, shear_power: falloff exp(-(psi / width)^power) of shear and torsion.
@@ -52,6 +53,7 @@ class TipParameters:
     focal_px: float = 503.4
     centre_px: tuple[float, float] = (331.0, 242.0)
     image_rotation_rad: float = -52.0 * _DEG
+    disc_radius_px: float = 6.2
     follow: float = 1.0
     rim_follow: float = 0.2
     shear_width_rad: float = 51.0 * _DEG
@@ -119,7 +121,7 @@ class Tip:
         slope = dent * p.dent_power * reach / (np.maximum(psi * np.sin(psi), 1e-9) * p.marker_radius_m)
         bulge = p.bulge * depth * np.exp(-(((psi - p.bulge_at_rad) / p.bulge_width_rad) ** 2))
 
-        moved = self._rest - dent[..., None] * axis[..., None, :]
+        moved: Array = self._rest - dent[..., None] * axis[..., None, :]
         moved += (p.follow * grip)[..., None] * shear[..., None, :]
         moved += (bulge + p.pin_lever_m * slope)[..., None] * outward
         moved -= (p.torsion_follow * torsion * grip)[..., None] * np.cross(axis[..., None, :], self._rest)
@@ -145,4 +147,5 @@ class Tip:
 
 def _torsion(R: Array) -> Array:
     """Gamma of R = Rz(gamma) Ry(beta) Rx(alpha), (...)."""
-    return np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    gamma: Array = np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    return gamma
