@@ -126,7 +126,8 @@ class SimTactip(Device):
 
 
 def _build(name: str, config: Any, context: DriverContext) -> SimTactip:
-    scene, mount = context.scene, context.devices.get(config.mounted_on)
+    scene: object = context.scene
+    mount: object = context.devices.get(config.mounted_on)
     if not isinstance(scene, Scene):
         raise ConfigError("a simulated sensor needs a scene", key=name, hint="add a scene: section to the cell file")
     if not isinstance(mount, Carrier):
