@@ -193,9 +193,9 @@ def model_path(name: str) -> Path:
 def _scene(plan: CellPlan, clock: Clock) -> Scene | None:
     if plan.cell.scene is None:
         return None
-    from drivers.simulation.scene import Scene, SceneConfig
+    from drivers.simulation.scene import SceneConfig
 
-    return Scene.build(SceneConfig.model_validate(plan.cell.scene), clock)
+    return SceneConfig.model_validate(plan.cell.scene).build(clock)
 
 
 def _sensor(
@@ -237,7 +237,7 @@ def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Devic
     )
     gate = estimator.gate
     contact_gate = (
-        ContactGate(model.reference, touch=gate.touch_percent / 100, release=gate.release_percent / 100)
+        ContactGate(model.reference, enter=gate.touch_percent / 100, leave=gate.release_percent / 100)
         if gate
         else None
     )

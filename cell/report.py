@@ -94,9 +94,8 @@ def write_report(folder: Path) -> str:
     (folder / "summary.json").write_text(json.dumps({**result, **summary}, indent=1) + "\n")
     from cell.plots import plot_contact, plot_trajectory
 
-    pictures = []
-    for sensor in run.roles("sensors", "contact"):
-        pictures.append(plot_contact(run, sensor, folder / f"contact_{sensor}.png"))
+    sensors = run.roles("sensors", "contact")
+    pictures = [plot_contact(run, sensor, folder / f"contact_{sensor}.png") for sensor in sensors]
     if (picture := plot_trajectory(run, folder / "trajectory.png")) is not None:
         pictures.append(picture)
     text = _text(folder, result, summary, pictures, run)

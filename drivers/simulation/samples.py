@@ -1,0 +1,124 @@
+"""Simulated training images with their labels, over the ranges of the public data (SPEC part 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from drivers.simulation.contact import ContactLaw, contact_at
+from drivers.simulation.render import PUBLIC_CROP, SmallRenderer
+from drivers.simulation.tip import Tip, TipParameters
+from geometry import se3
+from geometry.types import Array, ImageArray
+
+_IMAGES_PER_TIP = 16
+_RADIUS_LEVELS = 9
+_ADDITIVE = {"centre_px", "image_rotation_rad", "layout_phase_rad"}
+
+
+@dataclass(frozen=True, slots=True)
+class Variation:
+    """How much simulated sensors and images differ, so that a model does not learn one of them by heart.
+
+    Attributes:
+        parameters: relative standard deviation of the tip's parameters.
+        turn_rad: standard deviation of the image's and the layout's rotation.
+        shift_px: standard deviation of the image centre, in the frame.
+        marker_px: standard deviation of each marker's place, in the frame.
+        disc_radius: relative standard deviation of the discs' radii within an image.
+        missing: share of markers that are not seen.
+        noise: standard deviation of the small image's grey levels.
+    """
+
+    parameters: float = 0.03
+    turn_rad: float = 0.005
+    shift_px: float = 0.7
+    marker_px: float = 0.3
+    disc_radius: float = 0.08
+    missing: float = 0.003
+    noise: float = 3.0
+
+
+def training_set(
+    n: int,
+    seed: int,
+    *,
+    size_px: tuple[int, int] = (128, 128),
+    crop: tuple[int, int, int, int] = PUBLIC_CROP,
+    parameters: TipParameters | None = None,
+    law: ContactLaw | None = None,
+    variation: Variation | None = None,
+) -> Iterator[tuple[ImageArray, Array]]:
+    """Yield ``n`` pairs of a grey image and its label, the same for the same seed.
+
+    Depth is even in 0.5-6 mm, tilt in a 25 deg disc, shear in a 5 mm disc, torsion in +-5 deg; what the depth cannot
+    hold slips, and the label is the pose that is left.
+
+    Args:
+        n: how many.
+        seed: of everything random.
+        size_px: (width, height) of the images.
+        crop: (left, top, right, bottom) px of the 640x480 frame that they show.
+        parameters: of the sensor around which the others scatter.
+        law: how the tips slip.
+        variation: how far they scatter.
+
+    Yields:
+        image (height, width) uint8, and T_f_s (4, 4).
+    """
+    rng = np.random.default_rng(seed)
+    middle, law, variation = parameters or TipParameters(), law or ContactLaw(), variation or Variation()
+    levels = 1.0 + variation.disc_radius * np.linspace(-2.0, 2.0, _RADIUS_LEVELS)
+    renderer = SmallRenderer(size_px, crop, tuple(float(level) for level in middle.disc_radius_px * levels))
+    for start in range(0, n, _IMAGES_PER_TIP):
+        count = min(_IMAGES_PER_TIP, n - start)
+        tip = Tip(_scattered(middle, variation, rng))
+        T_f_s = np.stack([contact_at(pose, law).T_f_s for pose in random_poses(count, rng)])
+        pixels = tip.pixels(T_f_s)
+        pixels += rng.normal(0.0, variation.marker_px, pixels.shape)
+        seen = rng.random(pixels.shape[:2]) >= variation.missing
+        # The levels span two standard deviations to either side.
+        level = rng.normal((_RADIUS_LEVELS - 1) / 2.0, (_RADIUS_LEVELS - 1) / 4.0, pixels.shape[:2])
+        radius = np.clip(np.round(level), 0, _RADIUS_LEVELS - 1).astype(np.int64)
+        noise = rng.normal(0.0, variation.noise, (count, size_px[1], size_px[0]))
+        for i in range(count):
+            image = renderer.draw(pixels[i][seen[i]], radius[i][seen[i]])
+            yield np.clip(np.round(image + noise[i]), 0, 255).astype(np.uint8), T_f_s[i]
+
+
+def random_poses(n: int, rng: np.random.Generator) -> Array:
+    """(n, 4, 4) contacts T_f_s over the ranges of the public data, before any slip."""
+    tilt, shear = _disc(n, 25.0, rng), _disc(n, 5.0, rng)
+    depth, gamma = rng.uniform(0.5, 6.0, n), rng.uniform(-5.0, 5.0, n)
+    return se3.from_euler_mm_deg(np.column_stack([shear, depth, tilt, gamma]))
+
+
+def _disc(n: int, radius: float, rng: np.random.Generator) -> Array:
+    """(n, 2) points spread evenly over a disc."""
+    length, angle = radius * np.sqrt(rng.random(n)), rng.uniform(0.0, 2.0 * np.pi, n)
+    return np.column_stack([length * np.cos(angle), length * np.sin(angle)])
+
+
+def _scattered(middle: TipParameters, variation: Variation, rng: np.random.Generator) -> TipParameters:
+    changed = {
+        each.name: getattr(middle, each.name) * (1.0 + rng.normal(0.0, variation.parameters))
+        for each in fields(middle)
+        if each.name not in _ADDITIVE | {"rings", "camera_distance_m", "focal_px", "ring_step_rad"}
+    }
+    u, v = middle.centre_px + rng.normal(0.0, variation.shift_px, 2)
+    # Focal length and camera distance together set the scale: scattered alone they would change it by too much.
+    zoom = 1.0 + rng.normal(0.0, 0.3 * variation.parameters)
+    nearer = 1.0 + rng.normal(0.0, variation.parameters)
+    distance = middle.camera_distance_m * nearer
+    to_apex = (distance + middle.marker_radius_m) / (middle.camera_distance_m + middle.marker_radius_m)
+    return replace(
+        middle,
+        **changed,
+        centre_px=(float(u), float(v)),
+        image_rotation_rad=middle.image_rotation_rad + rng.normal(0.0, variation.turn_rad),
+        layout_phase_rad=middle.layout_phase_rad + rng.normal(0.0, variation.turn_rad),
+        camera_distance_m=distance,
+        focal_px=middle.focal_px * zoom * to_apex,
+    )
