@@ -38,6 +38,30 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
+class LabelledImages:
+    """Preprocessed images and what they show.
+
+    Attributes:
+        images: uint8 (n, height, width), as ``Preprocessing.reduce`` leaves them.
+        xi: (n, 6) log(T_s_f), m and rad.
+    """
+
+    images: ImageArray
+    xi: Array
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def digest(self) -> str:
+        """SHA-256 of the content, the same on every machine."""
+        content = hashlib.sha256(repr(self.images.shape).encode())
+        content.update(np.ascontiguousarray(self.images).data)
+        # To a picometre, so that the last bit of a logarithm does not make another data set.
+        content.update(np.round(self.xi, 12).astype("<f8").tobytes())
+        return content.hexdigest()
+
+
+@dataclass(frozen=True)
 class Split:
     """One split of a data set, images not yet read.
 
@@ -187,15 +211,6 @@ def load_reduced(
 def default_cache() -> Path:
     """``$XDG_CACHE_HOME/touchcell/images``, or the same under ``~/.cache``."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "touchcell" / "images"
-
-
-def digest(images: ImageArray, xi: Array) -> str:
-    """SHA-256 of a training set's content, the same on every machine."""
-    content = hashlib.sha256(repr(images.shape).encode())
-    content.update(np.ascontiguousarray(images).data)
-    # Labels are rounded to a picometre, so that the last bit of a logarithm does not make another data set.
-    content.update(np.ascontiguousarray(np.round(xi, 12)).astype("<f8").data)
-    return content.hexdigest()
 
 
 def _cache_key(split: Split, preprocessing: Preprocessing) -> str:

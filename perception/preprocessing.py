@@ -101,9 +101,7 @@ class Preprocessing(BaseModel):
         if self.crop is not None:
             image = image[self.crop.top : self.crop.bottom, self.crop.left : self.crop.right]
         if image.ndim == 3:
-            image = (
-                cast(ImageArray, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)) if image.shape[2] == 3 else image[:, :, 0]
-            )
+            image = cast(ImageArray, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)) if image.shape[2] == 3 else image[:, :, 0]
         if self.median_px is not None:
             image = cast(ImageArray, cv2.medianBlur(np.ascontiguousarray(image), self.median_px))
         if self.threshold is not None:
@@ -122,7 +120,9 @@ class Preprocessing(BaseModel):
             image = image * _disc(image.shape[0], image.shape[1], self.mask_radius_px)
         height, width = self.output_size
         if image.shape != (height, width):
-            image = cast(ImageArray, cv2.resize(image, (width, height), interpolation=_INTERPOLATIONS[self.interpolation]))
+            image = cast(
+                ImageArray, cv2.resize(image, (width, height), interpolation=_INTERPOLATIONS[self.interpolation])
+            )
         return image
 
     def apply(self, image: ImageArray) -> NDArray[np.float32]:
