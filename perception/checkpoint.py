@@ -60,7 +60,7 @@ def save_checkpoint(
     out: Path, recipe: dict[str, Any], network: nn.Module, optimizer: torch.optim.Optimizer, progress: Progress
 ) -> None:
     """Write the state after an epoch; a reader sees the old file or the new one."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     tensors = {f"network.{name}": tensor for name, tensor in network.state_dict().items()}
     tensors |= {f"best.{name}": tensor for name, tensor in progress.best_state.items()}
@@ -78,11 +78,8 @@ def save_checkpoint(
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
         unfinished = Path(scratch) / path.name
-        save_file(
-            {name: tensor.detach().contiguous() for name, tensor in tensors.items()},
-            unfinished,
-            metadata={_METADATA_KEY: text},
-        )
+        contiguous = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
+        unfinished.write_bytes(save(contiguous, metadata={_METADATA_KEY: text}))
         os.replace(unfinished, path)
 
 

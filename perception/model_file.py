@@ -124,7 +124,7 @@ def save_model(model: Model, path: Path) -> None:
     Raises:
         ModelError: a tensor is missing, of the wrong shape or not finite.
     """
-    from safetensors.numpy import save_file
+    from safetensors.numpy import save
 
     _check_tensors(model, path)
     tensors: dict[str, NDArray[np.generic]] = dict(model.tensors)
@@ -133,7 +133,7 @@ def save_model(model: Model, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
         unfinished = Path(scratch) / path.name
-        save_file(tensors, unfinished, metadata={_METADATA_KEY: model.header.model_dump_json()})
+        unfinished.write_bytes(save(tensors, metadata={_METADATA_KEY: model.header.model_dump_json()}))
         os.replace(unfinished, path)
 
 

@@ -65,11 +65,15 @@ class Display:
 
     def epoch(self, record: EpochRecord, *, best: bool) -> None:
         if record.epoch == 1:
-            self._console.print("epoch   train     val  " + " ".join(f"{name:>9}" for name in record.mae))
+            self._console.print(
+                "epoch   train     val  " + " ".join(f"{name:>9}" for name in record.mae), soft_wrap=True
+            )
         errors = " ".join(f"{error:9.3f}" for error in record.mae.values())
         mark = " *" if best else ""
         self._console.print(
-            f"{record.epoch:5d} {record.train_loss:7.3f} {record.validation_loss:7.3f}  {errors}{mark}", highlight=False
+            f"{record.epoch:5d} {record.train_loss:7.3f} {record.validation_loss:7.3f}  {errors}{mark}",
+            highlight=False,
+            soft_wrap=True,
         )
 
     def _show(self, name: str, description: str, done: int, total: int, loss: str = "") -> None:
