@@ -13,6 +13,7 @@ from drivers.samples import Frame, Stamped
 from geometry.types import Array, ImageArray
 from perception.graph import IMAGES, OUTPUTS, onnx_model
 from perception.model_file import Header, Model, load_model
+from perception.preprocessing import scale
 
 RANGE_TOLERANCE = 0.05
 """How far, in label half-ranges, a prediction may lie outside the taught range and still count as inside."""
@@ -71,7 +72,15 @@ class ContactModel:
         Raises:
             ImageError: the image is not what the model's preprocessing was made for.
         """
-        return self._decode(self._run(self._preprocessing.apply(image)[None])[0])
+        return self.predict_reduced(self.reduce(image))
+
+    def reduce(self, image: ImageArray) -> ImageArray:
+        """The model's preprocessing, uint8 (height, width): what a contact gate compares. Raises as ``predict``."""
+        return self._preprocessing.reduce(image)
+
+    def predict_reduced(self, reduced: ImageArray) -> Prediction:
+        """Contact in an image that ``reduce`` made, so that a gate and a prediction share the preprocessing."""
+        return self._decode(self._run(scale(reduced)[None, None])[0])
 
     def predict_batch(self, images: Sequence[ImageArray]) -> list[Prediction]:
         """``predict`` of several images in one run; faster per image, and the whole batch is held in memory."""
@@ -91,7 +100,9 @@ class ContactModel:
 
     def _decode(self, output: NDArray[np.float32]) -> Prediction:
         mean = output[:6].astype(np.float64)
-        sigma = self._sigma_scale * np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else self._sigma_scale
+        sigma = (
+            self._sigma_scale * np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else self._sigma_scale.copy()
+        )
         return Prediction(
             xi=self._centre + self._half_range * mean,
             sigma=sigma,

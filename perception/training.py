@@ -24,7 +24,7 @@ from perception.figures import write_curves, write_predictions
 from perception.labels import CONTACT_NAMES, contact_from_xi
 from perception.model_file import Header, Labels, Model, save_model, touchcell_version
 from perception.networks import ContactNetwork, gaussian_loss, weighted_absolute_loss, weighted_square_loss
-from perception.preprocessing import Preprocessing
+from perception.preprocessing import Preprocessing, scale
 from perception.training_display import Display, Observer
 
 _EVALUATION_BATCH = 100
@@ -339,8 +339,7 @@ def _label_range(training: LabelledImages, validation: LabelledImages) -> Labels
 
 
 def _as_input(images: ImageArray) -> Tensor:
-    scaled = torch.from_numpy(np.ascontiguousarray(images)).unsqueeze(1).float() / 255.0
-    return scaled.contiguous(memory_format=torch.channels_last)
+    return torch.from_numpy(scale(images)).unsqueeze(1).contiguous(memory_format=torch.channels_last)
 
 
 def _jittered(images: Tensor, settings: Settings) -> Tensor:
