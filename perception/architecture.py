@@ -1,0 +1,85 @@
+"""What a contact network looks like, without the library that trains it: the part of a model file that says which
+tensors there are and how they are joined."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Rate = Annotated[float, Field(ge=0.0, lt=1.0)]
+SixRates = tuple[Rate, Rate, Rate, Rate, Rate, Rate]
+
+MEAN_BOUNDS = (-3.0, 3.0)
+"""Bounds of a Gaussian-density network's means, in label half-ranges. Labels lie in [-1, 1]; between these the bound is
+nearly straight."""
+
+LOG_PRECISION_BOUNDS = (-3.0, 7.0)
+"""Bounds of the logarithms of its inverse standard deviations: sigma from 20 label half-ranges to a thousandth."""
+
+
+class Architecture(BaseModel):
+    """Blocks of 3x3 convolution, 2x2 maximum, normalisation and ReLU, then a hidden layer and the outputs.
+
+    Source: Lloyd & Lepora 2024, 3.1.4 (``cnn``: six means) and 3.1.5 (``gdn``: six means and six logarithms of inverse
+    standard deviations, each behind its own dropout, each bounded). The maximum is taken before the normalisation,
+    which with positive scales is the same function for a third of the work.
+
+    Attributes:
+        kind: cnn, or gdn for a Gaussian density.
+        input_size: (height, width) of the preprocessed image.
+        channels: features of each block.
+        hidden: units of the hidden layer.
+        feature_dropout: rate before the hidden layer.
+        mean_dropout: rate before each of the six means.
+        precision_dropout: rate before each of the six inverse standard deviations (gdn).
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["gdn", "cnn"] = "gdn"
+    input_size: tuple[int, int] = (128, 128)
+    channels: Annotated[tuple[Annotated[int, Field(gt=0)], ...], Field(min_length=1)] = (16, 32, 64, 128, 256)
+    hidden: int = Field(default=256, gt=0)
+    feature_dropout: Rate = 0.05
+    mean_dropout: SixRates = (0.05,) * 6
+    precision_dropout: SixRates = (0.05,) * 6
+
+    @model_validator(mode="after")
+    def _something_is_left(self) -> Architecture:
+        if min(self.feature_size) < 1:
+            raise ValueError(f"{len(self.channels)} halvings leave nothing of an image of {self.input_size}")
+        return self
+
+    @property
+    def outputs(self) -> int:
+        """6 means, and for gdn 6 logarithms of inverse standard deviations after them."""
+        return 12 if self.kind == "gdn" else 6
+
+    @property
+    def feature_size(self) -> tuple[int, int]:
+        """(height, width) that the blocks leave."""
+        return self.input_size[0] >> len(self.channels), self.input_size[1] >> len(self.channels)
+
+    @property
+    def bounds(self) -> tuple[list[float], list[float]] | None:
+        """(low, high) of each output, or None for cnn, whose outputs are free."""
+        if self.kind == "cnn":
+            return None
+        (mean_low, mean_high), (log_low, log_high) = MEAN_BOUNDS, LOG_PRECISION_BOUNDS
+        return [mean_low] * 6 + [log_low] * 6, [mean_high] * 6 + [log_high] * 6
+
+    def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of the tensors of a model file, normalisation folded into the convolutions."""
+        shapes: dict[str, tuple[int, ...]] = {}
+        before = 1
+        for i, features in enumerate(self.channels):
+            shapes[f"conv{i}.weight"] = (features, before, 3, 3)
+            shapes[f"conv{i}.bias"] = (features,)
+            before = features
+        height, width = self.feature_size
+        shapes["hidden.weight"] = (self.hidden, before * height * width)
+        shapes["hidden.bias"] = (self.hidden,)
+        shapes["output.weight"] = (self.outputs, self.hidden)
+        shapes["output.bias"] = (self.outputs,)
+        return shapes

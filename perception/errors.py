@@ -1,0 +1,67 @@
+"""What can go wrong with data sets, images, models and trainings, as types with attributes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from geometry.errors import TouchcellError
+
+
+class ImageError(TouchcellError, ValueError):
+    """An image is not the kind that a preprocessing was made for.
+
+    Attributes:
+        attribute: "size", "channels", "dtype" or "type".
+        expected: what the preprocessing wants.
+        found: what the image has.
+    """
+
+    def __init__(self, attribute: str, expected: Any, found: Any, *, hint: str = "") -> None:
+        super().__init__(f"image {attribute} is {found}, expected {expected}", hint=hint)
+        self.attribute = attribute
+        self.expected = expected
+        self.found = found
+
+
+class DataError(TouchcellError, ValueError):
+    """A data set is incomplete or damaged.
+
+    Attributes:
+        file: the file or folder concerned.
+        row: line of the label file (1 is the header), or 0.
+        column: column of the label file, or "".
+    """
+
+    def __init__(self, file: Path, reason: str, *, row: int = 0, column: str = "", hint: str = "") -> None:
+        where = f"{file}" + (f", line {row}" if row else "") + (f", column {column}" if column else "")
+        super().__init__(f"{where}: {reason}", hint=hint)
+        self.file = file
+        self.row = row
+        self.column = column
+
+
+class ModelError(TouchcellError, ValueError):
+    """A model file cannot be used.
+
+    Attributes:
+        file: the file.
+        key: the header field or tensor concerned, or "".
+    """
+
+    def __init__(self, file: Path, reason: str, *, key: str = "", hint: str = "") -> None:
+        super().__init__(f"{file}: {key + ': ' if key else ''}{reason}", hint=hint)
+        self.file = file
+        self.key = key
+
+
+class TrainingError(TouchcellError):
+    """A training cannot start or go on; no model was written.
+
+    Attributes:
+        epoch: the epoch (1-based) in which it stopped, or 0 when it never started.
+    """
+
+    def __init__(self, reason: str, *, epoch: int = 0, hint: str = "") -> None:
+        super().__init__(f"epoch {epoch}: {reason}" if epoch else reason, hint=hint)
+        self.epoch = epoch

@@ -1,0 +1,204 @@
+"""A trained model as one file, ``NAME.safetensors``: tensors, and in the header all that is needed to use them."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from geometry.types import Array, ImageArray
+from perception.architecture import Architecture
+from perception.errors import ModelError
+from perception.preprocessing import Preprocessing
+
+FORMAT_VERSION = 1
+_METADATA_KEY = "touchcell"
+_REFERENCE = "reference_image"
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
+SixPositive = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
+
+
+class Labels(BaseModel):
+    """What the outputs mean: exponential coordinates log(T_s_f), and the range of them that was taught.
+
+    A network's output o stands for ``centre + o * half_range``.
+
+    Attributes:
+        names: of the six components.
+        units: of the six components.
+        low: smallest label of the training set.
+        high: largest label of the training set.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    names: tuple[str, ...] = ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z")
+    units: tuple[str, ...] = ("m", "m", "m", "rad", "rad", "rad")
+    low: Six
+    high: Six
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Labels:
+        if any(high <= low for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError("every high must exceed its low")
+        return self
+
+    @property
+    def centre(self) -> Array:
+        """(6,) middle of the range."""
+        return 0.5 * np.add(self.low, self.high, dtype=np.float64)
+
+    @property
+    def half_range(self) -> Array:
+        """(6,) half of the range."""
+        return 0.5 * np.subtract(self.high, self.low, dtype=np.float64)
+
+
+class Header(BaseModel):
+    """Everything about a model but its tensors.
+
+    Attributes:
+        format_version: of this header.
+        touchcell_version: that wrote it.
+        architecture: which tensors there are and how they are joined.
+        preprocessing: from camera image to network input.
+        labels: what the outputs mean.
+        sigma_scale: (6,) gdn: what the network's standard deviations are multiplied by to be calibrated; cnn: the
+            standard deviations themselves, in label half-ranges. Found on the validation split.
+        training_data: digest of the training set (``LabelledImages.digest``).
+        training: settings and outcome of the training, for people.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format_version: Literal[1] = 1
+    touchcell_version: str
+    architecture: Architecture
+    preprocessing: Preprocessing
+    labels: Labels
+    sigma_scale: SixPositive
+    training_data: str
+    training: dict[str, str | int | float | list[float] | None] = {}
+
+    @model_validator(mode="after")
+    def _preprocessing_feeds_network(self) -> Header:
+        if self.preprocessing.output_size != self.architecture.input_size:
+            raise ValueError("the preprocessing's output_size is not the architecture's input_size")
+        return self
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained network.
+
+    Attributes:
+        header: what it is.
+        tensors: float32, as ``header.architecture.tensor_shapes`` names them.
+        reference: the preprocessed image (height, width) of the sensor out of contact, or None when nobody took one.
+    """
+
+    header: Header
+    tensors: dict[str, NDArray[np.float32]]
+    reference: ImageArray | None = None
+
+
+def touchcell_version() -> str:
+    """Version of the installed touchcell."""
+    return version("touchcell")
+
+
+def save_model(model: Model, path: Path) -> None:
+    """Write a model file, whole or not at all.
+
+    Raises:
+        ModelError: a tensor is missing, of the wrong shape or not finite.
+    """
+    from safetensors.numpy import save
+
+    _check_tensors(model, path)
+    tensors: dict[str, NDArray[np.generic]] = dict(model.tensors)
+    if model.reference is not None:
+        tensors[_REFERENCE] = model.reference
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+        unfinished = Path(scratch) / path.name
+        unfinished.write_bytes(save(tensors, metadata={_METADATA_KEY: model.header.model_dump_json()}))
+        os.replace(unfinished, path)
+
+
+def load_model(path: Path) -> Model:
+    """Read a model file.
+
+    Raises:
+        ModelError: the file is missing, truncated, not a touchcell model, of a newer format, or its tensors are not
+            those that its header announces.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise ModelError(path, "no such file", hint="train one with `touchcell train DATA --out NAME.safetensors`")
+    try:
+        with safe_open(path, framework="np") as stored:
+            metadata = stored.metadata() or {}
+            header = _parse_header(metadata.get(_METADATA_KEY), path)
+            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError) as error:
+        if isinstance(error, ModelError):
+            raise
+        raise ModelError(path, f"damaged or no safetensors file: {error}", hint="copy or train it again") from error
+    model = Model(header, tensors, reference=tensors.pop(_REFERENCE, None))
+    _check_tensors(model, path)
+    return model
+
+
+def _parse_header(text: str | None, path: Path) -> Header:
+    if text is None:
+        raise ModelError(path, "a safetensors file, but no touchcell model", key=_METADATA_KEY)
+    try:
+        fields = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ModelError(path, f"header is no JSON: {error}", key=_METADATA_KEY) from error
+    found = fields.get("format_version") if isinstance(fields, dict) else None
+    if found != FORMAT_VERSION:
+        newer = isinstance(found, int) and found > FORMAT_VERSION
+        raise ModelError(
+            path,
+            f"format {found}, this touchcell reads {FORMAT_VERSION}",
+            key="format_version",
+            hint="install a newer touchcell" if newer else "train it again",
+        )
+    try:
+        return Header.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ModelError(path, first["msg"], key=".".join(map(str, first["loc"])), hint="train it again") from error
+
+
+def _check_tensors(model: Model, path: Path) -> None:
+    shapes = model.header.architecture.tensor_shapes()
+    for name in shapes.keys() | model.tensors.keys():
+        if name not in model.tensors:
+            raise ModelError(path, "missing tensor", key=name)
+        if name not in shapes:
+            raise ModelError(path, "tensor that the architecture does not have", key=name)
+        tensor = model.tensors[name]
+        if tensor.shape != shapes[name] or tensor.dtype != np.float32:
+            raise ModelError(path, f"{tensor.dtype} {tensor.shape}, expected float32 {shapes[name]}", key=name)
+        if not np.isfinite(tensor).all():
+            raise ModelError(path, "holds values that are not finite", key=name)
+    reference = model.reference
+    if reference is not None and (
+        reference.dtype != np.uint8 or reference.shape != model.header.preprocessing.output_size
+    ):
+        raise ModelError(path, "is not an image as the preprocessing leaves it", key=_REFERENCE)

@@ -1,0 +1,375 @@
+"""Teaching a contact network: from labelled images to a model file. Needs the extra ``train`` (PyTorch)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from geometry.types import Array, ImageArray
+from perception.architecture import Architecture
+from perception.checkpoint import EpochRecord, Progress, delete_checkpoint, load_checkpoint, save_checkpoint
+from perception.dataset import LabelledImages, default_cache, load_reduced, read_split
+from perception.errors import TrainingError
+from perception.figures import write_curves, write_predictions
+from perception.labels import CONTACT_NAMES, contact_from_xi
+from perception.model_file import Header, Labels, Model, save_model, touchcell_version
+from perception.networks import ContactNetwork, gaussian_loss, weighted_absolute_loss, weighted_square_loss
+from perception.preprocessing import Preprocessing, scale
+from perception.training_display import Display, Observer
+
+_EVALUATION_BATCH = 100
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to train. The defaults, and the figures that chose them, are in docs/decisions/0002-training.md.
+
+    Attributes:
+        epochs: passes over the training set; the learning rate's schedule is stretched over them.
+        seed: of everything random.
+        batch_size: images per step.
+        learning_rate: its peak.
+        weight_decay: of AdamW.
+        patience: epochs without a better validation loss after which training stops.
+        gdn_weights: of the six absolute errors added to a density network's likelihood, in label half-ranges; the
+            likelihood alone learns nothing about gamma for ten epochs.
+        cnn_weights: of the six squared errors of a plain network.
+        shift_px: standard deviation of the jitter of training images along each axis, in pixels of the network's input.
+        rotation_deg: standard deviation of their rotation.
+        zoom: standard deviation of their scale, relative.
+    """
+
+    epochs: int = 40
+    seed: int = 0
+    batch_size: int = 16
+    learning_rate: float = 2e-3
+    weight_decay: float = 0.02
+    patience: int = 25
+    gdn_weights: tuple[float, ...] = (2.0, 2.0, 1.0, 1.0, 1.0, 5.0)
+    cnn_weights: tuple[float, ...] = (1.0, 1.0, 4.0, 4.0, 4.0, 1.0)
+    shift_px: float = 0.15
+    rotation_deg: float = 0.13
+    zoom: float = 0.0012
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.learning_rate) and self.learning_rate > 0.0):
+            raise TrainingError(f"learning rate {self.learning_rate} is not positive and finite")
+        if self.epochs < 1 or self.batch_size < 2 or self.patience < 1:
+            raise TrainingError("epochs and patience must be at least 1, the batch size at least 2")
+
+
+def learning_rate(step: int, steps: int, peak: float) -> float:
+    """The paper's schedule (Lloyd & Lepora 2024, 3.1.4) stretched over ``steps``: up from a hundredth of the peak in
+    the first 5 %, held for 2 %, then down in a straight line to a ten-thousandth of it."""
+    ramp, hold = 0.05 * steps, 0.07 * steps
+    if step < ramp:
+        return peak * (0.01 + 0.99 * step / ramp)
+    if step < hold:
+        return peak
+    return peak * max(1e-4, 1.0 - (step - hold) / (steps - hold))
+
+
+def train(
+    data: Path,
+    out: Path,
+    *,
+    kind: Literal["gdn", "cnn"] = "gdn",
+    epochs: int | None = None,
+    seed: int = 0,
+    resume: bool = True,
+    cache: Path | None = None,
+    observer: Observer | None = None,
+) -> None:
+    """Train on ``data/train``, choose by ``data/val``, and write the model file ``out`` with two figures beside it.
+
+    A training that was interrupted goes on from its last whole epoch when the same call is made again, and ends in the
+    model that it would have ended in.
+
+    Args:
+        data: data set, see ``dataset``.
+        out: ``NAME.safetensors``; figures become ``NAME_predictions.png`` and ``NAME_curves.png``.
+        kind: gdn predicts a Gaussian, cnn means alone.
+        epochs: None for the default of ``Settings``.
+        seed: of everything random; the same seed on the same machine gives the same file.
+        resume: go on with an interrupted training; False begins anew.
+        cache: folder for preprocessed images; None for ``dataset.default_cache()``.
+        observer: is told of the progress; None shows it on the terminal.
+
+    Raises:
+        DataError: the data set is damaged.
+        TrainingError: the labels cannot be learned, the loss is no number, nothing was learned, or the interrupted
+            training had other settings or data.
+    """
+    if observer is None:
+        with Display() as display:
+            train(data, out, kind=kind, epochs=epochs, seed=seed, resume=resume, cache=cache, observer=display)
+        return
+    splits = {name: read_split(data, name) for name in ("train", "val")}
+    first = next(splits["train"].read())
+    preprocessing = Preprocessing(input_size=(first.shape[0], first.shape[1]))
+    sets = {
+        name: LabelledImages(
+            load_reduced(
+                split,
+                preprocessing,
+                cache=cache or default_cache(),
+                progress=lambda done, total, name=name: observer.images(name, done, total),  # type: ignore[misc]
+            ),
+            split.xi,
+        )
+        for name, split in splits.items()
+    }
+    train_on_arrays(
+        sets["train"],
+        sets["val"],
+        out,
+        preprocessing=preprocessing,
+        kind=kind,
+        settings=Settings(seed=seed) if epochs is None else Settings(seed=seed, epochs=epochs),
+        resume=resume,
+        observer=observer,
+    )
+
+
+def train_on_arrays(
+    training: LabelledImages,
+    validation: LabelledImages,
+    out: Path,
+    *,
+    preprocessing: Preprocessing,
+    kind: Literal["gdn", "cnn"] = "gdn",
+    architecture: Architecture | None = None,
+    settings: Settings | None = None,
+    reference: ImageArray | None = None,
+    resume: bool = True,
+    observer: Observer | None = None,
+) -> Model:
+    """Train on images in memory and write the model file ``out`` with two figures beside it.
+
+    Args:
+        training: to learn from.
+        validation: to choose the best epoch by, and to calibrate sigma on.
+        out: ``NAME.safetensors``.
+        preprocessing: that made the images; becomes part of the model.
+        kind: of network, when no architecture is given.
+        architecture: None for the default one of this kind.
+        settings: None for the defaults.
+        reference: preprocessed image out of contact, kept in the model file for the contact gate.
+        resume: go on with an interrupted training of the same data and settings.
+        observer: is told of the progress.
+
+    Raises:
+        TrainingError: as ``train``.
+    """
+    settings = settings or Settings()
+    architecture = architecture or Architecture(kind=kind, input_size=preprocessing.output_size)
+    labels = _label_range(training, validation)
+    recipe: dict[str, object] = {
+        "data": training.digest(),
+        "validation_data": validation.digest(),
+        "architecture": architecture.model_dump(mode="json"),
+        "settings": asdict(settings),
+    }
+    with _own_randomness(settings.seed):
+        network = ContactNetwork(architecture)
+        network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        run = _Run(network, settings, labels, training, validation, observer)
+        run.fit(out, recipe, resume=resume)
+    outputs = run.outputs(validation.images)
+    model = Model(
+        Header(
+            touchcell_version=touchcell_version(),
+            architecture=architecture,
+            preprocessing=preprocessing,
+            labels=labels,
+            sigma_scale=_calibrate(outputs, run.validation_labels.numpy()),
+            training_data=training.digest(),
+            training={
+                **{key: list(value) if isinstance(value, tuple) else value for key, value in asdict(settings).items()},
+                "images": len(training),
+                "epochs_run": len(run.progress.history),
+                "best_epoch": run.progress.best_epoch,
+                "validation_loss": run.progress.best_loss,
+                "validation_mae": list(run.progress.history[run.progress.best_epoch - 1].mae.values()),
+            },
+        ),
+        network.folded(),
+        reference,
+    )
+    save_model(model, out)
+    sigma = np.broadcast_to(
+        np.array(model.header.sigma_scale) * (np.exp(-outputs[:, 6:]) if architecture.kind == "gdn" else 1.0),
+        (len(outputs), 6),
+    )
+    write_predictions(
+        out.with_name(f"{out.stem}_predictions.png"),
+        truth=contact_from_xi(validation.xi),
+        predicted=run.contacts(outputs),
+        sigma=sigma * labels.half_range,
+    )
+    write_curves(out.with_name(f"{out.stem}_curves.png"), run.progress.history)
+    delete_checkpoint(out)
+    return model
+
+
+@dataclass
+class _Run:
+    """One training: the network, its optimizer, and how far they have come."""
+
+    network: ContactNetwork
+    settings: Settings
+    labels: Labels
+    training: LabelledImages
+    validation: LabelledImages
+    observer: Observer | None
+    progress: Progress = field(default_factory=Progress)
+
+    def __post_init__(self) -> None:
+        learned = [parameter for parameter in self.network.parameters() if parameter.requires_grad]
+        self.optimizer = torch.optim.AdamW(
+            learned, lr=self.settings.learning_rate, weight_decay=self.settings.weight_decay
+        )
+        self.training_labels = self._normalised(self.training.xi)
+        self.validation_labels = self._normalised(self.validation.xi)
+        self.weights = torch.tensor(
+            self.settings.gdn_weights if self.network.architecture.kind == "gdn" else self.settings.cnn_weights
+        )
+
+    def fit(self, out: Path, recipe: dict[str, object], *, resume: bool) -> None:
+        """Run all epochs that are left and leave the best epoch's tensors in the network."""
+        if resume:
+            self.progress = load_checkpoint(out, recipe, self.network, self.optimizer) or self.progress
+        for epoch in range(len(self.progress.history) + 1, self.settings.epochs + 1):
+            if epoch - self.progress.best_epoch > self.settings.patience:
+                break
+            train_loss = self._epoch(epoch)
+            outputs = self.outputs(self.validation.images)
+            loss = self._loss(torch.from_numpy(outputs), self.validation_labels).item()
+            if not math.isfinite(loss):
+                raise TrainingError("the validation loss is no number", epoch=epoch, hint="lower the learning rate")
+            mae = np.abs(self.contacts(outputs) - contact_from_xi(self.validation.xi)).mean(axis=0)
+            record = EpochRecord(epoch, train_loss, loss, dict(zip(CONTACT_NAMES, mae.tolist(), strict=True)))
+            self.progress.add(record, self.network)
+            save_checkpoint(out, recipe, self.network, self.optimizer, self.progress)
+            if self.observer is not None:
+                self.observer.epoch(record, best=self.progress.best_epoch == epoch)
+        if self.progress.best_loss >= self._loss_of_knowing_nothing():
+            raise TrainingError(
+                f"nothing was learned: the validation loss stays at {self.progress.best_loss:.3g}",
+                epoch=len(self.progress.history),
+                hint="lower the learning rate, train longer, or look whether labels belong to their images",
+            )
+        self.network.load_state_dict(self.progress.best_state)
+
+    def outputs(self, images: ImageArray) -> NDArray[np.float32]:
+        """Network outputs (n, 6 or 12) for preprocessed images."""
+        self.network.eval()
+        with torch.inference_mode():
+            return np.concatenate(
+                [
+                    self.network(_as_input(images[i : i + _EVALUATION_BATCH])).numpy()
+                    for i in range(0, len(images), _EVALUATION_BATCH)
+                ]
+            )
+
+    def contacts(self, outputs: NDArray[np.float32]) -> Array:
+        """(n, 6) contacts, mm and degrees, that network outputs stand for."""
+        return contact_from_xi(self.labels.centre + self.labels.half_range * outputs[:, :6].astype(np.float64))
+
+    def _epoch(self, epoch: int) -> float:
+        # Every epoch has its own random numbers, so that a resumed training draws those of an uninterrupted one.
+        torch.manual_seed(int(np.random.SeedSequence((self.settings.seed, epoch)).generate_state(1)[0]))
+        self.network.train()
+        order = torch.randperm(len(self.training)).numpy()
+        batches = max(1, len(order) // self.settings.batch_size)
+        total = 0.0
+        for i in range(batches):
+            step = (epoch - 1) * batches + i
+            for group in self.optimizer.param_groups:
+                group["lr"] = learning_rate(step, batches * self.settings.epochs, self.settings.learning_rate)
+            chosen = order[i * self.settings.batch_size : (i + 1) * self.settings.batch_size]
+            images = _jittered(_as_input(self.training.images[chosen]), self.settings)
+            loss = self._loss(self.network(images), self.training_labels[chosen])
+            if not torch.isfinite(loss):
+                raise TrainingError("the loss is no number", epoch=epoch, hint="lower the learning rate")
+            self.optimizer.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), 10.0)
+            self.optimizer.step()
+            total += loss.item()
+            if self.observer is not None:
+                self.observer.batch(epoch, self.settings.epochs, i + 1, batches, total / (i + 1))
+        return total / batches
+
+    def _loss(self, outputs: Tensor, labels: Tensor) -> Tensor:
+        if self.network.architecture.kind == "cnn":
+            return weighted_square_loss(outputs, labels, self.weights)
+        return gaussian_loss(outputs, labels) + weighted_absolute_loss(outputs, labels, self.weights)
+
+    def _loss_of_knowing_nothing(self) -> float:
+        mean, deviation = self.training_labels.mean(0), self.training_labels.std(0)
+        constant = torch.cat([mean, -deviation.log()]).expand(len(self.validation_labels), -1)
+        return self._loss(constant, self.validation_labels).item()
+
+    def _normalised(self, xi: Array) -> Tensor:
+        return torch.from_numpy(((xi - self.labels.centre) / self.labels.half_range).astype(np.float32))
+
+
+def _label_range(training: LabelledImages, validation: LabelledImages) -> Labels:
+    for name, images in (("training", training), ("validation", validation)):
+        if len(images) < 2 or images.xi.shape != (len(images), 6):
+            raise TrainingError(f"the {name} set needs at least two images and as many labels of six components")
+        if not np.isfinite(images.xi).all():
+            raise TrainingError(f"the {name} set has labels that are not finite")
+    low, high = training.xi.min(axis=0), training.xi.max(axis=0)
+    for i, name in enumerate(CONTACT_NAMES):
+        if high[i] - low[i] < 1e-9:
+            raise TrainingError(f"all training labels have the same {name}", hint="collect contacts that vary in it")
+    return Labels(low=tuple(low.tolist()), high=tuple(high.tolist()))
+
+
+def _as_input(images: ImageArray) -> Tensor:
+    return torch.from_numpy(scale(images)).unsqueeze(1).contiguous(memory_format=torch.channels_last)
+
+
+def _jittered(images: Tensor, settings: Settings) -> Tensor:
+    """Images moved, turned and zoomed a little, as a camera that was taken off and put on again sees them."""
+    n, _, height, width = images.shape
+    angle = torch.randn(n) * math.radians(settings.rotation_deg)
+    zoom = 1.0 + torch.randn(n) * settings.zoom
+    motion = torch.zeros(n, 2, 3)
+    motion[:, 0, 0] = motion[:, 1, 1] = zoom * angle.cos()
+    motion[:, 0, 1] = -zoom * angle.sin()
+    motion[:, 1, 0] = zoom * angle.sin()
+    motion[:, :, 2] = torch.randn(n, 2) * settings.shift_px * torch.tensor([2.0 / width, 2.0 / height])
+    grid = functional.affine_grid(motion, list(images.shape), align_corners=False)
+    moved = functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
+    return moved.contiguous(memory_format=torch.channels_last)
+
+
+def _calibrate(
+    outputs: NDArray[np.float32], labels: NDArray[np.float32]
+) -> tuple[float, float, float, float, float, float]:
+    """Scales that give squared errors, in units of the predicted variance, a mean of one."""
+    residual = (labels - outputs[:, :6]).astype(np.float64)
+    if outputs.shape[1] > 6:
+        residual *= np.exp(outputs[:, 6:].astype(np.float64))
+    x, y, z, alpha, beta, gamma = np.sqrt((residual**2).mean(axis=0)).tolist()
+    return x, y, z, alpha, beta, gamma
+
+
+@contextmanager
+def _own_randomness(seed: int) -> Iterator[None]:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        yield
