@@ -15,7 +15,8 @@ Robotics (2nd ed. 2024), chapter 8, with the coefficients and the Jacobian block
 
 from __future__ import annotations
 
-from typing import Literal
+import os
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -37,7 +38,31 @@ __all__ = [
     "to_euler_mm_deg",
 ]
 
-BACKEND: Literal["compiled", "python"] = "python"
+
+class _Kernels(Protocol):
+    """What both backends offer."""
+
+    def exp(self, xi: ArrayLike, /) -> Array: ...
+    def log(self, T: ArrayLike, /) -> Array: ...
+    def compose(self, T_a_b: ArrayLike, T_b_c: ArrayLike, /) -> Array: ...
+    def inverse(self, T: ArrayLike, /) -> Array: ...
+    def adjoint(self, T: ArrayLike, /) -> Array: ...
+    def left_jacobian(self, xi: ArrayLike, /) -> Array: ...
+    def left_jacobian_inverse(self, xi: ArrayLike, /) -> Array: ...
+
+
+def _choose() -> tuple[_Kernels, Literal["compiled", "python"]]:
+    if not os.environ.get("TOUCHCELL_PURE_PYTHON"):
+        try:
+            from geometry import _se3c
+
+            return _se3c, "compiled"
+        except ImportError:
+            pass
+    return _plain, "python"
+
+
+_kernels, BACKEND = _choose()
 
 PROJECTABLE = 0.5
 """Largest Frobenius norm of R'R - I that ``project`` repairs; Newton's iteration converges from all of these."""
@@ -52,7 +77,7 @@ def exp(xi: ArrayLike) -> Array:
     Returns:
         (..., 4, 4), within 4 eps of the exact rotation and translation.
     """
-    return _plain.exp(xi)
+    return _kernels.exp(xi)
 
 
 def log(T: ArrayLike) -> Array:
@@ -64,7 +89,7 @@ def log(T: ArrayLike) -> Array:
     Returns:
         (..., 6) [v, w], m and rad, accurate at every angle; at an exact half turn one of the two valid answers.
     """
-    return _plain.log(T)
+    return _kernels.log(T)
 
 
 def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> Array:
@@ -72,17 +97,17 @@ def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> Array:
 
     Rounding drifts by 2e-13 in 1e6 products; ``project`` removes it.
     """
-    return _plain.compose(T_a_b, T_b_c)
+    return _kernels.compose(T_a_b, T_b_c)
 
 
 def inverse(T_a_b: ArrayLike) -> Array:
     """``T_b_a``, from the transpose of the rotation."""
-    return _plain.inverse(T_a_b)
+    return _kernels.inverse(T_a_b)
 
 
 def adjoint(T_a_b: ArrayLike) -> Array:
     """(..., 6, 6) matrix that takes a twist in frame b, [v, w], to the same twist in frame a."""
-    return _plain.adjoint(T_a_b)
+    return _kernels.adjoint(T_a_b)
 
 
 def left_jacobian(xi: ArrayLike) -> Array:
@@ -91,7 +116,7 @@ def left_jacobian(xi: ArrayLike) -> Array:
     Args:
         xi: (..., 6) [v, w], m and rad; any angle.
     """
-    return _plain.left_jacobian(xi)
+    return _kernels.left_jacobian(xi)
 
 
 def left_jacobian_inverse(xi: ArrayLike) -> Array:
@@ -100,7 +125,7 @@ def left_jacobian_inverse(xi: ArrayLike) -> Array:
     Args:
         xi: (..., 6) [v, w], m and rad. Made for angles to pi, as ``log`` returns them; singular at 2 pi.
     """
-    return _plain.left_jacobian_inverse(xi)
+    return _kernels.left_jacobian_inverse(xi)
 
 
 def from_euler_mm_deg(pose: ArrayLike) -> Array:

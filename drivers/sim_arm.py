@@ -1,0 +1,129 @@
+"""A simulated arm: a tool centre point that moves by twists, as ideally as its acceleration limits allow.
+
+It has no joints, no singularities and no tracking error beyond those limits; it is for tasks, not for arm dynamics.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from drivers.abilities import StopCategory
+from drivers.arm import Arm, LimitsConfig
+from drivers.clock import Clock
+from drivers.device import Lifecycle, OperatorToken
+from drivers.errors import StaleData
+from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
+from drivers.samples import Stamped, TcpState
+from drivers.simulation.kinematics import TwistFollower
+from drivers.simulation.scene import Scene
+from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Timeline
+from geometry import se3
+from geometry.types import Array
+
+CAPABILITIES = Capabilities(
+    kind="arm",
+    abilities=frozenset({"TcpSource", "TwistSink", "Stoppable", "HealthSource"}),
+    state_rate_hz=1.0 / DEFAULT_STEP_S,
+    stop_categories=frozenset({1, 2}),
+    has_brakes=True,
+)
+
+_READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE, Lifecycle.FAULTED)
+
+
+class SimArmConfig(DriverConfig):
+    """Where the arm stands and how fast it may be."""
+
+    start_pose_mm_deg: tuple[float, float, float, float, float, float]
+    base_pose_mm_deg: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    limits: LimitsConfig = LimitsConfig()
+    max_ttl_s: float = Field(default=1.0, gt=0.0, le=10.0)
+
+
+class SimArm(Arm):
+    """One simulated arm.
+
+    Args:
+        name: the device's name in the cell.
+        config: checked configuration.
+        clock: injected time.
+        timeline: of the scene that it moves in; its own if there is none.
+    """
+
+    def __init__(self, name: str, config: SimArmConfig, clock: Clock, timeline: Timeline | None = None) -> None:
+        super().__init__(
+            name,
+            clock,
+            config.limits.build(),
+            stop_categories=CAPABILITIES.stop_categories,
+            max_ttl_s=config.max_ttl_s,
+        )
+        self.T_world_base = se3.from_euler_mm_deg(config.base_pose_mm_deg)
+        self._timeline = timeline or Timeline(clock)
+        self._body = TwistFollower(se3.from_euler_mm_deg(config.start_pose_mm_deg), self.limits, self._timeline.step_ns)
+        self._timeline.add(Phase.MOTION, self._body.step)
+
+    def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
+        """State at the last step of the simulation. Raises StaleData if it is older than ``max_age_s``."""
+        self._require("tell its pose", *_READABLE)
+        t_ns = self._timeline.advance()
+        state = TcpState(self._body.T_base_tcp.copy(), self._body.velocity.copy())
+        sample = Stamped(state, t_ns, t_ns // self._timeline.step_ns)
+        age_s = sample.age_s(self._clock.now_ns())
+        if max_age_s is not None and age_s > max_age_s:
+            raise StaleData(self.name, age_s, max_age_s, sample.seq)
+        return sample
+
+    def at_rest(self) -> bool:
+        """Whether it stands still and is not about to move."""
+        self._timeline.advance()
+        return self._body.at_rest()
+
+    def health(self) -> dict[str, float | int | str | bool]:
+        """Speeds of the tool centre point and who commands it."""
+        self._timeline.advance()
+        velocity = self._body.velocity
+        return {
+            "speed_m_s": float(np.linalg.norm(velocity[:3])),
+            "rot_speed_rad_s": float(np.linalg.norm(velocity[3:])),
+            "owner": self.owner or "",
+        }
+
+    def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
+        """(4, 4) at the simulation's present step, in any lifecycle state and without advancing time: for scenes."""
+        return self.T_world_base @ self._body.T_base_tcp
+
+    def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
+        self._timeline.advance()
+        self._body.follow(twist_base, now_ns + round(ttl_s * 1e9))
+
+    def _begin_stop(self, category: StopCategory) -> None:
+        self._timeline.advance()
+        self._body.halt()
+
+    def _open(self) -> None:
+        self._timeline.advance()
+
+    def _close(self) -> None:
+        self._timeline.advance()
+        self._body.freeze()
+
+    def _recover(self, token: OperatorToken) -> None:
+        self._body.freeze()
+
+
+def _build(name: str, config: Any, context: DriverContext) -> SimArm:
+    scene = context.scene
+    return SimArm(name, config, context.clock, scene.timeline if isinstance(scene, Scene) else None)
+
+
+SPEC = DriverSpec(
+    name="sim_arm",
+    summary="simulated arm with ideal kinematics",
+    config=SimArmConfig,
+    capabilities=CAPABILITIES,
+    build=_build,
+)

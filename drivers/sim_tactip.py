@@ -1,0 +1,148 @@
+"""A simulated TacTip: camera frames of the markers of a tip that an arm carries through the scene."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from typing import Any, Literal
+
+from pydantic import Field
+
+from drivers.clock import Clock
+from drivers.device import Device, Lifecycle
+from drivers.errors import ConfigError, StaleData, TransportTimeout
+from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
+from drivers.samples import Frame, Stamped
+from drivers.simulation.render import FrameRenderer, Lighting
+from drivers.simulation.scene import Carrier, Scene
+from drivers.simulation.tip import Tip
+from geometry import se3
+
+CAPABILITIES = Capabilities(kind="camera", abilities=frozenset({"FrameSource", "HealthSource"}), state_rate_hz=30.0)
+
+_READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
+
+
+class SimTactipConfig(DriverConfig):
+    """Where the sensor is mounted and how its camera behaves."""
+
+    mounted_on: str
+    tcp_to_sensor_mm_deg: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    rate_hz: float = Field(default=30.0, ge=1.0, le=500.0)
+    latency_ms: float = Field(default=10.0, ge=0.0, le=1000.0)
+    noise: float = Field(default=2.0, ge=0.0, le=40.0)
+    output: Literal["raw", "processed"] = "raw"
+
+
+class SimTactip(Device):
+    """One simulated sensor.
+
+    Frames are exposed at whole multiples of the period on the clock, whether or not anybody reads them, and carry that
+    time; frame k has ``seq`` k. They become available ``latency_ms`` later and are drawn when they are read.
+
+    Args:
+        name: the device's name in the cell and in the scene.
+        config: checked configuration.
+        clock: injected time.
+        scene: what there is to touch.
+        mount: what carries it.
+        seed: of the noise; the same seed and frame give the same image.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        config: SimTactipConfig,
+        clock: Clock,
+        scene: Scene,
+        mount: Carrier,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(name, clock)
+        self._scene = scene
+        self._processed = config.output == "processed"
+        self._period_ns = round(1e9 / config.rate_hz)
+        self._latency_ns = round(config.latency_ms * 1e6)
+        self._first = math.ceil(scene.timeline.t_ns / self._period_ns)
+        self._tip = Tip()
+        self._renderer = FrameRenderer(
+            self._tip.parameters.disc_radius_px,
+            Lighting(noise=config.noise),
+            seed=(seed, zlib.crc32(name.encode())),
+        )
+        self._newest: Stamped[Frame] | None = None
+        self._drawn = 0
+        T_tcp_s = se3.from_euler_mm_deg(config.tcp_to_sensor_mm_deg)
+        scene.mount(name, lambda: mount.T_world_tcp() @ T_tcp_s)
+
+    def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
+        """Newest frame; waits for the very first. Raises StaleData if it is older than ``max_age_s``."""
+        self._require("deliver frames", *_READABLE)
+        self._clock.sleep_until_ns(self._available_ns(self._first))
+        now_ns = self._clock.now_ns()
+        seq = self._newest_seq(now_ns)
+        age_s = (now_ns - seq * self._period_ns) * 1e-9
+        if max_age_s is not None and age_s > max_age_s:
+            raise StaleData(self.name, age_s, max_age_s, seq)
+        return self._draw(seq)
+
+    def next(self, after_seq: int, timeout_s: float) -> Stamped[Frame]:
+        """Newest frame if its ``seq > after_seq``, else the first that is. Raises TransportTimeout."""
+        self._require("deliver frames", *_READABLE)
+        now_ns = self._clock.now_ns()
+        seq = max(self._newest_seq(now_ns), after_seq + 1, self._first)
+        deadline_ns = now_ns + round(timeout_s * 1e9)
+        if self._available_ns(seq) > deadline_ns:
+            self._clock.sleep_until_ns(deadline_ns)
+            raise TransportTimeout(self.name, f"frame after {after_seq}", timeout_s)
+        self._clock.sleep_until_ns(self._available_ns(seq))
+        return self._draw(seq)
+
+    def health(self) -> dict[str, float | int | str | bool]:
+        """How many frames were drawn."""
+        return {"frames_drawn": self._drawn, "rate_hz": 1e9 / self._period_ns}
+
+    def _available_ns(self, seq: int) -> int:
+        return seq * self._period_ns + self._latency_ns
+
+    def _newest_seq(self, now_ns: int) -> int:
+        return (now_ns - self._latency_ns) // self._period_ns
+
+    def _draw(self, seq: int) -> Stamped[Frame]:
+        if self._newest is None or self._newest.seq != seq:
+            t_ns = seq * self._period_ns
+            pixels = self._tip.pixels(self._scene.contact(self.name, t_ns).value.T_f_s)
+            image = self._renderer.processed(pixels) if self._processed else self._renderer.raw(pixels, seq)
+            image.flags.writeable = False
+            self._newest = Stamped(Frame(image), t_ns, seq)
+            self._drawn += 1
+        return self._newest
+
+    def _open(self) -> None:
+        self._scene.timeline.advance()
+
+    def _close(self) -> None:
+        self._newest = None
+
+
+def _build(name: str, config: Any, context: DriverContext) -> SimTactip:
+    scene, mount = context.scene, context.devices.get(config.mounted_on)
+    if not isinstance(scene, Scene):
+        raise ConfigError("a simulated sensor needs a scene", key=name, hint="add a scene: section to the cell file")
+    if not isinstance(mount, Carrier):
+        raise ConfigError(
+            f"{config.mounted_on!r} is no simulated arm of this cell",
+            key=f"{name}.mounted_on",
+            value=config.mounted_on,
+            hint=f"devices so far: {', '.join(context.devices) or 'none'}",
+        )
+    return SimTactip(name, config, context.clock, scene, mount, context.seed)
+
+
+SPEC = DriverSpec(
+    name="sim_tactip",
+    summary="simulated TacTip on an arm, in a simulated scene",
+    config=SimTactipConfig,
+    capabilities=CAPABILITIES,
+    build=_build,
+)

@@ -1,0 +1,73 @@
+"""A tool centre point that follows twists with limited acceleration and comes to rest when they expire."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from drivers.gate import TwistLimits
+from geometry import se3
+from geometry.types import Array
+
+
+class TwistFollower:
+    """Ideal kinematics: no joints, no dynamics but the acceleration limits.
+
+    Args:
+        T_base_tcp: start pose (4, 4).
+        limits: of which it uses the accelerations.
+        step_ns: length of a step.
+    """
+
+    def __init__(self, T_base_tcp: Array, limits: TwistLimits, step_ns: int) -> None:
+        self.T_base_tcp = T_base_tcp
+        self.velocity = np.zeros(6)
+        self._limits = limits
+        self._step_ns = step_ns
+        self._target = np.zeros(6)
+        self._expires_ns = 0
+
+    def follow(self, twist: Array, expires_ns: int) -> None:
+        """Head for ``twist`` (6,), along base axes, until ``expires_ns``."""
+        self._target = twist.copy()
+        self._expires_ns = expires_ns
+
+    def halt(self) -> None:
+        """Slow down to rest."""
+        self._target = np.zeros(6)
+
+    def freeze(self) -> None:
+        """Rest at once."""
+        self.halt()
+        self.velocity = np.zeros(6)
+
+    def at_rest(self) -> bool:
+        """Whether it neither moves nor is about to."""
+        return not (self.velocity.any() or self._target.any())
+
+    def step(self, t_ns: int) -> None:
+        """Move over the step that ends at ``t_ns``."""
+        if t_ns - self._step_ns >= self._expires_ns:
+            self.halt()
+        if self.at_rest():
+            return
+        dt_s = self._step_ns * 1e-9
+        change = self._target - self.velocity
+        velocity = self.velocity + np.concatenate(
+            [
+                _shorten(change[:3], self._limits.accel_m_s2 * dt_s),
+                _shorten(change[3:], self._limits.rot_accel_rad_s2 * dt_s),
+            ]
+        )
+        way = 0.5 * (self.velocity + velocity) * dt_s
+        T = np.eye(4)
+        T[:3, :3] = se3.exp(np.concatenate([np.zeros(3), way[3:]]))[:3, :3] @ self.T_base_tcp[:3, :3]
+        T[:3, 3] = self.T_base_tcp[:3, 3] + way[:3]
+        self.T_base_tcp = se3.project(T)
+        self.velocity = velocity
+
+
+def _shorten(vector: Array, longest: float) -> Array:
+    length = math.sqrt(float(vector @ vector))
+    return vector if length <= longest else vector * (longest / length)

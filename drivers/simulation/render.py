@@ -1,0 +1,150 @@
+"""Pictures of markers: anti-aliased discs, drawn as stamps that were made once for many sub-pixel offsets."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.types import Array, ImageArray
+
+Seed = int | tuple[int, ...]
+
+FRAME_SIZE = (640, 480)
+PUBLIC_CROP = (105, 20, 550, 460)
+"""(left, top, right, bottom) px of the public images within the 640x480 frame."""
+
+
+class Stamps:
+    """A disc of one radius, drawn with its centre anywhere.
+
+    Args:
+        radius_px: of the disc.
+        phases: sub-pixel offsets per axis; a centre is off by at most 1 / (2 phases) px per axis.
+    """
+
+    def __init__(self, radius_px: float, phases: int = 64) -> None:
+        self._phases = phases
+        self.reach = math.ceil(radius_px + 0.5)
+        grid = np.arange(-self.reach, self.reach + 1)
+        offsets = (np.arange(phases) + 0.5) / phases - 0.5
+        squared = (grid[None, :] - offsets[:, None]) ** 2
+        distance = np.sqrt(squared[:, None, :, None] + squared[None, :, None, :])
+        coverage = np.clip(radius_px - distance + 0.5, 0.0, 1.0)
+        self._stamps = np.round(255.0 * coverage).astype(np.uint8).reshape(phases * phases, grid.size, grid.size)
+
+    def which(self, centres: Array) -> tuple[list[list[int]], list[ImageArray]]:
+        """Whole-pixel centres [[u, v], ...] and the stamps for ``centres`` (n, 2) px."""
+        whole = np.floor(centres + 0.5)
+        phase = np.minimum(((centres - whole + 0.5) * self._phases).astype(np.int64), self._phases - 1)
+        chosen = phase[:, 1] * self._phases + phase[:, 0]
+        return whole.astype(np.int64).tolist(), [self._stamps[i] for i in chosen.tolist()]
+
+    def paint(self, image: ImageArray, centres: Array) -> None:
+        """Draw white discs at ``centres`` (n, 2) px into a grey ``image``; what lies outside is cut off."""
+        height, width = image.shape
+        reach = self.reach
+        whole, stamps = self.which(centres)
+        maximum = np.maximum
+        for (u, v), stamp in zip(whole, stamps, strict=True):
+            left, top, right, bottom = u - reach, v - reach, u + reach + 1, v + reach + 1
+            if left < 0 or top < 0 or right > width or bottom > height:
+                stamp = stamp[max(-top, 0) : max(height - top, 0), max(-left, 0) : max(width - left, 0)]
+                left, top = max(left, 0), max(top, 0)
+                right, bottom = max(right, 0), max(bottom, 0)
+            area = image[top:bottom, left:right]
+            maximum(area, stamp, out=area)
+
+
+@dataclass(frozen=True, slots=True)
+class Lighting:
+    """How the camera sees the pins. Grey levels of 255.
+
+    Attributes:
+        background: skin at the image centre.
+        pin: pin at the image centre.
+        vignetting: share of brightness lost in the corners.
+        noise: standard deviation of the sensor noise.
+    """
+
+    background: float = 60.0
+    pin: float = 190.0
+    vignetting: float = 0.25
+    noise: float = 2.0
+
+
+class FrameRenderer:
+    """Draws raw 640x480 camera frames and the public, thresholded kind.
+
+    Args:
+        disc_radius_px: of the pins in the frame.
+        lighting: grey levels.
+        seed: of the noise.
+    """
+
+    def __init__(self, disc_radius_px: float = 6.2, lighting: Lighting | None = None, seed: Seed = 0) -> None:
+        light = lighting or Lighting()
+        width, height = FRAME_SIZE
+        self._stamps = Stamps(disc_radius_px)
+        v, u = np.mgrid[:height, :width]
+        corner = math.hypot(width, height) / 2.0
+        fade = 1.0 - light.vignetting * ((u - width / 2.0) ** 2 + (v - height / 2.0) ** 2) / corner**2
+        self._background = np.round(light.background * fade).astype(np.uint8)
+        self._contrast = np.round((light.pin - light.background) * fade).astype(np.uint8)
+        self._seed = (seed,) if isinstance(seed, int) else tuple(seed)
+        # Drawing 307 200 normal numbers takes longer than the rest of the frame: frames take windows of one sheet.
+        sheet = np.random.default_rng(self._seed).normal(0.0, light.noise, (height + 64, width + 64))
+        self._noise = np.clip(np.round(sheet), -128, 127).astype(np.int8)
+
+    def raw(self, pixels: Array, frame: int = 0) -> ImageArray:
+        """Grey frame (480, 640) with discs at ``pixels`` (n, 2); ``frame`` chooses the noise."""
+        width, height = FRAME_SIZE
+        cover = np.zeros((height, width), np.uint8)
+        self._stamps.paint(cover, pixels)
+        clean = cv2.add(cv2.multiply(cover, self._contrast, scale=1.0 / 255.0), self._background)
+        top, left = np.random.default_rng((*self._seed, frame)).integers(0, 65, 2)
+        noise: NDArray[np.int8] = np.ascontiguousarray(self._noise[top : top + height, left : left + width])
+        return np.asarray(cv2.add(clean, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+
+    def processed(self, pixels: Array) -> ImageArray:
+        """Binary image (440, 445) as in the public data: cropped by PUBLIC_CROP and thresholded."""
+        left, top, right, bottom = PUBLIC_CROP
+        cover = np.zeros((bottom - top, right - left), np.uint8)
+        self._stamps.paint(cover, pixels - np.array([left, top], dtype=np.float64))
+        return np.where(cover > 127, np.uint8(255), np.uint8(0))
+
+
+class SmallRenderer:
+    """Draws the small images that a network sees, directly: as if cropped from the frame and resized by area.
+
+    Args:
+        size_px: (width, height) of the small image.
+        crop: (left, top, right, bottom) px of the frame that it shows.
+        disc_radius_px: radii of the pins in the frame, of which each marker takes one.
+    """
+
+    def __init__(
+        self,
+        size_px: tuple[int, int] = (128, 128),
+        crop: tuple[int, int, int, int] = PUBLIC_CROP,
+        disc_radius_px: tuple[float, ...] = (6.2,),
+    ) -> None:
+        left, top, right, bottom = crop
+        self._size = size_px
+        self._origin = np.array([left, top], dtype=np.float64)
+        self._scale = np.array([size_px[0] / (right - left), size_px[1] / (bottom - top)])
+        mean_scale = float(np.sqrt(self._scale[0] * self._scale[1]))
+        self._stamps = [Stamps(radius * mean_scale, phases=32) for radius in disc_radius_px]
+
+    def draw(self, pixels: Array, radius: NDArray[np.int64] | None = None) -> ImageArray:
+        """Grey image of discs at ``pixels`` (n, 2) of the frame; ``radius`` (n,) says which of the radii each has."""
+        image = np.zeros((self._size[1], self._size[0]), np.uint8)
+        centres = (pixels - self._origin + 0.5) * self._scale - 0.5
+        for index, stamps in enumerate(self._stamps):
+            stamps.paint(image, centres if radius is None else centres[radius == index])
+            if radius is None:
+                break
+        return image

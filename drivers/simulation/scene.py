@@ -1,0 +1,228 @@
+"""A simulated scene: surfaces, and the contacts of the sensors that arms carry through it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Annotated, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from drivers.clock import Clock
+from drivers.errors import ConfigError
+from drivers.samples import Stamped
+from drivers.simulation.contact import ContactLaw, ContactModel, ContactState
+from drivers.simulation.motions import Glide, Motion, Periodic, Still
+from drivers.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
+from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Timeline
+from geometry import se3
+from geometry.types import Array
+
+HISTORY_S = 2.5
+
+
+@runtime_checkable
+class Carrier(Protocol):
+    """A simulated arm, as the sensors see it that it carries."""
+
+    def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
+        """(4, 4) at the present step of the simulation; must not advance time."""
+        ...
+
+
+class Scene:
+    """Surfaces and the sensors that touch them. One thread only.
+
+    Contacts are stepped on the timeline's fixed grid to the clock's now whenever somebody reads one or an arm is asked.
+
+    Args:
+        surfaces: by name; motions count seconds from when the scene was made.
+        law: how every tip gives and slips.
+        clock: injected time.
+        step_s: grid of the simulation.
+    """
+
+    def __init__(
+        self, surfaces: Mapping[str, Surface], law: ContactLaw, clock: Clock, step_s: float = DEFAULT_STEP_S
+    ) -> None:
+        self.surfaces = dict(surfaces)
+        self.law = law
+        self.timeline = Timeline(clock, step_s)
+        self._start_ns = self.timeline.t_ns
+        self._sensors: dict[str, _MountedSensor] = {}
+
+    def mount(self, sensor: str, pose: Callable[[], Array]) -> None:
+        """Let ``sensor`` feel. ``pose`` gives T_world_s (4, 4) at the present step and must not advance time."""
+        if not self.surfaces:
+            raise ConfigError("the scene has no surface to touch", key="scene.surfaces")
+        if sensor in self._sensors:
+            raise ConfigError(f"sensor {sensor!r} is mounted already", key="scene", value=sensor)
+        mounted = _MountedSensor(self, pose)
+        self._sensors[sensor] = mounted
+        self.timeline.add(Phase.CONTACT, mounted.step)
+
+    def contact(self, sensor: str, t_ns: int | None = None) -> Stamped[ContactState]:
+        """What ``sensor`` feels now, or felt at ``t_ns`` (the step before it), at most HISTORY_S ago.
+
+        Raises:
+            ConfigError: no such sensor.
+            LookupError: ``t_ns`` lies in the future or too far back.
+        """
+        if sensor not in self._sensors:
+            raise ConfigError(f"no sensor {sensor!r} is mounted", key="scene", value=sensor)
+        now_ns = self.timeline.advance()
+        return self._sensors[sensor].at(now_ns if t_ns is None else t_ns)
+
+    def seconds(self, t_ns: int) -> float:
+        """Time of the surfaces' motions at ``t_ns``."""
+        return (t_ns - self._start_ns) * 1e-9
+
+
+class _MountedSensor:
+    def __init__(self, scene: Scene, pose: Callable[[], Array]) -> None:
+        self._scene = scene
+        self._pose = pose
+        self._model = ContactModel(scene.law)
+        self._step_ns = scene.timeline.step_ns
+        self._history: deque[Stamped[ContactState]] = deque(maxlen=round(HISTORY_S * 1e9 / self._step_ns))
+        self.step(scene.timeline.t_ns)
+
+    def step(self, t_ns: int) -> None:
+        T_world_s, t_s = self._pose(), self._scene.seconds(t_ns)
+        surfaces = list(self._scene.surfaces.values())
+        surface = surfaces[0]
+        if len(surfaces) > 1:
+            surface = min(surfaces, key=lambda each: each.nearest(T_world_s[:3, 3], t_s).distance_m)
+        state = self._model.step(T_world_s, surface, t_s)
+        self._history.append(Stamped(state, t_ns, t_ns // self._step_ns))
+
+    def at(self, t_ns: int) -> Stamped[ContactState]:
+        back = self._history[-1].seq - t_ns // self._step_ns
+        if not 0 <= back < len(self._history):
+            raise LookupError(f"no contact is kept for {t_ns} ns, the newest is of {self._history[-1].t_ns} ns")
+        return self._history[-1 - back]
+
+
+PoseMmDeg = tuple[float, float, float, float, float, float]
+_HERE: PoseMmDeg = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+_SI = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class GlideConfig(_Part):
+    """One smooth move: translations along and at most one rotation about the start frame's axes."""
+
+    kind: Literal["glide"]
+    displacement_mm_deg: PoseMmDeg
+    start_s: float = Field(ge=0.0)
+    duration_s: float = Field(gt=0.0)
+
+    @model_validator(mode="after")
+    def _one_rotation(self) -> GlideConfig:
+        if sum(angle != 0.0 for angle in self.displacement_mm_deg[3:]) > 1:
+            raise ValueError("displacement_mm_deg may turn about one axis only; use kind: periodic for more")
+        return self
+
+    def build(self, T_start: Array) -> Motion:
+        return Glide(T_start, np.array(self.displacement_mm_deg) * _SI, self.start_s, self.duration_s)
+
+
+class PeriodicConfig(_Part):
+    """Sines in all pose components of the start frame, begun gently; see ``motions.Periodic``."""
+
+    kind: Literal["periodic"]
+    amplitude_mm_deg: PoseMmDeg
+    shift_deg: PoseMmDeg = (0.0, 90.0, 0.0, 0.0, 90.0, 45.0)
+    period_s: float = Field(gt=0.0)
+    ramp_s: float = Field(default=1.0, gt=0.0)
+
+    def build(self, T_start: Array) -> Motion:
+        return Periodic(
+            T_start,
+            np.array(self.amplitude_mm_deg) * _SI,
+            np.radians(self.shift_deg),
+            self.period_s,
+            self.ramp_s,
+        )
+
+
+class _SurfaceConfig(_Part):
+    pose_mm_deg: PoseMmDeg = _HERE
+    motion: Annotated[GlideConfig | PeriodicConfig, Field(discriminator="kind")] | None = None
+
+    def shape(self) -> Shape:
+        raise NotImplementedError
+
+    def build(self) -> Surface:
+        T_world_body = se3.from_euler_mm_deg(self.pose_mm_deg)
+        return Surface(self.shape(), self.motion.build(T_world_body) if self.motion else Still(T_world_body))
+
+
+class PlaneConfig(_SurfaceConfig):
+    """A flat plate: the plane z = 0 of its pose, outside towards +z."""
+
+    kind: Literal["plane"]
+
+    def shape(self) -> Shape:
+        return Plane()
+
+
+class RampConfig(_SurfaceConfig):
+    """Flat, then bent over an arc to an incline along the pose's +x; see ``surfaces.Ramp``."""
+
+    kind: Literal["ramp"]
+    bend_radius_mm: float = Field(gt=0.0)
+    incline_deg: float = Field(gt=-90.0, lt=90.0)
+
+    def shape(self) -> Shape:
+        return Ramp(self.bend_radius_mm * 1e-3, float(np.radians(self.incline_deg)))
+
+
+class DomeConfig(_SurfaceConfig):
+    """A hemisphere on a plane, its centre at the pose's origin, rising towards +z."""
+
+    kind: Literal["dome"]
+    radius_mm: float = Field(gt=0.0)
+
+    def shape(self) -> Shape:
+        return Dome(self.radius_mm * 1e-3)
+
+
+class SphereConfig(_SurfaceConfig):
+    """A ball about the pose's origin."""
+
+    kind: Literal["sphere"]
+    radius_mm: float = Field(gt=0.0)
+
+    def shape(self) -> Shape:
+        return Sphere(self.radius_mm * 1e-3)
+
+
+class TipLawConfig(_Part):
+    """What every simulated tip of the scene is made of; see ``contact.ContactLaw``."""
+
+    radius_mm: float = Field(default=20.0, gt=0.0)
+    stiffness_n_mm: float = Field(default=1.5, gt=0.0)
+
+    def build(self) -> ContactLaw:
+        return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3)
+
+
+class SceneConfig(_Part):
+    """The ``scene:`` section of a cell file. Poses are in the world frame."""
+
+    surfaces: dict[
+        str,
+        Annotated[PlaneConfig | RampConfig | DomeConfig | SphereConfig, Field(discriminator="kind")],
+    ] = Field(min_length=1)
+    tip: TipLawConfig = TipLawConfig()
+    step_ms: float = Field(default=2.0, ge=0.1, le=10.0)
+
+    def build(self, clock: Clock) -> Scene:
+        """The scene, with its motions starting now."""
+        surfaces = {name: config.build() for name, config in self.surfaces.items()}
+        return Scene(surfaces, self.tip.build(), clock, self.step_ms * 1e-3)

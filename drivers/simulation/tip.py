@@ -1,0 +1,151 @@
+"""The TacTip's skin: where its 331 markers go in a contact, and where the camera sees them.
+
+The deformation is a sum of smooth fields around the contact axis, which is the inward normal through the sphere's
+centre; psi is a marker's angle from it. The forms are those that SIMULATION part 5 found necessary on real images.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.types import Array
+
+_MM = 1e-3
+_DEG = math.pi / 180.0
+
+
+@dataclass(frozen=True, slots=True)
+class TipParameters:
+    """One sensor: its layout, its camera and how its skin moves. Angles in radians, lengths in metres.
+
+    Attributes:
+        rings: marker rings around the central marker; ring k holds 6k.
+        ring_step_rad: polar angle from ring to ring.
+        layout_phase_rad: azimuth of each ring's first marker in the image.
+        marker_radius_m: distance of the undeformed markers from the sphere's centre.
+        camera_distance_m: from the pinhole to the sphere's centre, along z.
+        focal_px: focal length.
+        centre_px: (u, v) of the optical axis in the 640x480 frame; pixel centres are whole numbers.
+        image_rotation_rad: turn from sensor axes to image axes about z.
+        disc_radius_px: of the markers in the image.
+        follow: share of the shear that contacted markers follow.
+        rim_follow: share of the shear at the far rim.
+        shear_width_rad, shear_power: falloff exp(-(psi / width)^power) of shear and torsion.
+        torsion_follow: share of the torsion that shows.
+        dent_follow: share of the depth by which the contacted skin moves in.
+        dent_width_rad, dent_width_per_sqrt_m_rad, dent_power: falloff of the dent; it widens with the root of depth.
+        lean_follow: share of the dent's sideways part by which the whole dome leans, most at the apex.
+        sink_follow: the same for the part along the sensor's axis.
+        bulge: outward push around the contact, as a share of depth.
+        bulge_at_rad, bulge_width_rad: where it is largest and how far it reaches.
+        rock: how far shear raises the flank ahead and lowers the one behind.
+        pin_lever_m: length of the pins that swing when the skin under them turns.
+    """
+
+    rings: int = 10
+    ring_step_rad: float = 7.75 * _DEG
+    layout_phase_rad: float = -1.0 * _DEG
+    marker_radius_m: float = 18.0 * _MM
+    camera_distance_m: float = 41.7 * _MM
+    focal_px: float = 503.4
+    centre_px: tuple[float, float] = (331.0, 242.0)
+    image_rotation_rad: float = -52.0 * _DEG
+    disc_radius_px: float = 6.2
+    follow: float = 1.0
+    rim_follow: float = 0.2
+    shear_width_rad: float = 51.0 * _DEG
+    shear_power: float = 2.2
+    torsion_follow: float = 0.67
+    dent_follow: float = 1.0
+    dent_width_rad: float = 30.0 * _DEG
+    dent_width_per_sqrt_m_rad: float = 5.0 * _DEG / math.sqrt(_MM)
+    dent_power: float = 2.2
+    lean_follow: float = 0.3
+    sink_follow: float = 0.1
+    bulge: float = 0.1
+    bulge_at_rad: float = 40.0 * _DEG
+    bulge_width_rad: float = 50.0 * _DEG
+    rock: float = 0.3
+    pin_lever_m: float = 1.0 * _MM
+
+
+class Tip:
+    """A sensor with given parameters. All its functions take batches and give the same for one as for many."""
+
+    def __init__(self, parameters: TipParameters | None = None) -> None:
+        self.parameters = p = parameters or TipParameters()
+        ring = np.concatenate([np.full(max(6 * k, 1), k) for k in range(p.rings + 1)])
+        azimuth = np.concatenate([np.arange(max(6 * k, 1)) * 2.0 * np.pi / max(6 * k, 1) for k in range(p.rings + 1)])
+        azimuth += p.layout_phase_rad - p.image_rotation_rad
+        polar = p.ring_step_rad * ring
+        direction = [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
+        self._direction = np.stack(direction, axis=1)
+        self._rest = p.marker_radius_m * self._direction
+
+    @property
+    def rest_positions(self) -> Array:
+        """(markers, 3) m, undeformed, in the sensor frame."""
+        return self._rest.copy()
+
+    def marker_positions(self, T_f_s: Array) -> Array:
+        """Marker positions in the sensor frame in contacts ``T_f_s``.
+
+        Args:
+            T_f_s: (..., 4, 4) effective contact poses; those of negative depth leave the skin undeformed.
+
+        Returns:
+            (..., markers, 3) m.
+        """
+        p = self.parameters
+        R = T_f_s[..., :3, :3]
+        depth = np.maximum(T_f_s[..., 2, 3], 0.0)[..., None]
+        touching = (depth > 0.0).astype(np.float64)
+        axis = R[..., 2, :]
+        shear = -touching * (T_f_s[..., 0, 3, None] * R[..., 0, :] + T_f_s[..., 1, 3, None] * R[..., 1, :])
+        torsion = touching * _torsion(R)[..., None]
+
+        cos_psi = np.clip(axis @ self._direction.T, -1.0, 1.0)
+        psi = np.arccos(cos_psi)
+        grip = p.rim_follow + (1.0 - p.rim_follow) * np.exp(-((psi / p.shear_width_rad) ** p.shear_power))
+        dent_width = p.dent_width_rad + p.dent_width_per_sqrt_m_rad * np.sqrt(depth)
+        reach = (psi / dent_width) ** p.dent_power
+        dent = p.dent_follow * depth * np.exp(-reach)
+        ahead = shear @ self._direction.T
+
+        # Away from the contact axis, tangential to the sphere: sin(psi) long.
+        outward = self._direction - cos_psi[..., None] * axis[..., None, :]
+        # The dent's slope turns the skin and swings the pins: lever * d(dent)/d(arc), along outward / sin(psi).
+        slope = dent * p.dent_power * reach / (np.maximum(psi * np.sin(psi), 1e-9) * p.marker_radius_m)
+        bulge = p.bulge * depth * np.exp(-(((psi - p.bulge_at_rad) / p.bulge_width_rad) ** 2))
+
+        moved: Array = self._rest - dent[..., None] * axis[..., None, :]
+        moved += (p.follow * grip)[..., None] * shear[..., None, :]
+        moved += (bulge + p.pin_lever_m * slope)[..., None] * outward
+        moved -= (p.torsion_follow * torsion * grip)[..., None] * np.cross(axis[..., None, :], self._rest)
+        body = -depth * axis * np.array([p.lean_follow, p.lean_follow, p.sink_follow])
+        moved += (0.5 + 0.5 * self._direction[:, 2])[:, None] * body[..., None, :]
+        moved[..., 2] += p.rock * ahead * grip
+        return moved
+
+    def project(self, positions: Array) -> Array:
+        """Pixels (..., 2) in the 640x480 frame of points (..., 3) m in the sensor frame, by a pinhole camera."""
+        p = self.parameters
+        scale = p.focal_px / (p.camera_distance_m + positions[..., 2])
+        sin, cos = math.sin(p.image_rotation_rad), math.cos(p.image_rotation_rad)
+        x, y = positions[..., 0], positions[..., 1]
+        u = p.centre_px[0] + scale * (cos * x - sin * y)
+        v = p.centre_px[1] + scale * (sin * x + cos * y)
+        return np.stack([u, v], axis=-1)
+
+    def pixels(self, T_f_s: Array) -> Array:
+        """(..., markers, 2) px in the 640x480 frame, of contacts ``T_f_s`` (..., 4, 4)."""
+        return self.project(self.marker_positions(T_f_s))
+
+
+def _torsion(R: Array) -> Array:
+    """Gamma of R = Rz(gamma) Ry(beta) Rx(alpha), (...)."""
+    gamma: Array = np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    return gamma

@@ -1,0 +1,19 @@
+"""The one part of the build that pyproject.toml cannot say: where numpy's C headers are."""
+
+import numpy
+from setuptools import Extension, setup
+
+setup(
+    ext_modules=[
+        Extension(
+            "geometry._se3c",
+            sources=["geometry/_se3c.c"],
+            depends=["geometry/_se3_kernels.h"],
+            include_dirs=[numpy.get_include()],
+            # Contracted multiply-adds would make results depend on the machine.
+            extra_compile_args=["-O3", "-ffp-contract=off"],
+            # Without a compiler the plain kernels serve.
+            optional=True,
+        )
+    ]
+)
