@@ -8,7 +8,7 @@ setup(
         Extension(
             "geometry._se3c",
             sources=["geometry/_se3c.c"],
-            depends=["geometry/_se3_kernels.h"],
+            depends=["geometry/_se3_kernels.h", "geometry/_gaussian_kernels.h"],
             include_dirs=[numpy.get_include()],
             # Contracted multiply-adds would make results depend on the machine.
             extra_compile_args=["-O3", "-ffp-contract=off"],

@@ -16,11 +16,11 @@ LARGEST = 1e60
 """Largest magnitude of a component. The kernels multiply up to four components, which then cannot overflow."""
 
 
-def numbers(function: str, argument: str, value: ArrayLike, core: tuple[int, ...]) -> Array:
-    """Return ``value`` as a C-contiguous float64 array of shape (..., *core).
+def real(function: str, argument: str, value: ArrayLike, core: tuple[int, ...]) -> Array:
+    """Return ``value`` as a C-contiguous float64 array of shape (..., *core), finite or not.
 
     Raises:
-        GeometryError: it is not real numbers, has another shape, or is not finite.
+        GeometryError: it is not real numbers, or has another shape.
     """
     try:
         array = np.asarray(value)
@@ -31,7 +31,16 @@ def numbers(function: str, argument: str, value: ArrayLike, core: tuple[int, ...
     if array.shape[-len(core) :] != core:
         expected = ", ".join(["...", *map(str, core)])
         raise GeometryError(function, argument, f"has shape {array.shape}, not ({expected})")
-    array = np.ascontiguousarray(array, dtype=np.float64)
+    return np.ascontiguousarray(array, dtype=np.float64)
+
+
+def numbers(function: str, argument: str, value: ArrayLike, core: tuple[int, ...]) -> Array:
+    """Return ``value`` as ``real`` does.
+
+    Raises:
+        GeometryError: as ``real``, or it is not finite.
+    """
+    array = real(function, argument, value, core)
     if array.size and not (np.abs(array).max() <= LARGEST):
         raise GeometryError(function, argument, f"is not finite, or larger than {LARGEST:g}")
     return array

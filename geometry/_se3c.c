@@ -8,7 +8,10 @@
 #include <Python.h>
 #include <numpy/arrayobject.h>
 
+#include "_gaussian_kernels.h"
 #include "_se3_kernels.h"
+
+static const npy_intp POSE[2] = {4, 4}, COVARIANCE[2] = {6, 6};
 
 static PyObject *check_twist, *check_pose, *check_pose_pair;
 
@@ -112,11 +115,10 @@ static PyObject *py_left_jacobian_inverse(PyObject *module, PyObject *xi) { retu
 /* One pose, or as many as the other side has. NULL without an exception: an element is no pose. */
 static PyObject *run_compose(PyArrayObject *left, PyArrayObject *right, int trusted)
 {
-    static const npy_intp core[2] = {4, 4};
     npy_intp step_left = PyArray_NDIM(left) > 2 ? 16 : 0, step_right = PyArray_NDIM(right) > 2 ? 16 : 0;
     PyArrayObject *longer = step_left ? left : right;
     npy_intp count = PyArray_SIZE(longer) / 16;
-    PyObject *out = new_array(longer, 2, 2, core);
+    PyObject *out = new_array(longer, 2, 2, POSE);
     if (!out)
         return NULL;
     const double *a = PyArray_DATA(left), *b = PyArray_DATA(right);
@@ -137,12 +139,11 @@ static PyObject *run_compose(PyArrayObject *left, PyArrayObject *right, int trus
 
 static PyObject *py_compose(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
 {
-    static const npy_intp core[2] = {4, 4};
     if (count != 2) {
         PyErr_SetString(PyExc_TypeError, "compose takes two poses");
         return NULL;
     }
-    if (is_readable(arguments[0], 2, core) && is_readable(arguments[1], 2, core)) {
+    if (is_readable(arguments[0], 2, POSE) && is_readable(arguments[1], 2, POSE)) {
         PyArrayObject *left = (PyArrayObject *)arguments[0], *right = (PyArrayObject *)arguments[1];
         if (PyArray_NDIM(left) == 2 || PyArray_NDIM(right) == 2 || PyArray_SAMESHAPE(left, right)) {
             PyObject *out = run_compose(left, right, 0);
@@ -159,6 +160,102 @@ static PyObject *py_compose(PyObject *module, PyObject *const *arguments, Py_ssi
     return out;
 }
 
+static const double *readable_matrix(PyObject *value, const npy_intp *core)
+{
+    if (!is_readable(value, 2, core) || PyArray_NDIM((PyArrayObject *)value) != 2)
+        return NULL;
+    return PyArray_DATA((PyArrayObject *)value);
+}
+
+/* A mean and a covariance to return together. */
+typedef struct {
+    PyObject *mean, *covariance;
+    double *T, *S;
+} Pair;
+
+static int new_pair(Pair *pair)
+{
+    pair->mean = PyArray_SimpleNew(2, POSE, NPY_DOUBLE);
+    pair->covariance = PyArray_SimpleNew(2, COVARIANCE, NPY_DOUBLE);
+    if (!pair->mean || !pair->covariance) {
+        Py_XDECREF(pair->mean);
+        Py_XDECREF(pair->covariance);
+        return 0;
+    }
+    pair->T = PyArray_DATA((PyArrayObject *)pair->mean);
+    pair->S = PyArray_DATA((PyArrayObject *)pair->covariance);
+    return 1;
+}
+
+static PyObject *refuse(Pair *pair)
+{
+    Py_DECREF(pair->mean);
+    Py_DECREF(pair->covariance);
+    Py_RETURN_NONE;
+}
+
+static PyObject *py_admit(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    if (count != 2) {
+        PyErr_SetString(PyExc_TypeError, "admit takes a mean and a covariance");
+        return NULL;
+    }
+    const double *T = readable_matrix(arguments[0], POSE), *S = readable_matrix(arguments[1], COVARIANCE);
+    double factor[36];
+    Pair pair;
+    if (!T || !S || !is_pose(T))
+        Py_RETURN_NONE;
+    if (!new_pair(&pair))
+        return NULL;
+    if (!symmetric(S, pair.S) || !cholesky(pair.S, factor))
+        return refuse(&pair);
+    memcpy(pair.T, T, 16 * sizeof(double));
+    PyArray_CLEARFLAGS((PyArrayObject *)pair.mean, NPY_ARRAY_WRITEABLE);
+    PyArray_CLEARFLAGS((PyArrayObject *)pair.covariance, NPY_ARRAY_WRITEABLE);
+    return Py_BuildValue("NN", pair.mean, pair.covariance);
+}
+
+static PyObject *py_predict(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    if (count != 4) {
+        PyErr_SetString(PyExc_TypeError, "predict takes U, T, S and Q");
+        return NULL;
+    }
+    const double *U = readable_matrix(arguments[0], POSE), *T = readable_matrix(arguments[1], POSE);
+    const double *S = readable_matrix(arguments[2], COVARIANCE), *Q = readable_matrix(arguments[3], COVARIANCE);
+    Pair pair;
+    if (!U || !T || !S || !(Q || arguments[3] == Py_None) || !is_pose(U))
+        Py_RETURN_NONE;
+    if (!new_pair(&pair))
+        return NULL;
+    if (!predict_kernel(U, T, S, Q, pair.T, pair.S))
+        return refuse(&pair);
+    return Py_BuildValue("NN", pair.mean, pair.covariance);
+}
+
+static PyObject *py_fuse(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    if (count != 6) {
+        PyErr_SetString(PyExc_TypeError, "fuse takes T1, S1, T2, S2, tolerance and max_iterations");
+        return NULL;
+    }
+    const double *T1 = readable_matrix(arguments[0], POSE), *S1 = readable_matrix(arguments[1], COVARIANCE);
+    const double *T2 = readable_matrix(arguments[2], POSE), *S2 = readable_matrix(arguments[3], COVARIANCE);
+    double tolerance = PyFloat_AsDouble(arguments[4]), nis;
+    long max_iterations = PyLong_AsLong(arguments[5]);
+    int iterations;
+    Pair pair;
+    if (PyErr_Occurred())
+        return NULL;
+    if (!T1 || !S1 || !T2 || !S2)
+        Py_RETURN_NONE;
+    if (!new_pair(&pair))
+        return NULL;
+    if (!fuse_kernel(T1, S1, T2, S2, tolerance, (int)max_iterations, pair.T, pair.S, &iterations, &nis))
+        return refuse(&pair);
+    return Py_BuildValue("NNid", pair.mean, pair.covariance, iterations, nis);
+}
+
 static PyMethodDef METHODS[] = {
     {"exp", py_exp, METH_O, NULL},
     {"log", py_log, METH_O, NULL},
@@ -167,6 +264,9 @@ static PyMethodDef METHODS[] = {
     {"adjoint", py_adjoint, METH_O, NULL},
     {"left_jacobian", py_left_jacobian, METH_O, NULL},
     {"left_jacobian_inverse", py_left_jacobian_inverse, METH_O, NULL},
+    {"admit", (PyCFunction)(void (*)(void))py_admit, METH_FASTCALL, NULL},
+    {"predict", (PyCFunction)(void (*)(void))py_predict, METH_FASTCALL, NULL},
+    {"fuse", (PyCFunction)(void (*)(void))py_fuse, METH_FASTCALL, NULL},
     {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef MODULE = {
