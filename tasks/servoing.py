@@ -71,10 +71,10 @@ class ServoConfig(TaskConfig):
     kp_per_s: SixGains
     ki_per_s2: SixGains
     kd: SixGains = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    max_integral_speed_mm_s: NonNegativeFloat = 60.0
-    max_integral_turn_deg_s: NonNegativeFloat = 45.0
-    max_speed_mm_s: PositiveFloat = 80.0
-    max_turn_deg_s: PositiveFloat = 60.0
+    max_integral_speed_mm_s: NonNegativeFloat = 40.0
+    max_integral_turn_deg_s: NonNegativeFloat = 20.0
+    max_speed_mm_s: PositiveFloat = 60.0
+    max_turn_deg_s: PositiveFloat = 20.0
     max_frame_age_ms: PositiveFloat = 150.0
     max_state_age_ms: PositiveFloat = 50.0
     stale_timeout_s: PositiveFloat = 0.5
