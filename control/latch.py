@@ -110,7 +110,7 @@ class Latch:
         """
         refusals = {
             Refusal.NOT_LATCHED: self._state is LatchState.CLEAR,
-            Refusal.OLD_TOKEN: token.t_ns < self._latest_ns or token is self._used,
+            Refusal.OLD_TOKEN: token.t_ns < self._latest_ns or token == self._used,
             Refusal.CAUSE_PRESENT: self._present,
             Refusal.NOT_AT_REST: not at_rest,
             Refusal.MOTION_COMMANDED: commanded,

@@ -52,6 +52,17 @@ class TactileServo:
         self._pid.reset()
         self._t_ns: int | None = None
         self._V_tcp = np.zeros(6)
+        self._e = np.zeros(6)
+
+    @property
+    def active(self) -> bool:
+        """Whether it has seen a valid estimate since the latest reset."""
+        return self._t_ns is not None
+
+    @property
+    def latest_error(self) -> Array:
+        """Error motion (6,) of the latest step on the controlled components, zero on the others and after a reset."""
+        return np.where(self._free, 0.0, self._e)
 
     def error(self, T_s_f: Array) -> Array:
         """Error motion ``e`` (6,), m and rad, in the sensor frame; see the class for its sign."""
@@ -79,7 +90,9 @@ class TactileServo:
             dt_s = self._period_s if self._t_ns is None else (t_ns - self._t_ns) * 1e-9
             with np.errstate(invalid="ignore"):  # the controller refuses what is not finite, by name
                 V_ff_s = se3.adjoint(E) @ V_ff
-            V_s = self._pid.step(se3.log(E), V_ff_s, dt_s)
+            e = se3.log(E)
+            V_s = self._pid.step(e, V_ff_s, dt_s)
+            self._e = e
             self._V_tcp = self._Ad_tcp_sensor @ V_s
             self._t_ns = t_ns
         return self._V_tcp.copy()

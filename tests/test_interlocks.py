@@ -1,0 +1,176 @@
+"""Each rule at, just inside and just outside its limit; each way of getting its settings wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from control.interlocks import INTERLOCKS, Finite, build_interlocks, parse_interlocks
+from control.view import ArmView, CellView, SensorView
+from control.violation import Severity
+from drivers.commands import TwistCommand, TwistFrame
+from drivers.errors import ConfigError
+from drivers.samples import Stamped, TcpState
+from geometry import se3
+
+NOW = 1_000_000_000
+SENSOR_MOUNT = {"sensor": se3.from_euler_mm_deg(np.array([0, 0, 100.0, 0, 0, 0]))}
+GOOD = {
+    "box": {
+        "kind": "workspace",
+        "arm": "arm",
+        "sensor": "sensor",
+        "min_mm": [-100, -100, 0],
+        "max_mm": [100, 100, 300],
+    },
+    "speed": {"kind": "tcp_speed", "limit_m_s": 0.1, "limit_rad_s": 1.0},
+    "depth": {"kind": "depth", "limit_mm": 6.0},
+    "frames": {"kind": "frame_age", "limit_ms": 100},
+    "states": {"kind": "arm_state_age", "limit_ms": 50, "severity": "fault"},
+}
+
+
+def view(pose_mm_deg=(0, 0, 100, 0, 0, 0), twist=(0,) * 6, command=None, state_ns=NOW, **sensor) -> CellView:
+    state = TcpState(se3.from_euler_mm_deg(np.array(pose_mm_deg, dtype=float)), np.array(twist, dtype=float))
+    wanted = None if command is None else TwistCommand(np.array(command, dtype=float), TwistFrame.TCP, NOW, 0.03)
+    seen = SensorView(t_frame_ns=NOW, seq=17, in_contact=True, depth_m=0.003)
+    return CellView(
+        NOW,
+        {"arm": ArmView(Stamped(state, state_ns, 5), wanted)},
+        {"sensor": replace(seen, **sensor) if sensor else seen},
+    )
+
+
+def rule(name):
+    return build_interlocks(parse_interlocks({name: GOOD[name]}), SENSOR_MOUNT)[0]
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_a_quiet_cell_breaks_no_rule(name):
+    assert rule(name).check(view()) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "inside", "outside", "value", "limit", "unit"),
+    [
+        ("box", {"pose_mm_deg": (0, 0, 199, 0, 0, 0)}, {"pose_mm_deg": (0, 0, 201, 0, 0, 0)}, 0.301, 0.3, "m"),
+        ("box", {"pose_mm_deg": (-100, 0, 9, 0, 0, 0)}, {"pose_mm_deg": (-101, 0, 9, 0, 0, 0)}, -0.101, -0.1, "m"),
+        # Turned upside down, the sensor hangs 100 mm below the tool.
+        ("box", {"pose_mm_deg": (0, 0, 101, 180, 0, 0)}, {"pose_mm_deg": (0, 0, 99, 180, 0, 0)}, -0.001, 0.0, "m"),
+        ("speed", {"twist": (0.06, 0.08, 0, 0, 0, 0)}, {"twist": (0.06, 0.09, 0, 0, 0, 0)}, None, 0.1, "m/s"),
+        ("speed", {"twist": (0, 0, 0, 0, 0, 1)}, {"twist": (0, 0, 0, 0, 0, -1.1)}, 1.1, 1.0, "rad/s"),
+        ("speed", {"command": (0, 0, 0.1, 0, 0, 0)}, {"command": (0, 0, -0.11, 0, 0, 0)}, 0.11, 0.1, "m/s"),
+        ("depth", {"depth_m": 0.006}, {"depth_m": 0.0061}, 0.0061, 0.006, "m"),
+        ("frames", {"t_frame_ns": NOW - 100_000_000}, {"t_frame_ns": NOW - 101_000_000}, 0.101, 0.1, "s"),
+        ("frames", {"t_frame_ns": NOW}, {"t_frame_ns": NOW + 1_000_000}, -0.001, 0.1, "s"),
+        ("states", {"state_ns": NOW - 50_000_000}, {"state_ns": NOW - 51_000_000}, 0.051, 0.05, "s"),
+    ],
+)
+def test_limits(name, inside, outside, value, limit, unit):
+    interlock = rule(name)
+    assert interlock.check(view(**inside)) is None
+    found = interlock.check(view(**outside))
+    assert found is not None
+    assert (found.interlock, found.severity, found.unit, found.t_ns) == (name, interlock.severity, unit, NOW)
+    assert found.value == pytest.approx(math.hypot(0.06, 0.09) if value is None else value, abs=1e-12)
+    assert found.limit == pytest.approx(limit)
+    assert found.frame_seq == (17 if name in ("depth", "frames") else None)
+
+
+def test_the_worst_of_two_speeds_is_reported():
+    found = rule("speed").check(view(twist=(0.12, 0, 0, 0, 0, 0), command=(0, 0, 0, 0, 0, 5.0)))
+    assert (found.value, found.unit) == (5.0, "rad/s")
+
+
+def test_no_contact_is_no_depth():
+    assert rule("depth").check(view(in_contact=False, depth_m=None)) is None
+
+
+def test_a_tool_without_sensor_is_guarded_at_its_centre_point():
+    settings = {"box": {k: v for k, v in GOOD["box"].items() if k != "sensor"}}
+    (box,) = build_interlocks(parse_interlocks(settings), {})
+    assert box.check(view(pose_mm_deg=(0, 0, 299, 0, 0, 0))) is None
+    assert box.check(view(pose_mm_deg=(0, 0, 301, 0, 0, 0))).subject == "arm"
+
+
+def test_severity_comes_from_the_settings():
+    assert rule("states").severity is Severity.FAULT
+    assert rule("frames").severity is Severity.TRIP
+
+
+bad_numbers = st.sampled_from([math.nan, math.inf, -math.inf])
+
+
+@given(bad=bad_numbers, place=st.integers(0, 5))
+def test_anything_not_finite_is_found(bad, place):
+    twist = np.zeros(6)
+    twist[place] = bad
+    pose = np.eye(4)
+    pose[place % 3, place % 4] = bad
+    broken = [
+        view(twist=twist),
+        view(command=twist),
+        view(depth_m=bad),
+        view(nis=bad),
+        view(sigma_depth_m=bad),
+        CellView(NOW, {"arm": ArmView(Stamped(TcpState(pose, np.zeros(6)), NOW, 1))}),
+        CellView(
+            NOW,
+            {
+                "arm": ArmView(
+                    Stamped(TcpState(np.eye(4), np.zeros(6)), NOW, 1),
+                    TwistCommand(np.zeros(6), TwistFrame.TCP, NOW, bad),
+                )
+            },
+        ),
+    ]
+    for case in broken:
+        found = Finite().check(case)
+        assert found is not None
+        assert found.severity is Severity.FAULT
+    assert Finite().check(view(command=(1,) * 6, nis=3.0, sigma_depth_m=1e-4)) is None
+
+
+@pytest.mark.parametrize(
+    ("entry", "key"),
+    [
+        ({"kind": "depth"}, "interlocks.x.limit_mm"),
+        ({"kind": "depth", "limit_mm": None}, "interlocks.x.limit_mm"),
+        ({"kind": "depth", "limit_mm": 0}, "interlocks.x.limit_mm"),
+        ({"kind": "depth", "limit_mm": -1}, "interlocks.x.limit_mm"),
+        ({"kind": "depth", "limit_mm": math.nan}, "interlocks.x.limit_mm"),
+        ({"kind": "depth", "limit_mm": math.inf}, "interlocks.x.limit_mm"),
+        ({"kind": "depth", "limit_m": 0.006}, "interlocks.x.limit_mm"),
+        ({"kind": "depth", "limit_mm": 6, "limit_deg": 1}, "interlocks.x.limit_deg"),
+        ({"kind": "tcp_speed", "limit_m_s": 0.1}, "interlocks.x.limit_rad_s"),
+        ({"kind": "frame_age", "limit_ms": 10, "severity": "limit"}, "interlocks.x.severity"),
+        ({"kind": "finite"}, "interlocks.x"),
+        ({"limit_mm": 6}, "interlocks.x"),
+        ({**GOOD["box"], "min_mm": [200, -100, 0]}, "interlocks.x"),
+        ({**GOOD["box"], "max_mm": [100, 100]}, "interlocks.x.max_mm.2"),
+    ],
+)
+def test_wrong_settings_name_their_key(entry, key):
+    with pytest.raises(ConfigError) as caught:
+        parse_interlocks({"x": entry})
+    assert caught.value.key == key
+
+
+def test_an_unknown_sensor_is_a_config_error():
+    with pytest.raises(ConfigError) as caught:
+        build_interlocks(parse_interlocks({"box": GOOD["box"]}), {"left": np.eye(4)})
+    assert caught.value.key == "interlocks.box.sensor"
+    assert "left" in caught.value.hint
+
+
+def test_every_kind_is_listed_with_one_line():
+    assert set(INTERLOCKS) == {"finite"} | {entry["kind"] for entry in GOOD.values()}
+    for kind, spec in INTERLOCKS.items():
+        assert spec.kind == kind
+        assert spec.summary
+        assert "\n" not in spec.summary
