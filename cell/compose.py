@@ -20,6 +20,7 @@ from drivers.abilities import FrameSource, TcpSource
 from drivers.arm import Arm
 from drivers.clock import Clock, MonotonicClock, VirtualClock
 from drivers.device import Device
+from drivers.errors import ConfigError
 from drivers.registry import DriverContext
 from geometry import se3
 from geometry.types import Array
@@ -235,12 +236,16 @@ def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Devic
         if settings
         else None
     )
-    gate = estimator.gate
-    contact_gate = (
-        ContactGate(model.reference, enter=gate.touch_percent / 100, leave=gate.release_percent / 100)
-        if gate
-        else None
-    )
+    contact_gate = None
+    if (gate := estimator.gate) is not None:
+        if model.reference is None:
+            raise ConfigError(
+                f"model {estimator.model} holds no image out of contact, which a contact gate compares with",
+                key=f"sensors.{camera.name}.estimator.gate",
+                value=estimator.model,
+                hint="leave out `gate:`, so that every frame goes through the network",
+            )
+        contact_gate = ContactGate(model.reference, enter=gate.touch_percent / 100, leave=gate.release_percent / 100)
     return ContactPipeline(cast(FrameSource, camera), model, contact_gate=contact_gate, pose_filter=pose_filter)
 
 

@@ -64,6 +64,11 @@ class TactileServo:
         """Error motion (6,) of the latest step on the controlled components, zero on the others and after a reset."""
         return np.where(self._free, 0.0, self._e)
 
+    @property
+    def reference_mm_deg(self) -> Array:
+        """(6,) the desired contact as Euler components of ``T_f_sref``; NaN for axes that are not controlled."""
+        return np.where(self._free, np.nan, self._reference)
+
     def error(self, T_s_f: Array) -> Array:
         """Error motion ``e`` (6,), m and rad, in the sensor frame; see the class for its sign."""
         return se3.log(self._error_pose(T_s_f))

@@ -17,7 +17,12 @@ from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSp
 from drivers.samples import Frame, Stamped
 from geometry.types import ImageArray
 
-CAPABILITIES = Capabilities(kind="camera", abilities=frozenset({"FrameSource", "HealthSource"}), state_rate_hz=30.0)
+CAPABILITIES = Capabilities(
+    kind="camera",
+    abilities=frozenset({"FrameSource", "HealthSource"}),
+    state_rate_hz=30.0,
+    virtual_time=True,
+)
 
 _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
 # How a complete file ends: decoders fill what a truncated one lacks with grey and say nothing.

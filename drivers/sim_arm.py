@@ -29,6 +29,7 @@ CAPABILITIES = Capabilities(
     state_rate_hz=1.0 / DEFAULT_STEP_S,
     stop_categories=frozenset({1, 2}),
     has_brakes=True,
+    virtual_time=True,
 )
 
 _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE, Lifecycle.FAULTED)

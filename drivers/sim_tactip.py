@@ -18,7 +18,12 @@ from drivers.simulation.scene import Carrier, Scene
 from drivers.simulation.tip import Tip
 from geometry import se3
 
-CAPABILITIES = Capabilities(kind="camera", abilities=frozenset({"FrameSource", "HealthSource"}), state_rate_hz=30.0)
+CAPABILITIES = Capabilities(
+    kind="camera",
+    abilities=frozenset({"FrameSource", "HealthSource"}),
+    state_rate_hz=30.0,
+    virtual_time=True,
+)
 
 _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
 

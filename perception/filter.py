@@ -8,6 +8,7 @@ of two Gaussians on the manifold. Training poses are drawn evenly, so dividing b
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from geometry.gaussian import PoseGaussian
@@ -35,7 +36,7 @@ class PoseFilter:
         order: 2 or 4, order of the covariance's prediction (NUMERICS: 2 suffices below 0.1 rad of uncertainty).
     """
 
-    def __init__(self, noise_density: Array, *, order: int = 2) -> None:
+    def __init__(self, noise_density: Array, *, order: Literal[2, 4] = 2) -> None:
         self._noise_density = noise_density
         self._order = order
         self._state: FilterState | None = None

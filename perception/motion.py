@@ -23,6 +23,9 @@ class PoseHistory:
         self._times_ns: deque[int] = deque()
         self._poses: deque[Array] = deque()
 
+    def __len__(self) -> int:
+        return len(self._times_ns)
+
     def record(self, t_ns: int, T_base_sensor: Array) -> None:
         """Append a pose (4, 4); one that is not newer than the last replaces nothing and is ignored."""
         if self._times_ns and t_ns <= self._times_ns[-1]:

@@ -128,8 +128,8 @@ class ContactPipeline:
 
     def _process(self, frame: Stamped[Frame], read_ns: int) -> ContactEstimate:
         start = self._timer()
-        tensor = self._model.prepare(frame.value.image)
-        in_contact = self._contact_gate is None or self._contact_gate.update(tensor)
+        reduced = self._model.reduce(frame.value.image)
+        in_contact = self._contact_gate is None or self._contact_gate.update(reduced)
         preprocess_ns = self._timer() - start
         if not in_contact:
             self.times = StageTimes(read_ns, preprocess_ns)
@@ -138,7 +138,7 @@ class ContactPipeline:
                 self._filter.reset()
             return ContactEstimate(False, None, frame.t_ns, frame.seq, frame.t_ns)
         start = self._timer()
-        prediction = self._model.infer(tensor)
+        prediction = self._model.predict_reduced(reduced)
         infer_ns = self._timer() - start
         start = self._timer()
         observed = gaussian.from_exponential(prediction.xi, np.diag(prediction.sigma**2))
@@ -160,4 +160,4 @@ class ContactPipeline:
         )
 
     def _sensor_pose(self, t_ns: int) -> Array:
-        return self._poses.at(t_ns) if self._poses else np.eye(4)
+        return self._poses.at(t_ns) if len(self._poses) else np.eye(4)

@@ -422,10 +422,13 @@ class ServoTask:
         if contact is not None:
             telemetry["frame_age_ms"] = 1e-6 * (observation.now_ns - contact.t_frame_ns)
         if self._machine.state in (ServoState.SETTLE, ServoState.RUN) and self._servo.active:
-            e = self._servo.latest_error
-            units = zip(("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg"), _UNITS * e, strict=True)
-            telemetry |= {f"error_{name}": float(value) for name, value in units}
+            errors, references = _UNITS * self._servo.latest_error, self._servo.reference_mm_deg
+            for name, error, reference in zip(_COMPONENTS, errors, references, strict=True):
+                if np.isfinite(reference):
+                    telemetry[f"error_{name}"] = float(error)
+                    telemetry[f"reference_{name}"] = float(reference)
         return telemetry
 
 
+_COMPONENTS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 _UNITS = np.repeat([1e3, np.degrees(1.0)], 3)

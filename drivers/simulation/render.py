@@ -115,36 +115,3 @@ class FrameRenderer:
         cover = np.zeros((bottom - top, right - left), np.uint8)
         self._stamps.paint(cover, pixels - np.array([left, top], dtype=np.float64))
         return np.where(cover > 127, np.uint8(255), np.uint8(0))
-
-
-class SmallRenderer:
-    """Draws the small images that a network sees, directly: as if cropped from the frame and resized by area.
-
-    Args:
-        size_px: (width, height) of the small image.
-        crop: (left, top, right, bottom) px of the frame that it shows.
-        disc_radius_px: radii of the pins in the frame, of which each marker takes one.
-    """
-
-    def __init__(
-        self,
-        size_px: tuple[int, int] = (128, 128),
-        crop: tuple[int, int, int, int] = PUBLIC_CROP,
-        disc_radius_px: tuple[float, ...] = (6.2,),
-    ) -> None:
-        left, top, right, bottom = crop
-        self._size = size_px
-        self._origin = np.array([left, top], dtype=np.float64)
-        self._scale = np.array([size_px[0] / (right - left), size_px[1] / (bottom - top)])
-        mean_scale = float(np.sqrt(self._scale[0] * self._scale[1]))
-        self._stamps = [Stamps(radius * mean_scale, phases=32) for radius in disc_radius_px]
-
-    def draw(self, pixels: Array, radius: NDArray[np.int64] | None = None) -> ImageArray:
-        """Grey image of discs at ``pixels`` (n, 2) of the frame; ``radius`` (n,) says which of the radii each has."""
-        image = np.zeros((self._size[1], self._size[0]), np.uint8)
-        centres = (pixels - self._origin + 0.5) * self._scale - 0.5
-        for index, stamps in enumerate(self._stamps):
-            stamps.paint(image, centres if radius is None else centres[radius == index])
-            if radius is None:
-                break
-        return image

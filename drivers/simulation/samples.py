@@ -1,4 +1,4 @@
-"""Simulated training images with their labels, over the ranges of the public data (SPEC part 2)."""
+"""Random contacts as random simulated sensors see them, over the ranges of the public data (SPEC part 2)."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from drivers.simulation.contact import ContactLaw, contact_at
-from drivers.simulation.render import PUBLIC_CROP, SmallRenderer
 from drivers.simulation.tip import Tip, TipParameters
 from geometry import se3
-from geometry.types import Array, ImageArray
+from geometry.types import Array
 
 _IMAGES_PER_TIP = 16
-_RADIUS_LEVELS = 9
 _ADDITIVE = {"centre_px", "image_rotation_rad", "layout_phase_rad"}
 
 
@@ -27,9 +25,8 @@ class Variation:
         turn_rad: standard deviation of the image's and the layout's rotation.
         shift_px: standard deviation of the image centre, in the frame.
         marker_px: standard deviation of each marker's place, in the frame.
-        disc_radius: relative standard deviation of the discs' radii within an image.
+        disc_radius: relative standard deviation of the discs' radius from image to image.
         missing: share of markers that are not seen.
-        noise: standard deviation of the small image's grey levels.
     """
 
     parameters: float = 0.03
@@ -38,20 +35,32 @@ class Variation:
     marker_px: float = 0.3
     disc_radius: float = 0.08
     missing: float = 0.003
-    noise: float = 3.0
 
 
-def training_set(
+@dataclass(frozen=True, slots=True)
+class SampledContact:
+    """One random contact as one random sensor sees it.
+
+    Attributes:
+        T_f_s: (4, 4) label, after slip.
+        pixels: (markers, 2) px of the markers that are seen, in the 640x480 frame.
+        disc_radius_px: of the markers.
+    """
+
+    T_f_s: Array
+    pixels: Array
+    disc_radius_px: float
+
+
+def contacts(
     n: int,
     seed: int,
     *,
-    size_px: tuple[int, int] = (128, 128),
-    crop: tuple[int, int, int, int] = PUBLIC_CROP,
     parameters: TipParameters | None = None,
     law: ContactLaw | None = None,
     variation: Variation | None = None,
-) -> Iterator[tuple[ImageArray, Array]]:
-    """Yield ``n`` pairs of a grey image and its label, the same for the same seed.
+) -> Iterator[SampledContact]:
+    """Yield ``n`` random contacts, the same for the same seed.
 
     Depth is even in 0.5-6 mm, tilt in a 25 deg disc, shear in a 5 mm disc, torsion in +-5 deg; what the depth cannot
     hold slips, and the label is the pose that is left.
@@ -59,19 +68,12 @@ def training_set(
     Args:
         n: how many.
         seed: of everything random.
-        size_px: (width, height) of the images.
-        crop: (left, top, right, bottom) px of the 640x480 frame that they show.
         parameters: of the sensor around which the others scatter.
         law: how the tips slip.
         variation: how far they scatter.
-
-    Yields:
-        image (height, width) uint8, and T_f_s (4, 4).
     """
     rng = np.random.default_rng(seed)
     middle, law, variation = parameters or TipParameters(), law or ContactLaw(), variation or Variation()
-    levels = 1.0 + variation.disc_radius * np.linspace(-2.0, 2.0, _RADIUS_LEVELS)
-    renderer = SmallRenderer(size_px, crop, tuple(float(level) for level in middle.disc_radius_px * levels))
     for start in range(0, n, _IMAGES_PER_TIP):
         count = min(_IMAGES_PER_TIP, n - start)
         tip = Tip(_scattered(middle, variation, rng))
@@ -79,13 +81,9 @@ def training_set(
         pixels = tip.pixels(T_f_s)
         pixels += rng.normal(0.0, variation.marker_px, pixels.shape)
         seen = rng.random(pixels.shape[:2]) >= variation.missing
-        # The levels span two standard deviations to either side.
-        level = rng.normal((_RADIUS_LEVELS - 1) / 2.0, (_RADIUS_LEVELS - 1) / 4.0, pixels.shape[:2])
-        radius = np.clip(np.round(level), 0, _RADIUS_LEVELS - 1).astype(np.int64)
-        noise = rng.normal(0.0, variation.noise, (count, size_px[1], size_px[0]))
+        radius = tip.parameters.disc_radius_px * (1.0 + rng.normal(0.0, variation.disc_radius, count))
         for i in range(count):
-            image = renderer.draw(pixels[i][seen[i]], radius[i][seen[i]])
-            yield np.clip(np.round(image + noise[i]), 0, 255).astype(np.uint8), T_f_s[i]
+            yield SampledContact(T_f_s[i], pixels[i][seen[i]], float(radius[i]))
 
 
 def random_poses(n: int, rng: np.random.Generator) -> Array:
