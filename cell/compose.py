@@ -225,9 +225,8 @@ def _sensor(
 
 def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Device) -> ContactPipeline:
     from perception.contact_gate import ContactGate
-    from perception.inference import ContactModel
-
     from perception.filter import PoseFilter, isotropic_noise
+    from perception.inference import ContactModel
 
     model = ContactModel.load(model_path(estimator.model))
     settings = estimator.filter

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from geometry.gaussian import PoseGaussian
 
 from geometry import gaussian, se3
+from geometry.gaussian import PoseGaussian
 from geometry.types import Array
 
 

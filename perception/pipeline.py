@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from geometry.gaussian import PoseGaussian
 
 from drivers.abilities import FrameSource
 from drivers.errors import EndOfStream
 from drivers.samples import Frame, Stamped
 from geometry import gaussian
+from geometry.gaussian import PoseGaussian
 from geometry.types import Array
 from perception.contact_gate import ContactGate
 from perception.estimate import ContactEstimate

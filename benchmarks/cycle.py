@@ -1,0 +1,77 @@
+"""``touchcell bench cycle``: one control cycle from frame to twist, by stage, in a running cell.
+
+The shipped surface-following cell runs once with the learned estimator and once on the true contact, in simulated time;
+durations are measured inside the run loop around each stage. Drawing the simulated frame is not part of a real cell's
+cycle and is listed apart, as ``read frame``.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.provenance import provenance
+from cell.cli import find_cell
+from cell.compose import compose
+from cell.config import plan_cell
+from cell.loop import RunLoop
+from cell.recording import Recorder
+
+# Stages of a cycle with a new frame that also a real cell has.
+_STAGES = ("preprocess", "infer", "filter", "task and control", "supervisor", "gate and send")
+
+
+def run(arguments: Sequence[str], out: Path) -> None:
+    """Print and plot the latency budget; writes ``cycle.json`` and ``cycle.png`` into ``out``."""
+    path = find_cell(Path(arguments[0]) if arguments else Path("configs/surface_follow_sim.yaml"))
+    plan = plan_cell(path)
+    cell = compose(plan)
+    with tempfile.TemporaryDirectory() as folder, Recorder(Path(folder) / "run.mcap") as recorder, cell:
+        result = RunLoop(cell, recorder).run()
+    times_us = {stage: np.array(rows) * 1e-3 for stage, rows in result.times.rows.items()}
+    rows = {stage: _row(times_us[stage]) for stage in (*_STAGES, "read frame", "record") if stage in times_us}
+    total = sum(rows[stage]["median_us"] for stage in _STAGES if stage in rows)
+    rows["frame in, twist out"] = {
+        "median_us": total,
+        "p99_us": sum(rows[stage]["p99_us"] for stage in _STAGES if stage in rows),
+        "times": rows.get("infer", rows["supervisor"])["times"],
+    }
+    print(f"{'stage':<22}{'median us':>11}{'p99 us':>11}{'times':>8}")
+    for stage, row in rows.items():
+        print(f"{stage:<22}{row['median_us']:11.1f}{row['p99_us']:11.1f}{row['times']:8.0f}")
+    report = {**provenance(), "cell": path.name, "outcome": result.outcome.value, "stages": rows}
+    (out / "cycle.json").write_text(json.dumps(report, indent=1) + "\n")
+    _plot(rows, out / "cycle.png")
+
+
+def _row(times_us: np.ndarray) -> dict[str, float]:
+    return {
+        "median_us": float(np.median(times_us)),
+        "p99_us": float(np.percentile(times_us, 99)),
+        "times": float(len(times_us)),
+    }
+
+
+def _plot(rows: dict[str, dict[str, float]], path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    names = [name for name in _STAGES if name in rows]
+    figure, axis = plt.subplots(figsize=(9, 0.5 * len(names) + 1.5), layout="constrained")
+    position = np.arange(len(names))
+    axis.barh(position, [1e-3 * rows[name]["p99_us"] for name in names], color="#c6d3ea", label="p99")
+    axis.barh(position, [1e-3 * rows[name]["median_us"] for name in names], color="#4c72b0", label="median")
+    axis.set_yticks(position, names)
+    axis.invert_yaxis()
+    axis.set_xlabel("ms")
+    axis.set_title("one control cycle with a new frame, by stage")
+    axis.legend()
+    axis.grid(axis="x", alpha=0.3)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
