@@ -41,7 +41,10 @@ def predict(U: Array, T: Array, S: Array, Q: Array | None) -> tuple[Array, Array
     """Return U T and Ad(U) S Ad(U)' + Q."""
     if not _is(U, (4, 4)):
         return None
-    Ad = se3.adjoint(U)
+    try:
+        Ad = se3.adjoint(U)
+    except GeometryError:
+        return None
     moved = Ad @ S @ Ad.T
     if Q is not None:
         noise = semidefinite(Q)
@@ -114,12 +117,18 @@ def semidefinite(Q: Array) -> Array | None:
     noise = symmetric(Q)
     if noise is None:
         return None
-    quiet = np.diagonal(noise) == 0.0
-    if np.any(noise[quiet]):
+    variances = np.diagonal(noise)
+    quiet = variances == 0.0
+    if noise[quiet].any():
         return None
     # Raised by a hair, a singular Q is positive definite and an indefinite one is not.
-    raised = noise + np.diag(np.where(quiet, 1.0, 1e-9 * np.diagonal(noise)))
-    return None if cholesky(raised) is None else noise
+    raised = noise.copy()
+    raised.flat[::7] += np.where(quiet, 1.0, 1e-9 * variances)
+    try:
+        np.linalg.cholesky(raised)
+    except np.linalg.LinAlgError:
+        return None
+    return noise
 
 
 def _whitened(T: Array, inverse: Array, C: NDArray[np.floating]) -> Array:
