@@ -107,8 +107,8 @@ def train(
 
     Raises:
         DataError: the data set is damaged.
-        TrainingError: the labels cannot be learned, the loss is no number, nothing was learned, or the interrupted
-            training had other settings or data.
+        TrainingError: the labels cannot be learned, the loss is no number, the training diverged, or the
+            interrupted training had other settings or data.
     """
     if observer is None:
         with Display() as display:
@@ -263,11 +263,12 @@ class _Run:
             save_checkpoint(out, recipe, self.network, self.optimizer, self.progress)
             if self.observer is not None:
                 self.observer.epoch(record, best=self.progress.best_epoch == epoch)
-        if self.progress.best_loss >= self._loss_of_knowing_nothing():
+        guess = torch.zeros(len(self.validation_labels), self.network.architecture.outputs)
+        if self.progress.best_loss > 2.0 * self._loss(guess, self.validation_labels).item():
             raise TrainingError(
-                f"nothing was learned: the validation loss stays at {self.progress.best_loss:.3g}",
-                epoch=len(self.progress.history),
-                hint="lower the learning rate, train longer, or look whether labels belong to their images",
+                f"the training diverged: its best validation loss is {self.progress.best_loss:.3g}",
+                epoch=self.progress.best_epoch,
+                hint="lower the learning rate",
             )
         self.network.load_state_dict(self.progress.best_state)
 
@@ -315,11 +316,6 @@ class _Run:
         if self.network.architecture.kind == "cnn":
             return weighted_square_loss(outputs, labels, self.weights)
         return gaussian_loss(outputs, labels) + weighted_absolute_loss(outputs, labels, self.weights)
-
-    def _loss_of_knowing_nothing(self) -> float:
-        mean, deviation = self.training_labels.mean(0), self.training_labels.std(0)
-        constant = torch.cat([mean, -deviation.log()]).expand(len(self.validation_labels), -1)
-        return self._loss(constant, self.validation_labels).item()
 
     def _normalised(self, xi: Array) -> Tensor:
         return torch.from_numpy(((xi - self.labels.centre) / self.labels.half_range).astype(np.float32))
