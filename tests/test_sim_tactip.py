@@ -10,6 +10,7 @@ from drivers.errors import ConfigError, LifecycleError, StaleData, TransportTime
 from drivers.registry import DriverContext
 from drivers.sim_arm import SimArm
 from drivers.sim_tactip import SimTactip, SimTactipConfig
+from drivers.simulation.faults import FrameFaults
 from drivers.simulation.scene import Scene, SceneConfig
 
 
@@ -139,6 +140,36 @@ def test_a_disconnected_sensor_delivers_nothing() -> None:
         cell.tip.latest()
     with pytest.raises(LifecycleError):
         cell.tip.next(-1, 1.0)
+
+
+def test_a_frozen_camera_keeps_counting_but_shows_the_past() -> None:
+    cell = Cell()
+    last = cell.tip.next(2, 1.0)
+    cell.tip.faults = FrameFaults(frozen=True)
+    cell.move(0.05, 0.15)
+    frozen = cell.tip.next(last.seq, 1.0)
+    assert frozen.seq > last.seq
+    assert frozen.t_ns > last.t_ns
+    np.testing.assert_array_equal(frozen.value.image, last.value.image)
+    cell.tip.faults = FrameFaults()
+    assert (cell.tip.next(frozen.seq, 1.0).value.image != last.value.image).any()
+
+
+def test_a_silent_camera_goes_stale() -> None:
+    cell = Cell(latency_ms=0)
+    cell.tip.faults = FrameFaults(last_seq=2)
+    assert cell.tip.next(1, 1.0).seq == 2
+    with pytest.raises(TransportTimeout):
+        cell.tip.next(2, 0.5)
+    with pytest.raises(StaleData):
+        cell.tip.latest(max_age_s=0.1)
+
+
+def test_a_late_camera_delivers_old_frames() -> None:
+    cell = Cell(latency_ms=0)
+    cell.tip.faults = FrameFaults(extra_latency_s=0.1)
+    cell.clock.advance_s(0.5)
+    assert cell.tip.latest().t_ns == 400_000_000
 
 
 def test_it_needs_a_scene_and_a_simulated_arm() -> None:

@@ -43,7 +43,7 @@ class Stamps:
         coverage *= 255.0 / _ROWS
         self._stamps = np.round(coverage).astype(np.uint8).reshape(phases * phases, grid.size, grid.size)
 
-    def which(self, centres: Array) -> tuple[list[list[int]], list[ImageArray]]:
+    def _chosen(self, centres: Array) -> tuple[list[list[int]], list[ImageArray]]:
         """Whole-pixel centres [[u, v], ...] and the stamps for ``centres`` (n, 2) px."""
         whole = np.floor(centres + 0.5)
         phase = np.minimum(((centres - whole + 0.5) * self._phases).astype(np.int64), self._phases - 1)
@@ -54,7 +54,7 @@ class Stamps:
         """Draw white discs at ``centres`` (n, 2) px into a grey ``image``; what lies outside is cut off."""
         height, width = image.shape
         reach = self.reach
-        whole, stamps = self.which(centres)
+        whole, stamps = self._chosen(centres)
         maximum = np.maximum
         for (u, v), stamp in zip(whole, stamps, strict=True):
             left, top, right, bottom = u - reach, v - reach, u + reach + 1, v + reach + 1
