@@ -17,6 +17,7 @@ from drivers.device import Lifecycle, OperatorToken
 from drivers.errors import StaleData
 from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
 from drivers.samples import Stamped, TcpState
+from drivers.simulation.faults import ArmFaults
 from drivers.simulation.kinematics import TwistFollower
 from drivers.simulation.scene import Scene
 from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Timeline
@@ -52,6 +53,8 @@ class SimArm(Arm):
         config: checked configuration.
         clock: injected time.
         timeline: of the scene that it moves in; its own if there is none.
+
+    ``faults`` may be set at any time.
     """
 
     def __init__(self, name: str, config: SimArmConfig, clock: Clock, timeline: Timeline | None = None) -> None:
@@ -62,6 +65,7 @@ class SimArm(Arm):
             stop_categories=CAPABILITIES.stop_categories,
             max_ttl_s=config.max_ttl_s,
         )
+        self.faults = ArmFaults()
         self.T_world_base = se3.from_euler_mm_deg(config.base_pose_mm_deg)
         self._timeline = timeline or Timeline(clock)
         self._body = TwistFollower(se3.from_euler_mm_deg(config.start_pose_mm_deg), self.limits, self._timeline.step_ns)
@@ -72,6 +76,8 @@ class SimArm(Arm):
         self._require("tell its pose", *_READABLE)
         t_ns = self._timeline.advance()
         state = TcpState(self._body.T_base_tcp.copy(), self._body.velocity.copy())
+        if self.faults.nan_state:
+            state = TcpState(np.full((4, 4), np.nan), np.full(6, np.nan))
         sample = Stamped(state, t_ns, t_ns // self._timeline.step_ns)
         age_s = sample.age_s(self._clock.now_ns())
         if max_age_s is not None and age_s > max_age_s:
@@ -103,7 +109,8 @@ class SimArm(Arm):
 
     def _begin_stop(self, category: StopCategory) -> None:
         self._timeline.advance()
-        self._body.halt()
+        if not self.faults.deaf:
+            self._body.halt()
 
     def _open(self) -> None:
         self._timeline.advance()

@@ -13,6 +13,7 @@ from drivers.device import Device, Lifecycle
 from drivers.errors import ConfigError, StaleData, TransportTimeout
 from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
 from drivers.samples import Frame, Stamped
+from drivers.simulation.faults import FrameFaults
 from drivers.simulation.render import FrameRenderer, Lighting
 from drivers.simulation.scene import Carrier, Scene
 from drivers.simulation.tip import Tip
@@ -43,7 +44,8 @@ class SimTactip(Device):
     """One simulated sensor.
 
     Frames are exposed at whole multiples of the period on the clock, whether or not anybody reads them, and carry that
-    time; frame k has ``seq`` k. They become available ``latency_ms`` later and are drawn when they are read.
+    time; frame k has ``seq`` k. They become available ``latency_ms`` later and are drawn when they are read. ``faults``
+    may be set at any time.
 
     Args:
         name: the device's name in the cell and in the scene.
@@ -64,6 +66,7 @@ class SimTactip(Device):
         seed: int = 0,
     ) -> None:
         super().__init__(name, clock)
+        self.faults = FrameFaults()
         self._scene = scene
         self._processed = config.output == "processed"
         self._period_ns = round(1e9 / config.rate_hz)
@@ -97,7 +100,7 @@ class SimTactip(Device):
         now_ns = self._clock.now_ns()
         seq = max(self._newest_seq(now_ns), after_seq + 1, self._first)
         deadline_ns = now_ns + round(timeout_s * 1e9)
-        if self._available_ns(seq) > deadline_ns:
+        if self._available_ns(seq) > deadline_ns or self._never_comes(seq):
             self._clock.sleep_until_ns(deadline_ns)
             raise TransportTimeout(self.name, f"frame after {after_seq}", timeout_s)
         self._clock.sleep_until_ns(self._available_ns(seq))
@@ -108,20 +111,31 @@ class SimTactip(Device):
         return {"frames_drawn": self._drawn, "rate_hz": 1e9 / self._period_ns}
 
     def _available_ns(self, seq: int) -> int:
-        return seq * self._period_ns + self._latency_ns
+        return seq * self._period_ns + self._delay_ns()
+
+    def _delay_ns(self) -> int:
+        return self._latency_ns + round(self.faults.extra_latency_s * 1e9)
 
     def _newest_seq(self, now_ns: int) -> int:
-        return (now_ns - self._latency_ns) // self._period_ns
+        seq = (now_ns - self._delay_ns()) // self._period_ns
+        return seq if self.faults.last_seq is None else min(seq, self.faults.last_seq)
+
+    def _never_comes(self, seq: int) -> bool:
+        return self.faults.last_seq is not None and seq > self.faults.last_seq
 
     def _draw(self, seq: int) -> Stamped[Frame]:
         if self._newest is None or self._newest.seq != seq:
             t_ns = seq * self._period_ns
-            pixels = self._tip.pixels(self._scene.contact(self.name, t_ns).value.T_f_s)
-            image = self._renderer.processed(pixels) if self._processed else self._renderer.raw(pixels, seq)
-            image.flags.writeable = False
-            self._newest = Stamped(Frame(image), t_ns, seq)
-            self._drawn += 1
+            frame = self._newest.value if self._newest and self.faults.frozen else self._expose(seq, t_ns)
+            self._newest = Stamped(frame, t_ns, seq)
         return self._newest
+
+    def _expose(self, seq: int, t_ns: int) -> Frame:
+        pixels = self._tip.pixels(self._scene.contact(self.name, t_ns).value.T_f_s)
+        image = self._renderer.processed(pixels) if self._processed else self._renderer.raw(pixels, seq)
+        image.flags.writeable = False
+        self._drawn += 1
+        return Frame(image)
 
     def _open(self) -> None:
         self._scene.timeline.advance()

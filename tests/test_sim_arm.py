@@ -13,6 +13,7 @@ from drivers.errors import CommandRejected, LifecycleError, Rejection, StaleData
 from drivers.lease import Lease
 from drivers.registry import DriverContext
 from drivers.sim_arm import SimArm, SimArmConfig
+from drivers.simulation.faults import ArmFaults
 from geometry import se3
 
 START = (400.0, 0.0, 300.0, 180.0, 0.0, 0.0)
@@ -187,6 +188,29 @@ def test_deactivation_and_disconnection_leave_it_standing() -> None:
     clock.advance_s(0.5)
     arm.connect()
     np.testing.assert_array_equal(arm.tcp().value.T_base_tcp, stood)
+
+
+def test_a_pose_that_is_not_a_number_turns_no_twist() -> None:
+    clock = VirtualClock()
+    arm, lease = active(clock)
+    arm.faults = ArmFaults(nan_state=True)
+    assert np.isnan(arm.tcp().value.T_base_tcp).all()
+    with pytest.raises(CommandRejected) as caught:
+        send(arm, lease, clock, [0.1, 0, 0, 0, 0, 0], frame=TwistFrame.TCP)
+    assert caught.value.reason is Rejection.NON_FINITE
+
+
+def test_an_arm_deaf_to_stops_still_stops_when_its_command_expires() -> None:
+    clock = VirtualClock()
+    arm, lease = active(clock)
+    send(arm, lease, clock, [0.1, 0, 0, 0, 0, 0], 0.3)
+    clock.advance_s(0.2)
+    arm.faults = ArmFaults(deaf=True)
+    arm.stop()
+    clock.advance_s(0.09)
+    assert arm.tcp().value.twist[0] == pytest.approx(0.1)
+    clock.advance_s(0.3)
+    assert arm.at_rest()
 
 
 def test_state_is_fresh_to_one_step_and_says_so() -> None:

@@ -17,6 +17,8 @@ FRAME_SIZE = (640, 480)
 PUBLIC_CROP = (105, 20, 550, 460)
 """(left, top, right, bottom) px of the public images within the 640x480 frame."""
 
+_ROWS = 4
+
 
 class Stamps:
     """A disc of one radius, drawn with its centre anywhere.
@@ -31,12 +33,17 @@ class Stamps:
         self.reach = math.ceil(radius_px + 0.5)
         grid = np.arange(-self.reach, self.reach + 1)
         offsets = (np.arange(phases) + 0.5) / phases - 0.5
-        squared = (grid[None, :] - offsets[:, None]) ** 2
-        distance = np.sqrt(squared[:, None, :, None] + squared[None, :, None, :])
-        coverage = np.clip(radius_px - distance + 0.5, 0.0, 1.0)
-        self._stamps = np.round(255.0 * coverage).astype(np.uint8).reshape(phases * phases, grid.size, grid.size)
+        u = (grid[None, :] - offsets[:, None]).astype(np.float32)
+        # Coverage is exact along u, where a row of the disc is a chord, and averaged over rows of a pixel along v.
+        coverage = np.zeros((phases, phases, grid.size, grid.size), np.float32)
+        for row in (np.arange(_ROWS) + 0.5) / _ROWS - 0.5:
+            half = np.sqrt(np.maximum(radius_px**2 - (u + row) ** 2, 0.0))[:, None, :, None]
+            across = u[None, :, None, :]
+            coverage += np.clip(np.minimum(across + 0.5, half) - np.maximum(across - 0.5, -half), 0.0, 1.0)
+        coverage *= 255.0 / _ROWS
+        self._stamps = np.round(coverage).astype(np.uint8).reshape(phases * phases, grid.size, grid.size)
 
-    def which(self, centres: Array) -> tuple[list[list[int]], list[ImageArray]]:
+    def _chosen(self, centres: Array) -> tuple[list[list[int]], list[ImageArray]]:
         """Whole-pixel centres [[u, v], ...] and the stamps for ``centres`` (n, 2) px."""
         whole = np.floor(centres + 0.5)
         phase = np.minimum(((centres - whole + 0.5) * self._phases).astype(np.int64), self._phases - 1)
@@ -47,7 +54,7 @@ class Stamps:
         """Draw white discs at ``centres`` (n, 2) px into a grey ``image``; what lies outside is cut off."""
         height, width = image.shape
         reach = self.reach
-        whole, stamps = self.which(centres)
+        whole, stamps = self._chosen(centres)
         maximum = np.maximum
         for (u, v), stamp in zip(whole, stamps, strict=True):
             left, top, right, bottom = u - reach, v - reach, u + reach + 1, v + reach + 1

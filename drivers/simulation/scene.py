@@ -19,7 +19,7 @@ from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Timeline
 from geometry import se3
 from geometry.types import Array
 
-HISTORY_S = 2.5
+HISTORY_S = 5.0
 
 
 @runtime_checkable

@@ -39,8 +39,8 @@ class TipParameters:
         shear_width_rad, shear_power: falloff exp(-(psi / width)^power) of shear and torsion.
         torsion_follow: share of the torsion that shows.
         dent_follow: share of the depth by which the contacted skin moves in.
-        dent_width_rad_per_sqrt_m, dent_power: falloff exp(-(psi / width)^power) of the dent. The width grows with the root
-            of depth; the edge of a sphere's flattened cap would have sqrt(2 / tip radius), 10 rad per root metre.
+        dent_width_rad_per_sqrt_m, dent_power: falloff exp(-(psi / width)^power) of the dent. The width grows with the
+            root of depth; the edge of a sphere's flattened cap would have sqrt(2 / tip radius), 10 rad per root metre.
         lean_follow: share of the dent's sideways part by which the whole dome leans, most at the apex.
         sink_follow: the same for the part along the sensor's axis.
         bulge: outward push around the contact, as a share of depth.
@@ -54,7 +54,7 @@ class TipParameters:
     layout_phase_rad: float = -0.94 * _DEG
     marker_radius_m: float = 18.0 * _MM
     camera_distance_m: float = 41.6 * _MM
-    focal_px: float = 498.8
+    focal_px: float = 502.0
     centre_px: tuple[float, float] = (331.05, 241.5)
     image_rotation_rad: float = -51.6 * _DEG
     disc_radius_px: float = 6.2

@@ -1,0 +1,99 @@
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.simulation.render import PUBLIC_CROP, FrameRenderer, Lighting, SmallRenderer, Stamps
+from drivers.simulation.tip import Tip
+from geometry import se3
+
+STAMPS = Stamps(6.2)
+PIXELS = Tip().pixels(se3.from_euler_mm_deg([1, 2, 4, 5, -8, 2]))
+
+
+def centroid(image: np.ndarray) -> np.ndarray:
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+    weight = image.astype(np.float64)
+    return np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum()
+
+
+@given(u=st.floats(8, 32), v=st.floats(8, 32))
+def test_a_disc_is_where_it_belongs_to_a_fiftieth_of_a_pixel(u: float, v: float) -> None:
+    image = np.zeros((41, 41), np.uint8)
+    STAMPS.paint(image, np.array([[u, v]]))
+    assert np.linalg.norm(centroid(image) - [u, v]) < 0.02
+    assert image.sum() / 255 == pytest.approx(np.pi * 6.2**2, rel=0.01)
+
+
+# Whole sixteenths: nothing is lost when 40 is added.
+@given(u=st.integers(-320, 960).map(lambda n: n / 16), v=st.integers(-320, 960).map(lambda n: n / 16))
+def test_what_lies_outside_is_cut_off(u: float, v: float) -> None:
+    image = np.zeros((41, 41), np.uint8)
+    STAMPS.paint(image, np.array([[u, v]]))
+    framed = np.zeros((121, 121), np.uint8)
+    STAMPS.paint(framed, np.array([[u + 40, v + 40]]))
+    np.testing.assert_array_equal(image, framed[40:81, 40:81])
+
+
+def test_touching_discs_do_not_erase_or_add_up() -> None:
+    one, other, both = (np.zeros((41, 41), np.uint8) for _ in range(3))
+    STAMPS.paint(one, np.array([[15.0, 20.0]]))
+    STAMPS.paint(other, np.array([[22.3, 20.4]]))
+    STAMPS.paint(both, np.array([[15.0, 20.0], [22.3, 20.4]]))
+    np.testing.assert_array_equal(both, np.maximum(one, other))
+
+
+def test_the_same_seed_draws_the_same_frames() -> None:
+    first, second = FrameRenderer(seed=(3, 7)), FrameRenderer(seed=(3, 7))
+    np.testing.assert_array_equal(first.raw(PIXELS, 5), second.raw(PIXELS, 5))
+    assert (first.raw(PIXELS, 5) != first.raw(PIXELS, 6)).any()
+    assert (first.raw(PIXELS, 5) != FrameRenderer(seed=(3, 8)).raw(PIXELS, 5)).any()
+
+
+def test_raw_frames_have_bright_pins_dark_skin_vignetting_and_noise() -> None:
+    light = Lighting(background=60, pin=190, vignetting=0.25, noise=2.0)
+    frame = FrameRenderer(lighting=light).raw(PIXELS)
+    assert frame.shape == (480, 640)
+    assert frame.dtype == np.uint8
+    u, v = np.round(PIXELS[0]).astype(int)
+    assert frame[v, u] == pytest.approx(190, abs=10)
+    assert frame[:20, :20].mean() == pytest.approx(60 * 0.75, abs=2)
+    empty = FrameRenderer(lighting=light).raw(np.empty((0, 2)))
+    clean = FrameRenderer(lighting=Lighting(60, 190, 0.25, noise=0.0)).raw(np.empty((0, 2)))
+    difference = empty.astype(float) - clean
+    assert difference.std() == pytest.approx(2.0, rel=0.05)
+    assert difference.mean() == pytest.approx(0.0, abs=0.05)
+
+
+def test_thresholding_a_raw_frame_finds_the_pins_that_the_processed_image_shows() -> None:
+    renderer = FrameRenderer()
+    left, top, right, bottom = PUBLIC_CROP
+    raw = renderer.raw(PIXELS)[top:bottom, left:right]
+    processed = renderer.processed(PIXELS)
+    assert processed.shape == (440, 445)
+    assert set(np.unique(processed)) == {0, 255}
+    threshold = cv2.adaptiveThreshold(raw, 255, cv2.ADAPTIVE_THRESH_GAUSSIAN_C, cv2.THRESH_BINARY, 61, -5)
+    both = ((threshold > 0) & (processed > 0)).sum() / ((threshold > 0) | (processed > 0)).sum()
+    assert both > 0.85
+
+
+@pytest.mark.parametrize("size", [(128, 128), (64, 80)])
+def test_small_images_are_the_large_ones_resized_by_area(size: tuple[int, int]) -> None:
+    left, top, right, bottom = PUBLIC_CROP
+    cover = np.zeros((480, 640), np.uint8)
+    STAMPS.paint(cover, PIXELS)
+    resized = cv2.resize(cover[top:bottom, left:right], size, interpolation=cv2.INTER_AREA)
+    small = SmallRenderer(size).draw(PIXELS)
+    assert small.shape == (size[1], size[0])
+    # Where discs meet within a small pixel the larger cover counts, not the sum.
+    assert np.abs(small.astype(float) - resized).mean() < 8
+    assert np.corrcoef(small.ravel(), resized.ravel())[0, 1] > 0.98
+    assert centroid(small) == pytest.approx(centroid(resized), abs=0.1)
+
+
+def test_markers_may_have_different_radii() -> None:
+    renderer = SmallRenderer((128, 128), disc_radius_px=(5.0, 8.0))
+    centre = np.array([[327.0, 240.0]])
+    thin, thick = (renderer.draw(centre, np.array([level])).sum() for level in (0, 1))
+    assert thick / thin == pytest.approx((8 / 5) ** 2, rel=0.1)
