@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.simulation.render import PUBLIC_CROP, FrameRenderer, Lighting, SmallRenderer, Stamps
+from drivers.simulation.render import PUBLIC_CROP, FrameRenderer, Lighting, Stamps
 from drivers.simulation.tip import Tip
 from geometry import se3
 
@@ -76,24 +76,3 @@ def test_thresholding_a_raw_frame_finds_the_pins_that_the_processed_image_shows(
     threshold = cv2.adaptiveThreshold(raw, 255, cv2.ADAPTIVE_THRESH_GAUSSIAN_C, cv2.THRESH_BINARY, 61, -5)
     both = ((threshold > 0) & (processed > 0)).sum() / ((threshold > 0) | (processed > 0)).sum()
     assert both > 0.85
-
-
-@pytest.mark.parametrize("size", [(128, 128), (64, 80)])
-def test_small_images_are_the_large_ones_resized_by_area(size: tuple[int, int]) -> None:
-    left, top, right, bottom = PUBLIC_CROP
-    cover = np.zeros((480, 640), np.uint8)
-    STAMPS.paint(cover, PIXELS)
-    resized = cv2.resize(cover[top:bottom, left:right], size, interpolation=cv2.INTER_AREA)
-    small = SmallRenderer(size).draw(PIXELS)
-    assert small.shape == (size[1], size[0])
-    # Where discs meet within a small pixel the larger cover counts, not the sum.
-    assert np.abs(small.astype(float) - resized).mean() < 8
-    assert np.corrcoef(small.ravel(), resized.ravel())[0, 1] > 0.98
-    assert centroid(small) == pytest.approx(centroid(resized), abs=0.1)
-
-
-def test_markers_may_have_different_radii() -> None:
-    renderer = SmallRenderer((128, 128), disc_radius_px=(5.0, 8.0))
-    centre = np.array([[327.0, 240.0]])
-    thin, thick = (renderer.draw(centre, np.array([level])).sum() for level in (0, 1))
-    assert thick / thin == pytest.approx((8 / 5) ** 2, rel=0.1)

@@ -1,26 +1,19 @@
 import numpy as np
 
 from drivers.simulation.contact import ContactLaw
-from drivers.simulation.samples import Variation, random_poses, training_set
+from drivers.simulation.samples import Variation, contacts, random_poses
 from drivers.simulation.tip import Tip
 from geometry import se3
 
 
 def test_the_same_seed_gives_the_same_set_and_another_gives_another() -> None:
-    first, second, other = (list(training_set(20, seed)) for seed in (1, 1, 2))
-    for (image, T), (again, T_again) in zip(first, second, strict=True):
-        np.testing.assert_array_equal(image, again)
-        np.testing.assert_array_equal(T, T_again)
-    assert (first[0][0] != other[0][0]).any()
-
-
-def test_images_are_as_asked_and_as_many() -> None:
-    made = list(training_set(5, 0, size_px=(96, 64), crop=(111, 27, 541, 457)))
-    assert len(made) == 5
-    for image, T in made:
-        assert image.shape == (64, 96)
-        assert image.dtype == np.uint8
-        assert T.shape == (4, 4)
+    first, second, other = (list(contacts(20, seed)) for seed in (1, 1, 2))
+    assert len(first) == 20
+    for made, again in zip(first, second, strict=True):
+        np.testing.assert_array_equal(made.pixels, again.pixels)
+        np.testing.assert_array_equal(made.T_f_s, again.T_f_s)
+        assert made.disc_radius_px == again.disc_radius_px
+    assert (first[0].T_f_s != other[0].T_f_s).any()
 
 
 def test_poses_fill_the_ranges_of_the_public_data_and_no_more() -> None:
@@ -39,7 +32,7 @@ def test_poses_fill_the_ranges_of_the_public_data_and_no_more() -> None:
 
 def test_labels_are_what_is_left_after_slip() -> None:
     law = ContactLaw()
-    labels = np.stack([T for _, T in training_set(400, 3)])
+    labels = np.stack([contact.T_f_s for contact in contacts(400, 3)])
     for T in labels:
         depth = T[2, 3]
         assert np.hypot(T[0, 3], T[1, 3]) <= law.max_shear_m(depth) + 1e-12
@@ -50,17 +43,21 @@ def test_labels_are_what_is_left_after_slip() -> None:
     assert np.hypot(deep[:, 0, 3], deep[:, 1, 3]).max() > 0.004
 
 
-def test_without_variation_the_image_shows_the_label() -> None:
-    still = Variation(0, 0, 0, 0, 0, 0, 0)
+def test_without_variation_the_markers_are_those_of_the_default_sensor() -> None:
     tip = Tip()
-    for image, T in training_set(4, 5, size_px=(445, 440), variation=still):
-        u, v = np.round(tip.pixels(T) - [105.0, 20.0]).astype(int).T
-        seen = (u >= 0) & (u < 445) & (v >= 0) & (v < 440)
-        assert (image[v[seen], u[seen]] == 255).all()
-        assert image.mean() / 255 == np.clip(image.mean() / 255, 0.15, 0.25)
+    for contact in contacts(4, 5, variation=Variation(0, 0, 0, 0, 0, 0)):
+        np.testing.assert_allclose(contact.pixels, tip.pixels(contact.T_f_s), atol=1e-9)
+        assert contact.disc_radius_px == tip.parameters.disc_radius_px
+
+
+def test_markers_go_missing_at_the_given_rate() -> None:
+    seen = sum(len(contact.pixels) for contact in contacts(200, 6, variation=Variation(missing=0.1)))
+    assert abs(1 - seen / (200 * 331) - 0.1) < 0.01
 
 
 def test_sensors_differ_within_a_set() -> None:
-    still = Variation(marker_px=0, disc_radius=0, missing=0, noise=0)
-    images = [image.astype(float) for image, _ in training_set(33, 0, variation=still)]
-    assert np.abs(images[0] - images[-1]).mean() > 1.0
+    still = Variation(marker_px=0, disc_radius=0, missing=0)
+    tip = Tip()
+    offsets = [np.abs(each.pixels - tip.pixels(each.T_f_s)).mean() for each in contacts(33, 0, variation=still)]
+    assert offsets[0] > 0.2
+    assert abs(offsets[0] - offsets[-1]) > 0.01
