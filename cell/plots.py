@@ -23,6 +23,8 @@ _TITLES = dict(
 )
 # Order of the panels: what the sensor is servoed on first.
 _PANELS = ("z_mm", "alpha_deg", "beta_deg", "x_mm", "y_mm", "gamma_deg")
+# A TacTip's (SPEC part 2): ticks of this length from the tip's centre trace the surface that it is pressed on.
+_TIP_RADIUS_MM = 20.0
 _STATE_COLOURS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52", "#8172b3", "#937860", "#da8bc3", "#8c8c8c")
 
 
@@ -76,7 +78,7 @@ def plot_trajectory(run: Run, path: Path) -> Path | None:
             axis.set_ylabel("xyz"[j] + " (mm)")
             axis.set_aspect("equal", adjustable="datalim")
             axis.grid(alpha=0.3)
-    axes[0].set_title("from the side; ticks are the sensor's axis")
+    axes[0].set_title("from the side; ticks show the sensor's axis as far as its tip")
     axes[1].set_title("from above")
     handles = [plt.Line2D([], [], color=colour, lw=2, label=state) for state, colour in colours.items()]
     axes[0].legend(handles=handles, fontsize=9, loc="best")
@@ -99,8 +101,7 @@ def _draw_path(axis: plt.Axes, run: Run, t_s: Array, points: Array, colours: dic
 
 def _draw_axes(axis: plt.Axes, T: Array, points: Array, view: tuple[int, int]) -> None:
     ticks = np.linspace(0, len(T) - 1, 25).astype(int)
-    length_mm = 0.06 * max(float(np.ptp(points, axis=0).max()), 1.0)
-    tips = points[ticks] + length_mm * T[ticks, :3, 2]
+    tips = points[ticks] + _TIP_RADIUS_MM * T[ticks, :3, 2]
     for start, end in zip(points[ticks], tips, strict=True):
         axis.plot([start[view[0]], end[view[0]]], [start[view[1]], end[view[1]]], color="black", lw=0.7, alpha=0.6)
 
