@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivers.simulation.surfaces import Surface
+from geometry import se3
 from geometry.types import Array
 
 
@@ -37,11 +38,7 @@ class ContactState:
     @property
     def T_s_f(self) -> Array:  # noqa: N802  the field's own name
         """(4, 4) pose of the surface frame in the sensor frame: what the network predicts."""
-        R, p = self.T_f_s[:3, :3], self.T_f_s[:3, 3]
-        T = np.eye(4)
-        T[:3, :3] = R.T
-        T[:3, 3] = -R.T @ p
-        return T
+        return se3.inverse(self.T_f_s)
 
     @property
     def depth_m(self) -> float:
