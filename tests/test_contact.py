@@ -186,6 +186,16 @@ def test_sticking_over_a_curved_surface_comes_back_without_drift() -> None:
     np.testing.assert_allclose(state.T_f_s, start.T_f_s, atol=1e-12)
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_sensor_that_lies_on_its_side_above_a_table_is_no_special_case(side: float) -> None:
+    lying = euler(0, 0, -0.1, 0, 0, 0)
+    # Exactly along an axis, which no product of sines and cosines is.
+    lying[:3, :3] = np.array([[0, 0, side], [0, 1, 0], [-side, 0, 0]])
+    state = ContactModel().step(T_WORLD_F @ lying, FLAT, 0.0)
+    assert not state.in_contact
+    np.testing.assert_allclose(state.T_f_s, lying, atol=1e-12)
+
+
 def test_another_surface_is_another_contact() -> None:
     model = ContactModel()
     run(model, lambda t: T_WORLD_F @ euler(0.004 * t, 0, 0.006, 0, 0, 0), FLAT, 0.01, 1.0)

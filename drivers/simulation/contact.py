@@ -189,7 +189,9 @@ def _tilt(inward_in_s: Array) -> Array:
     x, y, z = (float(value) for value in inward_in_s)
     # The inverse rotation takes z to (-sin beta, sin alpha cos beta, cos alpha cos beta).
     cos_beta = math.hypot(y, z)
-    sin_beta, sin_alpha, cos_alpha = -x, y / cos_beta, z / cos_beta
+    # With the normal along the sensor's x axis alpha is free.
+    sin_alpha, cos_alpha = (y / cos_beta, z / cos_beta) if cos_beta > 1e-12 else (0.0, 1.0)
+    sin_beta = -x
     return np.array(
         [
             [cos_beta, sin_beta * sin_alpha, sin_beta * cos_alpha],
