@@ -130,11 +130,12 @@ class Arm(Device):
         if self.state not in (Lifecycle.ACTIVE, Lifecycle.FAULTED):
             return
         self._gate.reset()
-        self._begin_stop(category)
-        if category is not StopCategory.STOP_AND_HOLD:
+        removes_power = category is not StopCategory.STOP_AND_HOLD
+        if removes_power:
             self._desk.revoke()
-            if self.state is Lifecycle.ACTIVE:
-                self._state = Lifecycle.READY
+        self._begin_stop(category)
+        if removes_power and self.state is Lifecycle.ACTIVE:
+            self._state = Lifecycle.READY
 
     @abstractmethod
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:

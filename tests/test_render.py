@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.simulation.render import PUBLIC_CROP, FrameRenderer, Lighting, Stamps
@@ -18,6 +18,7 @@ def centroid(image: np.ndarray) -> np.ndarray:
     return np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum()
 
 
+@settings(deadline=None, derandomize=True)
 @given(u=st.floats(8, 32), v=st.floats(8, 32))
 def test_a_disc_is_where_it_belongs_to_a_fiftieth_of_a_pixel(u: float, v: float) -> None:
     image = np.zeros((41, 41), np.uint8)
@@ -27,6 +28,7 @@ def test_a_disc_is_where_it_belongs_to_a_fiftieth_of_a_pixel(u: float, v: float)
 
 
 # Whole sixteenths: nothing is lost when 40 is added.
+@settings(deadline=None, derandomize=True)
 @given(u=st.integers(-320, 960).map(lambda n: n / 16), v=st.integers(-320, 960).map(lambda n: n / 16))
 def test_what_lies_outside_is_cut_off(u: float, v: float) -> None:
     image = np.zeros((41, 41), np.uint8)

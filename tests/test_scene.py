@@ -6,7 +6,7 @@ from drivers.clock import VirtualClock
 from drivers.errors import ConfigError
 from drivers.simulation.contact import ContactLaw
 from drivers.simulation.motions import Glide
-from drivers.simulation.scene import Scene, SceneConfig
+from drivers.simulation.scene import ContactNotKept, Scene, SceneConfig
 from drivers.simulation.surfaces import Plane, Sphere, Surface
 from drivers.simulation.timeline import Phase, Timeline
 from geometry import se3
@@ -73,10 +73,10 @@ def test_the_past_can_be_read_but_not_the_future() -> None:
     clock.advance_s(0.3)
     assert scene.contact("tip", 200_000_000).value is then
     assert scene.contact("tip", 201_999_999).value is then
-    with pytest.raises(LookupError):
+    with pytest.raises(ContactNotKept):
         scene.contact("tip", 502_000_000)
     clock.advance_s(5.0)
-    with pytest.raises(LookupError):
+    with pytest.raises(ContactNotKept):
         scene.contact("tip", 200_000_000)
 
 

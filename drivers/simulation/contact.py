@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivers.simulation.surfaces import Surface
+from geometry import se3
 from geometry.types import Array
 
 
@@ -37,11 +38,7 @@ class ContactState:
     @property
     def T_s_f(self) -> Array:  # noqa: N802  the field's own name
         """(4, 4) pose of the surface frame in the sensor frame: what the network predicts."""
-        R, p = self.T_f_s[:3, :3], self.T_f_s[:3, 3]
-        T = np.eye(4)
-        T[:3, :3] = R.T
-        T[:3, 3] = -R.T @ p
-        return T
+        return se3.inverse(self.T_f_s)
 
     @property
     def depth_m(self) -> float:
@@ -192,7 +189,9 @@ def _tilt(inward_in_s: Array) -> Array:
     x, y, z = (float(value) for value in inward_in_s)
     # The inverse rotation takes z to (-sin beta, sin alpha cos beta, cos alpha cos beta).
     cos_beta = math.hypot(y, z)
-    sin_beta, sin_alpha, cos_alpha = -x, y / cos_beta, z / cos_beta
+    # With the normal along the sensor's x axis alpha is free.
+    sin_alpha, cos_alpha = (y / cos_beta, z / cos_beta) if cos_beta > 1e-12 else (0.0, 1.0)
+    sin_beta = -x
     return np.array(
         [
             [cos_beta, sin_beta * sin_alpha, sin_beta * cos_alpha],

@@ -10,6 +10,8 @@ from drivers.gate import TwistLimits
 from geometry import se3
 from geometry.types import Array
 
+_THREE_HALVES = 1.5 * np.eye(3)
+
 
 class TwistFollower:
     """Ideal kinematics: no joints, no dynamics but the acceleration limits.
@@ -61,10 +63,13 @@ class TwistFollower:
             ]
         )
         way = 0.5 * (self.velocity + velocity) * dt_s
-        T = np.eye(4)
-        T[:3, :3] = se3.exp(np.concatenate([np.zeros(3), way[3:]]))[:3, :3] @ self.T_base_tcp[:3, :3]
-        T[:3, 3] = self.T_base_tcp[:3, 3] + way[:3]
-        self.T_base_tcp = se3.project(T)
+        T = self.T_base_tcp.copy()
+        T[:3, 3] += way[:3]
+        way[:3] = 0.0
+        R = se3.exp(way)[:3, :3] @ T[:3, :3]
+        # One Newton-Schulz step takes off this step's rounding, so that none adds up; se3.project iterates for more.
+        T[:3, :3] = R @ (_THREE_HALVES - 0.5 * (R.T @ R))
+        self.T_base_tcp = T
         self.velocity = velocity
 
 

@@ -17,9 +17,25 @@ from drivers.simulation.motions import Glide, Motion, Periodic, Still
 from drivers.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
 from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Timeline
 from geometry import se3
+from geometry.errors import TouchcellError
 from geometry.types import Array
 
 HISTORY_S = 5.0
+
+
+class ContactNotKept(TouchcellError, LookupError):
+    """Asked for a contact of a time that the scene does not remember.
+
+    Attributes:
+        t_ns: the time that was asked for.
+        oldest_ns, newest_ns: the times that are remembered.
+    """
+
+    def __init__(self, t_ns: int, oldest_ns: int, newest_ns: int) -> None:
+        super().__init__(f"no contact of {t_ns} ns is kept, only of {oldest_ns} to {newest_ns} ns")
+        self.t_ns = t_ns
+        self.oldest_ns = oldest_ns
+        self.newest_ns = newest_ns
 
 
 @runtime_checkable
@@ -67,7 +83,7 @@ class Scene:
 
         Raises:
             ConfigError: no such sensor.
-            LookupError: ``t_ns`` lies in the future or too far back.
+            ContactNotKept: ``t_ns`` lies in the future or too far back.
         """
         if sensor not in self._sensors:
             raise ConfigError(f"no sensor {sensor!r} is mounted", key="scene", value=sensor)
@@ -100,7 +116,7 @@ class _MountedSensor:
     def at(self, t_ns: int) -> Stamped[ContactState]:
         back = self._history[-1].seq - t_ns // self._step_ns
         if not 0 <= back < len(self._history):
-            raise LookupError(f"no contact is kept for {t_ns} ns, the newest is of {self._history[-1].t_ns} ns")
+            raise ContactNotKept(t_ns, self._history[0].t_ns, self._history[-1].t_ns)
         return self._history[-1 - back]
 
 
