@@ -21,14 +21,16 @@ class ContactGate:
     """Compares preprocessed images with one taken out of contact, with hysteresis.
 
     The score of an image is the mean absolute difference from the reference, in grey levels over 255, in the blocks
-    that differ most. Contact begins when it rises above ``enter`` and ends when it falls below ``leave``.
+    that differ most. Contact begins when it rises above ``enter`` and ends when it falls below ``leave``. On simulated
+    128x128 images the score is 0.007 at rest with a noise of 3 grey levels, 0.023 at 0.2 mm depth, and from there rises
+    by 0.1 per millimetre.
 
     Attributes:
         in_contact: as of the last image.
         score: of the last image.
     """
 
-    def __init__(self, reference: ImageArray, *, enter: float = 0.08, leave: float = 0.05) -> None:
+    def __init__(self, reference: ImageArray, *, enter: float = 0.04, leave: float = 0.025) -> None:
         """
         Args:
             reference: uint8 (height, width), out of contact, as ``Preprocessing.reduce`` leaves it; a model file may

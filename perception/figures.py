@@ -41,6 +41,7 @@ def write_predictions(path: Path, *, truth: Array, predicted: Array, sigma: Arra
 def write_curves(path: Path, history: Sequence[EpochRecord]) -> None:
     """Loss, and validation error of every component relative to its first epoch, over epochs."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
     figure = Figure(figsize=(12, 4.5), layout="constrained")
     losses, errors = figure.subplots(1, 2)
@@ -52,5 +53,10 @@ def write_curves(path: Path, history: Sequence[EpochRecord]) -> None:
     for name, title in zip(CONTACT_NAMES, _TITLES, strict=True):
         errors.plot(epochs, [record.mae[name] for record in history], label=title)
     errors.set(xlabel="epoch", ylabel="validation MAE", yscale="log")
+    for formatted in (errors.yaxis.set_major_formatter, errors.yaxis.set_minor_formatter):
+        formatted(StrMethodFormatter("{x:g}"))
     errors.legend(ncols=2)
+    for axes in (losses, errors):
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Literal, NamedTuple, cast
 
 import cv2
@@ -153,7 +154,10 @@ def scale(reduced: ImageArray) -> NDArray[np.float32]:
     return np.multiply(reduced, np.float32(1.0 / 255.0), dtype=np.float32)
 
 
+@lru_cache(maxsize=4)
 def _disc(height: int, width: int, radius_px: float) -> ImageArray:
     y, x = np.ogrid[:height, :width]
     inside = (y - (height - 1) / 2) ** 2 + (x - (width - 1) / 2) ** 2 <= radius_px**2
-    return inside.astype(np.uint8)
+    disc: ImageArray = inside.astype(np.uint8)
+    disc.setflags(write=False)
+    return disc
