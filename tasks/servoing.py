@@ -50,6 +50,8 @@ class ServoConfig(TaskConfig):
         kd: derivative gain of each axis.
         max_integral_speed_mm_s: largest speed that integral action may ask for.
         max_integral_turn_deg_s: largest turning rate that integral action may ask for.
+        integral_zone_mm: larger errors are not integrated, so that pressing in does not overshoot ...
+        integral_zone_deg: ... nor does turning.
         max_speed_mm_s: largest speed of the sensor along each axis.
         max_turn_deg_s: largest turning rate of the sensor about each axis.
         max_frame_age_ms: the arm stops when the newest frame is older.
@@ -73,6 +75,8 @@ class ServoConfig(TaskConfig):
     kd: SixGains = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     max_integral_speed_mm_s: NonNegativeFloat = 40.0
     max_integral_turn_deg_s: NonNegativeFloat = 20.0
+    integral_zone_mm: PositiveFloat = 1.5
+    integral_zone_deg: PositiveFloat = 5.0
     max_speed_mm_s: PositiveFloat = 60.0
     max_turn_deg_s: PositiveFloat = 20.0
     max_frame_age_ms: PositiveFloat = 150.0
@@ -86,13 +90,14 @@ class ServoConfig(TaskConfig):
             np.array(self.kp_per_s),
             np.array(self.ki_per_s2),
             np.array(self.kd),
-            _speeds(self.max_integral_speed_mm_s, self.max_integral_turn_deg_s),
-            _speeds(self.max_speed_mm_s, self.max_turn_deg_s),
+            _six(self.max_integral_speed_mm_s, self.max_integral_turn_deg_s),
+            _six(self.integral_zone_mm, self.integral_zone_deg),
+            _six(self.max_speed_mm_s, self.max_turn_deg_s),
         )
 
 
-def _speeds(linear_mm_s: float, angular_deg_s: float) -> Array:
-    return np.repeat([1e-3 * linear_mm_s, np.radians(angular_deg_s)], 3)
+def _six(linear_mm: float, angular_deg: float) -> Array:
+    return np.repeat([1e-3 * linear_mm, np.radians(angular_deg)], 3)
 
 
 class ServoState(Enum):
@@ -157,8 +162,8 @@ class RunPhase(Protocol):
     """What a servoing task does once the contact has settled."""
 
     @property
-    def V_ff(self) -> Array:  # noqa: N802  the field's own name
-        """Feedforward twist (6,) in the desired sensor frame."""
+    def feedforward(self) -> Array:
+        """Twist (6,) in the desired sensor frame."""
         ...
 
     @property
@@ -388,7 +393,7 @@ class ServoTask:
             case ServoState.SETTLE:
                 return self._servo_step(np.zeros(6))
             case ServoState.RUN:
-                return self._servo_step(self._run.V_ff)
+                return self._servo_step(self._run.feedforward)
             case ServoState.RETRACT:
                 return self._along_z(-1e-3 * self._config.retract_speed_mm_s)
         return None
