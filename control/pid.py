@@ -61,7 +61,8 @@ class Pid:
 
     The error is smoothed by an exponentially weighted average before it is differentiated. It is the integral *term*
     that is accumulated and clipped: with constant gains that is the paper's clipped integral, in units that people can
-    judge; errors outside a zone do not add to it. After ``reset`` the first step has no derivative and no history, so it starts without a kick.
+    judge. Errors outside the integral zone do not add to it. After ``reset`` the first step has no derivative and no
+    history, so it starts without a kick.
     """
 
     def __init__(self, gains: PidGains) -> None:

@@ -196,11 +196,6 @@ class _Sight:
             return None
         return None if self.contact.belief is None else self.contact.belief.mean
 
-    @property
-    def lost(self) -> bool:
-        """Whether a fresh frame shows that there is no contact."""
-        return self.contact is not None and not self.contact.in_contact
-
 
 class ServoTask:
     """A task in execution; see ``tasks.interface.Task`` for what its members mean.
@@ -230,7 +225,6 @@ class ServoTask:
         self._machine = TaskMachine(servo_table(name, config, run.timeout_s), self)
         self._sight = _Sight(0, None, None)
         self._start: Array | None = None
-        self._last_T_base_sensor: Array | None = None
         self._steady_s = 0.0
         self._blind_s = 0.0
         self._reapproaches = 0
@@ -340,8 +334,9 @@ class ServoTask:
                     self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
             case ServoState.SETTLE:
                 self._watch_contact(dt_s)
-                self._steady_s = self._steady_s + dt_s if self._steady() else 0.0
-                if self._steady_s >= self._config.settle_time_s and self._steady():
+                steady = self._steady()
+                self._steady_s = self._steady_s + dt_s if steady else 0.0
+                if steady and self._steady_s >= self._config.settle_time_s:
                     self._post("settled")
             case ServoState.RUN:
                 self._watch_contact(dt_s)
@@ -354,8 +349,9 @@ class ServoTask:
                     self._post("retracted")
 
     def _watch_contact(self, dt_s: float) -> None:
-        if self._sight.lost:
-            self._post("lost", f"frame {self._sight.contact.seq}" if self._sight.contact else "")
+        contact = self._sight.contact
+        if contact is not None and not contact.in_contact:
+            self._post("lost", f"frame {contact.seq}")
         self._watch_sight(dt_s, blind=self._sight.T_base_sensor is None or self._sight.T_s_f is None)
 
     def _watch_sight(self, dt_s: float, *, blind: bool) -> None:
@@ -386,6 +382,7 @@ class ServoTask:
         """Twist (6,) of the tool in the present state; None where it has to stand still."""
         sight = self._sight
         if sight.T_base_sensor is None:
+            self._servo.reset()
             return None
         match self._machine.state:
             case ServoState.APPROACH:

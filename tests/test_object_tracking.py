@@ -76,6 +76,7 @@ def test_tracks_one_component_at_a_time_in_the_simulator(axis):
     log = loop.run(task)
     assert task.succeeded
     error = log.labels(after_s=1.0) - [0, 0, 6.0, 0, 0, 0]
+    print(f"{GLIDES[axis]}: RMS error {np.sqrt(np.mean(error**2, axis=0)).round(3)} mm, deg")
     np.testing.assert_array_less(np.abs(error).max(axis=0), [1.0, 1.0, 0.5, 0.5, 0.5, 0.5])
 
 
@@ -86,4 +87,5 @@ def test_tracks_all_components_at_once_in_the_simulator():
     log = loop.run(task)
     assert task.succeeded
     rms = np.sqrt(np.mean((log.labels(after_s=1.0) - [0, 0, 6.0, 0, 0, 0]) ** 2, axis=0))
+    print(f"all components: RMS error {rms.round(3)} mm, deg")
     np.testing.assert_array_less(rms, [0.5, 0.5, 0.15, 0.2, 0.2, 0.2])

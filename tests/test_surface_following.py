@@ -300,6 +300,9 @@ def test_follows_ramp_and_dome_in_the_simulator(surface, direction_deg):
     config = SurfaceFollowingConfig(direction_deg=direction_deg, distance_mm=100.0 if on_ramp else 60.0)
     task = SPEC.build(config, loop.context)
     log = loop.run(task)
+    print(
+        f"{surface} {direction_deg:g} deg: depth {log.depth_rms_mm(3.0):.3f} mm, tilt {log.tilt_rms_deg():.2f} deg RMS"
+    )
     assert task.succeeded
     assert log.depth_rms_mm(3.0) < 0.05
     assert log.tilt_rms_deg() < 0.7
