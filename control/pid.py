@@ -25,6 +25,8 @@ class PidGains:
         ki: integral gain, likewise, 1/s^2.
         kd: derivative gain, likewise, dimensionless.
         integral_limit: largest magnitude (6,) of each component of the integral term ``ki @ int(e)``, m/s and rad/s.
+        integral_zone: an error component (6,) larger than this is not integrated, m and rad: on the long way to a new
+            reference the integral would only gather what it has to give back as overshoot.
         output_limit: largest magnitude (6,) of each component of the output, feedforward included, m/s and rad/s.
 
     Raises:
@@ -35,13 +37,14 @@ class PidGains:
     ki: Array
     kd: Array
     integral_limit: Array
+    integral_zone: Array
     output_limit: Array
 
     def __post_init__(self) -> None:
         for name in ("kp", "ki", "kd"):
             gain = _finite(name, getattr(self, name), (6,), (6, 6))
             object.__setattr__(self, name, _frozen(np.diag(gain) if gain.ndim == 1 else gain))
-        for name in ("integral_limit", "output_limit"):
+        for name in ("integral_limit", "integral_zone", "output_limit"):
             limit = _finite(name, getattr(self, name), (6,))
             if (limit < 0.0).any():
                 raise ControlError(name, "has a negative component", limit)
@@ -58,7 +61,8 @@ class Pid:
 
     The error is smoothed by an exponentially weighted average before it is differentiated. It is the integral *term*
     that is accumulated and clipped: with constant gains that is the paper's clipped integral, in units that people can
-    judge. After ``reset`` the first step has no derivative and no history, so it starts without a kick.
+    judge. Errors outside the integral zone do not add to it. After ``reset`` the first step has no derivative and no
+    history, so it starts without a kick.
     """
 
     def __init__(self, gains: PidGains) -> None:
@@ -90,7 +94,8 @@ class Pid:
         before = e if self._smoothed is None else self._smoothed
         with np.errstate(over="ignore", invalid="ignore"):
             smoothed = SMOOTHING * e + (1.0 - SMOOTHING) * before
-            integral = np.clip(self._integral + gains.ki @ e * dt_s, -gains.integral_limit, gains.integral_limit)
+            near = np.where(np.abs(e) <= gains.integral_zone, e, 0.0)
+            integral = np.clip(self._integral + gains.ki @ near * dt_s, -gains.integral_limit, gains.integral_limit)
             output = V_ff + gains.kp @ e + integral + gains.kd @ ((smoothed - before) / dt_s)
         if not np.isfinite(output).all():
             raise ControlError("e", "is so large that the output overflows", e)

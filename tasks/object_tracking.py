@@ -20,8 +20,8 @@ class ObjectTrackingConfig(ServoConfig):
     depth_mm: PositiveFloat = 6.0
     settle_tolerance_mm: PositiveFloat = 1.0
     settle_tolerance_deg: PositiveFloat = 3.0
-    kp_per_s: SixGains = (8.0, 8.0, 8.0, 8.0, 8.0, 8.0)
-    ki_per_s2: SixGains = (16.0, 16.0, 16.0, 16.0, 16.0, 16.0)
+    kp_per_s: SixGains = (10.0, 10.0, 10.0, 8.0, 8.0, 8.0)
+    ki_per_s2: SixGains = (25.0, 25.0, 25.0, 16.0, 16.0, 16.0)
     duration_s: PositiveFloat = 30.0
 
 
@@ -33,8 +33,8 @@ class Track:
         self._timeout_s = config.duration_s + 1.0
 
     @property
-    def V_ff(self) -> Array:  # noqa: N802  the field's own name
-        """Feedforward twist (6,): none, the object leads."""
+    def feedforward(self) -> Array:
+        """No twist (6,): the object leads."""
         return np.zeros(6)
 
     @property

@@ -50,6 +50,8 @@ class ServoConfig(TaskConfig):
         kd: derivative gain of each axis.
         max_integral_speed_mm_s: largest speed that integral action may ask for.
         max_integral_turn_deg_s: largest turning rate that integral action may ask for.
+        integral_zone_mm: larger errors are not integrated, so that pressing in does not overshoot ...
+        integral_zone_deg: ... nor does turning.
         max_speed_mm_s: largest speed of the sensor along each axis.
         max_turn_deg_s: largest turning rate of the sensor about each axis.
         max_frame_age_ms: the arm stops when the newest frame is older.
@@ -73,6 +75,8 @@ class ServoConfig(TaskConfig):
     kd: SixGains = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     max_integral_speed_mm_s: NonNegativeFloat = 40.0
     max_integral_turn_deg_s: NonNegativeFloat = 20.0
+    integral_zone_mm: PositiveFloat = 1.5
+    integral_zone_deg: PositiveFloat = 5.0
     max_speed_mm_s: PositiveFloat = 60.0
     max_turn_deg_s: PositiveFloat = 20.0
     max_frame_age_ms: PositiveFloat = 150.0
@@ -86,13 +90,14 @@ class ServoConfig(TaskConfig):
             np.array(self.kp_per_s),
             np.array(self.ki_per_s2),
             np.array(self.kd),
-            _speeds(self.max_integral_speed_mm_s, self.max_integral_turn_deg_s),
-            _speeds(self.max_speed_mm_s, self.max_turn_deg_s),
+            _six(self.max_integral_speed_mm_s, self.max_integral_turn_deg_s),
+            _six(self.integral_zone_mm, self.integral_zone_deg),
+            _six(self.max_speed_mm_s, self.max_turn_deg_s),
         )
 
 
-def _speeds(linear_mm_s: float, angular_deg_s: float) -> Array:
-    return np.repeat([1e-3 * linear_mm_s, np.radians(angular_deg_s)], 3)
+def _six(linear_mm: float, angular_deg: float) -> Array:
+    return np.repeat([1e-3 * linear_mm, np.radians(angular_deg)], 3)
 
 
 class ServoState(Enum):
@@ -157,8 +162,8 @@ class RunPhase(Protocol):
     """What a servoing task does once the contact has settled."""
 
     @property
-    def V_ff(self) -> Array:  # noqa: N802  the field's own name
-        """Feedforward twist (6,) in the desired sensor frame."""
+    def feedforward(self) -> Array:
+        """Twist (6,) in the desired sensor frame."""
         ...
 
     @property
@@ -191,11 +196,6 @@ class _Sight:
             return None
         return None if self.contact.belief is None else self.contact.belief.mean
 
-    @property
-    def lost(self) -> bool:
-        """Whether a fresh frame shows that there is no contact."""
-        return self.contact is not None and not self.contact.in_contact
-
 
 class ServoTask:
     """A task in execution; see ``tasks.interface.Task`` for what its members mean.
@@ -225,7 +225,6 @@ class ServoTask:
         self._machine = TaskMachine(servo_table(name, config, run.timeout_s), self)
         self._sight = _Sight(0, None, None)
         self._start: Array | None = None
-        self._last_T_base_sensor: Array | None = None
         self._steady_s = 0.0
         self._blind_s = 0.0
         self._reapproaches = 0
@@ -335,8 +334,9 @@ class ServoTask:
                     self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
             case ServoState.SETTLE:
                 self._watch_contact(dt_s)
-                self._steady_s = self._steady_s + dt_s if self._steady() else 0.0
-                if self._steady_s >= self._config.settle_time_s and self._steady():
+                steady = self._steady()
+                self._steady_s = self._steady_s + dt_s if steady else 0.0
+                if steady and self._steady_s >= self._config.settle_time_s:
                     self._post("settled")
             case ServoState.RUN:
                 self._watch_contact(dt_s)
@@ -349,8 +349,9 @@ class ServoTask:
                     self._post("retracted")
 
     def _watch_contact(self, dt_s: float) -> None:
-        if self._sight.lost:
-            self._post("lost", f"frame {self._sight.contact.seq}" if self._sight.contact else "")
+        contact = self._sight.contact
+        if contact is not None and not contact.in_contact:
+            self._post("lost", f"frame {contact.seq}")
         self._watch_sight(dt_s, blind=self._sight.T_base_sensor is None or self._sight.T_s_f is None)
 
     def _watch_sight(self, dt_s: float, *, blind: bool) -> None:
@@ -381,6 +382,7 @@ class ServoTask:
         """Twist (6,) of the tool in the present state; None where it has to stand still."""
         sight = self._sight
         if sight.T_base_sensor is None:
+            self._servo.reset()
             return None
         match self._machine.state:
             case ServoState.APPROACH:
@@ -388,7 +390,7 @@ class ServoTask:
             case ServoState.SETTLE:
                 return self._servo_step(np.zeros(6))
             case ServoState.RUN:
-                return self._servo_step(self._run.V_ff)
+                return self._servo_step(self._run.feedforward)
             case ServoState.RETRACT:
                 return self._along_z(-1e-3 * self._config.retract_speed_mm_s)
         return None

@@ -33,14 +33,14 @@ class Follow:
     def __init__(self, config: SurfaceFollowingConfig) -> None:
         angle = np.radians(config.direction_deg)
         self._direction = np.array([np.cos(angle), np.sin(angle), 0.0])
-        self._V_ff = np.concatenate([1e-3 * config.speed_mm_s * self._direction, np.zeros(3)])
+        self._feedforward = np.concatenate([1e-3 * config.speed_mm_s * self._direction, np.zeros(3)])
         self._left_m = 1e-3 * config.distance_mm
         self._timeout_s = 2.0 * config.distance_mm / config.speed_mm_s + 1.0
 
     @property
-    def V_ff(self) -> Array:  # noqa: N802  the field's own name
-        """Feedforward twist (6,) in the desired sensor frame."""
-        return self._V_ff
+    def feedforward(self) -> Array:
+        """Twist (6,) in the desired sensor frame."""
+        return self._feedforward
 
     @property
     def timeout_s(self) -> float:

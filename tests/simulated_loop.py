@@ -1,4 +1,4 @@
-"""A control loop around the simulated arm and contact, on virtual time, with true contacts in place of perception."""
+"""A control loop around the simulated arm, on virtual time, with the true contact in place of perception."""
 
 from __future__ import annotations
 

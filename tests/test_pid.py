@@ -15,11 +15,11 @@ ZERO = np.zeros(6)
 WIDE = np.full(6, 1e6)
 
 
-def gains(kp=0.0, ki=0.0, kd=0.0, integral_limit=WIDE, output_limit=WIDE) -> PidGains:
+def gains(kp=0.0, ki=0.0, kd=0.0, integral_limit=WIDE, integral_zone=WIDE, output_limit=WIDE) -> PidGains:
     def of(gain):
         return np.full(6, gain) if np.ndim(gain) == 0 else np.asarray(gain)
 
-    return PidGains(of(kp), of(ki), of(kd), integral_limit, output_limit)
+    return PidGains(of(kp), of(ki), of(kd), integral_limit, integral_zone, output_limit)
 
 
 def test_each_term_by_hand():
@@ -60,6 +60,12 @@ def test_integral_is_clipped_and_unwinds_at_once():
         out = pid.step(np.ones(6), ZERO, 0.1)
     np.testing.assert_array_equal(out, limit)
     np.testing.assert_allclose(pid.step(-np.ones(6), ZERO, 0.1), limit - 0.1, atol=1e-15)
+
+
+def test_errors_outside_the_zone_are_not_integrated():
+    pid = Pid(gains(ki=1.0, integral_zone=np.full(6, 0.5)))
+    pid.step(np.array([0.5, 0.6, -0.4, -0.6, 0.0, 9.0]), ZERO, 1.0)
+    np.testing.assert_array_equal(pid.integral, [0.5, 0.0, -0.4, 0.0, 0.0, 0.0])
 
 
 def test_reset_starts_without_a_kick():
@@ -108,12 +114,13 @@ def test_an_overflow_is_an_error_not_an_infinity():
         ("ki", np.full(6, np.nan)),
         ("kd", np.ones((6, 5))),
         ("integral_limit", -np.ones(6)),
+        ("integral_zone", -np.ones(6)),
         ("output_limit", np.full(6, np.inf)),
         ("output_limit", np.ones((6, 6))),
     ],
 )
 def test_bad_gains_are_refused(name, value):
-    good = {"kp": ZERO, "ki": ZERO, "kd": ZERO, "integral_limit": WIDE, "output_limit": WIDE}
+    good = {"kp": ZERO, "ki": ZERO, "kd": ZERO, "integral_limit": WIDE, "integral_zone": WIDE, "output_limit": WIDE}
     with pytest.raises(ControlError) as caught:
         PidGains(**(good | {name: value}))
     assert caught.value.argument == name
@@ -137,11 +144,12 @@ limits = arrays(np.float64, 6, elements=st.floats(0, 10))
     ki=vectors,
     kd=vectors,
     integral_limit=limits,
+    integral_zone=limits,
     output_limit=limits,
     steps=st.lists(st.tuples(vectors, vectors, st.floats(1e-4, 1.0)), min_size=1, max_size=8),
 )
-def test_output_and_integral_never_leave_their_clips(kp, ki, kd, integral_limit, output_limit, steps):
-    pid = Pid(PidGains(kp, ki, kd, integral_limit, output_limit))
+def test_output_and_integral_never_leave_their_clips(kp, ki, kd, integral_limit, integral_zone, output_limit, steps):
+    pid = Pid(PidGains(kp, ki, kd, integral_limit, integral_zone, output_limit))
     for e, V_ff, dt_s in steps:
         out = pid.step(e, V_ff, dt_s)
         assert (np.abs(out) <= output_limit).all()

@@ -28,7 +28,9 @@ def contact(x=0.0, y=0.0, z=0.0, alpha=0.0, beta=0.0, gamma=0.0) -> np.ndarray:
 
 
 def servo(reference, axes=ALL, kp=8.0, ki=0.0, kd=0.0, T_tcp_sensor=MOUNT, output_limit=WIDE) -> TactileServo:
-    return TactileServo(reference, T_tcp_sensor, PidGains(kp * axes, ki * axes, kd * axes, WIDE, output_limit), DT)
+    return TactileServo(
+        reference, T_tcp_sensor, PidGains(kp * axes, ki * axes, kd * axes, WIDE, WIDE, output_limit), DT
+    )
 
 
 def run(control, T_w_tcp, T_w_f, V_ff, steps, T_tcp_sensor=MOUNT):
@@ -160,7 +162,7 @@ def test_non_finite_input_is_a_typed_error():
 @pytest.mark.parametrize("period_s", [0.0, -1.0, float("nan")])
 def test_the_period_must_be_positive(period_s):
     with pytest.raises(ControlError):
-        TactileServo(contact(z=3.0), MOUNT, PidGains(ALL, ALL, ALL, WIDE, WIDE), period_s)
+        TactileServo(contact(z=3.0), MOUNT, PidGains(ALL, ALL, ALL, WIDE, WIDE, WIDE), period_s)
 
 
 @given(
