@@ -27,7 +27,6 @@ class Log:
 
     t_s: list[float] = field(default_factory=list)
     truth: list[ContactState] = field(default_factory=list)
-    twists: list[Array] = field(default_factory=list)
 
     def labels(self, after_s: float = 0.0) -> Array:
         """(n, 6) true contact as x, y, z mm and alpha, beta, gamma degrees, from ``after_s`` into the run."""
@@ -99,7 +98,6 @@ class SimulatedLoop:
                 if task.state == "run":
                     log.t_s.append(self.clock.now_ns() * 1e-9)
                     log.truth.append(self.scene.contact("sensor").value)
-                    log.twists.append(action.twists["arm"].twist if "arm" in action.twists else np.zeros(6))
                 stopping = stopping or (stop_when is not None and stop_when(observation))
         return log
 

@@ -319,3 +319,17 @@ def test_holds_the_bars_under_single_frame_noise():
     assert task.succeeded
     assert log.depth_rms_mm(3.0) < 0.1
     assert log.tilt_rms_deg() < 1.0
+
+
+def test_an_operators_stop_withdraws_from_the_dome_and_comes_to_rest():
+    loop = SimulatedLoop(DOMES[0][0], (0.0, 0.0, 110.0, 180.0, 0.0, 0.0))
+    task = SPEC.build(SurfaceFollowingConfig(), loop.context)
+    loop.run(task, stop_when=lambda observation: task.state == "run" and observation.now_ns > 5e9)
+    assert task.state == "stopped"
+    assert not loop.scene.contact("sensor").value.in_contact
+    loop.clock.advance_s(1.0)
+    loop.scene.contact("sensor")
+    before = loop.arm.T_world_tcp().copy()
+    loop.clock.advance_s(1.0)
+    loop.scene.contact("sensor")
+    np.testing.assert_array_equal(loop.arm.T_world_tcp(), before)
