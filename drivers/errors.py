@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import Enum
+from pathlib import Path
 from typing import Any
 
 from geometry.errors import TouchcellError
@@ -29,6 +30,23 @@ class ConfigError(TouchcellError, ValueError):
         self.line = line
         self.key = key
         self.value = value
+
+
+class DataError(TouchcellError, ValueError):
+    """A data set is incomplete or damaged.
+
+    Attributes:
+        file: the file or folder concerned.
+        row: line of the label file (1 is the header), or 0.
+        column: column of the label file, or "".
+    """
+
+    def __init__(self, file: Path, reason: str, *, row: int = 0, column: str = "", hint: str = "") -> None:
+        where = f"{file}" + (f", line {row}" if row else "") + (f", column {column}" if column else "")
+        super().__init__(f"{where}: {reason}", hint=hint)
+        self.file = file
+        self.row = row
+        self.column = column
 
 
 class DeviceError(TouchcellError):

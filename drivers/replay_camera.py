@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from drivers.device import Device, Lifecycle
 from drivers.errors import ConnectError, CorruptMessage, DeviceGone, EndOfStream, StaleData, TransportTimeout
 from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
 from drivers.samples import Frame, Stamped
+from drivers.tactile_data import IMAGE_FOLDER, natural_order
 from geometry.types import ImageArray
 
 CAPABILITIES = Capabilities(
@@ -30,9 +30,16 @@ _ENDINGS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"
 
 
 class ReplayCameraConfig(DriverConfig):
-    """Which folder, and how fast."""
+    """Which images, and how fast.
 
-    folder: Path
+    Attributes:
+        data: a folder of images, or with ``split`` the root of a data set in the public layout.
+        split: train, val or test.
+        rate_hz: images per second.
+    """
+
+    data: Path
+    split: str | None = None
     rate_hz: float = Field(default=30.0, gt=0.0, le=1000.0)
 
 
@@ -50,7 +57,7 @@ class ReplayCamera(Device):
 
     def __init__(self, name: str, config: ReplayCameraConfig, clock: Clock) -> None:
         super().__init__(name, clock)
-        self._folder = config.folder
+        self._folder = config.data / config.split / IMAGE_FOLDER if config.split else config.data
         self._period_ns = round(1e9 / config.rate_hz)
         self._files: list[Path] = []
         self._start_ns = 0
@@ -129,9 +136,13 @@ class ReplayCamera(Device):
 
     def _open(self) -> None:
         if not self._folder.is_dir():
-            raise ConnectError(self.name, f"{self._folder} is no folder", hint="give the folder that holds the images")
+            raise ConnectError(
+                self.name,
+                f"{self._folder} is no folder",
+                hint="give the folder that holds the images, or the data set and its split",
+            )
         files = (file for file in self._folder.iterdir() if file.suffix.lower() in _ENDINGS)
-        self._files = sorted(files, key=_natural)
+        self._files = sorted(files, key=natural_order)
         if not self._files:
             raise ConnectError(self.name, f"{self._folder} holds no PNG or JPEG images")
         self._start_ns = self._clock.now_ns()
@@ -140,12 +151,6 @@ class ReplayCamera(Device):
         self._files = []
         self._size = None
         self._newest = None
-
-
-def _natural(file: Path) -> list[tuple[int, str]]:
-    """Sort key under which numbers within names count as numbers."""
-    parts = re.split(r"(\d+)", file.name)
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
 
 
 def _build(name: str, config: Any, context: DriverContext) -> ReplayCamera:

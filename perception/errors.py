@@ -24,23 +24,6 @@ class ImageError(TouchcellError, ValueError):
         self.found = found
 
 
-class DataError(TouchcellError, ValueError):
-    """A data set is incomplete or damaged.
-
-    Attributes:
-        file: the file or folder concerned.
-        row: line of the label file (1 is the header), or 0.
-        column: column of the label file, or "".
-    """
-
-    def __init__(self, file: Path, reason: str, *, row: int = 0, column: str = "", hint: str = "") -> None:
-        where = f"{file}" + (f", line {row}" if row else "") + (f", column {column}" if column else "")
-        super().__init__(f"{where}: {reason}", hint=hint)
-        self.file = file
-        self.row = row
-        self.column = column
-
-
 class ModelError(TouchcellError, ValueError):
     """A model file cannot be used.
 

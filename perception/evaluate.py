@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 
 from drivers.clock import Clock, MonotonicClock
-from perception.dataset import Progress, read_split
+from drivers.tactile_data import read_split
+from perception.dataset import Progress
 from perception.inference import ContactModel
-from perception.labels import CONTACT_NAMES, XI_UNITS, contact_from_xi
+from perception.labels import CONTACT_NAMES, XI_UNITS, contact_from_xi, xi_from_contact
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -93,7 +94,7 @@ def evaluate(
                 progress(i + 1, n)
     errors = np.abs(contact_from_xi(means) - labelled.contact_mm_deg).mean(axis=0)
     mae = dict(zip(CONTACT_NAMES, errors.tolist(), strict=True))
-    standardised = (labelled.xi - means) / sigmas
+    standardised = (xi_from_contact(labelled.contact_mm_deg) - means) / sigmas
     nll = (0.5 * standardised**2 + np.log(sigmas / XI_UNITS) + 0.5 * np.log(2.0 * np.pi)).sum(axis=1).mean()
     return Evaluation(
         n=n,

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from drivers.tactile_data import read_split
 from geometry.types import Array, ImageArray
 from perception.architecture import Architecture
 from perception.checkpoint import EpochRecord, Progress, delete_checkpoint, load_checkpoint, save_checkpoint
-from perception.dataset import LabelledImages, default_cache, load_reduced, read_split
+from perception.dataset import LabelledImages, default_cache, load_reduced
 from perception.errors import TrainingError
 from perception.figures import write_curves, write_predictions
-from perception.labels import CONTACT_NAMES, contact_from_xi
+from perception.labels import CONTACT_NAMES, contact_from_xi, xi_from_contact
 from perception.model_file import Header, Labels, Model, save_model, touchcell_version
 from perception.networks import ContactNetwork, gaussian_loss, weighted_absolute_loss, weighted_square_loss
 from perception.preprocessing import Preprocessing, scale
@@ -125,7 +126,7 @@ def train(
                 cache=cache or default_cache(),
                 progress=lambda done, total, name=name: observer.images(name, done, total),  # type: ignore[misc]
             ),
-            split.xi,
+            xi_from_contact(split.contact_mm_deg),
         )
         for name, split in splits.items()
     }

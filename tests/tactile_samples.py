@@ -8,8 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from drivers.tactile_data import IMAGE_COLUMN, LABEL_COLUMNS
 from geometry.types import Array, ImageArray
-from perception.dataset import IMAGE_COLUMN, LABEL_COLUMNS, LabelledImages
+from perception.dataset import LabelledImages
 from perception.labels import xi_from_contact
 from perception.preprocessing import Preprocessing
 

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from tactile_samples import SIZE, contacts, draw, labelled, preprocessing, write_split
 
+from drivers.errors import DataError
+from drivers.tactile_data import read_image, read_split
 from perception import dataset
-from perception.dataset import LabelledImages, load_reduced, read_image, read_split
-from perception.errors import DataError, ImageError
+from perception.dataset import LabelledImages, load_reduced
+from perception.errors import ImageError
 from perception.labels import contact_from_xi, xi_from_contact
 
 

@@ -13,7 +13,8 @@ from tactile_samples import CENTRE, contacts, draw, write_split
 from test_inference import constant_model
 
 from drivers.clock import VirtualClock
-from perception.errors import DataError, ImageError, ModelError
+from drivers.errors import DataError
+from perception.errors import ImageError, ModelError
 from perception.evaluate import evaluate, print_table
 from perception.labels import XI_UNITS, xi_from_contact
 from perception.model_file import Labels, save_model

@@ -39,7 +39,7 @@ def folder(tmp_path: Path) -> Path:
 
 def play(folder: Path, clock: VirtualClock, rate_hz: float = 10.0) -> ReplayCamera:
     camera = registry.spec("replay_camera").build(
-        "camera", ReplayCameraConfig(folder=folder, rate_hz=rate_hz), DriverContext(clock)
+        "camera", ReplayCameraConfig(data=folder, rate_hz=rate_hz), DriverContext(clock)
     )
     assert isinstance(camera, ReplayCamera)
     return camera

@@ -14,10 +14,11 @@ torch = pytest.importorskip("torch")
 
 from tactile_samples import labelled, preprocessing, write_split  # noqa: E402
 
+from drivers.errors import DataError  # noqa: E402
 from perception.architecture import Architecture  # noqa: E402
 from perception.checkpoint import EpochRecord, checkpoint_path  # noqa: E402
 from perception.dataset import LabelledImages  # noqa: E402
-from perception.errors import DataError, ModelError, TrainingError  # noqa: E402
+from perception.errors import ModelError, TrainingError  # noqa: E402
 from perception.model_file import Model, load_model  # noqa: E402
 from perception.training import Settings, learning_rate, train, train_on_arrays  # noqa: E402
 from perception.training_display import Display  # noqa: E402
