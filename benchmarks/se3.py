@@ -23,6 +23,7 @@ import numpy as np
 from benchmarks.provenance import provenance
 from benchmarks.se3_reference import Library, errors, points, reference
 from geometry import _plain, se3
+from geometry.gaussian import PoseGaussian, compound, fuse
 from geometry.types import Array
 
 BATCH = 100_000
@@ -63,6 +64,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
                 "scalar_us": {name: 1e6 * _seconds(call, 2000) for name, call in contender.scalar.items()},
                 "batch_ns": {name: 1e9 / BATCH * _seconds(call, 1) for name, call in contender.batch.items()},
             }
+    result["filter_us"] = {"backend": se3.BACKEND, **_filter_us()}
     _print(result)
     out.mkdir(parents=True, exist_ok=True)
     (out / "se3.json").write_text(json.dumps(result, indent=1) + "\n")
@@ -80,6 +82,19 @@ def _seconds(call: Call, count: int) -> float:
             call()
         best = min(best, (time.process_time() - start) / count)
     return best
+
+
+def _filter_us() -> dict[str, float]:
+    """One prediction with noise and one correction, as a filter makes them at every image."""
+    rng = np.random.default_rng(0)
+    A, B, Q = (1e-4 * (factor @ factor.T + np.eye(6)) for factor in rng.normal(size=(3, 6, 6)))
+    motion, offset = se3.exp(0.1 * rng.normal(size=(2, 6)))
+    prior = PoseGaussian(se3.exp(rng.normal(size=6)), A)
+    observation = PoseGaussian(se3.compose(offset, prior.mean), B)
+    return {
+        "compound": 1e6 * _seconds(lambda: compound(motion, prior, Q), 2000),
+        "fuse": 1e6 * _seconds(lambda: fuse(prior, observation), 2000),
+    }
 
 
 def _contenders() -> list[Contender]:
@@ -236,6 +251,9 @@ def _print(result: Mapping[str, Any]) -> None:
         for name, figures in libraries.items():
             cells = [form.format(figures[part][column]) if column in figures[part] else "-" for column in columns]
             print(f"{name:42s}" + "".join(f"{cell:>11s}" for cell in cells))
+    filtering = result["filter_us"]
+    steps = f"compound with noise {filtering['compound']:.1f}, fuse {filtering['fuse']:.1f}"
+    print(f"\nfilter steps ({filtering['backend']}), us: {steps}")
 
 
 def _plot(result: Mapping[str, Any], path: Path) -> None:

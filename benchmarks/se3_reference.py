@@ -1,7 +1,7 @@
 """Exact SE(3) to measure against: closed forms of the textbooks in mpmath, with digits to spare for their cancellation.
 
-They are not the formulas under test: the Jacobian's upper right block comes from Barfoot's Q (State Estimation for
-Robotics, 2nd ed. 2024, eq. 8.91), its inverse from -J^-1 Q J^-1.
+They are not the formulas under test: the Jacobian's upper right block is Barfoot's Q (State Estimation for Robotics,
+2nd ed. 2024, chapter 8), that of its inverse -J^-1 Q J^-1.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@
 
 #include "_se3_kernels.h"
 
-#define SMALLEST_PIVOT (4.0 * DBL_EPSILON)
+#define SMALLEST_PIVOT (32.0 * DBL_EPSILON)
 #define SMALLEST_VARIANCE 1e-60
 #define ASYMMETRY 1e-6
 

@@ -33,6 +33,7 @@ Entry: TypeAlias = Any
 """A float, or a float64 column."""
 
 Formula: TypeAlias = Callable[..., tuple[Entry, ...]]
+"""From entries to entries."""
 
 TERMS = 9
 SERIES_A = [(-1) ** k / factorial(2 * k + 1) for k in range(TERMS)]
@@ -93,7 +94,7 @@ def _apply(kernel: Formula, array: Array, core_ndim: int, core: tuple[int, ...])
         return np.array(kernel(*array.ravel().tolist())).reshape(core)
     count = math.prod(leading)
     out = np.empty((count, math.prod(core)))
-    columns = array.reshape(count, -1 if count else math.prod(array.shape[-core_ndim:])).T.copy()
+    columns = array.reshape(count, math.prod(array.shape[len(leading) :])).T.copy()
     for index, entry in enumerate(kernel(*columns)):
         out[:, index] = entry
     return out.reshape(leading + core)
@@ -204,9 +205,7 @@ def _polynomial(coefficients: Sequence[float], s: Entry) -> Entry:
     return total
 
 
-def _branch(
-    s: Entry, series: Callable[..., tuple[Entry, ...]], closed: Callable[..., tuple[Entry, ...]], *more: Entry
-) -> tuple[Entry, ...]:
+def _branch(s: Entry, series: Formula, closed: Formula, *more: Entry) -> tuple[Entry, ...]:
     """Evaluate ``series`` where s < 1 and ``closed`` elsewhere."""
     if isinstance(s, float):
         return series(s, *more) if s < 1.0 else closed(s, *more)

@@ -116,6 +116,9 @@ def from_exponential(xi: ArrayLike, covariance_xi: ArrayLike) -> PoseGaussian:
     Args:
         xi: (6,) [v, w], m and rad.
         covariance_xi: (6, 6).
+
+    Raises:
+        NotPositiveDefinite: the covariance is none, as for ``PoseGaussian``.
     """
     J = se3.left_jacobian(xi)
     if J.ndim != 2:
@@ -198,7 +201,7 @@ def mahalanobis_squared(g: PoseGaussian, T: ArrayLike) -> float:
 
 
 def _fourth_order(S: Array, Q: Array) -> Array:
-    """What the fourth order adds to S + Q (Barfoot and Furgale 2014, eq. 55 and below)."""
+    """What the fourth order adds to S + Q (Barfoot and Furgale 2014, section III)."""
     A_S, A_Q = _moment(S), _moment(Q)
     mixed = A_Q @ S + A_S @ Q
     Svv, Svw, Sww = S[:3, :3], S[:3, 3:], S[3:, 3:]

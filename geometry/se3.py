@@ -65,7 +65,7 @@ def _choose() -> tuple[_Kernels, Literal["compiled", "python"]]:
 _kernels, BACKEND = _choose()
 
 PROJECTABLE = 0.5
-"""Largest Frobenius norm of R'R - I that ``project`` repairs; Newton's iteration converges from all of these."""
+"""Largest Frobenius norm of R'R - I that ``project`` repairs; its iteration converges from all of these."""
 
 
 def exp(xi: ArrayLike) -> Array:
