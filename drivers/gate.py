@@ -70,26 +70,15 @@ class TwistGate:
         previous = self._last if now_ns <= self._expires_ns else np.zeros(6)
         dt_s = min(command.ttl_s, (now_ns - self._last_ns) * 1e-9)
         limits = self._limits
-        allowed = np.concatenate(
-            [
-                _limit(
-                    "tcp linear",
-                    wanted[:3],
-                    previous[:3],
-                    limits.speed_m_s,
-                    limits.accel_m_s2 * dt_s,
-                    adjustments,
-                ),
-                _limit(
-                    "tcp angular",
-                    wanted[3:],
-                    previous[3:],
-                    limits.rot_speed_rad_s,
-                    limits.rot_accel_rad_s2 * dt_s,
-                    adjustments,
-                ),
-            ]
+        allowed = _limited(wanted, limits.speed_m_s, limits.rot_speed_rad_s, "speed", adjustments)
+        step = _limited(
+            allowed - previous,
+            limits.accel_m_s2 * dt_s,
+            limits.rot_accel_rad_s2 * dt_s,
+            "acceleration",
+            adjustments,
         )
+        allowed = previous + step
         self._last = allowed
         self._last_ns = now_ns
         self._expires_ns = now_ns + round(command.ttl_s * 1e9)
@@ -126,17 +115,16 @@ class TwistGate:
         return CommandRejected(self._device, reason, message, value=value, limit=limit)
 
 
-def _limit(
-    name: str, wanted: Array, previous: Array, max_norm: float, max_step: float, adjustments: list[Adjustment]
-) -> Array:
-    """Scale to ``max_norm``, then step from ``previous`` by at most ``max_step``; directions are kept."""
-    speed = float(np.linalg.norm(wanted))
-    if speed > max_norm:
-        adjustments.append(Adjustment(f"{name} speed", speed, max_norm))
-        wanted = wanted * (max_norm / speed)
-    step = wanted - previous
-    change = float(np.linalg.norm(step))
-    if change > max_step:
-        adjustments.append(Adjustment(f"{name} acceleration", change, max_step))
-        wanted = previous + step * (max_step / change)
-    return wanted
+def _limited(twist: Array, max_linear: float, max_angular: float, what: str, adjustments: list[Adjustment]) -> Array:
+    """``twist`` scaled by one factor so that neither part exceeds its limit.
+
+    One factor for both parts: scaling them apart would bend the motion of whatever sits on a lever, and a tactile
+    sensor that turns about its contact would be torn off it.
+    """
+    scale = 1.0
+    for part, vector, limit in (("linear", twist[:3], max_linear), ("angular", twist[3:], max_angular)):
+        size = math.sqrt(float(vector @ vector))
+        if size > limit:
+            adjustments.append(Adjustment(f"tcp {part} {what}", size, limit))
+            scale = min(scale, limit / size)
+    return twist if scale == 1.0 else twist * scale

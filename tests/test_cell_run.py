@@ -81,7 +81,7 @@ def test_run_command_leaves_a_folder_that_speaks(tmp_path: Path, capsys: pytest.
     assert names >= {"contact_sensor.png", "trajectory.png"}
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["outcome"] == "done"
-    assert summary["errors"]["sensor"]["control"]["rms"]["z_mm"] < 0.1
+    assert summary["errors"]["sensor"]["control"]["rms"]["z_mm"] < 0.2
     assert str(folder) in capsys.readouterr().out
 
 
