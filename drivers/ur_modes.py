@@ -108,10 +108,13 @@ SAFETY_FAULTS: Mapping[SafetyMode, FaultEntry] = {
         "robot emergency stop", FaultClass.SAFETY_STOP, Remedy.OPERATOR, _EMERGENCY
     ),
     SafetyMode.VIOLATION: FaultEntry(
-        "safety violation", FaultClass.SAFETY_STOP, Remedy.POWER_CYCLE, "read the log on the pendant, restart the safety"
+        "safety violation",
+        FaultClass.SAFETY_STOP,
+        Remedy.POWER_CYCLE,
+        "read the log on the pendant, restart its safety",
     ),
     SafetyMode.FAULT: FaultEntry(
-        "safety fault", FaultClass.INTERNAL, Remedy.SERVICE, "read the log on the pendant, restart the safety"
+        "safety fault", FaultClass.INTERNAL, Remedy.SERVICE, "read the log on the pendant, restart its safety"
     ),
     SafetyMode.VALIDATE_JOINT_ID: FaultEntry(
         "joint identity not validated", FaultClass.CONFIGURATION, Remedy.SERVICE, "validate the joints on the pendant"
@@ -123,7 +126,10 @@ SAFETY_FAULTS: Mapping[SafetyMode, FaultEntry] = {
         "automatic mode safeguard stop", FaultClass.SAFETY_STOP, Remedy.OPERATOR, "close the guard, then recover"
     ),
     SafetyMode.SYSTEM_THREE_POSITION_ENABLING_STOP: FaultEntry(
-        "three-position enabling stop", FaultClass.SAFETY_STOP, Remedy.OPERATOR, "hold the enabling device, then recover"
+        "three-position enabling stop",
+        FaultClass.SAFETY_STOP,
+        Remedy.OPERATOR,
+        "hold the enabling device, then recover",
     ),
 }
 """Every safety mode but NORMAL and REDUCED, in which the arm may move."""
@@ -183,5 +189,5 @@ def program_fault(device: str, state: RuntimeState) -> DeviceFault | None:
         vendor_code=f"runtime_state {int(state)}",
         fault_class=FaultClass.MOTION,
         needs=Remedy.RECOVER,
-        hint="stopped from the pendant, by the safety system, or by the controller's watchdog after silence of the host",
+        hint="stopped from the pendant, by the safety system, or by its watchdog after silence of the host",
     )
