@@ -1,9 +1,9 @@
 """The wire format of Universal Robots' Real-Time Data Exchange (RTDE), version 2: pure functions, no input or output.
 
 Every packet is ``u16 size, u8 type, payload``, big-endian, size counting itself. A client agrees on the version, names
-the variables it wants to read (one output recipe) and to write (input recipes), then starts the stream of data packets,
-each ``u8 recipe, values``. There is no checksum: TCP carries it, so a damaged packet shows as a wrong size, type, recipe
-or value. Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", for e-Series PolyScope 5.
+the variables it wants to read (one output recipe) and to write (input recipes), then starts the stream of data
+packets, each ``u8 recipe, values``. There is no checksum, since TCP has one: a damaged packet can only show as a wrong
+size, type, recipe or value. Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", for e-Series PolyScope 5.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Facts of ur-rtde 1.6.5 that shape this module (its program and client, read and run against the emulator):
 
-- ``speedL(xd, a, time)`` does not expire: the uploaded program calls ``speedl(xd, a, t=time)`` again and again until it is
-  told otherwise. ``time`` only says how soon it takes up a newer twist, so it is one control period here.
+- ``speedL(xd, a, time)`` does not expire: the uploaded program calls ``speedl(xd, a, t=time)`` again and again until it
+  is told otherwise. ``time`` only says how soon it takes up a newer twist, so it is one control period here.
 - ``setWatchdog`` stops the whole program when ``input_int_register_0`` is not written often enough. It is therefore set
   always, and proven once per activation by keeping silent until the program has stopped.
 - Registers outlive the program: one that starts while ``input_int_register_0`` still says speedL moves at once. It is

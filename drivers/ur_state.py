@@ -121,6 +121,11 @@ class StateReader:
         """Whether more packets are being dropped than a healthy link explains: over 10 of the last 50."""
         return sum(self._misses) > _BUDGET_MISSES
 
+    def forget_misses(self) -> None:
+        """Start the budget anew, after a person has looked at the fault."""
+        with self._lock:
+            self._misses.clear()
+
     def poll(self) -> Snapshot | None:
         """Newest good snapshot, or None before the first."""
         with self._lock:
