@@ -40,8 +40,9 @@ from drivers.gate import TwistLimits
 from drivers.lease import Lease
 from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
 from drivers.samples import JointState, Stamped, TcpState
-from drivers.ur_control import ControlLink, bounded, dashboard
+from drivers.ur_control import ControlLink
 from drivers.ur_modes import RobotMode, RuntimeState, SafetyMode, power_fault, program_fault, safety_fault
+from drivers.ur_sdk import bounded, dashboard, retire
 from drivers.ur_state import RATE_HZ, VARIABLES, Snapshot, StateReader
 from geometry import se3
 from geometry.types import Array
@@ -123,9 +124,9 @@ class UrArm(Arm):
     Until it is activated, ``tcp`` tells the pose of the tool centre point that is set on the pendant, because only a
     running program may set another; from then on that of ``flange_to_tcp_mm_deg``, read back.
 
-    One thread, started by ``connect`` and joined by ``disconnect``, checks the state every 4 ms, ends expired twists, keeps
-    the watchdog quiet and latches faults. It cannot run while another thread holds the interpreter's lock; then the
-    watchdog stops the arm.
+    One thread, started by ``connect`` and joined by ``disconnect``, checks the state every 4 ms, ends expired twists,
+    keeps the watchdog quiet and latches faults. It cannot run while another thread holds the interpreter's lock; then
+    the watchdog stops the arm.
 
     Args:
         name: the device's name in the cell.
@@ -277,6 +278,7 @@ class UrArm(Arm):
         self._require_remote_control()
         self._require_no_program()
         self._power_on()
+        _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
         link = ControlLink(self.name, self._config.host, self._clock, self._config.watchdog_hz)
         self._link = link
         try:
@@ -458,8 +460,7 @@ class UrArm(Arm):
     def _stop_receiving(self) -> None:
         receive, self._receive = self._receive, None
         if receive is not None:
-            with suppress(DeviceError):
-                bounded(self.name, "disconnect", self._config.connect_timeout_s, receive.disconnect)
+            retire(self.name, receive)
 
     def _opened(self) -> StateReader:
         if self._reader is None:

@@ -10,15 +10,15 @@ Facts of ur-rtde 1.6.5 that shape this module (its program and client, read and 
   cleared before every upload.
 - On a lost connection the client reconnects by itself and, where it may upload, restarts its program and repeats the
   command. So it is made without leave to upload, which is done here, once, by ``open``.
-- Commands that wait for an answer wait up to 300 s. They run in a thread of their own and are given up earlier.
+- Commands that wait for an answer wait up to 300 s (``drivers/ur_sdk.py``).
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from typing import Any, TypeVar
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
@@ -31,11 +31,9 @@ from drivers.errors import (
     FaultClass,
     Rejection,
     Remedy,
-    TransportTimeout,
 )
+from drivers.ur_sdk import bounded, dashboard, retire
 from geometry.types import Array
-
-T = TypeVar("T")
 
 PERIOD_S = 0.002
 _ANSWER_S = 1.0
@@ -45,52 +43,7 @@ _TRIP_SLACK_S = 0.5
 _POLL_NS = 2_000_000
 _KICKS_PER_WATCHDOG_PERIOD = 4
 _TOOL_TOLERANCE = 1e-6
-_DASHBOARD_S = 1.0
 _AT_REST = [0.0] * 6
-
-
-def bounded(device: str, what: str, timeout_s: float, call: Callable[[], T]) -> T:
-    """Result of a vendor call that may hang: it is left behind in its thread after ``timeout_s``.
-
-    Raises:
-        TransportTimeout: it had not returned.
-        DeviceGone: it raised one of the vendor's errors.
-    """
-    results: list[T] = []
-    errors: list[Exception] = []
-
-    def work() -> None:
-        try:
-            results.append(call())
-        except Exception as error:
-            errors.append(error)
-
-    # A daemon, because a call into a frozen controller must not keep the process from ending.
-    thread = threading.Thread(target=work, name=f"{device} {what}", daemon=True)
-    thread.start()
-    thread.join(timeout_s)
-    if errors:
-        if isinstance(errors[0], DeviceError):
-            raise errors[0]
-        raise DeviceGone(device, f"{what}: {errors[0]}") from errors[0]
-    if not results:
-        raise TransportTimeout(device, what, timeout_s)
-    return results[0]
-
-
-@contextmanager
-def dashboard(device: str, host: str) -> Iterator[Any]:
-    """ur-rtde's dashboard client, connected. Raises DeviceGone when the dashboard does not answer."""
-    from dashboard_client import DashboardClient
-
-    client = DashboardClient(host)
-    try:
-        client.connect(round(_DASHBOARD_S * 1e3))
-        yield client
-    except RuntimeError as error:
-        raise DeviceGone(device, f"dashboard of {host}: {error}") from error
-    finally:
-        client.disconnect()
 
 
 class ControlLink:
@@ -237,8 +190,7 @@ class ControlLink:
                 return
             with suppress(DeviceError), dashboard(self._device, self._host) as client:
                 client.stop()
-            with suppress(DeviceError):
-                bounded(self._device, "disconnect", _OPEN_S, control.disconnect)
+            retire(self._device, control)
 
     def _start_program(self) -> None:
         control = self._control

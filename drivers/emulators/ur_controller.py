@@ -69,6 +69,7 @@ class Controller:
         self._starting: tuple[float, int] | None = None
         self._powering: tuple[float, RobotMode] | None = None
         self._input_s = 0.0
+        self._input_travel_m = 0.0
         self._stopped_s = -math.inf
 
     @property
@@ -80,6 +81,11 @@ class Controller:
     def last_input_age_s(self) -> float:
         """Seconds since input_int_register_0 (or 24) was last written."""
         return self.t_s - self._input_s
+
+    @property
+    def travel_since_input_m(self) -> float:
+        """How far the tool has moved since then."""
+        return self.arm.travel_m - self._input_travel_m
 
     def step(self) -> None:
         """Let one control period pass."""
@@ -122,8 +128,12 @@ class Controller:
     def write_inputs(self, values: dict[str, Value]) -> None:
         """Take over a data packet. Registers keep their values when a program stops or a client goes."""
         self.inputs.update(values)
-        if "input_int_register_0" in values or "input_int_register_24" in values:
-            self._input_s = self.t_s
+        for register in ("input_int_register_0", "input_int_register_24"):
+            command = values.get(register)
+            if isinstance(command, int):
+                self._input_s = self.t_s
+                self._input_travel_m = self.arm.travel_m
+                self.commands[NAMES.get(command, str(command))] += 1
 
     def start_program(self, text: str) -> None:
         """Run an uploaded script, if it is ur-rtde's, the arm is powered, safe, and in remote control."""
@@ -216,10 +226,6 @@ class Controller:
         """Stop the program when inputs come more slowly than ``min_hz``; 0 switches it off."""
         self.watchdog_hz = min_hz
         self._input_s = self.t_s
-
-    def count(self, command: int) -> None:
-        """Remember that the program obeyed ``command`` once more."""
-        self.commands[NAMES.get(command, str(command))] += 1
 
     def log(self, message: str) -> None:
         """Note something for whoever reads the state."""

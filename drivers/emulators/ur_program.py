@@ -4,9 +4,9 @@ No URScript is interpreted. The program's threads are generators, of which each 
 matters for safety is kept: the speed thread takes up the newest target, hands it to ``speedl`` for ``time`` seconds, and
 repeats it for ever, so only another command, a stop of the program or the watchdog ends a motion.
 
-Commands arrive in ``input_int_register_0``. Streaming ones are obeyed in every cycle; the others once, until the register
-returns to 0. ``output_int_register_0`` answers 1 (ready) or 2 (done). Source: the program and the client of ur-rtde 1.6.5
-(MIT); for the built-in functions, Universal Robots, "The URScript Programming Language for e-Series".
+Commands arrive in ``input_int_register_0``. Streaming ones are obeyed in every cycle; the others once, until the
+register returns to 0. ``output_int_register_0`` answers 1 (ready) or 2 (done). Source: the program and the client of
+ur-rtde 1.6.5 (MIT); for the built-in functions, Universal Robots, "The URScript Programming Language for e-Series".
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ NAMES = {
     MOVEL: "moveL",
     MOVEL_FK: "moveL_FK",
     ZERO_FT_SENSOR: "zeroFtSensor",
+    0: "none",
     SPEEDJ: "speedJ",
     SPEEDL: "speedL",
     SERVOJ: "servoJ",
@@ -107,14 +108,12 @@ class ControlProgram:
         while True:
             command = self._integer(0)
             if command in STREAMED:
-                self._controller.count(command)
                 self._stream(command)
                 self._answer(READY)
             elif command == 0:
                 obeyed = False
                 self._answer(READY)
             elif not obeyed:
-                self._controller.count(command)
                 if command == STOP_SCRIPT:
                     return
                 yield from self._execute(command)
