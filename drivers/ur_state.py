@@ -133,6 +133,9 @@ class StateReader:
                 timestamp_s = self._receive.getTimestamp()
                 if timestamp_s == self._seen_s:
                     break
+                if not math.isfinite(timestamp_s):
+                    self._miss_corrupt()
+                    break
                 values = self._values()
                 if self._receive.getTimestamp() == timestamp_s:
                     self._seen_s = timestamp_s

@@ -19,7 +19,7 @@ rtde_control = pytest.importorskip("rtde_control", reason="pip install touchcell
 rtde_receive = pytest.importorskip("rtde_receive")
 dashboard_client = pytest.importorskip("dashboard_client")
 
-ADDRESSES = itertools.count(10_000_000 + os.getpid() % 50_000 * 100)
+ADDRESSES = itertools.count(5_000_000 + os.getpid() % 40_000 * 100)
 DEADLINE_S = 5.0
 
 

@@ -16,7 +16,7 @@ UNLOCK_AFTER_S = 0.1
 
 
 def host_of(address: int) -> str:
-    """The loopback address of emulator ``address``, 0 to 15 999 999: its ports are fixed, so each needs its own."""
+    """The loopback address of emulator ``address``, below 11 000 000: its ports are fixed, so each needs its own."""
     high, low = divmod(address, 250)
     return f"127.{64 + high // 250}.{high % 250}.{low + 1}"
 
