@@ -535,24 +535,21 @@ class UrArm(Arm):
         self._await(lambda state: state.robot_mode is RobotMode.POWER_OFF, _MODE_CHANGE_S, "power-off")
 
     def _unlock(self) -> None:
-        try:
-            with dashboard(self.name, self._config.host) as client:
+        with dashboard(self.name, self._config.host) as client:
+            try:
                 client.unlockProtectiveStop()
-        except ValueError as error:
-            raise self._not_unlocked(error) from error
+            except RuntimeError as error:
+                raise DeviceFault(
+                    self.name,
+                    f"the protective stop stays: {error}",
+                    fault_class=FaultClass.CONTACT,
+                    needs=Remedy.RECOVER,
+                    hint="wait until 5 s after the stop, and look at the arm first",
+                ) from error
         self._await(
             lambda state: state.safety_mode is not SafetyMode.PROTECTIVE_STOP,
             _RECOVER_S,
             "release of the protective stop",
-        )
-
-    def _not_unlocked(self, error: Exception) -> DeviceFault:
-        return DeviceFault(
-            self.name,
-            f"the protective stop stays: {error}",
-            fault_class=FaultClass.CONTACT,
-            needs=Remedy.RECOVER,
-            hint="wait until 5 s after the stop, and look at the arm first",
         )
 
     def _await(self, condition: Callable[[Snapshot], bool], timeout_s: float, what: str) -> Snapshot:

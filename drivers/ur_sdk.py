@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -19,6 +20,7 @@ T = TypeVar("T")
 
 _DASHBOARD_S = 1.0
 _GOODBYE_S = 0.1
+_POLL_S = 0.001
 
 
 def bounded(device: str, what: str, timeout_s: float, call: Callable[[], T]) -> T:
@@ -74,4 +76,6 @@ def retire(device: str, interface: Any) -> None:
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(interface))
     goodbye = threading.Thread(target=interface.disconnect, name=f"{device} goodbye")
     goodbye.start()
-    goodbye.join(_GOODBYE_S)
+    deadline_s = time.monotonic() + _GOODBYE_S
+    while interface.isConnected() and time.monotonic() < deadline_s:
+        goodbye.join(_POLL_S)

@@ -375,20 +375,19 @@ def test_activation_proves_the_watchdog_and_sets_the_tool(arm: UrArm, emulator: 
     assert arm.state is Lifecycle.ACTIVE
 
 
-@pytest.mark.parametrize(
-    ("fault", "value", "words"),
-    [
+def test_activation_is_refused(arm: UrArm, emulator: EmulatorProcess) -> None:
+    refusals = (
         ("local_control", True, "local control"),
-        ("speed_slider", 0.0, "slider"),
         ("registers_in_use", True, "in use"),
-    ],
-)
-def test_activation_is_refused(arm: UrArm, emulator: EmulatorProcess, fault: str, value: Any, words: str) -> None:
-    emulator.fault(fault, value)
-    wait_until(lambda: fault != "speed_slider" or arm.health()["speed_fraction"] == value, "slider")
-    with pytest.raises(DeviceError, match=words):
-        arm.activate()
-    assert arm.state is Lifecycle.READY
+        ("speed_slider", 0, "slider"),
+    )
+    for fault, value, words in refusals:
+        emulator.fault(fault, value)
+        wait_until(lambda fault=fault: fault != "speed_slider" or arm.health()["speed_fraction"] == 0, "slider")  # type: ignore[misc]
+        with pytest.raises(DeviceError, match=words):
+            arm.activate()
+        assert arm.state is Lifecycle.READY
+        emulator.clear(fault)
     state = emulator.state()
     assert state["energising"] == 0
     assert state["runtime_state"] == "STOPPED"
@@ -650,6 +649,18 @@ def test_a_protective_stop_ends_the_program_and_waits_for_a_person(
     assert arm.state is Lifecycle.READY
     state = emulator.state()
     assert (state["safety_mode"], state["runtime_state"], state["moving"]) == ("NORMAL", "STOPPED", False)
+
+
+def test_a_protective_stop_cannot_be_released_at_once(address: int) -> None:
+    with EmulatorProcess("ur", "--host", host_of(address)) as emulator:
+        arm = UrArm("ur", UrConfig(host=host_of(address), flange_to_tcp_mm_deg=TOOL_MM_DEG), CLOCK)
+        with arm:
+            arm.configure()
+            emulator.fault("protective_stop")
+            wait_faulted(arm)
+            with pytest.raises(DeviceFault, match="stays"):
+                arm.recover(TOKEN)
+            assert arm.state is Lifecycle.FAULTED
 
 
 def test_an_emergency_stop_is_not_ours_to_clear(arm: UrArm, lease: Lease, emulator: EmulatorProcess) -> None:

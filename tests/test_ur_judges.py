@@ -104,7 +104,7 @@ def test_receive_control_and_dashboard(emulator: EmulatorProcess, host: str) -> 
 def _unlocks(dashboard: object) -> bool:
     try:
         dashboard.unlockProtectiveStop()  # type: ignore[attr-defined]
-    except ValueError:
+    except RuntimeError:
         return False
     return True
 
