@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from types import TracebackType
 from typing import Self, final
 
 from drivers.clock import Clock
-from drivers.errors import DeviceError, LifecycleError
+from drivers.errors import CommandRejected, DeviceError, LifecycleError, TransportError
 
 
 class Lifecycle(Enum):
@@ -122,7 +123,9 @@ class Device(ABC):
             return
         try:
             if self._state is Lifecycle.ACTIVE:
-                self._deactivate(self._disconnect_policy())
+                # A device that cannot be reached cannot be stopped from here either.
+                with suppress(TransportError):
+                    self._deactivate(self._disconnect_policy())
         finally:
             self._state = Lifecycle.DISCONNECTED
             self._fault_error = None
@@ -151,9 +154,11 @@ class Device(ABC):
         return error
 
     def _attempt(self, step: Callable[[], None]) -> None:
-        """Run a step and latch FAULTED if the device fails in it."""
+        """Run a step and latch FAULTED if the device fails in it; a refused command is no failure."""
         try:
             step()
+        except CommandRejected:
+            raise
         except DeviceError as error:
             raise self._to_faulted(error) from None
 
