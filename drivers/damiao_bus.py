@@ -1,11 +1,11 @@
 """Requests to Damiao motors and their answers, over any python-can bus.
 
-A motor answers only when addressed, so one thread that sends a cycle's requests and collects the answers owns the bus: no
-receive thread is needed, nothing can overflow unseen, and an answer is never waited for twice.
+A motor answers only when addressed, so one thread that sends a cycle's requests and collects the answers owns the bus:
+no receive thread is needed, nothing can overflow unseen, and an answer is never waited for twice.
 
 Answers carry no time. Each is stamped with the moment at which its request was sent, so its age is never understated: a
-motor's requests wait in a queue and its answers come in order (CAN keeps the order of one sender). After a loss the queue
-would stay one entry too long; then a register is read as well, whose answer names itself and so marks where the queue is.
+motor's requests wait in a queue and its answers come in order (CAN keeps the order of one sender). After a loss the
+queue would stay one entry too long; then a register is read as well, whose answer names itself and so marks the place.
 """
 
 from __future__ import annotations
@@ -168,8 +168,8 @@ class MotorBus:
     def exchange(self, data: Sequence[bytes | None], until_ns: int) -> list[Answer | None]:
         """Send every motor its frame, or a request for its state where there is none, and collect answers.
 
-        Returns as soon as all have answered this very request, and at ``until_ns`` at the latest, with the newest answer
-        that came from each meanwhile.
+        Returns as soon as all have answered this very request, and at ``until_ns`` at the latest, with the newest
+        answer that came from each meanwhile.
 
         Raises:
             DeviceGone: the bus has gone.

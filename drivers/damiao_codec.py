@@ -291,9 +291,9 @@ def frame_time_s(bitrate: int, data_bitrate: int | None = None) -> float:
         bitrate: bit/s, of the arbitration phase for CAN FD.
         data_bitrate: bit/s of the data phase for CAN FD with bit rate switching; None for classic CAN.
 
-    Source: ISO 11898-1 frame formats. Classic: 111 bits and at most 24 stuff bits. FD: 30 bits and at most 4 stuff bits
-    at ``bitrate``; 96 bits (ESI, DLC, data, stuff count, 17-bit CRC with its fixed stuff bits) and at most 17 stuff bits
-    at ``data_bitrate``.
+    Source: ISO 11898-1 frame formats. Classic: 111 bits and at most 24 stuff bits. FD: 30 bits and at most 4 stuff
+    bits at ``bitrate``; 96 bits (ESI, DLC, data, stuff count, 17-bit CRC with its fixed stuff bits) and at most 17
+    stuff bits at ``data_bitrate``.
     """
     if data_bitrate is None:
         return 135 / bitrate

@@ -1,7 +1,7 @@
 """Joint setpoints from expiring twists or joint goals, for arms whose motors take positions.
 
-The setpoint moves from its own last value, never from a measurement: a loaded or noisy arm does not creep. Whatever ends
-a motion (a stop, an expired twist, another goal), the setpoint first slows down within the acceleration limits.
+The setpoint moves from its own last value, never from a measurement: a loaded or noisy arm does not creep. Whatever
+ends a motion (a stop, an expired twist, another goal), the setpoint first slows down within the acceleration limits.
 """
 
 from __future__ import annotations
@@ -111,7 +111,8 @@ class JointSetpoint:
         distance = float(np.linalg.norm(way))
         if distance < 1e-9:
             self._end_line()
-            self._task = None
+            if self._task is goal:
+                self._task = None
             return
         direction = way / distance
         if self._line_speed > 0.0 and float(direction @ self._line) < 0.999:

@@ -1,8 +1,8 @@
 """A CAN bus without a kernel module: a UNIX SEQPACKET hub, and the python-can interface ``touchcell_hub`` to it.
 
-Every packet is one frame in SocketCAN's layout (``struct can_frame``, 16 bytes, or ``struct canfd_frame``, 72 bytes), so
-order and frame boundaries are the kernel's. The hub closing its end is an unplugged adapter. Any python-can program can
-use it: ``can.Bus(interface="touchcell_hub", channel="/path/of/the/hub")``.
+Every packet is one frame in SocketCAN's layout (``struct can_frame``, 16 bytes, or ``struct canfd_frame``, 72 bytes),
+so order and frame boundaries are the kernel's. The hub closing its end is an unplugged adapter. Any python-can program
+can use it: ``can.Bus(interface="touchcell_hub", channel="/path/of/the/hub")``.
 """
 
 from __future__ import annotations

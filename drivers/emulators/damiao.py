@@ -1,8 +1,8 @@
 """An arm of Damiao motors on an emulated CAN bus: registers, MIT impedance control, in-motor timeout, faults.
 
 Each motor is a second-order system (inertia, viscous friction, the weight of the arm that the chain description gives)
-integrated in steps of 0.5 ms. Inertias are constant and uncoupled: this proves protocol and fault handling, not dynamics.
-Until a motor is first enabled the arm lies on its stand; afterwards a disabled joint sinks against friction alone.
+integrated in steps of 0.5 ms. Inertias are constant and uncoupled: this proves protocol and fault handling, not
+dynamics. Until a motor is first enabled the arm lies on its stand; afterwards a disabled joint sinks against friction alone.
 """
 
 from __future__ import annotations
