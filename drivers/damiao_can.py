@@ -1,8 +1,8 @@
 """Arms of Damiao motors in MIT mode on CAN (OpenArm, YAM, reBot and home-made ones), over python-can.
 
 The makers give no Cartesian control, so this driver owns it: a loop of its own turns expiring twists into joint
-setpoints (``drivers.joint_setpoint``), adds the torques that carry the arm's weight, and sends every motor a position, a
-velocity and a torque. The same loop collects the answers; motors speak only when asked, so it needs no second thread.
+setpoints (``drivers.joint_setpoint``), adds the torques that carry the arm's weight, and sends every motor a position,
+a velocity and a torque. The same loop collects the answers; motors speak only when asked, so one thread is enough.
 
 What stops the arm: an expired twist, by slowing down in the loop; a dead host process, by each motor holding its last
 position and then, after its own timeout, letting go. **An arm without brakes sinks then**, and whenever it is disabled.

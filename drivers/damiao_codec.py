@@ -179,14 +179,18 @@ def encode_mit(command: MitCommand, ranges: Ranges) -> bytes:
     """Eight bytes: q 16 bit, dq, kp, kd, tau 12 bit each, big-endian, each linear over its range, to the nearest step.
 
     Raises:
-        CodecError: a value is not finite or lies outside its range; nothing is ever saturated silently.
+        CodecError: a value is not finite or lies outside its range (nothing is ever saturated silently), or all are so
+            near their upper ends that a motor would take the bytes for a special command.
     """
     q = _steps("q", command.q, -ranges.position_rad, ranges.position_rad, 16)
     dq = _steps("dq", command.dq, -ranges.velocity_rad_s, ranges.velocity_rad_s, 12)
     kp = _steps("kp", command.kp, 0.0, KP_MAX, 12)
     kd = _steps("kd", command.kd, 0.0, KD_MAX, 12)
     tau = _steps("tau", command.tau, -ranges.torque_n_m, ranges.torque_n_m, 12)
-    return (q << 48 | dq << 36 | kp << 24 | kd << 12 | tau).to_bytes(8, "big")
+    data = (q << 48 | dq << 36 | kp << 24 | kd << 12 | tau).to_bytes(8, "big")
+    if data[:7] == ENABLE[:7] and data[7] >= CLEAR_ERROR[7]:
+        raise CodecError("command", command, "would read as enable, disable, set zero or clear error")
+    return data
 
 
 def decode_mit(data: bytes, ranges: Ranges) -> MitCommand:

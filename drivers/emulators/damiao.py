@@ -2,7 +2,7 @@
 
 Each motor is a second-order system (inertia, viscous friction, the weight of the arm that the chain description gives)
 integrated in steps of 0.5 ms. Inertias are constant and uncoupled: this proves protocol and fault handling, not
-dynamics. Until a motor is first enabled the arm lies on its stand; afterwards a disabled joint sinks against friction alone.
+dynamics. Until a motor is first enabled the arm lies on its stand; afterwards a disabled joint sinks against friction.
 """
 
 from __future__ import annotations
@@ -105,6 +105,7 @@ class DamiaoArm(Emulator):
         "error_frames": "report this many bus errors",
         "fault_bits": "[motor index, status nibble]: the motor reports it and lets go",
         "hot": "[motor index, degrees Celsius] of the winding; at 100 the motor lets go",
+        "push": "[motor index, N m]: somebody pushes that joint",
         "nan": "the full-scale registers read as NaN",
         "restart": "the motors lose power for a moment",
     }
@@ -239,12 +240,16 @@ class DamiaoArm(Emulator):
         q_set, dq_set, kp, kd, feed = np.array([[c.q, c.dq, c.kp, c.kd, c.tau] for c in commands]).T
         strongest = np.array([motor.ranges.torque_n_m for motor in self.motors])
         lowest, highest = self._chain.lower - 0.05, self._chain.upper + 0.05
+        pushed = np.zeros(len(self.motors))
+        if "push" in self.active:
+            index, pushed_n_m = self.active["push"]
+            pushed[index] = pushed_n_m
         while self._steps < due:
             if self._steps % _GRAVITY_EVERY == 0:
                 self._weight = self._chain.gravity_torques(self._q)
             wanted = kp * (q_set - self._q) + kd * (dq_set - self._dq) + feed
             self._tau = np.where(enabled, np.clip(wanted, -strongest, strongest), 0.0)
-            acceleration = (self._tau - self._weight - self._friction * self._dq) / self._inertia
+            acceleration = (self._tau + pushed - self._weight - self._friction * self._dq) / self._inertia
             self._dq = self._dq + _STEP_S * acceleration
             self._q = self._q + _STEP_S * self._dq
             stopped = (self._q < lowest) | (self._q > highest)
