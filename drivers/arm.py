@@ -1,8 +1,8 @@
 """What every arm has in common: one lease, one gate, and rest whenever either is given up.
 
 A driver fills in ``tcp``, ``at_rest``, ``_stream_twist`` and ``_begin_stop`` besides the hooks of ``Device``
-(``_after_rest`` in place of ``_deactivate``). It never sees a command that is not finite, in base axes, owned, fresh and
-within the limits.
+(``_after_rest`` in place of ``_deactivate``). It never sees a command that is not finite, along base axes, owned, fresh
+and within the limits.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from contextlib import suppress
 from typing import final
 
 import numpy as np
+from pydantic import Field
 
 from drivers.abilities import StopCategory
 from drivers.clock import Clock
@@ -21,12 +22,26 @@ from drivers.device import DeactivatePolicy, Device, Lifecycle
 from drivers.errors import CommandRejected, DeviceError, DeviceFault, FaultClass, LifecycleError, Rejection
 from drivers.gate import TwistGate, TwistLimits
 from drivers.lease import Lease, LeaseDesk
+from drivers.registry import DriverConfig
 from drivers.samples import Stamped, TcpState
 from geometry.types import Array
 
 _REST_POLL_NS = 5_000_000
 _REST_MARGIN_S = 1.0
 _SHORTEST_TTL_S = 1e-3
+
+
+class LimitsConfig(DriverConfig):
+    """The ``limits:`` of an arm in the cell file: speeds and accelerations of the tool centre point."""
+
+    tcp_speed_m_s: float = Field(default=0.10, gt=0.0)
+    tcp_accel_m_s2: float = Field(default=0.5, gt=0.0)
+    tcp_rot_speed_rad_s: float = Field(default=0.5, gt=0.0)
+    tcp_rot_accel_rad_s2: float = Field(default=2.5, gt=0.0)
+
+    def build(self) -> TwistLimits:
+        """The gate's limits."""
+        return TwistLimits(self.tcp_speed_m_s, self.tcp_accel_m_s2, self.tcp_rot_speed_rad_s, self.tcp_rot_accel_rad_s2)
 
 
 class Arm(Device):
@@ -115,11 +130,12 @@ class Arm(Device):
         if self.state not in (Lifecycle.ACTIVE, Lifecycle.FAULTED):
             return
         self._gate.reset()
-        self._begin_stop(category)
-        if category is not StopCategory.STOP_AND_HOLD:
+        removes_power = category is not StopCategory.STOP_AND_HOLD
+        if removes_power:
             self._desk.revoke()
-            if self.state is Lifecycle.ACTIVE:
-                self._state = Lifecycle.READY
+        self._begin_stop(category)
+        if removes_power and self.state is Lifecycle.ACTIVE:
+            self._state = Lifecycle.READY
 
     @abstractmethod
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:

@@ -1,4 +1,4 @@
-"""A driver beside the emulated device that it drives: what the conformance suite and ``touchcell bench devices`` run."""
+"""A driver beside its emulated device: what the conformance suite and ``touchcell bench devices`` run."""
 
 from __future__ import annotations
 
