@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers import damiao_codec as codec
 from drivers.abilities import StopCategory
-from drivers.arm import Arm
+from drivers.arm import Arm, LimitsConfig
 from drivers.clock import Clock
 from drivers.damiao_bus import Address, Answer, MotorBus
 from drivers.damiao_codec import MitCommand, Register
@@ -40,7 +40,6 @@ from drivers.errors import (
     StaleData,
     TransportTimeout,
 )
-from drivers.gate import TwistLimits
 from drivers.joint_setpoint import JointSetpoint
 from drivers.kinematics import GRAVITY_M_S2, ChainDescription, DifferentialIk, SerialChain, Tool, Vector3
 from drivers.lease import Lease
@@ -95,10 +94,7 @@ class DamiaoCanConfig(DriverConfig):
     max_missed_fraction: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.25
     tracking_error_deg: Positive = 8.0
 
-    tcp_speed_m_s: Positive = 0.10
-    tcp_accel_m_s2: Positive = 0.5
-    tcp_rot_speed_deg_s: Positive = 30.0
-    tcp_rot_accel_deg_s2: Positive = 150.0
+    limits: LimitsConfig = LimitsConfig()
 
     park_deg: tuple[float, ...] | None = None
     park_tolerance_deg: Positive = 5.0
@@ -128,15 +124,6 @@ class DamiaoCanConfig(DriverConfig):
         """Largest part of the bus that commands and answers take."""
         return codec.bus_load(len(self.motors), self.rate_hz, self.bitrate, self.data_bitrate if self.fd else None)
 
-    def limits(self) -> TwistLimits:
-        """What the gate allows."""
-        return TwistLimits(
-            self.tcp_speed_m_s,
-            self.tcp_accel_m_s2,
-            float(np.deg2rad(self.tcp_rot_speed_deg_s)),
-            float(np.deg2rad(self.tcp_rot_accel_deg_s2)),
-        )
-
     def describe(self) -> ChainDescription:
         """The arm. Raises ConfigError if there is none or it has another number of joints."""
         is_file = Path(self.chain).suffix in (".yaml", ".yml")
@@ -158,10 +145,10 @@ class DamiaoCanArm(Arm):
     """
 
     def __init__(self, name: str, config: DamiaoCanConfig, clock: Clock) -> None:
-        super().__init__(name, clock, config.limits())
+        super().__init__(name, clock, config.limits.build())
         self._config = config
         self._chain = SerialChain(config.describe(), config.tool, config.gravity_m_s2)
-        self._setpoint = JointSetpoint(self._chain, DifferentialIk(self._chain), config.limits())
+        self._setpoint = JointSetpoint(self._chain, DifferentialIk(self._chain), self.limits)
         motors = config.motors
         self._direction = np.array([motor.direction for motor in motors], dtype=np.float64)
         self._offset = np.deg2rad([motor.offset_deg for motor in motors])

@@ -265,7 +265,7 @@ def test_pushing_the_arm_off_its_setpoint_is_a_fault_and_it_gives_way(
     assert arm.fault.fault_class is FaultClass.MOTION
     assert "joint base" in arm.fault.name
     # It holds where it was pushed to instead of pushing back.
-    assert abs(emulator.state()["target_rad"][0]) > np.deg2rad(7.0)
+    wait(lambda: abs(emulator.state()["target_rad"][0]) > np.deg2rad(7.0))
     assert emulator.state()["enabled"] == 6
 
 
@@ -460,8 +460,8 @@ def test_can_fd_works_as_well(channel: Path, emulator: EmulatorProcess) -> None:
         ({"rate_hz": 1000.0, "watchdog_s": 0.1}, "load the bus to 162%"),
         ({"watchdog_s": 0.0}, "watchdog_s"),
         ({"rate_hz": 100.0, "watchdog_s": 0.03}, "four cycles"),
-        ({"tcp_speed_m_s": -0.1}, "tcp_speed_m_s"),
-        ({"tcp_speed_m_s": float("nan")}, "tcp_speed_m_s"),
+        ({"limits": {"tcp_speed_m_s": -0.1}}, "tcp_speed_m_s"),
+        ({"limits": {"tcp_speed_m_s": float("nan")}}, "tcp_speed_m_s"),
         ({"park_deg": [0.0]}, "park_deg"),
         ({"park_deg": None, "on_disconnect": "park_then_off"}, "needs park_deg"),
         ({"motors": [{"esc_id": 1, "mst_id": 17}] * 2}, "share one esc_id"),

@@ -28,6 +28,7 @@ def config(channel: Path, **changes: object) -> damiao_can.DamiaoCanConfig:
         "rate_hz": 200.0,
         "watchdog_s": 0.2,
         "max_silence_s": 0.2,
+        "max_missed_fraction": 0.6,
     }
     return damiao_can.DamiaoCanConfig.model_validate(settings | changes)
 
