@@ -11,6 +11,7 @@ from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Literal, final
 
+import numpy as np
 from pydantic import Field
 
 from drivers.clock import Clock
@@ -80,14 +81,14 @@ class RawFrame:
     """A frame as it came, not decoded.
 
     Attributes:
-        data: its bytes.
+        data: its bytes, in the configured pixel format.
         t_ns: stamp.
         seq: number, going on over restarts of the stream.
         t_device_ns: the device's own stamp where it is not the one in ``t_ns``.
         quality: SUSPECT without a trustworthy stamp.
     """
 
-    data: bytes | ImageArray
+    data: bytes
     t_ns: int
     seq: int
     t_device_ns: int | None = None
@@ -226,6 +227,25 @@ class Camera(Device):
             self._decoded = Stamped(frame, raw.t_ns, raw.seq, raw.t_device_ns, raw.quality)
         return self._decoded
 
+    def _decode(self, raw: RawFrame) -> ImageArray:
+        config = self._config
+        grey = config.color == "grey"
+        pixels = np.frombuffer(raw.data, np.uint8)
+        if config.pixel_format != "MJPG":
+            pixels = pixels.reshape(config.height_px, config.width_px, -1)
+            if grey:
+                return np.ascontiguousarray(pixels[:, :, 0])
+        import cv2
+
+        if config.pixel_format == "GREY":
+            return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR), np.uint8)
+        if config.pixel_format == "YUYV":
+            return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_YUV2BGR_YUYV), np.uint8)
+        image = cv2.imdecode(pixels, cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
+        if image is None or image.shape[:2] != (config.height_px, config.width_px):
+            raise CorruptMessage(self.name, f"frame {raw.seq} cannot be decoded")
+        return np.asarray(image, np.uint8)
+
     @final
     def _recover(self, token: OperatorToken) -> None:
         self._close()
@@ -243,10 +263,6 @@ class Camera(Device):
     @abstractmethod
     def _wait(self, timeout_s: float) -> None:
         """Return when a frame waits or after ``timeout_s``. Raises DeviceGone."""
-
-    @abstractmethod
-    def _decode(self, raw: RawFrame) -> ImageArray:
-        """Image of a frame, grey or BGR as configured. Raises CorruptMessage."""
 
     @abstractmethod
     def _exposure_and_gain(self) -> tuple[float | None, float | None]:

@@ -9,17 +9,14 @@ import math
 import time
 from typing import Any
 
-import numpy as np
-
 from drivers import v4l2_codec as codec
 from drivers.camera import Camera, CameraConfig, RawFrame, SettingRefused
 from drivers.clock import Clock
 from drivers.device import Device
-from drivers.errors import ConnectError, CorruptMessage, DeviceGone, TransportError
+from drivers.errors import ConnectError, DeviceGone, TransportError
 from drivers.registry import Capabilities, DriverContext, DriverSpec
 from drivers.samples import Quality
 from drivers.v4l2_node import KernelCalls, SystemCalls, VideoNode
-from geometry.types import ImageArray
 
 _LONGEST_PAUSE_S = 0.5
 _FEWEST_BUFFERS = 4
@@ -193,27 +190,6 @@ class V4l2Camera(Camera):
 
     def _wait(self, timeout_s: float) -> None:
         self._opened().wait(timeout_s)
-
-    def _decode(self, raw: RawFrame) -> ImageArray:
-        config = self._config
-        if config.pixel_format == "MJPG":
-            return self._decode_jpeg(raw)
-        pixels = np.frombuffer(raw.data, np.uint8).reshape(config.height_px, config.width_px, -1)
-        grey = config.color == "grey"
-        if grey:
-            return np.ascontiguousarray(pixels[:, :, 0])
-        import cv2
-
-        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_YUV2BGR_YUYV if pixels.shape[2] == 2 else cv2.COLOR_GRAY2BGR))
-
-    def _decode_jpeg(self, raw: RawFrame) -> ImageArray:
-        import cv2
-
-        mode = cv2.IMREAD_GRAYSCALE if self._config.color == "grey" else cv2.IMREAD_COLOR
-        image = cv2.imdecode(np.frombuffer(raw.data, np.uint8), mode)
-        if image is None or image.shape[:2] != (self._config.height_px, self._config.width_px):
-            raise CorruptMessage(self.name, f"frame {raw.seq} cannot be decoded")
-        return np.asarray(image, np.uint8)
 
     def _exposure_and_gain(self) -> tuple[float | None, float | None]:
         return (

@@ -36,6 +36,7 @@ _PRIORITY_INTERACTIVE, _PRIORITY_RECORD = 2, 3
 _WHICH_CURRENT, _WHICH_DEFAULT = 0, 0x0F000000
 _CLASS_MASK = 0x0FFF0000
 _FOCUS_ABSOLUTE = 0x009A090A
+_BUFFERS_MMAP, _BUFFERS_ORPHANED = 1, 1 << 4
 _GUARDED = frozenset(
     {
         codec.S_INPUT,
@@ -234,7 +235,7 @@ class CameraModel:
         reply = _fresh(codec.StreamParameters, body, "type")
         if reply.type != codec.VIDEO_CAPTURE:
             raise Refused(errno.EINVAL)
-        reply.capability, reply.readbuffers = codec.CAP_TIMEPERFRAME, 1
+        reply.capability = codec.CAP_TIMEPERFRAME
         reply.timeperframe = codec.Fraction(1, self.rate_hz)
 
     def _set_parameters(self, handle: Handle, body: bytearray) -> None:
@@ -280,7 +281,7 @@ class CameraModel:
             raise Refused(errno.EBUSY)
         reply = _fresh(codec.RequestBuffers, body, "type", "memory")
         reply.count = self.buffers = min(asked.count, codec.MAX_BUFFERS)
-        reply.capabilities = 1
+        reply.capabilities = _BUFFERS_MMAP | _BUFFERS_ORPHANED
         self.owner = handle if self.buffers else None
         self.queued.clear()
 
@@ -410,36 +411,29 @@ class CameraModel:
         return control.value
 
     def _get_extended(self, handle: Handle, body: bytearray) -> None:
-        header, items = self._extended(body, setting=False)
+        header, items = self._extended(body)
         for item in items:
             control = self.controls[item.id]
             item.value64 = control.default if header.which == _WHICH_DEFAULT else control.value
 
     def _try_extended(self, handle: Handle, body: bytearray) -> None:
-        header, items = self._extended(body, setting=True)
-        self._check_all(header, items, lambda position: position)
+        _, items = self._extended(body, setting=True)
         for item in items:
             item.value64 = self.controls[item.id].nearest(_low_word(item))
 
     def _set_extended(self, handle: Handle, body: bytearray) -> None:
-        header, items = self._extended(body, setting=True)
-        # Nothing has been set yet, which error_idx == count says.
-        self._check_all(header, items, lambda position: header.count)
+        try:
+            _, items = self._extended(body, setting=True)
+        except Refused:
+            # Nothing has been set yet, which an index past the end says.
+            header = codec.ExtendedControls.from_buffer(body)
+            header.error_idx = header.count
+            raise
         for item in items:
             item.value64 = self._store(handle, item.id, _low_word(item))
 
-    def _check_all(
-        self, header: codec.ExtendedControls, items: list[codec.ExtendedControl], index: Callable[[int], int]
-    ) -> None:
-        for position, item in enumerate(items):
-            try:
-                self._check(item.id, _low_word(item))
-            except Refused:
-                header.error_idx = index(position)
-                raise
-
     def _extended(
-        self, body: bytearray, *, setting: bool
+        self, body: bytearray, *, setting: bool = False
     ) -> tuple[codec.ExtendedControls, list[codec.ExtendedControl]]:
         header = codec.ExtendedControls.from_buffer(body)
         header.error_idx, header.reserved = header.count, 0
@@ -449,10 +443,14 @@ class CameraModel:
         plain = header.which in (_WHICH_CURRENT, _WHICH_DEFAULT)
         if (not plain and header.which not in classes) or (setting and header.which == _WHICH_DEFAULT):
             raise Refused(errno.EINVAL)
-        for item in items:
+        for position, item in enumerate(items):
             if not plain and item.id & _CLASS_MASK != header.which:
                 raise Refused(errno.EINVAL)
+            if setting:
+                header.error_idx = position
+                self._check(item.id, _low_word(item))
             self._readable(item.id)
+        header.error_idx = header.count
         return header, items
 
     def _subscribe(self, handle: Handle, body: bytearray) -> None:

@@ -63,7 +63,13 @@ static int fail(int error)
     return -1;
 }
 
-#define REAL(name) ((__typeof__(&name))dlsym(RTLD_NEXT, #name))
+#define REAL(name)                                                                                                     \
+    (__extension__({                                                                                                   \
+        static __typeof__(&name) real;                                                                                 \
+        if (!real)                                                                                                     \
+            real = (__typeof__(&name))dlsym(RTLD_NEXT, #name);                                                         \
+        real;                                                                                                          \
+    }))
 
 /* A socket's path is limited to 107 characters; through /proc/self/fd the folder's length does not count. */
 static int connect_to(const char *folder, const char *name)
@@ -388,6 +394,14 @@ int ioctl(int fd, unsigned long request, ...)
 }
 
 int close(int fd) { return device_of(fd) ? touchcell_v4l2_close(fd) : REAL(close)(fd); }
+
+/* The camera only streams into mapped memory, as its capabilities say. */
+ssize_t read(int fd, void *data, size_t size) { return device_of(fd) ? fail(EINVAL) : REAL(read)(fd, data, size); }
+
+ssize_t write(int fd, const void *data, size_t size)
+{
+    return device_of(fd) ? fail(EINVAL) : REAL(write)(fd, data, size);
+}
 
 void *mmap(void *where, size_t length, int protection, int flags, int fd, off_t offset)
 {
