@@ -42,14 +42,14 @@ class CameraConfig(DriverConfig):
     """
 
     device: str = Field(min_length=1)
-    width_px: int = Field(640, gt=0, le=8192)
-    height_px: int = Field(480, gt=0, le=8192)
+    width_px: int = Field(default=640, gt=0, le=8192)
+    height_px: int = Field(default=480, gt=0, le=8192)
     pixel_format: Literal["MJPG", "YUYV", "GREY"] = "MJPG"
-    rate_hz: float = Field(30.0, gt=0.0, le=1000.0)
+    rate_hz: float = Field(default=30.0, gt=0.0, le=1000.0)
     color: Literal["grey", "bgr"] = "grey"
-    exposure_us: int | None = Field(None, gt=0, multiple_of=100)
-    gain: int | None = Field(None, ge=0)
-    stall_s: float = Field(0.5, gt=0.0, le=10.0)
+    exposure_us: int | None = Field(default=None, gt=0, multiple_of=100)
+    gain: int | None = Field(default=None, ge=0)
+    stall_s: float = Field(default=0.5, gt=0.0, le=10.0)
 
 
 class SettingRefused(ConfigError):

@@ -119,6 +119,19 @@ class VideoNode:
         """Where it is plugged in, as the driver tells it."""
         return bytes(self._capability.bus_info).decode("utf-8", "replace")
 
+    def pixel_formats(self) -> list[str]:
+        """Four-character names of what it can deliver. Raises TransportError, DeviceGone."""
+        names: list[str] = []
+        while True:
+            description = codec.FormatDescription(index=len(names), type=codec.VIDEO_CAPTURE)
+            try:
+                self._calls.ioctl(self._fd, codec.ENUM_FMT, description)
+            except OSError as error:
+                if error.errno == errno.EINVAL:
+                    return names
+                raise self._error(error, "list the picture formats") from None
+            names.append(codec.fourcc_text(description.pixelformat))
+
     def set_picture(self, pixel_format: str, width_px: int, height_px: int) -> Picture:
         """Ask for a format and return what the device chose. Raises TransportError, DeviceGone."""
         request = codec.Format(type=codec.VIDEO_CAPTURE)
