@@ -24,6 +24,7 @@ from geometry.types import ImageArray
 
 _FIRST_FRAME_S = 5.0
 _UNREAD_PERIODS = 4.0
+_SHORTEST_WAIT_S = 1e-3
 
 
 class CameraConfig(DriverConfig):
@@ -130,7 +131,7 @@ class Camera(Device):
             LifecycleError: not READY or ACTIVE.
         """
         self._require("read frames", Lifecycle.READY, Lifecycle.ACTIVE)
-        self._attempt(self._empty_queue)
+        self._attempt(self._refresh)
         age_s = self._age_s()
         limit_s = self._config.stall_s if max_age_s is None else max_age_s
         if self._newest is None or age_s > limit_s:
@@ -159,7 +160,7 @@ class Camera(Device):
         """Counters of good, lost, unread, frozen and bad frames, brightness and its drift, settings as read back."""
         if self._state in (Lifecycle.READY, Lifecycle.ACTIVE):
             try:
-                self._empty_queue()
+                self._refresh()
             except DeviceError as error:
                 self._to_faulted(error)
         return {
@@ -187,22 +188,30 @@ class Camera(Device):
         t_ns = self._newest.t_ns if self._newest else self._since_ns
         return (self._clock.now_ns() - t_ns) * 1e-9
 
-    def _empty_queue(self) -> None:
-        if self._collect():
-            self._await_after(self._last_seq, _UNREAD_PERIODS / self._config.rate_hz, self._config.stall_s)
+    def _refresh(self) -> None:
+        self._empty_queue()
         self._judge(self._config.stall_s)
+
+    def _silence_s(self) -> float:
+        # Since the stream began, as the newest frame may be from before a recovery.
+        return min(self._age_s(), (self._clock.now_ns() - self._since_ns) * 1e-9)
+
+    def _empty_queue(self) -> None:
+        give_up_ns = self._clock.now_ns() + round(_UNREAD_PERIODS / self._config.rate_hz * 1e9)
+        while self._collect() and (left_ns := give_up_ns - self._clock.now_ns()) > 0:
+            self._wait(left_ns * 1e-9)
 
     def _await_after(self, after_seq: int, timeout_s: float, stall_s: float) -> None:
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        overflowed = self._collect()
-        while overflowed or self._newest is None or self._newest.seq <= after_seq:
+        self._empty_queue()
+        self._judge(stall_s)
+        while self._newest is None or self._newest.seq <= after_seq:
             left_s = (deadline_ns - self._clock.now_ns()) * 1e-9
             if left_s <= 0.0:
                 return
-            if not overflowed:
-                self._judge(stall_s)
-            self._wait(left_s)
-            overflowed = self._collect()
+            self._wait(min(left_s, max(stall_s - self._silence_s(), _SHORTEST_WAIT_S)))
+            self._collect()
+            self._judge(stall_s)
 
     def _judge(self, stall_s: float) -> None:
         if self._watch.out_of_budget:
@@ -210,8 +219,7 @@ class Camera(Device):
             raise CorruptMessage(
                 self.name, f"too many bad frames, most of them {worst}", hint="check the cable and the USB bandwidth"
             )
-        last_ns = max(self._since_ns, self._newest.t_ns if self._newest else 0)
-        if self._clock.now_ns() - last_ns > stall_s * 1e9:
+        if self._silence_s() > stall_s:
             raise TransportTimeout(self.name, "good frame", stall_s, hint="the camera hangs; plug it in again")
 
     def _read(self, raw: RawFrame) -> Stamped[Frame]:

@@ -30,6 +30,7 @@ from drivers.emulators.v4l2_shim import environment
 
 _MAX_MESSAGE = 8192
 _LATE_PERIODS = 10
+_OLDER_FRAMES = 100
 _FOREIGN_CLOCK_NS = 1_000_000_000_000
 _EXPOSURE_FOR_FULL_LIGHT = 157
 _GAIN_FOR_DOUBLE_LIGHT = 50
@@ -77,7 +78,7 @@ class V4l2Emulator(Emulator):
         "exposure_drift": "change of brightness per second, as a fraction",
         "stuck_controls": "controls accept every value and change nothing",
         "no_monotonic": "stamps on an unknown clock",
-        "out_of_order": "count of frames with an older number and stamp than the one before",
+        "out_of_order": "count of frames with the number and stamp of 100 frames ago",
         "unplug": "the camera is gone until this is cleared",
         "restart": "seconds for which the camera is gone before it comes back by itself",
     }
@@ -250,8 +251,8 @@ class V4l2Emulator(Emulator):
         if self.spend("error_flag"):
             flags |= codec.BUF_ERROR
         if self.spend("out_of_order"):
-            sequence -= 2
-            stamp_ns -= 2 * round(1e9 / self.model.rate_hz)
+            sequence -= _OLDER_FRAMES
+            stamp_ns -= _OLDER_FRAMES * round(1e9 / self.model.rate_hz)
         if "no_monotonic" in self.active:
             stamp_ns += _FOREIGN_CLOCK_NS
         owner = self.model.owner
