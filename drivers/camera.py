@@ -242,7 +242,7 @@ class Camera(Device):
         if config.pixel_format != "MJPG":
             pixels = pixels.reshape(config.height_px, config.width_px, -1)
             if grey:
-                return np.ascontiguousarray(pixels[:, :, 0])
+                return pixels[:, :, 0].copy()
         import cv2
 
         if config.pixel_format == "GREY":

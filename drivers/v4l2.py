@@ -84,6 +84,7 @@ class V4l2Camera(Camera):
                 )
             self._previous = None
             self._overrun = False
+            self._queue_empty_ns = self._clock.now_ns()
             self._begin_stream()
         except BaseException:
             node.stop()
