@@ -52,7 +52,7 @@ class FrameWatch:
     def admit(self, data: bytes) -> None:
         """Count a good frame; ``data`` are its bytes as they came."""
         self.good += 1
-        # An odd stride meets the brightness bytes of YUYV, and the whole picture, as its rim may be black without noise.
+        # All over the picture, as its rim may be black without noise; an odd stride meets both bytes of YUYV.
         fingerprint = zlib.crc32(data[:: len(data) // _FINGERPRINT_BYTES | 1])
         if fingerprint == self._fingerprint:
             self.frozen += 1

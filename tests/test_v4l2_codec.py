@@ -19,8 +19,8 @@ HEADER = Path("/usr/include/linux/videodev2.h")
 
 # "ioctl numbers" of the kernel documentation: direction (2 bits: 1 write, 2 read), size (14 bits), type 'V' = 0x56 (8),
 # number (8). QUERYCAP reads 104 bytes as number 0: 2 << 30 | 104 << 16 | 0x56 << 8 | 0. The sizes follow from the
-# structures in the documentation of each request on a 64-bit machine, e.g. v4l2_buffer: 5 u32, 4 bytes hole, timeval 16,
-# timecode 16, sequence, memory, union 8, length, reserved2, request_fd, 4 bytes tail = 88 = 0x58.
+# structures in the documentation of each request on a 64-bit machine, e.g. v4l2_buffer: 5 u32, 4 bytes hole, timeval
+# 16, timecode 16, sequence, memory, union 8, length, reserved2, request_fd, 4 bytes tail = 88 = 0x58.
 GOLDEN_REQUESTS = {
     "QUERYCAP": 0x80685600,
     "ENUM_FMT": 0xC0405602,
