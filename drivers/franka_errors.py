@@ -66,6 +66,15 @@ ERRORS: tuple[VendorError, ...] = (
     VendorError("cartesian_motion_generator_acceleration_discontinuity", _MOTION, _RECOVER, _SMOOTHER),
     VendorError("cartesian_motion_generator_elbow_sign_inconsistent", _MOTION, _RECOVER, _AWAY),
     VendorError("cartesian_motion_generator_start_elbow_invalid", _MOTION, _RECOVER, _START),
+    VendorError("force_controller_desired_force_tolerance_violation", _CONTACT, _RECOVER, _PUSHED),
+    VendorError("start_elbow_sign_inconsistent", _MOTION, _RECOVER, _DESK),
+    VendorError(
+        "communication_constraints_violation",
+        FaultClass.COMMUNICATION,
+        _RECOVER,
+        "20 command packets were lost or late: use a PREEMPT_RT kernel, a direct cable, no power saving",
+    ),
+    VendorError("power_limit_violation", FaultClass.OVERLOAD, _RECOVER, _SLOWER),
     VendorError("cartesian_motion_generator_joint_position_limits_violation", _MOTION, _RECOVER, _AWAY),
     VendorError(
         "cartesian_motion_generator_joint_velocity_limits_violation", _MOTION, _RECOVER, "near a singularity: " + _AWAY
@@ -82,16 +91,7 @@ ERRORS: tuple[VendorError, ...] = (
         _RECOVER,
         "the commanded pose was no rigid transform",
     ),
-    VendorError("force_controller_desired_force_tolerance_violation", _CONTACT, _RECOVER, _PUSHED),
     VendorError("controller_torque_discontinuity", _MOTION, _RECOVER, _SMOOTHER),
-    VendorError("start_elbow_sign_inconsistent", _MOTION, _RECOVER, _DESK),
-    VendorError(
-        "communication_constraints_violation",
-        FaultClass.COMMUNICATION,
-        _RECOVER,
-        "20 command packets were lost or late: use a PREEMPT_RT kernel, a direct cable, no power saving",
-    ),
-    VendorError("power_limit_violation", FaultClass.OVERLOAD, _RECOVER, _SLOWER),
     VendorError("joint_p2p_insufficient_torque_for_planning", FaultClass.OVERLOAD, _RECOVER, _DESK),
     VendorError(
         "tau_j_range_violation",

@@ -206,10 +206,10 @@ class FrankaEmulator(Emulator):
             self._client.close()
             self._client, self._client_udp = None, None
 
-    def _tick(self, count: int) -> None:
+    def _tick(self, late: bool) -> None:
         if "pause" in self.active:
             return
-        self._counts["late"] += count > 1
+        self._counts["late"] += late
         self._state.message_id += 1
         if "unplug" not in self.active:
             self._read_requests()

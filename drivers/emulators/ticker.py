@@ -8,10 +8,8 @@ from __future__ import annotations
 import asyncio
 import ctypes
 import os
+import time
 from collections.abc import Callable
-
-_CLOCK_MONOTONIC = 1
-_NONBLOCK_CLOEXEC = os.O_NONBLOCK | os.O_CLOEXEC
 
 
 class _Timespec(ctypes.Structure):
@@ -23,23 +21,23 @@ class _Itimerspec(ctypes.Structure):
 
 
 class Ticker:
-    """Calls ``on_tick(n)`` from the running loop each period; n > 1 when the process overslept n - 1 periods.
+    """Calls ``on_tick(late)`` from the running loop each period.
+
+    A late tick shifts the ones after it, so that two are never closer than three quarters of a period.
 
     Args:
         period_ns: below one second.
-        on_tick: called in the loop's thread.
+        on_tick: called in the loop's thread with whether this tick was late.
     """
 
-    def __init__(self, period_ns: int, on_tick: Callable[[int], None]) -> None:
-        libc = ctypes.CDLL(None, use_errno=True)
+    def __init__(self, period_ns: int, on_tick: Callable[[bool], None]) -> None:
+        self._period_ns = period_ns
         self._on_tick = on_tick
-        self._fd: int = libc.timerfd_create(_CLOCK_MONOTONIC, _NONBLOCK_CLOEXEC)
+        self._libc = ctypes.CDLL(None, use_errno=True)
+        self._fd: int = self._libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if self._fd < 0:
             raise OSError(ctypes.get_errno(), "timerfd_create")
-        period = _Timespec(0, period_ns)
-        if libc.timerfd_settime(self._fd, 0, ctypes.byref(_Itimerspec(period, period)), None):
-            os.close(self._fd)
-            raise OSError(ctypes.get_errno(), "timerfd_settime")
+        self._arm()
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._fd, self._expired)
 
@@ -48,9 +46,20 @@ class Ticker:
         self._loop.remove_reader(self._fd)
         os.close(self._fd)
 
+    def _arm(self) -> None:
+        period = _Timespec(0, self._period_ns)
+        if self._libc.timerfd_settime(self._fd, 0, ctypes.byref(_Itimerspec(period, period)), None):
+            raise OSError(ctypes.get_errno(), "timerfd_settime")
+        self._due_ns = time.monotonic_ns() + self._period_ns
+
     def _expired(self) -> None:
         try:
-            count = int.from_bytes(os.read(self._fd, 8), "little")
+            os.read(self._fd, 8)
         except BlockingIOError:
             return
-        self._on_tick(count)
+        late = time.monotonic_ns() - self._due_ns > self._period_ns // 4
+        if late:
+            self._arm()
+        else:
+            self._due_ns += self._period_ns
+        self._on_tick(late)
