@@ -118,3 +118,17 @@ ERRORS: tuple[VendorError, ...] = (
 """By wire index."""
 
 BY_NAME: dict[str, VendorError] = {error.name: error for error in ERRORS}
+
+MODES: dict[str, VendorError] = {
+    "Other": VendorError(
+        "joints locked or controller not ready",
+        FaultClass.SAFETY_STOP,
+        _OPERATOR,
+        "unlock the joints and activate FCI in Desk",
+    ),
+    "Guiding": VendorError("guided by hand", FaultClass.SAFETY_STOP, _OPERATOR, "let go of the guiding buttons"),
+    "Reflex": VendorError("stopped by a reflex", _MOTION, _RECOVER, "look at the arm, then recover"),
+    "UserStopped": VendorError("user stop", FaultClass.SAFETY_STOP, _OPERATOR, "release the stop button, then recover"),
+    "AutomaticErrorRecovery": VendorError("recovering", FaultClass.INTERNAL, _RECOVER, "wait until it has recovered"),
+}
+"""Robot modes (franky's names) in which the arm does not obey; "Idle" and "Move" are the good ones."""
