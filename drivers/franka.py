@@ -8,7 +8,10 @@ sends nothing: it only makes sure that the arm rests, obeys and reports no error
 
 from __future__ import annotations
 
+import os
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -71,10 +74,13 @@ _FIRST_STATE_S = 2.0
 _SILENCE_S = 0.5
 _FRESH_S = 0.1
 _RECOVERY_S = 5.0
+# franky's motions are smooth already, and libfranka's filter assumes that no state is ever lost: after one it jumps.
+_NO_FILTER_HZ = 1000.0
 _POLL_NS = 2_000_000
 _REST_SPEED_RAD_S = 0.005
 _FRAME_TOLERANCE = 1e-5
 _OBEYS = ("Idle", "Move")
+_NEEDS_A_PERSON = ("UserStopped", "Other", "Guiding")
 _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE, Lifecycle.FAULTED)
 _REALTIME_KERNEL = Path("/sys/kernel/realtime")
 
@@ -198,7 +204,7 @@ class FrankaArm(Arm):
             "states": reader.states,
             "bad_states": reader.bad,
             "command_success_rate": reading.success_rate,
-            "in_motion": bool(self._robot.is_in_control),
+            "in_motion": reader.in_motion,
             "external_force_n": float(np.linalg.norm(reading.wrench[:3])),
         }
 
@@ -211,7 +217,8 @@ class FrankaArm(Arm):
         config = self._config
         realtime = franky.RealtimeConfig.Enforce if config.enforce_realtime else franky.RealtimeConfig.Ignore
         try:
-            self._robot = franky.Robot(config.host, realtime_config=realtime)
+            with _own_scheduling():
+                self._robot = franky.Robot(config.host, realtime_config=realtime)
         except (franky.Exception, RuntimeError) as error:
             raise ConnectError(
                 self.name,
@@ -299,7 +306,7 @@ class FrankaArm(Arm):
         if reader.failure is not None:
             raise reader.failure
         reading = self._await_reading(_FRESH_S, "fresh state")
-        if reading.mode in ("UserStopped", "Other", "Guiding"):
+        if reading.mode in _NEEDS_A_PERSON:
             raise self._fault(reading)
         force = float(np.linalg.norm(reading.wrench[:3]))
         if force > self._config.contact_force_limit_n:
@@ -316,7 +323,7 @@ class FrankaArm(Arm):
         self._contact.clear()
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
-        self._surface()
+        self._reading("move", _FRESH_S)
         franky, config = self._franky, self._config
         linear, angular = twist_base[:3], twist_base[3:]
         # Of the whole time-to-live, the ramp to the target included; a second waypoint brakes harder than the first.
@@ -337,6 +344,10 @@ class FrankaArm(Arm):
         self._start(motion, franky.CartesianVelocityStopMotion, franky.ControlSignalType.CartesianVelocities)
 
     def _begin_stop(self, category: StopCategory) -> None:
+        reader = self._open_reader()
+        # While a silent arm rests, franky would wait for it.
+        if not reader.in_motion and (reader.newest is None or self._age_s(reader.newest) > _FRESH_S):
+            return
         franky = self._franky
         kinds = franky.ControlSignalType
         stops = {
@@ -347,7 +358,8 @@ class FrankaArm(Arm):
         try:
             running = self._robot.current_control_signal_type
             if running is not None:
-                self._robot.move(stops[running](self._config.stop_dynamics_factor), asynchronous=True)
+                stop = stops[running](self._config.stop_dynamics_factor)
+                self._robot.move(stop, asynchronous=True, cutoff_frequency=_NO_FILTER_HZ)
         except (franky.Exception, RuntimeError) as error:
             raise self._translated(error) from None
 
@@ -371,7 +383,7 @@ class FrankaArm(Arm):
         reaction.register_callback(lambda state, relative, absolute: contact.set())
         motion.add_reaction(reaction)
         try:
-            robot.move(motion, asynchronous=True)
+            robot.move(motion, asynchronous=True, cutoff_frequency=_NO_FILTER_HZ)
         except (franky.Exception, RuntimeError) as error:
             raise self._to_faulted(self._translated(error)) from None
 
@@ -384,7 +396,7 @@ class FrankaArm(Arm):
         self._desk.check(lease)
         if self.state is not Lifecycle.ACTIVE:
             raise CommandRejected(self.name, Rejection.MODE, f"device is {self.state.value}, not active")
-        self._surface()
+        self._reading("move", _FRESH_S)
         return target
 
     def _goal_factor(self, speed_fraction: float) -> float:
@@ -430,12 +442,13 @@ class FrankaArm(Arm):
             raise self._to_faulted(self._contact_fault("contact force limit reached"))
 
     def _fault(self, reading: Reading) -> DeviceFault:
-        if reading.errors:
-            name = reading.errors[0]
-            return self._by_table(BY_NAME[name], ERRORS.index(BY_NAME[name]))
+        said = self._open_reader().aborted
+        if reading.mode in _NEEDS_A_PERSON:
+            return self._by_table(MODES[reading.mode], reading.mode)
+        if names := reading.errors or (reading.last_errors if said else ()):
+            return self._by_table(BY_NAME[names[0]], ERRORS.index(BY_NAME[names[0]]))
         if reading.mode in MODES:
             return self._by_table(MODES[reading.mode], reading.mode)
-        said = self._open_reader().aborted
         return DeviceFault(self.name, f"motion aborted: {said}", fault_class=FaultClass.MOTION)
 
     def _by_table(self, entry: VendorError, code: int | str) -> DeviceFault:
@@ -493,6 +506,16 @@ def _joint_limits(urdf: str) -> Array:
     return np.array(
         [[float(limit.attrib[side]) for side in ("lower", "upper")] for limit in limits if limit is not None]
     )
+
+
+@contextmanager
+def _own_scheduling() -> Iterator[None]:
+    # Where it may, libfranka makes whoever connects a real-time thread: Python must not starve the machine.
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, parameters)
 
 
 def _has_realtime_kernel() -> bool:

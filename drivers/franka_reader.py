@@ -34,7 +34,8 @@ class Reading:
         q, dq, tau: joints (7,).
         wrench: (6,) what the world exerts on the tool centre point.
         mode: franky's name of the robot mode.
-        errors: names of the errors that are present, or else of those that ended the last motion.
+        errors: names of the errors that are present.
+        last_errors: names of those that ended the last motion.
         success_rate: share of the last 100 command packets that arrived in time.
     """
 
@@ -48,6 +49,7 @@ class Reading:
     wrench: Array
     mode: str
     errors: tuple[str, ...]
+    last_errors: tuple[str, ...]
     success_rate: float
 
     def is_finite(self) -> bool:
@@ -74,6 +76,7 @@ class StateReader:
         self._newest: Reading | None = None
         self._failure: DeviceError | None = None
         self._aborted: str | None = None
+        self._in_motion = False
         self._bad = 0
         self._bad_in_a_row = 0
         self._states = 0
@@ -98,6 +101,11 @@ class StateReader:
         return self._aborted
 
     @property
+    def in_motion(self) -> bool:
+        """Whether a motion was running when it last read."""
+        return self._in_motion
+
+    @property
     def bad(self) -> int:
         """States that were not readable or not finite."""
         return self._bad
@@ -112,10 +120,11 @@ class StateReader:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread and wait for it."""
+        """End the thread, wait for it and let go of the robot, which disconnects when nobody holds it."""
         self._halt.set()
         if self._thread.is_alive():
             self._thread.join(_JOIN_S)
+        self._robot = None
 
     def forget(self) -> None:
         """Forget a motion that died."""
@@ -135,21 +144,27 @@ class StateReader:
 
     def _read(self) -> None:
         last_ns, self._read_ns = self._read_ns, self._clock.now_ns()
+        franky = self._franky
+        said = None
         try:
             self._robot.poll_motion()
-        except (self._franky.ControlException, self._franky.CommandException) as error:
-            self._aborted = str(error)
+        except (franky.ControlException, franky.CommandException, franky.ProtocolException) as error:
+            said = str(error)
+        self._in_motion = self._robot.is_in_control
         try:
-            state = self._robot.state
-        except self._franky.ProtocolException as error:
+            self._take(self._robot.state, last_ns)
+        except franky.ProtocolException as error:
             self._count_bad(str(error))
-            return
+        # Only now, so that the newest reading tells why the motion died.
+        self._aborted = said or self._aborted
+
+    def _take(self, state: Any, t_ns: int) -> None:
         device_ms = state.time.to_msec()
         if device_ms == self._device_ms:
             return
         self._device_ms = device_ms
         self._states += 1
-        reading = self._convert(state, last_ns, device_ms)
+        reading = self._convert(state, t_ns, device_ms)
         if not reading.is_finite():
             self._count_bad("state with numbers that are not finite")
             return
@@ -170,7 +185,8 @@ class StateReader:
             # Franka counts what the arm exerts on the world as positive.
             wrench=-np.asarray(state.O_F_ext_hat_K),
             mode=state.robot_mode.name,
-            errors=_present(state.current_errors) or _present(state.last_motion_errors),
+            errors=_present(state.current_errors),
+            last_errors=_present(state.last_motion_errors),
             success_rate=float(state.control_command_success_rate),
         )
 

@@ -94,6 +94,7 @@ class FrankaEmulator(Emulator):
         self._lost = 0
         self._last_command_ms: int | None = None
         self._stopped_at: list[float] | None = None
+        self._reflex_detail = ""
         self._ticker: Ticker | None = None
 
     async def start(self) -> None:
@@ -127,6 +128,7 @@ class FrankaEmulator(Emulator):
             "energised": state.mode is not Mode.OTHER,
             "errors": self._error_names(state.errors),
             "last_errors": self._error_names(state.reflex_reason),
+            "reflex_detail": self._reflex_detail,
             "connected": self._client is not None,
             "watchdog_s": _LOST_LIMIT * 1e-3,
             "time_ms": state.message_id,
@@ -184,7 +186,8 @@ class FrankaEmulator(Emulator):
         self._stop_listening()
         self._state.message_id = 0
         self._clear_errors()
-        self._state.mode = Mode.IDLE
+        self._move_id = None
+        self._end_motion(Mode.IDLE)
         asyncio.get_running_loop().call_later(_RESTART_S, self._listen)
 
     def _accept(self) -> None:
@@ -199,10 +202,8 @@ class FrankaEmulator(Emulator):
         self._client, self._buffer = client, b""
 
     def _drop_client(self) -> None:
+        # A motion goes on until its commands have been missing for long enough.
         if self._client is not None:
-            if self._move_id is not None:
-                self._move_id = None
-                self._end_motion(Mode.IDLE)
             self._client.close()
             self._client, self._client_udp = None, None
 
@@ -270,7 +271,8 @@ class FrankaEmulator(Emulator):
         elif request is Request.MOVE:
             self._begin_move(command_id, payload)
         elif request is Request.STOP_MOVE:
-            self._finish_move(MoveStatus.PREEMPTED, Mode.IDLE)
+            if self._move_id is not None:
+                self._finish_move(MoveStatus.PREEMPTED, Mode.IDLE)
             self._reply(encode_reply(request, command_id, SetterStatus.SUCCESS))
         elif request is Request.AUTOMATIC_ERROR_RECOVERY:
             self._reply(encode_reply(request, command_id, self._recover()))
@@ -289,7 +291,7 @@ class FrankaEmulator(Emulator):
             status = MoveStatus.REJECTED_BY_SAFETY
         elif self._state.mode is not Mode.IDLE:
             status = MoveStatus.NOT_POSSIBLE
-        elif not self._arm.begin(generator):
+        elif not self._arm.begin(generator, self._state.message_id):
             status = MoveStatus.SINGULAR_START
         else:
             status = MoveStatus.MOTION_STARTED
@@ -352,13 +354,14 @@ class FrankaEmulator(Emulator):
         try:
             self._arm.step(command, _PERIOD_NS * 1e-9)
         except Reflex as reflex:
-            self._reflex(reflex.name)
+            self._reflex(reflex.name, reflex.detail)
             return
         if command is not None and (command.finished or command.torque_finished):
             self._finish_move(MoveStatus.SUCCESS, Mode.IDLE)
 
-    def _reflex(self, name: str) -> None:
+    def _reflex(self, name: str, detail: str = "") -> None:
         flag = _INDEX[name]
+        self._reflex_detail = detail
         self._counts["reflexes"] += 1
         self._state.errors[flag] = self._state.reflex_reason[flag] = 1
         self._finish_move(MoveStatus.REFLEX_ABORTED, Mode.REFLEX)

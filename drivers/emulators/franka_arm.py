@@ -89,11 +89,12 @@ def urdf() -> str:
 
 
 class Reflex(Exception):
-    """The arm refuses to go on; ``name`` is Franka's name of the error."""
+    """The arm refuses to go on; ``name`` is Franka's name of the error, ``detail`` what was seen."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, detail: str = "") -> None:
         super().__init__(name)
         self.name = name
+        self.detail = detail
 
 
 @dataclass(slots=True)
@@ -132,6 +133,7 @@ class EmulatedArm:
     twist_c: Array = field(default_factory=lambda: np.zeros(6))
     _generator: Generator = Generator.IDLE
     _profile: _Profile | None = None
+    _began_id: int = 0
     _T_commanded: Array = field(default_factory=lambda: np.eye(4))
 
     def __post_init__(self) -> None:
@@ -143,14 +145,15 @@ class EmulatedArm:
         self.T_base_ee = T_base_flange @ self.F_T_NE @ self.NE_T_EE
         self.J = np.vstack([np.cross(axes, self.T_base_ee[:3, 3:] - origins, axis=0), axes])
 
-    def begin(self, generator: Generator) -> bool:
-        """Take up a motion generator; False at a pose too singular for a Cartesian one."""
+    def begin(self, generator: Generator, message_id: int = 0) -> bool:
+        """Take up a motion generator with the state ``message_id``; False at a pose too singular for a Cartesian one."""
         if generator in (Generator.CARTESIAN_POSITION, Generator.CARTESIAN_VELOCITY):
             smallest = np.linalg.svd(self.J, compute_uv=False)[-1]
             if smallest < _SMALLEST_SINGULAR_VALUE:
                 return False
         self._generator = generator
         self._profile = None
+        self._began_id = message_id
         self.halt()
         return True
 
@@ -214,7 +217,7 @@ class EmulatedArm:
     def _check_profile(self, message_id: int, value: Array, *, is_velocity: bool) -> Array:
         """Compare with the command before, over the time between the states that they answer; returns the velocity."""
         last = self._profile or _Profile(
-            message_id - 1, np.zeros_like(value) if is_velocity else value, np.zeros_like(value), np.zeros_like(value)
+            self._began_id, np.zeros_like(value) if is_velocity else value, np.zeros_like(value), np.zeros_like(value)
         )
         dt_s = (message_id - last.message_id) * _TICK_S
         if dt_s <= 0.0:
@@ -234,12 +237,15 @@ class EmulatedArm:
             accel_ok = bool((np.abs(acceleration) <= JOINT_ACCEL_RAD_S2).all())
             jerk_ok = bool((np.abs(jerk) <= JOINT_JERK_RAD_S3).all())
         # Franka's names: a jump of the velocity breaks the acceleration limit, one of the acceleration the jerk limit.
-        if not speed_ok:
-            raise Reflex(f"{prefix}_motion_generator_velocity_limits_violation")
-        if not accel_ok:
-            raise Reflex(f"{prefix}_motion_generator_velocity_discontinuity")
-        if not jerk_ok:
-            raise Reflex(f"{prefix}_motion_generator_acceleration_discontinuity")
+        checks = (
+            (speed_ok, "velocity_limits_violation"),
+            (accel_ok, "velocity_discontinuity"),
+            (jerk_ok, "acceleration_discontinuity"),
+        )
+        for is_ok, name in checks:
+            if not is_ok:
+                detail = f"state {message_id}, {dt_s:g} s after the last: {velocity}, {acceleration}, {jerk} (SI)"
+                raise Reflex(f"{prefix}_motion_generator_{name}", detail)
         return velocity
 
     def _check_joints(self) -> None:
