@@ -12,6 +12,7 @@ import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -110,6 +111,19 @@ class FrankaConfig(DriverConfig):
     flange_to_tcp_mm_deg: tuple[float, float, float, float, float, float] | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class _Scheduling:
+    policy: int
+    priority: int
+
+    @classmethod
+    def of_this_thread(cls) -> _Scheduling:
+        return cls(os.sched_getscheduler(0), os.sched_getparam(0).sched_priority)
+
+    def apply(self) -> None:
+        os.sched_setscheduler(0, self.policy, os.sched_param(self.priority))
+
+
 class FrankaArm(Arm):
     """One Franka arm.
 
@@ -125,6 +139,7 @@ class FrankaArm(Arm):
         self._franky: Any = None
         self._robot: Any = None
         self._reader: StateReader | None = None
+        self._control_scheduling: _Scheduling | None = None
         self._contact = threading.Event()
         self._joint_limits = np.zeros((7, 2))
 
@@ -217,8 +232,11 @@ class FrankaArm(Arm):
         config = self._config
         realtime = franky.RealtimeConfig.Enforce if config.enforce_realtime else franky.RealtimeConfig.Ignore
         try:
-            with _own_scheduling():
+            # libfranka makes whoever connects a real-time thread, where it may, and its control threads inherit that.
+            # Python must not starve the machine, so it keeps its own scheduling and lends theirs only to them.
+            with _scheduled():
                 self._robot = franky.Robot(config.host, realtime_config=realtime)
+                self._control_scheduling = _Scheduling.of_this_thread()
         except (franky.Exception, RuntimeError) as error:
             raise ConnectError(
                 self.name,
@@ -358,14 +376,13 @@ class FrankaArm(Arm):
         try:
             running = self._robot.current_control_signal_type
             if running is not None:
-                stop = stops[running](self._config.stop_dynamics_factor)
-                self._robot.move(stop, asynchronous=True, cutoff_frequency=_NO_FILTER_HZ)
+                self._move(stops[running](self._config.stop_dynamics_factor))
         except (franky.Exception, RuntimeError) as error:
             raise self._translated(error) from None
 
     def _start(self, motion: Any, stop_motion: Any, kind: Any) -> None:
-        franky, robot = self._franky, self._robot
-        running = robot.current_control_signal_type
+        franky = self._franky
+        running = self._robot.current_control_signal_type
         if running not in (None, kind):
             raise CommandRejected(
                 self.name,
@@ -383,9 +400,13 @@ class FrankaArm(Arm):
         reaction.register_callback(lambda state, relative, absolute: contact.set())
         motion.add_reaction(reaction)
         try:
-            robot.move(motion, asynchronous=True, cutoff_frequency=_NO_FILTER_HZ)
+            self._move(motion)
         except (franky.Exception, RuntimeError) as error:
             raise self._to_faulted(self._translated(error)) from None
+
+    def _move(self, motion: Any) -> None:
+        with _scheduled(self._control_scheduling):
+            self._robot.move(motion, asynchronous=True, cutoff_frequency=_NO_FILTER_HZ)
 
     def _checked_goal(self, what: str, goal: Array, shape: tuple[int, ...], lease: Lease) -> Array:
         target = np.asarray(goal, dtype=np.float64)
@@ -509,13 +530,14 @@ def _joint_limits(urdf: str) -> Array:
 
 
 @contextmanager
-def _own_scheduling() -> Iterator[None]:
-    # Where it may, libfranka makes whoever connects a real-time thread: Python must not starve the machine.
-    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+def _scheduled(policy: _Scheduling | None = None) -> Iterator[None]:
+    """Run as ``policy`` for a while, and be again what this thread was."""
+    before = _Scheduling.of_this_thread()
+    (policy or before).apply()
     try:
         yield
     finally:
-        os.sched_setscheduler(0, policy, parameters)
+        before.apply()
 
 
 def _has_realtime_kernel() -> bool:
