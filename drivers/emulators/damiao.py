@@ -172,6 +172,7 @@ class DamiaoArm(Emulator):
             "dq_rad_s": self._dq.tolist(),
             "tau_n_m": self._tau.tolist(),
             "position_m": T_base_tcp[:3, 3].tolist(),
+            "T_base_tcp": T_base_tcp.tolist(),
             "still": bool((np.abs(self._dq) < 5e-3).all()),
             "energised": any(motor.status == codec.ENABLED for motor in self.motors),
             "enabled": sum(motor.status == codec.ENABLED for motor in self.motors),

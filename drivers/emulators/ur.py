@@ -185,6 +185,7 @@ class UrEmulator(Emulator):
             "t_s": controller.t_s,
             "position_m": arm.T_base_tcp[:3, 3].tolist(),
             "pose": ur_model.pose_vector(arm.T_base_tcp).tolist(),
+            "T_base_tcp": arm.T_base_tcp.tolist(),
             "flange_to_tcp": ur_model.pose_vector(arm.T_flange_tcp).tolist(),
             "q": arm.q.tolist(),
             "qd": arm.qd.tolist(),

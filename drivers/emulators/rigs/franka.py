@@ -27,6 +27,7 @@ def rig(folder: Path, address: int) -> Rig:
         spec=SPEC,
         start=start,
         build=build,
+        pose="T_base_ee",
         faults={
             "drop_states": (5, "transient"),
             "corrupt": (3, "transient"),

@@ -36,6 +36,7 @@ def rig(folder: Path, address: int) -> Rig:
         spec=SPEC,
         start=start,
         build=build,
+        pose="T_base_tcp",
         faults={
             "drop": (5, "transient"),
             "corrupt": (5, "transient"),

@@ -1,0 +1,4 @@
+from drivers.conformance.suite import suite
+from drivers.emulators.rigs.franka import rig
+
+TestDriver = suite(rig)

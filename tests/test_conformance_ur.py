@@ -1,0 +1,4 @@
+from drivers.conformance.suite import suite
+from drivers.emulators.rigs.ur import rig
+
+TestDriver = suite(rig)
