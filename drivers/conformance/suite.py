@@ -21,12 +21,13 @@ class Needs:
     Attributes:
         needs: abilities, "arm", "camera", "truth" (an emulator), "process" (an emulator of its own), "limited axes".
         on_bench: whether it may be done to a real device.
-        per_fault: whether it is done once for each fault of the rig.
+        of_faults: chooses among the rig's faults, by name, value and lawful answer, those for each of which it is done;
+            None for a check that has nothing to do with them.
     """
 
     needs: tuple[str, ...]
     on_bench: bool
-    per_fault: bool
+    of_faults: Callable[[str, Any, str], bool] | None
 
     def missing(self, rig: Rig) -> str | None:
         """Why the check does not apply to ``rig``, or None."""
@@ -51,11 +52,13 @@ class Needs:
         return None
 
 
-def check(*needs: str, on_bench: bool = False, per_fault: bool = False) -> Callable[[C], C]:
+def check(
+    *needs: str, on_bench: bool = False, of_faults: Callable[[str, Any, str], bool] | None = None
+) -> Callable[[C], C]:
     """Make a function of a ``Bench`` (and a fault's name) a check of the suite; see ``Needs``."""
 
     def mark(function: C) -> C:
-        function.conformance = Needs(needs, on_bench, per_fault)  # type: ignore[attr-defined]
+        function.conformance = Needs(needs, on_bench, of_faults)  # type: ignore[attr-defined]
         return function
 
     return mark
@@ -73,11 +76,11 @@ def suite(rig: RigFunction, *, prefix: str = "Test") -> type:
     body: dict[str, Any] = {"rig_function": staticmethod(rig), "driver": plan.spec.name}
     for function in _checks():
         needs: Needs = function.conformance
-        if not needs.per_fault:
+        choose = needs.of_faults
+        if choose is None:
             body[f"test_{function.__name__}"] = _method(function)
-        elif plan.faults:
-            method = pytest.mark.parametrize("fault", list(plan.faults))(_fault_method(function))
-            body[f"test_{function.__name__}"] = method
+        elif chosen := [fault for fault, (value, answer) in plan.faults.items() if choose(fault, value, answer)]:
+            body[f"test_{function.__name__}"] = pytest.mark.parametrize("fault", chosen)(_fault_method(function))
     return type(f"{prefix}{plan.spec.name.title().replace('_', '')}", (), body)
 
 
