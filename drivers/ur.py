@@ -8,7 +8,6 @@ system and the buttons of the robot, which alone are rated for it. ``docs/device
 from __future__ import annotations
 
 import math
-import socket
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -34,6 +33,7 @@ from drivers.errors import (
     Rejection,
     Remedy,
     StaleData,
+    TransportError,
     TransportTimeout,
 )
 from drivers.gate import TwistLimits
@@ -42,7 +42,8 @@ from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSp
 from drivers.samples import JointState, Stamped, TcpState
 from drivers.ur_control import ControlLink
 from drivers.ur_modes import RobotMode, RuntimeState, SafetyMode, power_fault, program_fault, safety_fault
-from drivers.ur_sdk import bounded, dashboard, retire
+from drivers.ur_registers import RtdeWire
+from drivers.ur_sdk import dashboard, retire
 from drivers.ur_state import RATE_HZ, VARIABLES, Snapshot, StateReader
 from geometry import se3
 from geometry.types import Array
@@ -441,13 +442,10 @@ class UrArm(Arm):
     def _start_receiving(self) -> None:
         from rtde_receive import RTDEReceiveInterface
 
-        host = self._config.host
-        self._receive = bounded(
-            self.name,
-            "RTDE receive",
-            self._config.connect_timeout_s,
-            lambda: RTDEReceiveInterface(host, RATE_HZ, list(VARIABLES)),
-        )
+        try:
+            self._receive = RTDEReceiveInterface(self._config.host, RATE_HZ, list(VARIABLES))
+        except RuntimeError as error:
+            raise DeviceGone(self.name, f"RTDE state of {self._config.host}: {error}") from error
         reader = StateReader(self._receive, self._clock)
         deadline_ns = self._clock.now_ns() + round(_FIRST_STATE_S * 1e9)
         warm_ns = self._clock.now_ns() + round(_CLOCK_WARM_UP_S * 1e9)
@@ -562,29 +560,23 @@ class UrArm(Arm):
 
 
 def _ask_version(device: str, host: str, timeout_s: float) -> tuple[int, int, int, int]:
-    """The controller's version by a connection of our own: ur-rtde's waits for ever on a frozen controller."""
-    hint = f"is {host} the controller, powered and reachable?"
+    """The controller's version by a connection of our own: ur-rtde's constructors wait for ever on a frozen one."""
     try:
-        with socket.create_connection((host, ur_codec.PORT), timeout_s) as wire:
-            wire.settimeout(timeout_s)
-            wire.sendall(ur_codec.encode(ur_codec.version_request()))
-            if not ur_codec.parse_accepted(_read_packet(wire).payload):
+        wire = RtdeWire(device, host, timeout_s)
+        try:
+            if not ur_codec.parse_accepted(wire.ask(ur_codec.version_request()).payload):
                 raise ConnectError(device, f"RTDE of {host} does not speak version {ur_codec.PROTOCOL_VERSION}")
-            wire.sendall(ur_codec.encode(ur_codec.Packet(ur_codec.PacketType.GET_URCONTROL_VERSION)))
-            return ur_codec.parse_controller_version(_read_packet(wire).payload)
-    except (OSError, CorruptMessage) as error:
-        raise ConnectError(device, f"no RTDE at {host}:{ur_codec.PORT}", [error], hint=hint) from error
-
-
-def _read_packet(wire: socket.socket) -> ur_codec.Packet:
-    stream = b""
-    while True:
-        piece = wire.recv(4096)
-        if not piece:
-            raise ConnectionResetError("closed by the controller")
-        packets, stream = ur_codec.split(stream + piece)
-        if packets:
-            return packets[0]
+            answer = wire.ask(ur_codec.Packet(ur_codec.PacketType.GET_URCONTROL_VERSION))
+            return ur_codec.parse_controller_version(answer.payload)
+        finally:
+            wire.close()
+    except (OSError, TransportError) as error:
+        raise ConnectError(
+            device,
+            f"no RTDE at {host}:{ur_codec.PORT}",
+            [error],
+            hint=f"is {host} the controller, powered and reachable?",
+        ) from error
 
 
 def _pose_vector(T: Array) -> Array:

@@ -348,7 +348,7 @@ def test_a_frozen_controller_is_no_hang(emulator: EmulatorProcess, address: int)
     config = UrConfig(host=host_of(address), flange_to_tcp_mm_deg=TOOL_MM_DEG, connect_timeout_s=0.2)
     with pytest.raises(ConnectError) as caught:
         UrArm("ur", config, CLOCK).connect()
-    assert isinstance(caught.value.causes[0], TimeoutError)
+    assert isinstance(caught.value.causes[0], TransportTimeout)
 
 
 def test_a_missing_sdk_names_the_extra(monkeypatch: pytest.MonkeyPatch, address: int) -> None:

@@ -10,8 +10,8 @@ import argparse
 import asyncio
 import contextlib
 import math
-from collections.abc import Awaitable, Callable
-from typing import Any
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -133,7 +133,7 @@ class UrEmulator(Emulator):
         unlock_after_s: how long a protective stop cannot be unlocked.
     """
 
-    faults = {
+    faults: ClassVar[Mapping[str, str]] = {
         "pause": "the network side hangs: sockets stay open, nothing is read or written; the arm itself goes on",
         "drop": "the next N state packets are not sent",
         "delay": "state packets arrive this many seconds late",
@@ -311,7 +311,7 @@ class UrEmulator(Emulator):
         if self.spend("drop"):
             return
         if self.spend("nan"):
-            values = values | {name: (math.nan,) * 6 for name in ("actual_q", "actual_TCP_pose", "actual_TCP_speed")}
+            values = values | dict.fromkeys(("actual_q", "actual_TCP_pose", "actual_TCP_speed"), (math.nan,) * 6)
         if self.spend("corrupt"):
             values = values | {"actual_TCP_pose": (1e30,) * 6, "actual_qd": (-7e8,) * 6, "robot_mode": 1 << 20}
         if self._previous and self.spend("out_of_order"):
