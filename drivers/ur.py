@@ -312,6 +312,7 @@ class UrArm(Arm):
             self._stop_receiving()
             _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
             self._start_receiving()
+        self._opened().forget()
         snapshot = self._fresh()
         if snapshot.runtime_state is not RuntimeState.STOPPED:
             with suppress(DeviceError), dashboard(self.name, self._config.host) as client:
@@ -329,13 +330,12 @@ class UrArm(Arm):
         fault = safety_fault(self.name, snapshot.safety_mode, snapshot.safety_bits)
         if fault is not None:
             raise fault
-        self._opened().forget_misses()
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
         link = self._link
         try:
             if link is None or self.state is not Lifecycle.ACTIVE:
-                raise CommandRejected(self.name, Rejection.MODE, f"device has become {self.state.value}")
+                raise CommandRejected(self.name, Rejection.MODE, "the arm has just been given up")
             expires_ns = now_ns + round(ttl_s * 1e9)
             link.speed(twist_base, self._config.accel, self._config.stop_accel_m_s2, expires_ns)
         except CommandRejected:

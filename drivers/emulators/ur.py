@@ -27,7 +27,7 @@ from drivers.ur_modes import RobotMode, RuntimeState, SafetyMode
 DASHBOARD_PORT = 29999
 SCRIPT_PORTS = (30001, 30002, 30003)
 VERSION = (5, 11, 1, 108249)
-_MAX_CATCH_UP_STEPS = 50
+_MAX_LATE_S = 0.5
 _MAX_BUFFER_BYTES = 1 << 20
 
 _OUTPUT_TYPES = {
@@ -291,13 +291,10 @@ class UrEmulator(Emulator):
         loop = asyncio.get_running_loop()
         due_s = loop.time()
         while True:
-            due_s += PERIOD_S
-            if (wait_s := due_s - loop.time()) > 0:
-                await asyncio.sleep(wait_s)
-            elif self._steps % _MAX_CATCH_UP_STEPS == 0:
-                # A process that was stopped for long does not live through the lost time.
-                due_s = max(due_s, loop.time() - _MAX_CATCH_UP_STEPS * PERIOD_S)
-                await asyncio.sleep(0)
+            # A late process catches up, because a controller's clock does not slow down, but reads its inputs between
+            # any two steps; one that was stopped altogether does not live through the lost time.
+            due_s = max(due_s + PERIOD_S, loop.time() - _MAX_LATE_S)
+            await asyncio.sleep(max(0.0, due_s - loop.time()))
             self._controller.step()
             self._steps += 1
             self._stream()
