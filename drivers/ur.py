@@ -149,6 +149,8 @@ class UrArm(Arm):
         self._model = ""
         self._proven_watchdog_s: float | None = None
         self._ttl_stops = 0
+        self._dropping = threading.Lock()
+        self._program_is_ours = False
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
         """Pose and twist of the tool centre point. Raises StaleData if it is older than ``max_age_s``."""
@@ -282,6 +284,7 @@ class UrArm(Arm):
         _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
         link = ControlLink(self.name, self._config.host, self._clock, self._config.watchdog_hz)
         self._link = link
+        self._program_is_ours = True
         try:
             link.open(self._flange_to_tcp)
             snapshot = self._await(
@@ -313,23 +316,11 @@ class UrArm(Arm):
             _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
             self._start_receiving()
         self._opened().forget()
-        snapshot = self._fresh()
-        if snapshot.runtime_state is not RuntimeState.STOPPED:
-            with suppress(DeviceError), dashboard(self.name, self._config.host) as client:
-                client.stop()
-        if snapshot.safety_mode is SafetyMode.PROTECTIVE_STOP:
+        if self._program_is_ours:
+            self._end_program()
+        if self._fresh().safety_mode is SafetyMode.PROTECTIVE_STOP:
             self._unlock()
-        snapshot = self._await(
-            lambda state: (
-                safety_fault(self.name, state.safety_mode, state.safety_bits) is not None
-                or state.runtime_state is RuntimeState.STOPPED
-            ),
-            _RECOVER_S,
-            "end of the program",
-        )
-        fault = safety_fault(self.name, snapshot.safety_mode, snapshot.safety_bits)
-        if fault is not None:
-            raise fault
+        self._refuse_if_unsafe()
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
         link = self._link
@@ -434,10 +425,11 @@ class UrArm(Arm):
     def _drop_program(self) -> None:
         self._supervised_from_seq = None
         self._proven_watchdog_s = None
-        link, self._link = self._link, None
-        if link is not None:
-            link.close()
-            self._ttl_stops += link.ttl_stops
+        with self._dropping:
+            link, self._link = self._link, None
+            if link is not None:
+                link.close()
+                self._ttl_stops += link.ttl_stops
 
     def _start_receiving(self) -> None:
         from rtde_receive import RTDEReceiveInterface
@@ -531,6 +523,14 @@ class UrArm(Arm):
         with dashboard(self.name, self._config.host) as client:
             client.powerOff()
         self._await(lambda state: state.robot_mode is RobotMode.POWER_OFF, _MODE_CHANGE_S, "power-off")
+
+    def _end_program(self) -> None:
+        # It may have survived the fault if nobody could be reached then.
+        if self._fresh().runtime_state is not RuntimeState.STOPPED:
+            with dashboard(self.name, self._config.host) as client:
+                client.stop()
+        self._await(lambda state: state.runtime_state is RuntimeState.STOPPED, _RECOVER_S, "end of the program")
+        self._program_is_ours = False
 
     def _unlock(self) -> None:
         with dashboard(self.name, self._config.host) as client:

@@ -400,6 +400,10 @@ def test_somebody_elses_program_is_left_alone(arm: UrArm, emulator: EmulatorProc
     with pytest.raises(DeviceFault, match="another program"):
         arm.activate()
     assert emulator.state()["runtime_state"] == "PLAYING"
+    emulator.fault("protective_stop")
+    wait_faulted(arm)
+    wait_until(lambda: _recovers(arm), "recovery")
+    assert emulator.state()["runtime_state"] == "PAUSED", "neither ended nor resumed"
 
 
 def test_activation_powers_the_arm(arm: UrArm, emulator: EmulatorProcess) -> None:
@@ -484,9 +488,10 @@ def test_stop_is_at_once_and_keeps_the_lease(arm: UrArm, lease: Lease, emulator:
     drive(arm, lease, [0.05, 0, 0, 0, 0, 0], emulator)
 
 
-def test_stop_then_remove_power(arm: UrArm, lease: Lease, emulator: EmulatorProcess) -> None:
+@pytest.mark.parametrize("category", [StopCategory.STOP_THEN_REMOVE_POWER, StopCategory.REMOVE_POWER])
+def test_stops_that_remove_power(arm: UrArm, lease: Lease, emulator: EmulatorProcess, category: StopCategory) -> None:
     drive(arm, lease, [0.05, 0, 0, 0, 0, 0], emulator)
-    arm.stop(StopCategory.STOP_THEN_REMOVE_POWER)
+    arm.stop(category)
     emulator.wait_for(robot_mode="POWER_OFF", moving=False)
     assert arm.state is Lifecycle.READY
     assert arm.owner is None
