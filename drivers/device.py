@@ -90,14 +90,14 @@ class Device(ABC):
         """PASSIVE -> READY: check and set parameters; nothing is energised."""
         self._require("configure", Lifecycle.PASSIVE)
         self._configure()
-        self._state = Lifecycle.READY
+        self._enter(Lifecycle.READY)
 
     @final
     def activate(self) -> None:
         """READY -> ACTIVE: the only call that energises; the setpoint starts at the present state."""
         self._require("activate", Lifecycle.READY)
         self._activate()
-        self._state = Lifecycle.ACTIVE
+        self._enter(Lifecycle.ACTIVE)
 
     @final
     def deactivate(self, policy: DeactivatePolicy = DeactivatePolicy.HOLD) -> None:
@@ -106,7 +106,7 @@ class Device(ABC):
             return
         self._require("deactivate", Lifecycle.ACTIVE)
         self._deactivate(policy)
-        self._state = Lifecycle.READY
+        self._enter(Lifecycle.READY)
 
     @final
     def recover(self, token: OperatorToken) -> None:
@@ -146,11 +146,18 @@ class Device(ABC):
             hint = str(self._fault_error) if self._fault_error else ""
             raise LifecycleError(self.name, operation, self._state.value, [s.value for s in allowed], hint=hint)
 
+    def _enter(self, state: Lifecycle) -> None:
+        """Enter ``state``, unless a thread of the driver has latched a fault on the way: then raise that."""
+        if self._fault_error is not None:
+            raise self._fault_error
+        self._state = state
+
     def _to_faulted(self, error: DeviceError) -> DeviceError:
         """Latch the first fault; returns it so that callers can raise it."""
         if self._state is not Lifecycle.FAULTED:
-            self._state = Lifecycle.FAULTED
+            # The error first: who reads the state from another thread finds it.
             self._fault_error = error
+            self._state = Lifecycle.FAULTED
         return error
 
     def _attempt(self, step: Callable[[], None]) -> None:

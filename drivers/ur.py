@@ -8,7 +8,6 @@ system and the buttons of the robot, which alone are rated for it. ``docs/device
 from __future__ import annotations
 
 import math
-import socket
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -34,6 +33,7 @@ from drivers.errors import (
     Rejection,
     Remedy,
     StaleData,
+    TransportError,
     TransportTimeout,
 )
 from drivers.gate import TwistLimits
@@ -42,7 +42,8 @@ from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSp
 from drivers.samples import JointState, Stamped, TcpState
 from drivers.ur_control import ControlLink
 from drivers.ur_modes import RobotMode, RuntimeState, SafetyMode, power_fault, program_fault, safety_fault
-from drivers.ur_sdk import bounded, dashboard, retire
+from drivers.ur_registers import RtdeWire
+from drivers.ur_sdk import dashboard, retire
 from drivers.ur_state import RATE_HZ, VARIABLES, Snapshot, StateReader
 from geometry import se3
 from geometry.types import Array
@@ -148,6 +149,8 @@ class UrArm(Arm):
         self._model = ""
         self._proven_watchdog_s: float | None = None
         self._ttl_stops = 0
+        self._dropping = threading.Lock()
+        self._program_is_ours = False
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
         """Pose and twist of the tool centre point. Raises StaleData if it is older than ``max_age_s``."""
@@ -281,6 +284,7 @@ class UrArm(Arm):
         _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
         link = ControlLink(self.name, self._config.host, self._clock, self._config.watchdog_hz)
         self._link = link
+        self._program_is_ours = True
         try:
             link.open(self._flange_to_tcp)
             snapshot = self._await(
@@ -311,30 +315,18 @@ class UrArm(Arm):
             self._stop_receiving()
             _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
             self._start_receiving()
-        snapshot = self._fresh()
-        if snapshot.runtime_state is not RuntimeState.STOPPED:
-            with suppress(DeviceError), dashboard(self.name, self._config.host) as client:
-                client.stop()
-        if snapshot.safety_mode is SafetyMode.PROTECTIVE_STOP:
+        self._opened().forget()
+        if self._program_is_ours:
+            self._end_program()
+        if self._fresh().safety_mode is SafetyMode.PROTECTIVE_STOP:
             self._unlock()
-        snapshot = self._await(
-            lambda state: (
-                safety_fault(self.name, state.safety_mode, state.safety_bits) is not None
-                or state.runtime_state is RuntimeState.STOPPED
-            ),
-            _RECOVER_S,
-            "end of the program",
-        )
-        fault = safety_fault(self.name, snapshot.safety_mode, snapshot.safety_bits)
-        if fault is not None:
-            raise fault
-        self._opened().forget_misses()
+        self._refuse_if_unsafe()
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
         link = self._link
         try:
             if link is None or self.state is not Lifecycle.ACTIVE:
-                raise CommandRejected(self.name, Rejection.MODE, f"device has become {self.state.value}")
+                raise CommandRejected(self.name, Rejection.MODE, "the arm has just been given up")
             expires_ns = now_ns + round(ttl_s * 1e9)
             link.speed(twist_base, self._config.accel, self._config.stop_accel_m_s2, expires_ns)
         except CommandRejected:
@@ -433,21 +425,19 @@ class UrArm(Arm):
     def _drop_program(self) -> None:
         self._supervised_from_seq = None
         self._proven_watchdog_s = None
-        link, self._link = self._link, None
-        if link is not None:
-            link.close()
-            self._ttl_stops += link.ttl_stops
+        with self._dropping:
+            link, self._link = self._link, None
+            if link is not None:
+                link.close()
+                self._ttl_stops += link.ttl_stops
 
     def _start_receiving(self) -> None:
         from rtde_receive import RTDEReceiveInterface
 
-        host = self._config.host
-        self._receive = bounded(
-            self.name,
-            "RTDE receive",
-            self._config.connect_timeout_s,
-            lambda: RTDEReceiveInterface(host, RATE_HZ, list(VARIABLES)),
-        )
+        try:
+            self._receive = RTDEReceiveInterface(self._config.host, RATE_HZ, list(VARIABLES))
+        except RuntimeError as error:
+            raise DeviceGone(self.name, f"RTDE state of {self._config.host}: {error}") from error
         reader = StateReader(self._receive, self._clock)
         deadline_ns = self._clock.now_ns() + round(_FIRST_STATE_S * 1e9)
         warm_ns = self._clock.now_ns() + round(_CLOCK_WARM_UP_S * 1e9)
@@ -534,6 +524,14 @@ class UrArm(Arm):
             client.powerOff()
         self._await(lambda state: state.robot_mode is RobotMode.POWER_OFF, _MODE_CHANGE_S, "power-off")
 
+    def _end_program(self) -> None:
+        # It may have survived the fault if nobody could be reached then.
+        if self._fresh().runtime_state is not RuntimeState.STOPPED:
+            with dashboard(self.name, self._config.host) as client:
+                client.stop()
+        self._await(lambda state: state.runtime_state is RuntimeState.STOPPED, _RECOVER_S, "end of the program")
+        self._program_is_ours = False
+
     def _unlock(self) -> None:
         with dashboard(self.name, self._config.host) as client:
             try:
@@ -562,29 +560,23 @@ class UrArm(Arm):
 
 
 def _ask_version(device: str, host: str, timeout_s: float) -> tuple[int, int, int, int]:
-    """The controller's version by a connection of our own: ur-rtde's waits for ever on a frozen controller."""
-    hint = f"is {host} the controller, powered and reachable?"
+    """The controller's version by a connection of our own: ur-rtde's constructors wait for ever on a frozen one."""
     try:
-        with socket.create_connection((host, ur_codec.PORT), timeout_s) as wire:
-            wire.settimeout(timeout_s)
-            wire.sendall(ur_codec.encode(ur_codec.version_request()))
-            if not ur_codec.parse_accepted(_read_packet(wire).payload):
+        wire = RtdeWire(device, host, timeout_s)
+        try:
+            if not ur_codec.parse_accepted(wire.ask(ur_codec.version_request()).payload):
                 raise ConnectError(device, f"RTDE of {host} does not speak version {ur_codec.PROTOCOL_VERSION}")
-            wire.sendall(ur_codec.encode(ur_codec.Packet(ur_codec.PacketType.GET_URCONTROL_VERSION)))
-            return ur_codec.parse_controller_version(_read_packet(wire).payload)
-    except (OSError, CorruptMessage) as error:
-        raise ConnectError(device, f"no RTDE at {host}:{ur_codec.PORT}", [error], hint=hint) from error
-
-
-def _read_packet(wire: socket.socket) -> ur_codec.Packet:
-    stream = b""
-    while True:
-        piece = wire.recv(4096)
-        if not piece:
-            raise ConnectionResetError("closed by the controller")
-        packets, stream = ur_codec.split(stream + piece)
-        if packets:
-            return packets[0]
+            answer = wire.ask(ur_codec.Packet(ur_codec.PacketType.GET_URCONTROL_VERSION))
+            return ur_codec.parse_controller_version(answer.payload)
+        finally:
+            wire.close()
+    except (OSError, TransportError) as error:
+        raise ConnectError(
+            device,
+            f"no RTDE at {host}:{ur_codec.PORT}",
+            [error],
+            hint=f"is {host} the controller, powered and reachable?",
+        ) from error
 
 
 def _pose_vector(T: Array) -> Array:

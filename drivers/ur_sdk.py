@@ -1,8 +1,7 @@
-"""Calls into ur-rtde 1.6.5 that may hang, kept from holding up the caller and the rest of the process.
+"""What touchcell calls in ur-rtde 1.6.5 besides its state stream, and how it is kept from doing harm.
 
-Its methods release the interpreter's lock, so ``bounded`` can leave a hanging one behind. Its constructors and
-destructors do not release it: call a constructor only right after the controller has answered, and never let a
-destructor run, because it sleeps 0.5 s during which no thread of the process would move (``retire``).
+Its constructors and destructors hold the interpreter's lock: call a constructor only right after the controller has
+answered, and never let a destructor run, because it sleeps 0.5 s during which no thread of the process would move.
 """
 
 from __future__ import annotations
@@ -10,46 +9,15 @@ from __future__ import annotations
 import ctypes
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any
 
-from drivers.errors import DeviceError, DeviceGone, TransportTimeout
-
-T = TypeVar("T")
+from drivers.errors import DeviceGone
 
 _DASHBOARD_S = 1.0
 _GOODBYE_S = 0.1
 _POLL_S = 0.001
-
-
-def bounded(device: str, what: str, timeout_s: float, call: Callable[[], T]) -> T:
-    """Result of a vendor call that may hang: it is left behind in its thread after ``timeout_s``.
-
-    Raises:
-        TransportTimeout: it had not returned.
-        DeviceGone: it raised one of the vendor's errors.
-    """
-    results: list[T] = []
-    errors: list[Exception] = []
-
-    def work() -> None:
-        try:
-            results.append(call())
-        except Exception as error:
-            errors.append(error)
-
-    # A daemon, because a call into a frozen controller must not keep the process from ending.
-    thread = threading.Thread(target=work, name=f"{device} {what}", daemon=True)
-    thread.start()
-    thread.join(timeout_s)
-    if errors:
-        if isinstance(errors[0], DeviceError):
-            raise errors[0]
-        raise DeviceGone(device, f"{what}: {errors[0]}") from errors[0]
-    if not results:
-        raise TransportTimeout(device, what, timeout_s)
-    return results[0]
 
 
 @contextmanager
@@ -65,6 +33,31 @@ def dashboard(device: str, host: str) -> Iterator[Any]:
         raise DeviceGone(device, f"dashboard of {host}: {error}") from error
     finally:
         client.disconnect()
+
+
+def upload_control_program(device: str, host: str) -> None:
+    """Send ur-rtde's control program to a controller on which none is playing, and let go of it.
+
+    The command register is cleared first, for it outlives programs and clients: a program that starts while it still
+    says speedL would move at once. ur-rtde's control interface does that on construction. It serves for nothing else,
+    since it reconnects by itself when the link drops, racing with its own threads: that repeats commands, takes the
+    registers from others, and was seen to crash the process.
+
+    Raises:
+        DeviceGone: the controller did not take it, or another client owns the registers.
+    """
+    from rtde_control import RTDEControlInterface
+
+    try:
+        control = RTDEControlInterface(host, flags=RTDEControlInterface.FLAG_NO_WAIT)
+    except RuntimeError as error:
+        raise DeviceGone(device, f"RTDE control of {host}: {error}") from error
+    try:
+        control.reuploadScript()
+    except RuntimeError as error:
+        raise DeviceGone(device, f"upload to {host}: {error}") from error
+    finally:
+        retire(device, control)
 
 
 def retire(device: str, interface: Any) -> None:

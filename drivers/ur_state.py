@@ -37,11 +37,21 @@ VARIABLES = (
     "joint_temperatures",
 )
 
-_MAX_JOINT_RAD = 2.0 * math.pi + 0.1
 _MAX_JOINT_SPEED_RAD_S = 2.0 * math.pi
-_MAX_REACH_M = 3.0
-_MAX_TCP_SPEED = 20.0
-_MAX_WRENCH = 2000.0
+# Largest magnitudes that can be true, in the order in which StateReader reads: far beyond what the arm can do.
+_BOUNDS = np.array(
+    [
+        1e9,  # timestamp, s
+        *[3.0] * 3,  # position, m
+        *[2.0 * math.pi] * 3,  # rotation vector, rad
+        *[20.0] * 6,  # speed of the tool, m/s and rad/s
+        *[2000.0] * 6,  # wrench, N and N m
+        1.0,  # speed slider
+        *[2.0 * math.pi + 0.1] * 6,  # joints, rad
+        *[_MAX_JOINT_SPEED_RAD_S] * 12,  # actual and target joint speeds
+        *[200.0] * 6,  # temperatures, Celsius
+    ]
+)
 _JUMP_SLACK_RAD = 0.02
 _ATTEMPTS = 3
 # Two quartz clocks differ by less; see _place.
@@ -121,10 +131,11 @@ class StateReader:
         """Whether more packets are being dropped than a healthy link explains: over 10 of the last 50."""
         return sum(self._misses) > _BUDGET_MISSES
 
-    def forget_misses(self) -> None:
-        """Start the budget anew, after a person has looked at the fault."""
+    def forget(self) -> None:
+        """Start the budget and the comparison of the clocks anew, after a person has looked at the fault."""
         with self._lock:
             self._misses.clear()
+            self._offset_ns = None
 
     def poll(self) -> Snapshot | None:
         """Newest good snapshot, or None before the first."""
@@ -163,32 +174,24 @@ class StateReader:
     def _take(self, timestamp_s: float, values: tuple[list[float], list[float], tuple[int, ...]]) -> None:
         tool, joints, (robot_mode, safety_mode, safety_bits, runtime_state) = values
         numbers = np.array([timestamp_s, *tool, *joints])
-        if not np.isfinite(numbers).all() or timestamp_s < 0.0:
+        # Written so that NaN fails.
+        if not (np.abs(numbers) <= _BOUNDS).all() or timestamp_s < 0.0:
             return self._miss_corrupt()
         t_device_ns = round(timestamp_s * 1e9)
+        q = numbers[20:26]
         newest = self._newest
-        if newest is not None and t_device_ns <= newest.t_device_ns:
-            self.out_of_order += 1
-            self._misses.append(True)
-            return None
-        pose, speed, force = numbers[1:7], numbers[7:13], numbers[13:19]
-        q, qd, qd_target, temperatures = numbers[20:26], numbers[26:32], numbers[32:38], numbers[38:44]
-        in_range = (
-            np.abs(pose[:3]).max() <= _MAX_REACH_M
-            and np.linalg.norm(pose[3:]) <= 2.0 * math.pi
-            and np.abs(speed).max() <= _MAX_TCP_SPEED
-            and np.abs(force).max() <= _MAX_WRENCH
-            and np.abs(q).max() <= _MAX_JOINT_RAD
-            and max(np.abs(qd).max(), np.abs(qd_target).max()) <= _MAX_JOINT_SPEED_RAD_S
-        )
-        if in_range and newest is not None:
-            passed_s = (t_device_ns - newest.t_device_ns) * 1e-9
-            in_range = np.abs(q - newest.q).max() <= _MAX_JOINT_SPEED_RAD_S * passed_s + _JUMP_SLACK_RAD
+        if newest is not None:
+            passed_ns = t_device_ns - newest.t_device_ns
+            if passed_ns <= 0:
+                self.out_of_order += 1
+                self._misses.append(True)
+                return None
+            reach = _MAX_JOINT_SPEED_RAD_S * passed_ns * 1e-9 + _JUMP_SLACK_RAD
+            if not (np.abs(q - newest.q) <= reach).all():
+                return self._miss_corrupt()
         try:
             modes = RobotMode(robot_mode), SafetyMode(safety_mode), RuntimeState(runtime_state)
         except ValueError:
-            in_range = False
-        if not in_range:
             return self._miss_corrupt()
         self._misses.append(False)
         self._newest = Snapshot(
@@ -196,12 +199,12 @@ class StateReader:
             t_device_ns=t_device_ns,
             seq=round(timestamp_s * RATE_HZ),
             q=q,
-            qd=qd,
-            qd_target=qd_target,
-            tcp_pose=pose,
-            tcp_speed=speed,
-            tcp_force=force,
-            temperatures=temperatures,
+            qd=numbers[26:32],
+            qd_target=numbers[32:38],
+            tcp_pose=numbers[1:7],
+            tcp_speed=numbers[7:13],
+            tcp_force=numbers[13:19],
+            temperatures=numbers[38:44],
             robot_mode=modes[0],
             safety_mode=modes[1],
             safety_bits=safety_bits,

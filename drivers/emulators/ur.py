@@ -10,8 +10,8 @@ import argparse
 import asyncio
 import contextlib
 import math
-from collections.abc import Awaitable, Callable
-from typing import Any
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from drivers.ur_modes import RobotMode, RuntimeState, SafetyMode
 DASHBOARD_PORT = 29999
 SCRIPT_PORTS = (30001, 30002, 30003)
 VERSION = (5, 11, 1, 108249)
-_MAX_CATCH_UP_STEPS = 50
+_MAX_LATE_S = 0.5
 _MAX_BUFFER_BYTES = 1 << 20
 
 _OUTPUT_TYPES = {
@@ -133,7 +133,7 @@ class UrEmulator(Emulator):
         unlock_after_s: how long a protective stop cannot be unlocked.
     """
 
-    faults = {
+    faults: ClassVar[Mapping[str, str]] = {
         "pause": "the network side hangs: sockets stay open, nothing is read or written; the arm itself goes on",
         "drop": "the next N state packets are not sent",
         "delay": "state packets arrive this many seconds late",
@@ -292,13 +292,10 @@ class UrEmulator(Emulator):
         loop = asyncio.get_running_loop()
         due_s = loop.time()
         while True:
-            due_s += PERIOD_S
-            if (wait_s := due_s - loop.time()) > 0:
-                await asyncio.sleep(wait_s)
-            elif self._steps % _MAX_CATCH_UP_STEPS == 0:
-                # A process that was stopped for long does not live through the lost time.
-                due_s = max(due_s, loop.time() - _MAX_CATCH_UP_STEPS * PERIOD_S)
-                await asyncio.sleep(0)
+            # A late process catches up, because a controller's clock does not slow down, but reads its inputs between
+            # any two steps; one that was stopped altogether does not live through the lost time.
+            due_s = max(due_s + PERIOD_S, loop.time() - _MAX_LATE_S)
+            await asyncio.sleep(max(0.0, due_s - loop.time()))
             self._controller.step()
             self._steps += 1
             self._stream()
@@ -312,7 +309,7 @@ class UrEmulator(Emulator):
         if self.spend("drop"):
             return
         if self.spend("nan"):
-            values = values | {name: (math.nan,) * 6 for name in ("actual_q", "actual_TCP_pose", "actual_TCP_speed")}
+            values = values | dict.fromkeys(("actual_q", "actual_TCP_pose", "actual_TCP_speed"), (math.nan,) * 6)
         if self.spend("corrupt"):
             values = values | {"actual_TCP_pose": (1e30,) * 6, "actual_qd": (-7e8,) * 6, "robot_mode": 1 << 20}
         if self._previous and self.spend("out_of_order"):

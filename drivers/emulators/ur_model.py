@@ -1,7 +1,7 @@
 """Kinematics of a UR5e: where the flange is for given joint angles, and how fast it moves.
 
-Denavit-Hartenberg parameters: Universal Robots, "DH parameters for calculations of kinematics and dynamics", UR5e. A real
-arm differs by millimetres, because each carries its own calibration.
+Denavit-Hartenberg parameters: Universal Robots, "DH parameters for calculations of kinematics and dynamics", UR5e. A
+real arm differs by millimetres, because each carries its own calibration.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The control program that ur-rtde uploads, as the register protocol that it speaks.
 
-No URScript is interpreted. The program's threads are generators, of which each ``yield`` is one ``sync()`` of 2 ms. What
-matters for safety is kept: the speed thread takes up the newest target, hands it to ``speedl`` for ``time`` seconds, and
-repeats it for ever, so only another command, a stop of the program or the watchdog ends a motion.
+No URScript is interpreted. The program's threads are generators, of which each ``yield`` is one ``sync()`` of 2 ms.
+What matters for safety is kept: the speed thread takes up the newest target, hands it to ``speedl`` for ``time``
+seconds, and repeats it for ever, so only another command, a stop of the program or the watchdog ends a motion.
 
 Commands arrive in ``input_int_register_0``. Streaming ones are obeyed in every cycle; the others once, until the
 register returns to 0. ``output_int_register_0`` answers 1 (ready) or 2 (done). Source: the program and the client of

@@ -21,6 +21,19 @@ def host_of(address: int) -> str:
     return f"127.{64 + high // 250}.{high % 250}.{low + 1}"
 
 
+def config_of(address: int) -> UrConfig:
+    """The configuration with which the rig's driver finds emulator ``address``.
+
+    Patient, because test machines are busy: whoever cannot run for a tenth of a second loses the arm by default.
+    """
+    return UrConfig(
+        host=host_of(address),
+        flange_to_tcp_mm_deg=(0.0, 0.0, 100.0, 0.0, 0.0, 0.0),
+        watchdog_hz=5.0,
+        state_timeout_s=0.3,
+    )
+
+
 def rig(folder: Path, address: int) -> Rig:
     """The rig on its own loopback address; it keeps nothing in ``folder``."""
     host = host_of(address)
@@ -29,8 +42,7 @@ def rig(folder: Path, address: int) -> Rig:
         return EmulatorProcess("ur", "--host", host, "--unlock-after", str(UNLOCK_AFTER_S)).start()
 
     def build(clock: Clock) -> Device:
-        config = UrConfig(host=host, flange_to_tcp_mm_deg=(0.0, 0.0, 100.0, 0.0, 0.0, 0.0))
-        return SPEC.build("ur", config, DriverContext(clock))
+        return SPEC.build("ur", config_of(address), DriverContext(clock))
 
     return Rig(
         spec=SPEC,
