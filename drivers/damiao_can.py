@@ -208,10 +208,10 @@ class DamiaoCanArm(Arm):
 
     def watchdog_s(self) -> float:
         """Silence after which the motors let go, as read back from them; the longest of them."""
-        ticks = [self._bus.timeout_ticks[index] for index in range(len(self._config.motors))]
-        if any(tick is None for tick in ticks):
+        known = [ticks for ticks in self._bus.timeout_ticks if ticks is not None]
+        if len(known) < len(self._enabled):
             raise LifecycleError(self.name, "tell the watchdog", self.state.value, [Lifecycle.READY.value])
-        return max(tick or 0 for tick in ticks) * codec.TIMEOUT_TICK_S
+        return max(known) * codec.TIMEOUT_TICK_S
 
     def go_to_joints(self, q: Array, lease: Lease, *, speed_fraction: float = 0.1) -> None:
         """Start moving to ``q`` (n,) rad in a straight line in joint space, within the limits of the tool centre point.

@@ -311,6 +311,13 @@ def test_bus_off_is_a_fault_that_shows_in_health(arm: DamiaoCanArm, emulator: Em
     wait(lambda: arm.health()["bus_state"] == "active" and arm.joints().age_s(CLOCK.now_ns()) < 0.1)
     arm.recover(TOKEN)
     assert arm.state is Lifecycle.READY
+    emulator.fault("bus_off")
+    wait(lambda: faulted(arm))
+    arm.disconnect()
+    emulator.fault("reset")
+    arm.connect()
+    assert arm.state is Lifecycle.PASSIVE
+    assert arm.health()["bus_state"] == "active"
 
 
 def test_motors_that_lost_power_are_noticed(arm: DamiaoCanArm, emulator: EmulatorProcess) -> None:
