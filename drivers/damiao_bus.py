@@ -11,7 +11,6 @@ queue would stay one entry too long; then a register is read as well, whose answ
 from __future__ import annotations
 
 import errno
-import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -68,7 +67,7 @@ class _Pending:
 
 
 class MotorBus:
-    """The motors of one arm on one CAN bus. Every public call takes the bus for itself while it lasts.
+    """The motors of one arm on one CAN bus. One thread at a time.
 
     Args:
         device: name for errors.
@@ -93,16 +92,20 @@ class MotorBus:
         self._clock = clock
         self._fd = fd
         self._bus: Any = None
-        self._lock = threading.RLock()
-        self._ranges: list[Ranges | None] = [None] * len(addresses)
-        self._pending: list[deque[_Pending]] = [deque() for _ in addresses]
-        self._newest: list[Answer | None] = [None] * len(addresses)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Start as on a bus that was never open."""
+        n = len(self._addresses)
+        self._ranges: list[Ranges | None] = [None] * n
+        self._pending: list[deque[_Pending]] = [deque() for _ in range(n)]
+        self._newest: list[Answer | None] = [None] * n
         self._registers: dict[tuple[int, int], float | int] = {}
         self._wanted_register: tuple[int, int] | None = None
         self._bus_off = False
         self.counters = Counters()
         self.last_error = ""
-        self.timeout_ticks: list[int | None] = [None] * len(addresses)
+        self.timeout_ticks: list[int | None] = [None] * n
 
     @property
     def state(self) -> str:
@@ -117,6 +120,7 @@ class MotorBus:
         Raises:
             ConnectError: no bus, or motors that do not answer or not as configured; ``causes`` names each.
         """
+        self._forget()
         self._bus = self._connect()
         causes: list[Exception] = []
         for index, address in enumerate(self._addresses):
@@ -133,10 +137,9 @@ class MotorBus:
 
     def close(self) -> None:
         """Leave the bus; without effect on one that was never opened."""
-        with self._lock:
-            if self._bus is not None:
-                self._bus.shutdown()
-                self._bus = None
+        if self._bus is not None:
+            self._bus.shutdown()
+            self._bus = None
 
     def ranges(self, index: int) -> Ranges:
         """Full scales of a motor, as it told."""
@@ -155,15 +158,14 @@ class MotorBus:
 
     def command(self, index: int, data: bytes) -> Feedback:
         """Send one frame to one motor and wait for its answer. Raises TransportTimeout, DeviceGone."""
-        with self._lock:
-            self._settle()
-            self._send(index, self._addresses[index].esc_id, data)
-            until_ns = self._clock.now_ns() + round(_REGISTER_TIMEOUT_S * 1e9)
-            while (answer := self._newest[index]) is None and self._receive(until_ns):
-                pass
-            if answer is None:
-                raise self._no_answer(index)
-            return answer.feedback
+        self._settle()
+        self._send(index, self._addresses[index].esc_id, data)
+        until_ns = self._clock.now_ns() + round(_REGISTER_TIMEOUT_S * 1e9)
+        while (answer := self._newest[index]) is None and self._receive(until_ns):
+            pass
+        if answer is None:
+            raise self._no_answer(index)
+        return answer.feedback
 
     def exchange(self, data: Sequence[bytes | None], until_ns: int) -> list[Answer | None]:
         """Send every motor its frame, or a request for its state where there is none, and collect answers.
@@ -175,28 +177,27 @@ class MotorBus:
             DeviceGone: the bus has gone.
             DeviceFault: the controller is bus-off.
         """
-        with self._lock:
-            self._newest = [None] * len(self._addresses)
-            self._fence()
-            start_ns = self._clock.now_ns()
-            for index, (address, frame) in enumerate(zip(self._addresses, data, strict=True)):
-                if frame is None:
-                    self._send(index, codec.PARAMETER_ID, codec.request_feedback(address.esc_id))
-                else:
-                    self._send(index, address.esc_id, frame)
-            while not self._all_since(start_ns) and self._receive(until_ns):
-                pass
-            self.counters.missed += sum(answer is None for answer in self._newest)
-            if self._bus_off:
-                raise DeviceFault(
-                    self._device,
-                    "bus-off",
-                    vendor_code="bus-off",
-                    fault_class=FaultClass.COMMUNICATION,
-                    needs=Remedy.OPERATOR,
-                    hint="check wiring, termination and bit rates, then restart the interface",
-                )
-            return list(self._newest)
+        self._newest = [None] * len(self._addresses)
+        self._fence()
+        start_ns = self._clock.now_ns()
+        for index, (address, frame) in enumerate(zip(self._addresses, data, strict=True)):
+            if frame is None:
+                self._send(index, codec.PARAMETER_ID, codec.request_feedback(address.esc_id))
+            else:
+                self._send(index, address.esc_id, frame)
+        while not self._all_since(start_ns) and self._receive(until_ns):
+            pass
+        self.counters.missed += sum(answer is None for answer in self._newest)
+        if self._bus_off:
+            raise DeviceFault(
+                self._device,
+                "bus-off",
+                vendor_code="bus-off",
+                fault_class=FaultClass.COMMUNICATION,
+                needs=Remedy.OPERATOR,
+                hint="check wiring, termination and bit rates, then restart the interface",
+            )
+        return list(self._newest)
 
     def _all_since(self, start_ns: int) -> bool:
         return all(answer is not None and answer.t_ns >= start_ns for answer in self._newest)
@@ -209,20 +210,19 @@ class MotorBus:
         )
 
     def _ask(self, index: int, register: int, request: bytes) -> float | int:
-        with self._lock:
-            self._settle()
-            self._wanted_register = (index, register)
-            try:
-                for _ in range(_REGISTER_TRIES):
-                    self._put(codec.PARAMETER_ID, request)
-                    until_ns = self._clock.now_ns() + round(_REGISTER_TIMEOUT_S * 1e9)
-                    while (index, register) not in self._registers and self._receive(until_ns):
-                        pass
-                    if (index, register) in self._registers:
-                        return self._registers.pop((index, register))
-            finally:
-                self._wanted_register = None
-            raise self._no_answer(index)
+        self._settle()
+        self._wanted_register = (index, register)
+        try:
+            for _ in range(_REGISTER_TRIES):
+                self._put(codec.PARAMETER_ID, request)
+                until_ns = self._clock.now_ns() + round(_REGISTER_TIMEOUT_S * 1e9)
+                while (index, register) not in self._registers and self._receive(until_ns):
+                    pass
+                if (index, register) in self._registers:
+                    return self._registers.pop((index, register))
+        finally:
+            self._wanted_register = None
+        raise self._no_answer(index)
 
     def _no_answer(self, index: int) -> TransportTimeout:
         what = f"answer of motor {self._addresses[index].esc_id}"

@@ -19,7 +19,7 @@ from drivers.commands import TwistCommand, TwistFrame
 from drivers.damiao_can import DamiaoCanArm
 from drivers.device import DeactivatePolicy, Lifecycle, OperatorToken
 from drivers.emulators.process import EmulatorProcess
-from drivers.emulators.rigs.damiao_can import PARK_DEG, config, rig
+from drivers.emulators.rigs.damiao_can import config, rig
 from drivers.errors import (
     CommandRejected,
     ConfigError,
@@ -311,6 +311,13 @@ def test_bus_off_is_a_fault_that_shows_in_health(arm: DamiaoCanArm, emulator: Em
     wait(lambda: arm.health()["bus_state"] == "active" and arm.joints().age_s(CLOCK.now_ns()) < 0.1)
     arm.recover(TOKEN)
     assert arm.state is Lifecycle.READY
+    emulator.fault("bus_off")
+    wait(lambda: faulted(arm))
+    arm.disconnect()
+    emulator.fault("reset")
+    arm.connect()
+    assert arm.state is Lifecycle.PASSIVE
+    assert arm.health()["bus_state"] == "active"
 
 
 def test_motors_that_lost_power_are_noticed(arm: DamiaoCanArm, emulator: EmulatorProcess) -> None:
@@ -480,7 +487,21 @@ def test_gains_that_would_push_too_hard_are_refused(channel: Path, emulator: Emu
         arm.configure()
 
 
-def test_the_park_pose_lies_within_the_joint_limits(tmp_path: Path) -> None:
-    arm = config(tmp_path).describe()
-    for joint, angle in zip(arm.joints, PARK_DEG, strict=True):
-        assert joint.lower_deg <= angle <= joint.upper_deg
+def test_a_park_pose_outside_the_joint_limits_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="joint 'elbow'"):
+        config(tmp_path, park_deg=[0.0, 0.0, 155.0, 0.0, 0.0, 0.0]).describe()
+
+
+def test_another_number_of_motors_than_joints_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="has 6 joints"):
+        DamiaoCanArm("arm", config(tmp_path, motors=[{"esc_id": 1, "mst_id": 17}], park_deg=None), CLOCK)
+
+
+def test_a_motor_that_will_not_enable_leaves_none_enabled(arm: DamiaoCanArm, emulator: EmulatorProcess) -> None:
+    arm.connect()
+    arm.configure()
+    emulator.fault("refuse", 3)
+    with pytest.raises(DeviceFault, match="motor 4: does not enable"):
+        arm.activate()
+    assert emulator.state()["enabled"] == 0
+    assert arm.state is Lifecycle.READY

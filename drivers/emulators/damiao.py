@@ -107,6 +107,7 @@ class DamiaoArm(Emulator):
         "fault_bits": "[motor index, status nibble]: the motor reports it and lets go",
         "hot": "[motor index, degrees Celsius] of the winding; at 100 the motor lets go",
         "push": "[motor index, N m]: somebody pushes that joint",
+        "refuse": "this motor (index from 0) does not enable",
         "nan": "the full-scale registers read as NaN",
         "restart": "the motors lose power for a moment",
         "reset": "everything is as it was when the emulator started",
@@ -302,6 +303,8 @@ class DamiaoArm(Emulator):
 
     def _on_special(self, index: int, data: bytes) -> None:
         motor = self.motors[index]
+        if data == codec.ENABLE and self.active.get("refuse") == index:
+            return
         if data == codec.ENABLE and motor.status in (codec.DISABLED, codec.ENABLED):
             motor.status = codec.ENABLED
             motor.command = codec.MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
