@@ -215,7 +215,10 @@ def test_a_control_that_only_seems_to_obey_is_refused(
     assert camera.latest().value.gain == 30.0
 
 
-@pytest.mark.parametrize("settings", [{"rate_hz": float("nan")}, {"exposure_us": 150}, {"width_px": 0}, {"gane": 3}])
+@pytest.mark.parametrize(
+    "settings",
+    [{"rate_hz": float("nan")}, {"exposure_us": 150}, {"width_px": 0}, {"gane": 3}, {"stall_s": 0.05}],
+)
 def test_nonsense_is_refused_before_any_device_is_touched(settings: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=next(iter(settings))):
         V4l2Config.model_validate({"device": NODE} | settings)

@@ -299,7 +299,7 @@ class V4l2Emulator(Emulator):
         return light * max(0.0, 1.0 + drift_per_s * (time.monotonic() - self._drift_since_s))
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=96)
 def _frame(source: Path | int, width: int, height: int, pixel_format: str, light: int) -> bytes:
     if isinstance(source, Path):
         image = picture.from_file(source, width, height)
