@@ -1,8 +1,8 @@
 """What all live cameras have in common: the newest frame or an error that says why there is none.
 
-The queue of frames is emptied when somebody reads, only the newest is kept, and it is decoded once, when it is wanted. So
-no reader thread is needed where a queue can be emptied without blocking and is deep enough for the longest pause between
-two reads. After a longer one it is full of old frames, which is seen and answered by waiting for the next frame.
+The queue of frames is emptied when somebody reads, only the newest is kept, and it is decoded once, when it is wanted.
+So no reader thread is needed where a queue can be emptied without blocking and is deep enough for the longest pause
+between two reads. After a longer one it is full of old frames, which is seen and answered by waiting for the next.
 """
 
 from __future__ import annotations
