@@ -1,18 +1,18 @@
 """What all live cameras have in common: the newest frame or an error that says why there is none.
 
-There is no reader thread. The driver's queue is emptied when somebody reads, only the newest frame is kept, and it is
-decoded once, when it is wanted. That needs a queue deep enough for the longest pause between two reads; after a longer
-one the queue is full of old frames, which is seen and answered by waiting for the next frame.
+The queue of frames is emptied when somebody reads, only the newest is kept, and it is decoded once, when it is wanted.
+So no reader thread is needed where a queue can be emptied without blocking and is deep enough for the longest pause
+between two reads. After a longer one it is full of old frames, which is seen and answered by waiting for the next.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Literal, final
+from typing import Literal, Self, final
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from drivers.clock import Clock
 from drivers.device import Device, Lifecycle, OperatorToken
@@ -24,6 +24,7 @@ from geometry.types import ImageArray
 
 _FIRST_FRAME_S = 5.0
 _UNREAD_PERIODS = 4.0
+_STALL_PERIODS = 3
 _SHORTEST_WAIT_S = 1e-3
 
 
@@ -39,7 +40,7 @@ class CameraConfig(DriverConfig):
         exposure_us: exposure time in steps of 100 us, or None to keep the camera's own. Automatic exposure is switched
             off either way.
         gain: gain in the camera's own units, or None to keep its own.
-        stall_s: silence after which the camera counts as failed.
+        stall_s: silence after which the camera counts as failed; at least three periods.
     """
 
     device: str = Field(min_length=1)
@@ -51,6 +52,12 @@ class CameraConfig(DriverConfig):
     exposure_us: int | None = Field(default=None, gt=0, multiple_of=100)
     gain: int | None = Field(default=None, ge=0)
     stall_s: float = Field(default=0.5, gt=0.0, le=10.0)
+
+    @model_validator(mode="after")
+    def _silence_is_longer_than_the_period(self) -> Self:
+        if self.stall_s * self.rate_hz < _STALL_PERIODS:
+            raise ValueError(f"stall_s must be at least {_STALL_PERIODS} periods, {_STALL_PERIODS / self.rate_hz:g} s")
+        return self
 
 
 class SettingRefused(ConfigError):
@@ -69,7 +76,7 @@ class SettingRefused(ConfigError):
             f"{asked} refused, {reason}",
             key=f"{device}.{setting}",
             value=asked,
-            hint="leave it out" if given is None else f"write {given}, or see `v4l2-ctl --all` for what it offers",
+            hint="leave it out" if given is None else "`v4l2-ctl --list-ctrls --list-formats-ext` shows what it offers",
         )
         self.device = device
         self.setting = setting

@@ -45,10 +45,8 @@ def cameras(dev: Path = Path("/dev"), calls: SystemCalls | None = None) -> list[
     for node in sorted(dev.glob("video*"), key=_natural):
         address = _stable(node, [dev / "v4l" / "by-id", dev / "v4l" / "by-path"])
         needs = _permission(node)
-        if address == str(node):
-            needs.append("has no by-id name: after a restart it may be another camera")
         description = "camera"
-        if not _permission(node):
+        if not needs:
             try:
                 description = _describe_camera(node, calls or KernelCalls())
             except ConnectError as error:
@@ -57,6 +55,8 @@ def cameras(dev: Path = Path("/dev"), calls: SystemCalls | None = None) -> list[
                 needs.append(error.message)
             except TransportError as error:
                 needs.append(error.message)
+        if address == str(node):
+            needs.append("has no by-id name: after a restart it may be another camera")
         found.append(Found("camera", address, str(node), description, tuple(needs)))
     return found
 

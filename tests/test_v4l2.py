@@ -33,6 +33,7 @@ from drivers.errors import (
 from drivers.registry import spec
 from drivers.samples import Frame, Quality, Stamped
 from drivers.v4l2 import SPEC, V4l2Camera, V4l2Config
+from drivers.v4l2_codec import Arrival
 
 TOKEN = OperatorToken("test", 0)
 DEADLINE_S = 5.0
@@ -136,10 +137,8 @@ def test_frames_are_stamped_numbered_and_show_what_the_sensor_saw(
     make: Callable[..., V4l2Camera], emulator: EmulatorProcess
 ) -> None:
     frames = read(ready(make(pixel_format="GREY")), 20)
-    # Gain 10 is 1.2 times the light, exposure 15.7 ms is the emulated camera's nominal one.
     for frame in frames:
-        expected = picture.brightened(picture.synthetic(frame.seq % picture.PICTURES, 640, 480), 1.2)
-        np.testing.assert_array_equal(frame.value.image, expected)
+        assert_number_is_true(frame)
         assert frame.quality is Quality.GOOD
         assert (frame.value.exposure, frame.value.gain) == (0.0157, 10.0)
     stamps = np.array([frame.t_ns for frame in frames])
@@ -216,7 +215,10 @@ def test_a_control_that_only_seems_to_obey_is_refused(
     assert camera.latest().value.gain == 30.0
 
 
-@pytest.mark.parametrize("settings", [{"rate_hz": float("nan")}, {"exposure_us": 150}, {"width_px": 0}, {"gane": 3}])
+@pytest.mark.parametrize(
+    "settings",
+    [{"rate_hz": float("nan")}, {"exposure_us": 150}, {"width_px": 0}, {"gane": 3}, {"stall_s": 0.05}],
+)
 def test_nonsense_is_refused_before_any_device_is_touched(settings: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=next(iter(settings))):
         V4l2Config.model_validate({"device": NODE} | settings)
@@ -250,10 +252,20 @@ def test_after_a_long_pause_the_newest_frame_comes_and_the_gap_is_the_readers(
     assert health["frames_lost"] == 0
 
 
-def test_lost_frames_are_counted(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
-    read(camera, 3)
+def assert_number_is_true(frame: Stamped[Frame]) -> None:
+    # Gain 10 is 1.2 times the light, exposure 15.7 ms is the emulated camera's nominal one.
+    expected = picture.brightened(picture.synthetic(frame.seq % picture.PICTURES, 640, 480), 1.2)
+    np.testing.assert_array_equal(frame.value.image, expected)
+
+
+def test_lost_frames_are_counted_and_leave_a_gap_in_the_numbers(
+    make: Callable[..., V4l2Camera], emulator: EmulatorProcess
+) -> None:
+    camera = ready(make(pixel_format="GREY"))
+    assert_number_is_true(camera.latest())
     emulator.fault("drop", 3)
     read_until(camera, "frames_lost", 3)
+    assert_number_is_true(camera.latest())
     assert camera.health()["frames_lost"] == 3
     assert camera.health()["frames_unread"] == 0
 
@@ -279,6 +291,42 @@ def test_a_few_bad_frames_are_refused_counted_and_survived(
     assert (np.diff([frame.seq for frame in frames]) > 0).all()
     assert (np.diff([frame.t_ns for frame in frames]) > 0).all()
     assert camera.state is Lifecycle.READY
+
+
+@pytest.mark.parametrize(
+    ("sequence", "stamp_ahead_ns", "reading"),
+    [
+        (1, -900_000, "frames_bad_out_of_order"),
+        (0, -900_000, "frames_bad_out_of_order"),
+        (2, -1_000_000, "frames_bad_out_of_order"),
+        (2, 10_000_000_000, "frames_bad_from_the_future"),
+        (2, -900_000, "frames_good"),
+    ],
+)
+def test_a_number_or_a_stamp_alone_can_make_a_frame_bad(sequence: int, stamp_ahead_ns: int, reading: str) -> None:
+    clock = MonotonicClock()
+    camera = V4l2Camera("tip", clock, V4l2Config(device=NODE, pixel_format="GREY"))
+    now_ns = clock.now_ns()
+    data = bytes(640 * 480)
+    camera._examine(_arrival(1, now_ns - 1_000_000), data)
+    before = camera.health()
+    camera._examine(_arrival(sequence, now_ns + stamp_ahead_ns), data)
+    after = camera.health()
+    changed = {key for key in after if key.startswith("frames_") and after[key] != before.get(key, 0)}
+    assert reading in changed
+    assert ("frames_good" in changed) == (reading == "frames_good")
+
+
+def _arrival(sequence: int, stamp_ns: int) -> Arrival:
+    return Arrival(
+        index=0,
+        bytes_used=640 * 480,
+        sequence=sequence,
+        stamp_ns=stamp_ns,
+        monotonic=True,
+        start_of_exposure=True,
+        damaged=False,
+    )
 
 
 def test_too_many_bad_frames_are_a_fault(camera: V4l2Camera, emulator: EmulatorProcess) -> None:

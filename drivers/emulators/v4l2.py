@@ -225,6 +225,7 @@ class V4l2Emulator(Emulator):
             self._stream = None
         if begins:
             self._sequence = -1
+            self._shown = b""
             self._stream = asyncio.create_task(self._run_sensor())
 
     async def _run_sensor(self) -> None:
@@ -255,15 +256,17 @@ class V4l2Emulator(Emulator):
             stamp_ns -= _OLDER_FRAMES * round(1e9 / self.model.rate_hz)
         if "no_monotonic" in self.active:
             stamp_ns += _FOREIGN_CLOCK_NS
-        owner = self.model.owner
-        delay_s = float(self.active.get("delay", 0.0))
+        stream, delay_s = self._stream, float(self.active.get("delay", 0.0))
         if delay_s > 0.0:
-            asyncio.get_running_loop().call_later(delay_s, self._deliver, owner, data, sequence, stamp_ns, flags)
+            asyncio.get_running_loop().call_later(delay_s, self._deliver, stream, data, sequence, stamp_ns, flags)
         else:
-            self._deliver(owner, data, sequence, stamp_ns, flags)
+            self._deliver(stream, data, sequence, stamp_ns, flags)
 
-    def _deliver(self, owner: Handle | None, data: bytes, sequence: int, stamp_ns: int, flags: int) -> None:
-        if owner is None or owner is not self.model.owner or not self.model.streaming:
+    def _deliver(
+        self, stream: asyncio.Task[None] | None, data: bytes, sequence: int, stamp_ns: int, flags: int
+    ) -> None:
+        owner = self.model.owner
+        if owner is None or stream is not self._stream:
             return
         index = self.model.next_buffer()
         if index is None:
@@ -299,7 +302,7 @@ class V4l2Emulator(Emulator):
         return light * max(0.0, 1.0 + drift_per_s * (time.monotonic() - self._drift_since_s))
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=96)
 def _frame(source: Path | int, width: int, height: int, pixel_format: str, light: int) -> bytes:
     if isinstance(source, Path):
         image = picture.from_file(source, width, height)

@@ -117,6 +117,10 @@ class CameraModel:
     Args:
         card: product name.
         on_stream: called with True when streaming starts and False when it ends.
+
+    Attributes:
+        settings_changed: requests that changed anything or started the stream.
+        energising: settings of a control that moves something, which on this camera is the focus.
     """
 
     def __init__(self, card: str, on_stream: Callable[[bool], None]) -> None:

@@ -11,13 +11,13 @@ from drivers.emulators.rig import Rig
 from drivers.emulators.v4l2_shim import ShimCalls
 from drivers.v4l2 import SPEC, V4l2Camera, V4l2Config
 
-RATE_HZ = 60.0
+_RATE_HZ = 60.0
 
 
 def rig(folder: Path, address: int) -> Rig:
     """A camera at /dev/video``address`` whose sockets live in ``folder``."""
     config = V4l2Config(
-        device=f"/dev/v4l/by-id/usb-TacTip_{address:04d}-video-index0", rate_hz=RATE_HZ, exposure_us=15700, gain=10
+        device=f"/dev/v4l/by-id/usb-TacTip_{address:04d}-video-index0", rate_hz=_RATE_HZ, exposure_us=15700, gain=10
     )
 
     def start() -> EmulatorProcess:
