@@ -1,9 +1,9 @@
 """Franka arms (FR3, Research 3) over franky, which keeps libfranka's 1 kHz loop in a thread outside the GIL.
 
-A twist becomes a Cartesian velocity motion that lasts as long as its time-to-live: libfranka's thread counts that time and
-brakes the arm even if Python hangs. If the whole process dies, the controller misses 20 command packets and stops the arm
-with a communication reflex. The Franka Control Interface cannot release or close the brakes; Desk does. So ``activate``
-sends nothing: it only makes sure that the arm rests, obeys and reports no error.
+A twist becomes a Cartesian velocity motion that lasts as long as its time-to-live: libfranka's thread counts that time
+and brakes the arm even if Python hangs. If the whole process dies, the controller misses 20 command packets and stops
+the arm with a communication reflex. The Franka Control Interface cannot release or close the brakes; Desk does. So
+``activate`` sends nothing: it only makes sure that the arm rests, obeys and reports no error.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from drivers.clock import Clock
 from drivers.device import DeactivatePolicy, Lifecycle, OperatorToken
 from drivers.errors import (
     CommandRejected,
-    ConfigError,
     ConnectError,
     DeviceError,
     DeviceFault,
@@ -154,7 +153,7 @@ class FrankaArm(Arm):
         return _stamped(JointState(reading.q, reading.dq, reading.tau), reading)
 
     def wrench(self, max_age_s: float | None = None) -> Stamped[Array]:
-        """(6,) wrench of the world on the tool centre point, base axes, estimated by the controller. Raises as ``tcp``."""
+        """(6,) wrench of the world on the tool centre point along base axes, as the controller estimates. As ``tcp``."""
         reading = self._reading("tell its wrench", max_age_s)
         return _stamped(reading.wrench, reading)
 
@@ -228,8 +227,14 @@ class FrankaArm(Arm):
         return _WATCHDOG_S
 
     def _open(self) -> None:
-        franky = self._franky = _import_franky(self.name)
         config = self._config
+        if config.enforce_realtime and not _has_realtime_kernel():
+            raise ConnectError(
+                self.name,
+                "this kernel is not PREEMPT_RT",
+                hint="boot a real-time kernel, or set enforce_realtime: false and expect communication reflexes",
+            )
+        franky = self._franky = _import_franky(self.name)
         realtime = franky.RealtimeConfig.Enforce if config.enforce_realtime else franky.RealtimeConfig.Ignore
         try:
             # libfranka makes whoever connects a real-time thread, where it may, and its control threads inherit that.
@@ -260,18 +265,13 @@ class FrankaArm(Arm):
 
     def _configure(self) -> None:
         config = self._config
-        if config.enforce_realtime and not _has_realtime_kernel():
-            raise ConfigError(
-                "this kernel is not PREEMPT_RT",
-                key=f"{self.name}.enforce_realtime",
-                value=True,
-                hint="boot a real-time kernel, or set enforce_realtime: false and expect communication reflexes",
-            )
         # Twice the limit for forces: libfranka's thread should brake the arm gently before the controller does it hard.
         force, torque = 2.0 * config.contact_force_limit_n, config.contact_torque_limit_nm
         try:
             self._robot.set_collision_behavior([60.0] * 7, [force] * 3 + [torque] * 3)
             self._set_frames()
+            # A reading from before would have another tool centre point.
+            self._await_reading(_FIRST_STATE_S, "state", after_ms=self._robot.state.time.to_msec())
         except (self._franky.Exception, RuntimeError) as error:
             raise DeviceFault(
                 self.name,
@@ -501,12 +501,18 @@ class FrankaArm(Arm):
             return DeviceFault(self.name, f"command refused: {error}", fault_class=FaultClass.MOTION)
         return DeviceGone(self.name, f"lost the controller: {error}", hint="disconnect and connect again")
 
-    def _await_reading(self, timeout_s: float, what: str) -> Reading:
-        """A reading that was not there yet. Raises TransportTimeout, or what ended the reader."""
+    def _await_reading(self, timeout_s: float, what: str, after_ms: int | None = None) -> Reading:
+        """A reading later than ``after_ms`` of the controller's time, or than the newest one.
+
+        Raises:
+            TransportTimeout: there is none in time.
+            DeviceError: what ended the reader.
+        """
         reader = self._open_reader()
-        before = reader.newest
+        if after_ms is None:
+            after_ms = reader.newest.device_ms if reader.newest else -1
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        while (reading := reader.newest) is before or reading is None:
+        while (reading := reader.newest) is None or reading.device_ms <= after_ms:
             if reader.failure is not None:
                 raise reader.failure
             now_ns = self._clock.now_ns()

@@ -27,7 +27,7 @@ class Reading:
     """What one state packet says, in SI units along base axes.
 
     Attributes:
-        t_ns: start of the read before the one that found it: it cannot have come earlier, so its age is never understated.
+        t_ns: start of the read before the one that found it: it cannot have come earlier, so no age is understated.
         device_ms: the controller's own time.
         T_base_tcp: (4, 4).
         twist: (6,) of the tool centre point, from measured joint velocities.

@@ -136,6 +136,7 @@ class FrankaEmulator(Emulator):
             "at_last_command_m": self._stopped_at,
             "force_threshold": arm.force_threshold.tolist(),
             "received": self._received,
+            "active": self.active,
             **self._counts,
         }
 
