@@ -37,6 +37,7 @@ from drivers.errors import (
     Rejection,
     Remedy,
     StaleData,
+    TransportError,
     TransportTimeout,
 )
 from drivers.franka_errors import BY_NAME, ERRORS, MODES, VendorError
@@ -77,7 +78,8 @@ _RECOVERY_S = 5.0
 # franky's motions are smooth already, and libfranka's filter assumes that no state is ever lost: after one it jumps.
 _NO_FILTER_HZ = 1000.0
 _POLL_NS = 2_000_000
-_REST_SPEED_RAD_S = 0.005
+_JOINT_TORQUE_NM = 20.0
+_REST_SPEED_RAD_S = 0.01
 _FRAME_TOLERANCE = 1e-5
 _OBEYS = ("Idle", "Move")
 _NEEDS_A_PERSON = ("UserStopped", "Other", "Guiding")
@@ -140,6 +142,7 @@ class FrankaArm(Arm):
         self._reader: StateReader | None = None
         self._control_scheduling: _Scheduling | None = None
         self._contact = threading.Event()
+        self._moved_ns = clock.now_ns()
         self._joint_limits = np.zeros((7, 2))
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
@@ -153,15 +156,18 @@ class FrankaArm(Arm):
         return _stamped(JointState(reading.q, reading.dq, reading.tau), reading)
 
     def wrench(self, max_age_s: float | None = None) -> Stamped[Array]:
-        """(6,) wrench of the world on the tool centre point along base axes, as the controller estimates. As ``tcp``."""
+        """(6,) wrench of the world on the tool centre point along base axes, the controller's estimate. As ``tcp``."""
         reading = self._reading("tell its wrench", max_age_s)
         return _stamped(reading.wrench, reading)
 
     def at_rest(self) -> bool:
         """Whether a fresh state shows it standing still and no motion is running."""
         self._require("tell whether it is at rest", *_READABLE)
-        reading = self._open_reader().newest
-        if reading is None or self._age_s(reading) > _FRESH_S or self._robot.is_in_control:
+        reader = self._open_reader()
+        reading = reader.newest
+        if reading is None or self._age_s(reading) > _FRESH_S:
+            return False
+        if reader.in_motion or reader.looked_ns <= self._moved_ns:
             return False
         return bool(np.abs(reading.dq).max() < _REST_SPEED_RAD_S)
 
@@ -251,7 +257,7 @@ class FrankaArm(Arm):
             ) from None
         # Every motion names its own factor; the robot's would multiply it.
         self._robot.relative_dynamics_factor = 1.0
-        self._joint_limits = _joint_limits(self._robot.model_urdf)
+        self._joint_limits = _joint_limits(self.name, self._robot.model_urdf)
         self._contact.clear()
         self._reader = StateReader(self.name, franky, self._robot, self._clock)
         self._reader.start()
@@ -268,7 +274,7 @@ class FrankaArm(Arm):
         # Twice the limit for forces: libfranka's thread should brake the arm gently before the controller does it hard.
         force, torque = 2.0 * config.contact_force_limit_n, config.contact_torque_limit_nm
         try:
-            self._robot.set_collision_behavior([60.0] * 7, [force] * 3 + [torque] * 3)
+            self._robot.set_collision_behavior([_JOINT_TORQUE_NM] * 7, [force] * 3 + [torque] * 3)
             self._set_frames()
             # A reading from before would have another tool centre point.
             self._await_reading(_FIRST_STATE_S, "state", after_ms=self._robot.state.time.to_msec())
@@ -406,6 +412,7 @@ class FrankaArm(Arm):
 
     def _move(self, motion: Any) -> None:
         with _scheduled(self._control_scheduling):
+            self._moved_ns = self._clock.now_ns()
             self._robot.move(motion, asynchronous=True, cutoff_frequency=_NO_FILTER_HZ)
 
     def _checked_goal(self, what: str, goal: Array, shape: tuple[int, ...], lease: Lease) -> Array:
@@ -458,12 +465,12 @@ class FrankaArm(Arm):
         if self.state is not Lifecycle.ACTIVE:
             return
         if reading.mode not in _OBEYS or reader.aborted is not None:
-            raise self._to_faulted(self._fault(reading))
+            raise self._to_faulted(self._fault(reading, reader.aborted))
         if self._contact.is_set():
             raise self._to_faulted(self._contact_fault("contact force limit reached"))
 
-    def _fault(self, reading: Reading) -> DeviceFault:
-        said = self._open_reader().aborted
+    def _fault(self, reading: Reading, said: str | None = None) -> DeviceFault:
+        """What the controller says is wrong; ``said`` by franky when a motion died."""
         if reading.mode in _NEEDS_A_PERSON:
             return self._by_table(MODES[reading.mode], reading.mode)
         if names := reading.errors or (reading.last_errors if said else ()):
@@ -493,10 +500,10 @@ class FrankaArm(Arm):
 
     def _translated(self, error: Exception) -> DeviceError:
         if isinstance(error, self._franky.ControlException):
-            reading = self._open_reader().newest
-            if reading is not None and (reading.errors or reading.mode in MODES):
-                return self._fault(reading)
-            return DeviceFault(self.name, f"motion aborted: {error}", fault_class=FaultClass.MOTION)
+            try:
+                return self._fault(self._await_reading(_FRESH_S, "state"), str(error))
+            except TransportError as gone:
+                return gone
         if isinstance(error, self._franky.CommandException):
             return DeviceFault(self.name, f"command refused: {error}", fault_class=FaultClass.MOTION)
         return DeviceGone(self.name, f"lost the controller: {error}", hint="disconnect and connect again")
@@ -526,13 +533,14 @@ def _stamped(value: Any, reading: Reading) -> Stamped[Any]:
     return Stamped(value, reading.t_ns, reading.device_ms, reading.device_ms * 1_000_000)
 
 
-def _joint_limits(urdf: str) -> Array:
+def _joint_limits(device: str, urdf: str) -> Array:
     """(7, 2) lower and upper limits in rad that the arm's own model declares."""
-    joints = [joint for joint in ElementTree.fromstring(urdf).iter("joint") if joint.get("type") == "revolute"]
-    limits = [joint.find("limit") for joint in joints[:7]]
-    return np.array(
-        [[float(limit.attrib[side]) for side in ("lower", "upper")] for limit in limits if limit is not None]
-    )
+    try:
+        joints = [joint for joint in ElementTree.fromstring(urdf).iter("joint") if joint.get("type") == "revolute"]
+        limits = [next(joint.iter("limit")).attrib for joint in joints[:7]]
+        return np.array([[float(limit["lower"]), float(limit["upper"])] for limit in limits]).reshape(7, 2)
+    except (ElementTree.ParseError, StopIteration, KeyError, ValueError) as error:
+        raise ConnectError(device, "the controller's model of the arm cannot be read", [error]) from None
 
 
 @contextmanager

@@ -1,8 +1,8 @@
 """An emulated Franka controller: the Franka Control Interface, version 10, on TCP 1337 and UDP at 1 kHz.
 
-Faithful where libfranka looks: handshake, model, motions and their outcomes, modes, reflexes, recovery, lost packets. Not
-emulated: dynamics, contact, the braking of a reflex (it stops at once), Desk, the gripper. While this process oversleeps
-its clock stands still, so that a busy machine slows the robot down and does not make it jump.
+Faithful where libfranka looks: handshake, model, motions and their outcomes, modes, reflexes, recovery, lost packets.
+Not emulated: dynamics, contact, the braking of a reflex (it stops at once), Desk, the gripper. While this process
+oversleeps its clock stands still, so that a busy machine slows the robot down and does not make it jump.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ def rig(folder: Path, address: int) -> Rig:
             "user_stop": (True, "fault"),
         },
         notes=(
-            "reflex thresholds, modes and recovery as Franka documents them; a real arm brakes in a reflex, this one stops",
-            "20 lost command packets stop a real arm; here too, and at once",
+            "reflex thresholds, modes and recovery are as Franka documents them; a real arm brakes, this one stops",
+            "20 lost command packets stop the arm, as Franka documents it",
         ),
     )
