@@ -73,7 +73,7 @@ CAPABILITIES = Capabilities(
 _WATCHDOG_S = 0.02
 _FIRST_STATE_S = 2.0
 _SILENCE_S = 0.5
-_FRESH_S = 0.1
+_FRESH_S = 0.25
 _RECOVERY_S = 5.0
 # franky's motions are smooth already, and libfranka's filter assumes that no state is ever lost: after one it jumps.
 _NO_FILTER_HZ = 1000.0

@@ -103,7 +103,7 @@ class Reflex(Exception):
 class _Profile:
     """Last value, velocity and acceleration of the commanded signal, to see discontinuities.
 
-    ``steady`` tells whether it answered the state right after the one before: across lost packets derivatives are means.
+    ``steady`` tells whether it answered the next state: across lost packets derivatives are means.
     """
 
     message_id: int
