@@ -163,9 +163,8 @@ class FrankaArm(Arm):
     def at_rest(self) -> bool:
         """Whether a fresh state shows it standing still and no motion is running."""
         self._require("tell whether it is at rest", *_READABLE)
-        reader = self._open_reader()
-        reading = reader.newest
-        if reading is None or self._age_s(reading) > _FRESH_S:
+        reader, reading = self._open_reader(), self._newest()
+        if self._age_s(reading) > _FRESH_S:
             return False
         if reader.in_motion or reader.looked_ns <= self._moved_ns:
             return False
@@ -213,10 +212,7 @@ class FrankaArm(Arm):
     def health(self) -> dict[str, float | int | str | bool]:
         """Mode, errors and packet counters."""
         self._require("tell its health", *_READABLE)
-        reader = self._open_reader()
-        reading = reader.newest
-        if reading is None:
-            return {"mode": "unknown", "states": reader.states, "bad_states": reader.bad}
+        reader, reading = self._open_reader(), self._newest()
         return {
             "mode": reading.mode,
             "errors": ", ".join(reading.errors),
@@ -368,9 +364,8 @@ class FrankaArm(Arm):
         self._start(motion, franky.CartesianVelocityStopMotion, franky.ControlSignalType.CartesianVelocities)
 
     def _begin_stop(self, category: StopCategory) -> None:
-        reader = self._open_reader()
         # While a silent arm rests, franky would wait for it.
-        if not reader.in_motion and (reader.newest is None or self._age_s(reader.newest) > _FRESH_S):
+        if not self._open_reader().in_motion and self._age_s(self._newest()) > _FRESH_S:
             return
         franky = self._franky
         kinds = franky.ControlSignalType
@@ -438,14 +433,18 @@ class FrankaArm(Arm):
         assert self._reader is not None, "guarded by the lifecycle"
         return self._reader
 
+    def _newest(self) -> Reading:
+        reading = self._open_reader().newest
+        assert reading is not None, "connecting waits for the first one"
+        return reading
+
     def _age_s(self, reading: Reading) -> float:
         return (self._clock.now_ns() - reading.t_ns) * 1e-9
 
     def _reading(self, purpose: str, max_age_s: float | None) -> Reading:
         self._require(purpose, *_READABLE)
         self._surface()
-        reading = self._open_reader().newest
-        assert reading is not None, "connecting waits for the first one"
+        reading = self._newest()
         age_s = self._age_s(reading)
         if max_age_s is not None and age_s > max_age_s:
             raise StaleData(self.name, age_s, max_age_s, reading.device_ms)
@@ -455,9 +454,7 @@ class FrankaArm(Arm):
         """Raise, and latch, whatever has gone wrong since the last call; FAULTED already stays as it is."""
         if self.state is Lifecycle.FAULTED:
             return
-        reader = self._open_reader()
-        reading = reader.newest
-        assert reading is not None, "connecting waits for the first one"
+        reader, reading = self._open_reader(), self._newest()
         if reader.failure is not None:
             raise self._to_faulted(reader.failure)
         if self._age_s(reading) > _SILENCE_S:

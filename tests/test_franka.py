@@ -458,7 +458,7 @@ def test_a_silent_arm_is_stale_and_then_a_fault(bench: Bench, fault: str, moving
         bench.send([0.02, 0, 0, 0, 0, 0], lease, 1.0)
         bench.moved()
     bench.emulator.fault(fault)
-    until(StaleData, lambda: bench.arm.tcp(0.1))
+    until(StaleData, lambda: bench.arm.tcp(0.3))
     assert not bench.arm.at_rest()
     until(TransportTimeout, lambda: bench.arm.tcp())
     assert bench.arm.state is Lifecycle.FAULTED

@@ -12,6 +12,7 @@ import asyncio
 import socket
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, ClassVar
 
 import numpy as np
@@ -284,7 +285,9 @@ class FrankaEmulator(Emulator):
 
     def _reply(self, reply: bytes) -> None:
         if self._client is not None:
-            self._client.send(reply)
+            # A client that has gone is noticed by the next read.
+            with suppress(OSError):
+                self._client.sendall(reply)
 
     def _begin_move(self, command_id: int, payload: bytes) -> None:
         controller, generator = decode_move(payload)
