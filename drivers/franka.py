@@ -1,9 +1,9 @@
 """Franka arms (FR3, Research 3) over franky, which keeps libfranka's 1 kHz loop in a thread outside the GIL.
 
-A twist becomes a Cartesian velocity motion that lasts as long as its time-to-live: libfranka's thread counts that time and
-brakes the arm even if Python hangs. If the whole process dies, the controller misses 20 command packets and stops the arm
-with a communication reflex. The Franka Control Interface cannot release or close the brakes; Desk does. So ``activate``
-sends nothing: it only makes sure that the arm rests, obeys and reports no error.
+A twist becomes a Cartesian velocity motion that lasts as long as its time-to-live: libfranka's thread counts that time
+and brakes the arm even if Python hangs. If the whole process dies, the controller misses 20 command packets and stops
+the arm with a communication reflex. The Franka Control Interface cannot release or close the brakes; Desk does. So
+``activate`` sends nothing: it only makes sure that the arm rests, obeys and reports no error.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from drivers.clock import Clock
 from drivers.device import DeactivatePolicy, Lifecycle, OperatorToken
 from drivers.errors import (
     CommandRejected,
-    ConfigError,
     ConnectError,
     DeviceError,
     DeviceFault,
@@ -38,6 +37,7 @@ from drivers.errors import (
     Rejection,
     Remedy,
     StaleData,
+    TransportError,
     TransportTimeout,
 )
 from drivers.franka_errors import BY_NAME, ERRORS, MODES, VendorError
@@ -73,12 +73,13 @@ CAPABILITIES = Capabilities(
 _WATCHDOG_S = 0.02
 _FIRST_STATE_S = 2.0
 _SILENCE_S = 0.5
-_FRESH_S = 0.1
+_FRESH_S = 0.25
 _RECOVERY_S = 5.0
 # franky's motions are smooth already, and libfranka's filter assumes that no state is ever lost: after one it jumps.
 _NO_FILTER_HZ = 1000.0
 _POLL_NS = 2_000_000
-_REST_SPEED_RAD_S = 0.005
+_JOINT_TORQUE_NM = 20.0
+_REST_SPEED_RAD_S = 0.01
 _FRAME_TOLERANCE = 1e-5
 _OBEYS = ("Idle", "Move")
 _NEEDS_A_PERSON = ("UserStopped", "Other", "Guiding")
@@ -141,6 +142,7 @@ class FrankaArm(Arm):
         self._reader: StateReader | None = None
         self._control_scheduling: _Scheduling | None = None
         self._contact = threading.Event()
+        self._moved_ns = clock.now_ns()
         self._joint_limits = np.zeros((7, 2))
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
@@ -154,15 +156,17 @@ class FrankaArm(Arm):
         return _stamped(JointState(reading.q, reading.dq, reading.tau), reading)
 
     def wrench(self, max_age_s: float | None = None) -> Stamped[Array]:
-        """(6,) wrench of the world on the tool centre point, base axes, estimated by the controller. Raises as ``tcp``."""
+        """(6,) wrench of the world on the tool centre point along base axes, the controller's estimate. As ``tcp``."""
         reading = self._reading("tell its wrench", max_age_s)
         return _stamped(reading.wrench, reading)
 
     def at_rest(self) -> bool:
         """Whether a fresh state shows it standing still and no motion is running."""
         self._require("tell whether it is at rest", *_READABLE)
-        reading = self._open_reader().newest
-        if reading is None or self._age_s(reading) > _FRESH_S or self._robot.is_in_control:
+        reader, reading = self._open_reader(), self._newest()
+        if self._age_s(reading) > _FRESH_S:
+            return False
+        if reader.in_motion or reader.looked_ns <= self._moved_ns:
             return False
         return bool(np.abs(reading.dq).max() < _REST_SPEED_RAD_S)
 
@@ -208,10 +212,7 @@ class FrankaArm(Arm):
     def health(self) -> dict[str, float | int | str | bool]:
         """Mode, errors and packet counters."""
         self._require("tell its health", *_READABLE)
-        reader = self._open_reader()
-        reading = reader.newest
-        if reading is None:
-            return {"mode": "unknown", "states": reader.states, "bad_states": reader.bad}
+        reader, reading = self._open_reader(), self._newest()
         return {
             "mode": reading.mode,
             "errors": ", ".join(reading.errors),
@@ -228,8 +229,14 @@ class FrankaArm(Arm):
         return _WATCHDOG_S
 
     def _open(self) -> None:
-        franky = self._franky = _import_franky(self.name)
         config = self._config
+        if config.enforce_realtime and not _has_realtime_kernel():
+            raise ConnectError(
+                self.name,
+                "this kernel is not PREEMPT_RT",
+                hint="boot a real-time kernel, or set enforce_realtime: false and expect communication reflexes",
+            )
+        franky = self._franky = _import_franky(self.name)
         realtime = franky.RealtimeConfig.Enforce if config.enforce_realtime else franky.RealtimeConfig.Ignore
         try:
             # libfranka makes whoever connects a real-time thread, where it may, and its control threads inherit that.
@@ -246,7 +253,7 @@ class FrankaArm(Arm):
             ) from None
         # Every motion names its own factor; the robot's would multiply it.
         self._robot.relative_dynamics_factor = 1.0
-        self._joint_limits = _joint_limits(self._robot.model_urdf)
+        self._joint_limits = _joint_limits(self.name, self._robot.model_urdf)
         self._contact.clear()
         self._reader = StateReader(self.name, franky, self._robot, self._clock)
         self._reader.start()
@@ -260,18 +267,13 @@ class FrankaArm(Arm):
 
     def _configure(self) -> None:
         config = self._config
-        if config.enforce_realtime and not _has_realtime_kernel():
-            raise ConfigError(
-                "this kernel is not PREEMPT_RT",
-                key=f"{self.name}.enforce_realtime",
-                value=True,
-                hint="boot a real-time kernel, or set enforce_realtime: false and expect communication reflexes",
-            )
         # Twice the limit for forces: libfranka's thread should brake the arm gently before the controller does it hard.
         force, torque = 2.0 * config.contact_force_limit_n, config.contact_torque_limit_nm
         try:
-            self._robot.set_collision_behavior([60.0] * 7, [force] * 3 + [torque] * 3)
+            self._robot.set_collision_behavior([_JOINT_TORQUE_NM] * 7, [force] * 3 + [torque] * 3)
             self._set_frames()
+            # A reading from before would have another tool centre point.
+            self._await_reading(_FIRST_STATE_S, "state", after_ms=self._robot.state.time.to_msec())
         except (self._franky.Exception, RuntimeError) as error:
             raise DeviceFault(
                 self.name,
@@ -362,9 +364,8 @@ class FrankaArm(Arm):
         self._start(motion, franky.CartesianVelocityStopMotion, franky.ControlSignalType.CartesianVelocities)
 
     def _begin_stop(self, category: StopCategory) -> None:
-        reader = self._open_reader()
         # While a silent arm rests, franky would wait for it.
-        if not reader.in_motion and (reader.newest is None or self._age_s(reader.newest) > _FRESH_S):
+        if not self._open_reader().in_motion and self._age_s(self._newest()) > _FRESH_S:
             return
         franky = self._franky
         kinds = franky.ControlSignalType
@@ -406,6 +407,7 @@ class FrankaArm(Arm):
 
     def _move(self, motion: Any) -> None:
         with _scheduled(self._control_scheduling):
+            self._moved_ns = self._clock.now_ns()
             self._robot.move(motion, asynchronous=True, cutoff_frequency=_NO_FILTER_HZ)
 
     def _checked_goal(self, what: str, goal: Array, shape: tuple[int, ...], lease: Lease) -> Array:
@@ -431,14 +433,18 @@ class FrankaArm(Arm):
         assert self._reader is not None, "guarded by the lifecycle"
         return self._reader
 
+    def _newest(self) -> Reading:
+        reading = self._open_reader().newest
+        assert reading is not None, "connecting waits for the first one"
+        return reading
+
     def _age_s(self, reading: Reading) -> float:
         return (self._clock.now_ns() - reading.t_ns) * 1e-9
 
     def _reading(self, purpose: str, max_age_s: float | None) -> Reading:
         self._require(purpose, *_READABLE)
         self._surface()
-        reading = self._open_reader().newest
-        assert reading is not None, "connecting waits for the first one"
+        reading = self._newest()
         age_s = self._age_s(reading)
         if max_age_s is not None and age_s > max_age_s:
             raise StaleData(self.name, age_s, max_age_s, reading.device_ms)
@@ -448,9 +454,7 @@ class FrankaArm(Arm):
         """Raise, and latch, whatever has gone wrong since the last call; FAULTED already stays as it is."""
         if self.state is Lifecycle.FAULTED:
             return
-        reader = self._open_reader()
-        reading = reader.newest
-        assert reading is not None, "connecting waits for the first one"
+        reader, reading = self._open_reader(), self._newest()
         if reader.failure is not None:
             raise self._to_faulted(reader.failure)
         if self._age_s(reading) > _SILENCE_S:
@@ -458,12 +462,12 @@ class FrankaArm(Arm):
         if self.state is not Lifecycle.ACTIVE:
             return
         if reading.mode not in _OBEYS or reader.aborted is not None:
-            raise self._to_faulted(self._fault(reading))
+            raise self._to_faulted(self._fault(reading, reader.aborted))
         if self._contact.is_set():
             raise self._to_faulted(self._contact_fault("contact force limit reached"))
 
-    def _fault(self, reading: Reading) -> DeviceFault:
-        said = self._open_reader().aborted
+    def _fault(self, reading: Reading, said: str | None = None) -> DeviceFault:
+        """What the controller says is wrong; ``said`` by franky when a motion died."""
         if reading.mode in _NEEDS_A_PERSON:
             return self._by_table(MODES[reading.mode], reading.mode)
         if names := reading.errors or (reading.last_errors if said else ()):
@@ -493,20 +497,26 @@ class FrankaArm(Arm):
 
     def _translated(self, error: Exception) -> DeviceError:
         if isinstance(error, self._franky.ControlException):
-            reading = self._open_reader().newest
-            if reading is not None and (reading.errors or reading.mode in MODES):
-                return self._fault(reading)
-            return DeviceFault(self.name, f"motion aborted: {error}", fault_class=FaultClass.MOTION)
+            try:
+                return self._fault(self._await_reading(_FRESH_S, "state"), str(error))
+            except TransportError as gone:
+                return gone
         if isinstance(error, self._franky.CommandException):
             return DeviceFault(self.name, f"command refused: {error}", fault_class=FaultClass.MOTION)
         return DeviceGone(self.name, f"lost the controller: {error}", hint="disconnect and connect again")
 
-    def _await_reading(self, timeout_s: float, what: str) -> Reading:
-        """A reading that was not there yet. Raises TransportTimeout, or what ended the reader."""
+    def _await_reading(self, timeout_s: float, what: str, after_ms: int | None = None) -> Reading:
+        """A reading later than ``after_ms`` of the controller's time, or than the newest one.
+
+        Raises:
+            TransportTimeout: there is none in time.
+            DeviceError: what ended the reader.
+        """
         reader = self._open_reader()
-        before = reader.newest
+        if after_ms is None:
+            after_ms = reader.newest.device_ms if reader.newest else -1
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        while (reading := reader.newest) is before or reading is None:
+        while (reading := reader.newest) is None or reading.device_ms <= after_ms:
             if reader.failure is not None:
                 raise reader.failure
             now_ns = self._clock.now_ns()
@@ -520,13 +530,14 @@ def _stamped(value: Any, reading: Reading) -> Stamped[Any]:
     return Stamped(value, reading.t_ns, reading.device_ms, reading.device_ms * 1_000_000)
 
 
-def _joint_limits(urdf: str) -> Array:
+def _joint_limits(device: str, urdf: str) -> Array:
     """(7, 2) lower and upper limits in rad that the arm's own model declares."""
-    joints = [joint for joint in ElementTree.fromstring(urdf).iter("joint") if joint.get("type") == "revolute"]
-    limits = [joint.find("limit") for joint in joints[:7]]
-    return np.array(
-        [[float(limit.attrib[side]) for side in ("lower", "upper")] for limit in limits if limit is not None]
-    )
+    try:
+        joints = [joint for joint in ElementTree.fromstring(urdf).iter("joint") if joint.get("type") == "revolute"]
+        limits = [next(joint.iter("limit")).attrib for joint in joints[:7]]
+        return np.array([[float(limit["lower"]), float(limit["upper"])] for limit in limits]).reshape(7, 2)
+    except (ElementTree.ParseError, StopIteration, KeyError, ValueError) as error:
+        raise ConnectError(device, "the controller's model of the arm cannot be read", [error]) from None
 
 
 @contextmanager

@@ -27,7 +27,7 @@ class Reading:
     """What one state packet says, in SI units along base axes.
 
     Attributes:
-        t_ns: start of the read before the one that found it: it cannot have come earlier, so its age is never understated.
+        t_ns: start of the read before the one that found it: it cannot have come earlier, so no age is understated.
         device_ms: the controller's own time.
         T_base_tcp: (4, 4).
         twist: (6,) of the tool centre point, from measured joint velocities.
@@ -77,6 +77,7 @@ class StateReader:
         self._failure: DeviceError | None = None
         self._aborted: str | None = None
         self._in_motion = False
+        self._looked_ns = 0
         self._bad = 0
         self._bad_in_a_row = 0
         self._states = 0
@@ -102,8 +103,13 @@ class StateReader:
 
     @property
     def in_motion(self) -> bool:
-        """Whether a motion was running when it last read."""
+        """Whether a motion was running when it last looked."""
         return self._in_motion
+
+    @property
+    def looked_ns(self) -> int:
+        """When it last looked whether a motion was running."""
+        return self._looked_ns
 
     @property
     def bad(self) -> int:
@@ -150,7 +156,9 @@ class StateReader:
             self._robot.poll_motion()
         except (franky.ControlException, franky.CommandException, franky.ProtocolException) as error:
             said = str(error)
+        looked_ns = self._clock.now_ns()
         self._in_motion = self._robot.is_in_control
+        self._looked_ns = looked_ns
         try:
             self._take(self._robot.state, last_ns)
         except franky.ProtocolException as error:

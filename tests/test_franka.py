@@ -21,7 +21,6 @@ from drivers.commands import TwistFrame
 from drivers.device import DeactivatePolicy, Lifecycle
 from drivers.errors import (
     CommandRejected,
-    ConfigError,
     ConnectError,
     CorruptMessage,
     DeviceFault,
@@ -94,7 +93,9 @@ def test_its_spec_needs_no_sdk() -> None:
 
 def test_a_missing_sdk_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "franky", None)
-    arm = registry.spec("franka").build("arm", FrankaConfig(host="127.0.0.1"), registry.DriverContext(MonotonicClock()))
+    arm = registry.spec("franka").build(
+        "arm", FrankaConfig(host="127.0.0.1", enforce_realtime=False), registry.DriverContext(MonotonicClock())
+    )
     with pytest.raises(ConnectError, match=r"touchcell\[franka\]"):
         arm.connect()
     assert arm.state is Lifecycle.DISCONNECTED
@@ -153,12 +154,12 @@ def test_a_second_owner_is_turned_away(bench: Bench) -> None:
 
 
 @pytest.mark.skipif(Path("/sys/kernel/realtime").exists(), reason="this kernel is a real-time one")
-def test_no_realtime_kernel_is_found_before_moving(benches: Callable[..., Bench]) -> None:
-    arm = benches(enforce_realtime=True).arm
-    arm.connect()
-    with pytest.raises(ConfigError, match="enforce_realtime"):
-        arm.configure()
-    assert arm.state is Lifecycle.PASSIVE
+@pytest.mark.skipif(Path("/sys/kernel/realtime").exists(), reason="this kernel is a real-time one")
+def test_a_missing_realtime_kernel_is_found_before_connecting(benches: Callable[..., Bench]) -> None:
+    bench = benches(enforce_realtime=True)
+    with pytest.raises(ConnectError, match="enforce_realtime: false"):
+        bench.arm.connect()
+    assert bench.truth()["requests"] == 0
 
 
 def test_pose_and_joints_are_true(benches: Callable[..., Bench]) -> None:
@@ -308,19 +309,17 @@ def test_pose_goals_arrive_and_keep_the_speed_limit(benches: Callable[..., Bench
     assert 0.02 < fastest < 0.0501
 
 
-@pytest.mark.parametrize(
-    ("goal", "reason"),
-    [
+def test_impossible_joint_goals_are_refused(bench: Bench) -> None:
+    lease = bench.active()
+    goals = [
         (np.full(7, np.nan), Rejection.NON_FINITE),
         (np.zeros(6), Rejection.SHAPE),
         (np.array([0, 0, 0, 0.5, 0, 1.5, 0]), Rejection.LIMIT),
-    ],
-)
-def test_impossible_joint_goals_are_refused(bench: Bench, goal: np.ndarray[Any, Any], reason: Rejection) -> None:
-    lease = bench.active()
-    with pytest.raises(CommandRejected) as rejected:
-        bench.arm.go_to_joints(goal, lease)
-    assert rejected.value.reason is reason
+    ]
+    for goal, reason in goals:
+        with pytest.raises(CommandRejected) as rejected:
+            bench.arm.go_to_joints(goal, lease)
+        assert rejected.value.reason is reason
     bench.arm.release(lease)
     with pytest.raises(CommandRejected) as rejected:
         bench.arm.go_to_joints(np.array([0, -0.7, 0, -2.3, 0, 1.6, 0.7]), lease)
@@ -413,23 +412,24 @@ def test_a_torque_is_left_to_the_controller(bench: Bench) -> None:
     assert faulted(bench).name == "cartesian_reflex"
 
 
-@pytest.mark.parametrize("fault", ["nan", "out_of_order", "drop_states"])
 @pytest.mark.parametrize("moving", [False, True])
-def test_a_few_bad_states_pass(bench: Bench, fault: str, moving: bool) -> None:
+def test_a_few_bad_states_pass(bench: Bench, moving: bool) -> None:
     lease = bench.active()
-    if moving:
-        bench.send([0.02, 0, 0, 0, 0, 0], lease, 1.0)
-        bench.moved()
-    bench.emulator.fault(fault, 6)
-    seen = []
-    while len(seen) < 2 or seen[-1] < seen[0] + 50:
-        sample = bench.arm.tcp(1.0)
-        assert np.isfinite(sample.value.T_base_tcp).all()
-        seen.append(sample.seq)
+    seen = [bench.arm.tcp().seq]
+    for fault in ("nan", "out_of_order", "drop_states"):
+        if moving:
+            bench.send([0.02, 0, 0, 0, 0, 0], lease, 1.0)
+            bench.moved()
+        bench.emulator.fault(fault, 6)
+        begin = seen[-1]
+        while seen[-1] < begin + 30:
+            sample = bench.arm.tcp(1.0)
+            assert np.isfinite(sample.value.T_base_tcp).all()
+            seen.append(sample.seq)
+            bench.clock.sleep_until_ns(bench.clock.now_ns() + 1_000_000)
     assert seen == sorted(seen)
     assert bench.arm.state is Lifecycle.ACTIVE
-    if fault == "nan":
-        assert 1 <= bench.arm.health()["bad_states"] <= 6
+    assert 1 <= bench.arm.health()["bad_states"] <= 6
 
 
 def test_states_that_stay_bad_are_a_fault(bench: Bench) -> None:
@@ -458,7 +458,7 @@ def test_a_silent_arm_is_stale_and_then_a_fault(bench: Bench, fault: str, moving
         bench.send([0.02, 0, 0, 0, 0, 0], lease, 1.0)
         bench.moved()
     bench.emulator.fault(fault)
-    until(StaleData, lambda: bench.arm.tcp(0.1))
+    until(StaleData, lambda: bench.arm.tcp(0.3))
     assert not bench.arm.at_rest()
     until(TransportTimeout, lambda: bench.arm.tcp())
     assert bench.arm.state is Lifecycle.FAULTED

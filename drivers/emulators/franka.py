@@ -1,8 +1,8 @@
 """An emulated Franka controller: the Franka Control Interface, version 10, on TCP 1337 and UDP at 1 kHz.
 
-Faithful where libfranka looks: handshake, model, motions and their outcomes, modes, reflexes, recovery, lost packets. Not
-emulated: dynamics, contact, the braking of a reflex (it stops at once), Desk, the gripper. While this process oversleeps
-its clock stands still, so that a busy machine slows the robot down and does not make it jump.
+Faithful where libfranka looks: handshake, model, motions and their outcomes, modes, reflexes, recovery, lost packets.
+Not emulated: dynamics, contact, the braking of a reflex (it stops at once), Desk, the gripper. While this process
+oversleeps its clock stands still, so that a busy machine slows the robot down and does not make it jump.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import asyncio
 import socket
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, ClassVar
 
 import numpy as np
@@ -136,6 +137,7 @@ class FrankaEmulator(Emulator):
             "at_last_command_m": self._stopped_at,
             "force_threshold": arm.force_threshold.tolist(),
             "received": self._received,
+            "active": self.active,
             **self._counts,
         }
 
@@ -283,7 +285,9 @@ class FrankaEmulator(Emulator):
 
     def _reply(self, reply: bytes) -> None:
         if self._client is not None:
-            self._client.send(reply)
+            # A client that has gone is noticed by the next read.
+            with suppress(OSError):
+                self._client.sendall(reply)
 
     def _begin_move(self, command_id: int, payload: bytes) -> None:
         controller, generator = decode_move(payload)

@@ -1,7 +1,7 @@
 """The emulated Franka arm itself: kinematics, limits, reflexes. No I/O and no clock: it moves when it is stepped.
 
-Denavit-Hartenberg table, joint and Cartesian limits of the FR3 from Franka's "Robot and interface specifications". There are
-no dynamics: the arm is where it was commanded to be, and a reflex stops it at once where a real arm brakes.
+Denavit-Hartenberg table, joint and Cartesian limits of the FR3 from Franka's "Robot and interface specifications".
+There are no dynamics: the arm is where it was commanded to be, and a reflex stops it at once where a real arm brakes.
 """
 
 from __future__ import annotations
@@ -74,10 +74,12 @@ def urdf() -> str:
     parts.append('<joint name="base_joint" type="fixed"><parent link="base"/><child link="link0"/></joint>')
     for i in range(7):
         alpha, d = _DH_ALPHA_RAD[i], _DH_D_M[i]
+        origin = f"{_DH_A_M[i]} {-d * _SIN_ALPHA[i]} {d * _COS_ALPHA[i]}"
         parts.append(
             f'<joint name="joint{i + 1}" type="revolute"><parent link="link{i}"/><child link="link{i + 1}"/>'
-            f'<origin rpy="{alpha} 0 0" xyz="{_DH_A_M[i]} {-d * _SIN_ALPHA[i]} {d * _COS_ALPHA[i]}"/><axis xyz="0 0 1"/>'
-            f'<limit effort="87" lower="{JOINT_MIN_RAD[i]}" upper="{JOINT_MAX_RAD[i]}" velocity="{JOINT_SPEED_RAD_S[i]}"/>'
+            f'<origin rpy="{alpha} 0 0" xyz="{origin}"/><axis xyz="0 0 1"/>'
+            f'<limit effort="87" lower="{JOINT_MIN_RAD[i]}" upper="{JOINT_MAX_RAD[i]}"'
+            f' velocity="{JOINT_SPEED_RAD_S[i]}"/>'
             f'<position_based_velocity_limits velocity_offset="{_VELOCITY_OFFSET_RAD_S[i]}"'
             f' deceleration_limit="{_DECELERATION_RAD_S2[i]}"/></joint>'
         )
@@ -99,12 +101,16 @@ class Reflex(Exception):
 
 @dataclass(slots=True)
 class _Profile:
-    """Last value, velocity and acceleration of the commanded signal, to see discontinuities."""
+    """Last value, velocity and acceleration of the commanded signal, to see discontinuities.
+
+    ``steady`` tells whether it answered the next state: across lost packets derivatives are means.
+    """
 
     message_id: int
     value: Array
     velocity: Array
     acceleration: Array
+    steady: bool = True
 
 
 @dataclass(slots=True)
@@ -146,7 +152,7 @@ class EmulatedArm:
         self.J = np.vstack([np.cross(axes, self.T_base_ee[:3, 3:] - origins, axis=0), axes])
 
     def begin(self, generator: Generator, message_id: int = 0) -> bool:
-        """Take up a motion generator with the state ``message_id``; False at a pose too singular for a Cartesian one."""
+        """Take up a motion generator at state ``message_id``; False at a pose too singular for a Cartesian one."""
         if generator in (Generator.CARTESIAN_POSITION, Generator.CARTESIAN_VELOCITY):
             smallest = np.linalg.svd(self.J, compute_uv=False)[-1]
             if smallest < _SMALLEST_SINGULAR_VALUE:
@@ -225,7 +231,8 @@ class EmulatedArm:
         velocity = value if is_velocity else (value - last.value) / dt_s
         acceleration = (velocity - last.velocity) / dt_s
         jerk = (acceleration - last.acceleration) / dt_s
-        self._profile = _Profile(message_id, value, velocity, acceleration)
+        steady = message_id - last.message_id == 1
+        self._profile = _Profile(message_id, value, velocity, acceleration, steady)
         if value.shape == (6,):
             prefix = "cartesian"
             speed_ok = _within(velocity, SPEED_M_S, ROT_SPEED_RAD_S)
@@ -239,8 +246,8 @@ class EmulatedArm:
         # Franka's names: a jump of the velocity breaks the acceleration limit, one of the acceleration the jerk limit.
         checks = (
             (speed_ok, "velocity_limits_violation"),
-            (accel_ok, "velocity_discontinuity"),
-            (jerk_ok, "acceleration_discontinuity"),
+            (accel_ok or not (is_velocity or (steady and last.steady)), "velocity_discontinuity"),
+            (jerk_ok or not (steady and last.steady), "acceleration_discontinuity"),
         )
         for is_ok, name in checks:
             if not is_ok:

@@ -12,8 +12,8 @@ from drivers.franka import SPEC, FrankaArm, FrankaConfig
 
 
 def rig(folder: Path, address: int) -> Rig:
-    """An arm at loopback address 127.0.0.0 + ``address``; ``folder`` is not needed."""
-    host = str(IPv4Address("127.0.0.0") + address)
+    """An arm at a loopback address of its own, since libfranka's port is fixed; it keeps nothing in ``folder``."""
+    host = str(IPv4Address("127.96.0.1") + address)
     # Emulators run where no real-time kernel is.
     config = FrankaConfig(host=host, enforce_realtime=False)
 
@@ -30,7 +30,6 @@ def rig(folder: Path, address: int) -> Rig:
         pose="T_base_ee",
         faults={
             "drop_states": (5, "transient"),
-            "corrupt": (3, "transient"),
             "out_of_order": (5, "transient"),
             "nan": (3, "transient"),
             "pause": (True, "fault"),
@@ -40,7 +39,8 @@ def rig(folder: Path, address: int) -> Rig:
             "user_stop": (True, "fault"),
         },
         notes=(
-            "reflex thresholds, modes and recovery as Franka documents them; a real arm brakes in a reflex, this one stops",
-            "20 lost command packets stop a real arm; here too, and at once",
+            "reflex thresholds, modes and recovery are as Franka documents them; a real arm brakes, this one stops",
+            "a state packet cut short is counted while the arm rests, but ends a motion: libfranka gives up",
+            "20 lost command packets stop the arm, as Franka documents it",
         ),
     )
