@@ -164,7 +164,7 @@ class Arm(Device):
         """Begin to stop at once and return; called in ACTIVE and FAULTED, with an offered category only."""
 
     def _followable(self, twist_base: Array) -> tuple[Array, tuple[Adjustment, ...]]:
-        """What the arm can follow of an admitted twist, and why it differs; within the limits. All, unless it says so."""
+        """What the arm can follow of an admitted twist, and why it differs: all of it, unless a driver knows better."""
         return twist_base, ()
 
     def _after_rest(self, policy: DeactivatePolicy) -> None:

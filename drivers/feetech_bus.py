@@ -176,8 +176,8 @@ class ServoBus:
 
     def _ask(self, servo: int, request: bytes, length: int) -> bytes:
         with self._lock:
+            self._drain()
             for _ in range(_TRIES):
-                self._await_quiet()
                 if not self._send(request):
                     continue
                 until_ns = self._clock.now_ns() + round(_ANSWER_TIMEOUT_S * 1e9)
@@ -190,6 +190,7 @@ class ServoBus:
                         if packet.servo == servo and len(packet.data) == length:
                             return packet.data
                         self.counters.unexpected += 1
+                self._await_quiet()
             raise TransportTimeout(self._device, f"answer of servo {servo}", _ANSWER_TIMEOUT_S)
 
     def _drain(self) -> None:

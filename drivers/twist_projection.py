@@ -1,4 +1,4 @@
-"""What an arm with fewer than six joints can follow of a twist: the linear part first, then what is left of the rotation.
+"""What an arm with fewer than six joints can follow of a twist: the linear part first, then rotation if any is left.
 
 A least-squares compromise would push the tip off its path for the sake of a rotation that the arm cannot make. So the
 joints give the linear velocity, and only motion that leaves the tip where it is serves the angular one (task priority,
@@ -26,8 +26,8 @@ def followable(J: Array, twist: Array) -> tuple[Array, tuple[Adjustment, ...]]:
         twist: (6,) [v, w] along base axes.
 
     Returns:
-        The twist that can be followed, and one adjustment per part that differs: asked is the norm of that part, allowed
-        is the norm less that of what is lost (negative where the arm rotates although it was not asked to).
+        The twist that can be followed, and one adjustment per part (linear, angular) that differs, with the norms of
+        that part. The arm may rotate although it was not asked to, where the tip cannot move otherwise.
     """
     linear, angular = J[:3], J[3:]
     push = np.linalg.pinv(linear, rcond=_relative(linear, _SHORTEST_LEVER_M))
@@ -40,10 +40,9 @@ def followable(J: Array, twist: Array) -> tuple[Array, tuple[Adjustment, ...]]:
         ("joints: linear", slice(0, 3), _NEGLIGIBLE_M_S),
         ("joints: angular", slice(3, 6), _NEGLIGIBLE_RAD_S),
     ):
-        lost = float(np.linalg.norm(twist[part] - followed[part]))
-        if lost > negligible:
-            asked = float(np.linalg.norm(twist[part]))
-            adjustments.append(Adjustment(name, asked, asked - lost))
+        if np.linalg.norm(twist[part] - followed[part]) > negligible:
+            norms = float(np.linalg.norm(twist[part])), float(np.linalg.norm(followed[part]))
+            adjustments.append(Adjustment(name, *norms))
     return followed, tuple(adjustments)
 
 
