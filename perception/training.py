@@ -179,8 +179,9 @@ def train_on_arrays(
     settings = settings or Settings()
     architecture = architecture or Architecture(kind=kind, input_size=preprocessing.output_size)
     labels = _label_range(training, validation)
+    training_data = training.digest()
     recipe: dict[str, object] = {
-        "data": training.digest(),
+        "data": training_data,
         "validation_data": validation.digest(),
         "architecture": architecture.model_dump(mode="json"),
         "settings": asdict(settings),
@@ -198,7 +199,7 @@ def train_on_arrays(
             preprocessing=preprocessing,
             labels=labels,
             sigma_scale=_calibrate(outputs, run.validation_labels.numpy()),
-            training_data=training.digest(),
+            training_data=training_data,
             training={
                 **{key: list(value) if isinstance(value, tuple) else value for key, value in asdict(settings).items()},
                 "images": len(training),
@@ -259,6 +260,29 @@ class _Run:
         """Run all epochs that are left and leave the best epoch's tensors in the average."""
         if resume:
             self.progress = load_checkpoint(out, recipe, self.network, self.average, self.optimizer) or self.progress
+        try:
+            self._remaining_epochs(out, recipe)
+        except TrainingError:
+            # There is nothing to go on with, and it must not stand in the way of another learning rate.
+            delete_checkpoint(out)
+            raise
+        self.average.load_state_dict(self.progress.best_state)
+
+    def outputs(self, images: ImageArray) -> NDArray[np.float32]:
+        """Network outputs (n, 6 or 12) for preprocessed images."""
+        with torch.inference_mode():
+            return np.concatenate(
+                [
+                    self.average(_as_input(images[i : i + _EVALUATION_BATCH])).numpy()
+                    for i in range(0, len(images), _EVALUATION_BATCH)
+                ]
+            )
+
+    def contacts(self, outputs: NDArray[np.float32]) -> Array:
+        """(n, 6) contacts, mm and degrees, that network outputs stand for."""
+        return contact_from_xi(self.labels.centre + self.labels.half_range * outputs[:, :6].astype(np.float64))
+
+    def _remaining_epochs(self, out: Path, recipe: dict[str, object]) -> None:
         for epoch in range(len(self.progress.history) + 1, self.settings.epochs + 1):
             if epoch - self.progress.best_epoch > self.settings.patience:
                 break
@@ -280,21 +304,6 @@ class _Run:
                 epoch=self.progress.best_epoch,
                 hint="lower the learning rate",
             )
-        self.average.load_state_dict(self.progress.best_state)
-
-    def outputs(self, images: ImageArray) -> NDArray[np.float32]:
-        """Network outputs (n, 6 or 12) for preprocessed images."""
-        with torch.inference_mode():
-            return np.concatenate(
-                [
-                    self.average(_as_input(images[i : i + _EVALUATION_BATCH])).numpy()
-                    for i in range(0, len(images), _EVALUATION_BATCH)
-                ]
-            )
-
-    def contacts(self, outputs: NDArray[np.float32]) -> Array:
-        """(n, 6) contacts, mm and degrees, that network outputs stand for."""
-        return contact_from_xi(self.labels.centre + self.labels.half_range * outputs[:, :6].astype(np.float64))
 
     def _epoch(self, epoch: int) -> float:
         # Every epoch has its own random numbers, so that a resumed training draws those of an uninterrupted one.
