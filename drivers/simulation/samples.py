@@ -64,8 +64,8 @@ def contacts(
 ) -> Iterator[SampledContact]:
     """Yield ``n`` random contacts, the same for the same seed.
 
-    Depth is even in ``depth_mm``, tilt in a 25 deg disc, shear in a 5 mm disc, torsion in +-5 deg; what the depth cannot
-    hold slips, and the label is the pose that is left.
+    Depth is even in ``depth_mm``, tilt in a 25 deg disc, shear in a 5 mm disc, torsion in +-5 deg; what the depth
+    cannot hold slips, and the label is the pose that is left.
 
     Args:
         n: how many.
