@@ -33,6 +33,9 @@ PREPROCESSING = Preprocessing(
 # Weights below 3 MB, so that the file can ship.
 ARCHITECTURE = Architecture(channels=(8, 16, 32, 64, 128), hidden=192)
 
+# From the first touch to beyond the depth at which objects are tracked, so that neither is outside the training range.
+DEPTH_MM = (0.0, 6.5)
+
 VARIATION = Variation(parameters=0.01, turn_rad=0.002, shift_px=0.3, marker_px=0.1, disc_radius=0.03, missing=0.002)
 
 
@@ -63,7 +66,7 @@ def draw(samples: int, seed: int, split: str, observer: Observer) -> LabelledIma
     images: ImageArray = np.empty((samples, height, width), np.uint8)
     labels = np.empty((samples, 4, 4))
     renderers: dict[float, FrameRenderer] = {}
-    for i, contact in enumerate(contacts(samples, seed, variation=VARIATION)):
+    for i, contact in enumerate(contacts(samples, seed, depth_mm=DEPTH_MM, variation=VARIATION)):
         # A renderer draws discs of one radius; a twentieth of a pixel is finer than anybody sees.
         radius_px = round(20 * contact.disc_radius_px) / 20
         if radius_px not in renderers:

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from drivers.clock import Clock
 from drivers.device import Device, Lifecycle
-from drivers.errors import ConnectError, DataError, EndOfStream, StaleData
+from drivers.errors import ConnectError, DataError, StaleData
 from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
 from drivers.samples import Stamped, TcpState
 from drivers.tactile_data import natural_order, read_split
@@ -29,7 +29,8 @@ class ReplayArmConfig(DriverConfig):
 class ReplayArm(Device):
     """Tells where the sensor was for each labelled image: ``T_f_s`` of the label, so its base is the surface frame.
 
-    Pose k is reached k periods after ``connect``, in natural order of the images' names, like the replay camera's.
+    Pose k is reached k periods after ``connect``, in natural order of the images' names, like the replay camera's; the
+    arm stays at the last.
 
     Args:
         name: the device's name in the cell.
@@ -45,12 +46,10 @@ class ReplayArm(Device):
         self._poses: Array = np.empty((0, 4, 4))
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """Pose of the newest image. Raises StaleData, and EndOfStream a period after the last pose."""
+        """Pose of the newest image. Raises StaleData."""
         self._require("tell its pose", Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
         now_ns = self._clock.now_ns()
-        seq = (now_ns - self._start_ns) // self._period_ns
-        if seq >= len(self._poses):
-            raise EndOfStream(self.name, f"all {len(self._poses)} poses of {self._config.data} have been played")
+        seq = min((now_ns - self._start_ns) // self._period_ns, len(self._poses) - 1)
         t_ns = self._start_ns + seq * self._period_ns
         if max_age_s is not None and (age_s := (now_ns - t_ns) * 1e-9) > max_age_s:
             raise StaleData(self.name, age_s, max_age_s, seq)

@@ -57,12 +57,18 @@ def checkpoint_path(out: Path) -> Path:
 
 
 def save_checkpoint(
-    out: Path, recipe: dict[str, Any], network: nn.Module, optimizer: torch.optim.Optimizer, progress: Progress
+    out: Path,
+    recipe: dict[str, Any],
+    network: nn.Module,
+    average: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    progress: Progress,
 ) -> None:
     """Write the state after an epoch; a reader sees the old file or the new one."""
     from safetensors.torch import save
 
     tensors = {f"network.{name}": tensor for name, tensor in network.state_dict().items()}
+    tensors |= {f"average.{name}": tensor for name, tensor in average.state_dict().items()}
     tensors |= {f"best.{name}": tensor for name, tensor in progress.best_state.items()}
     for i, state in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer.{i}.{name}": tensor for name, tensor in state.items()}
@@ -84,9 +90,9 @@ def save_checkpoint(
 
 
 def load_checkpoint(
-    out: Path, recipe: dict[str, Any], network: nn.Module, optimizer: torch.optim.Optimizer
+    out: Path, recipe: dict[str, Any], network: nn.Module, average: nn.Module, optimizer: torch.optim.Optimizer
 ) -> Progress | None:
-    """Put network and optimizer into the state of the checkpoint; None when there is no checkpoint.
+    """Put network, average and optimizer into the state of the checkpoint; None when there is no checkpoint.
 
     Raises:
         TrainingError: the checkpoint is damaged, or of a training with another recipe.
@@ -111,6 +117,7 @@ def load_checkpoint(
         return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
     network.load_state_dict(part("network."))
+    average.load_state_dict(part("average."))
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in part("optimizer.").items():
         index, field_name = name.split(".")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -41,6 +42,7 @@ class Settings:
         batch_size: images per step.
         learning_rate: its peak.
         weight_decay: of AdamW.
+        memory: of the running average of the network that is validated and kept, as the share that stays in a step.
         patience: epochs without a better validation loss after which training stops.
         gdn_weights: of the six absolute errors added to a density network's likelihood, in label half-ranges; the
             likelihood alone learns nothing about gamma for ten epochs.
@@ -50,11 +52,12 @@ class Settings:
         zoom: standard deviation of their scale, relative.
     """
 
-    epochs: int = 40
+    epochs: int = 24
     seed: int = 0
     batch_size: int = 16
     learning_rate: float = 2e-3
     weight_decay: float = 0.02
+    memory: float = 0.998
     patience: int = 25
     gdn_weights: tuple[float, ...] = (2.0, 2.0, 1.0, 1.0, 1.0, 5.0)
     cnn_weights: tuple[float, ...] = (1.0, 1.0, 4.0, 4.0, 4.0, 1.0)
@@ -65,6 +68,8 @@ class Settings:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.learning_rate) and self.learning_rate > 0.0):
             raise TrainingError(f"learning rate {self.learning_rate} is not positive and finite")
+        if not 0.0 <= self.memory < 1.0:
+            raise TrainingError(f"memory {self.memory} does not lie in [0, 1)")
         if self.epochs < 1 or self.batch_size < 2 or self.patience < 1:
             raise TrainingError("epochs and patience must be at least 1, the batch size at least 2")
 
@@ -175,8 +180,9 @@ def train_on_arrays(
     settings = settings or Settings()
     architecture = architecture or Architecture(kind=kind, input_size=preprocessing.output_size)
     labels = _label_range(training, validation)
+    training_data = training.digest()
     recipe: dict[str, object] = {
-        "data": training.digest(),
+        "data": training_data,
         "validation_data": validation.digest(),
         "architecture": architecture.model_dump(mode="json"),
         "settings": asdict(settings),
@@ -194,7 +200,7 @@ def train_on_arrays(
             preprocessing=preprocessing,
             labels=labels,
             sigma_scale=_calibrate(outputs, run.validation_labels.numpy()),
-            training_data=training.digest(),
+            training_data=training_data,
             training={
                 **{key: list(value) if isinstance(value, tuple) else value for key, value in asdict(settings).items()},
                 "images": len(training),
@@ -204,7 +210,7 @@ def train_on_arrays(
                 "validation_mae": list(run.progress.history[run.progress.best_epoch - 1].mae.values()),
             },
         ),
-        network.folded(),
+        run.average.folded(),
         reference,
     )
     save_model(model, out)
@@ -225,7 +231,11 @@ def train_on_arrays(
 
 @dataclass
 class _Run:
-    """One training: the network, its optimizer, and how far they have come."""
+    """One training: the network, its optimizer, and how far they have come.
+
+    What is validated and kept is a running average of the network over the last few hundred steps: it errs less than
+    the network does while the learning rate is high, and it errs smoothly, so that the best epoch is no accident.
+    """
 
     network: ContactNetwork
     settings: Settings
@@ -240,6 +250,7 @@ class _Run:
         self.optimizer = torch.optim.AdamW(
             learned, lr=self.settings.learning_rate, weight_decay=self.settings.weight_decay
         )
+        self.average = copy.deepcopy(self.network).eval()
         self.training_labels = self._normalised(self.training.xi)
         self.validation_labels = self._normalised(self.validation.xi)
         self.weights = torch.tensor(
@@ -247,9 +258,32 @@ class _Run:
         )
 
     def fit(self, out: Path, recipe: dict[str, object], *, resume: bool) -> None:
-        """Run all epochs that are left and leave the best epoch's tensors in the network."""
+        """Run all epochs that are left and leave the best epoch's tensors in the average."""
         if resume:
-            self.progress = load_checkpoint(out, recipe, self.network, self.optimizer) or self.progress
+            self.progress = load_checkpoint(out, recipe, self.network, self.average, self.optimizer) or self.progress
+        try:
+            self._remaining_epochs(out, recipe)
+        except TrainingError:
+            # There is nothing to go on with, and it must not stand in the way of another learning rate.
+            delete_checkpoint(out)
+            raise
+        self.average.load_state_dict(self.progress.best_state)
+
+    def outputs(self, images: ImageArray) -> NDArray[np.float32]:
+        """Network outputs (n, 6 or 12) for preprocessed images."""
+        with torch.inference_mode():
+            return np.concatenate(
+                [
+                    self.average(_as_input(images[i : i + _EVALUATION_BATCH])).numpy()
+                    for i in range(0, len(images), _EVALUATION_BATCH)
+                ]
+            )
+
+    def contacts(self, outputs: NDArray[np.float32]) -> Array:
+        """(n, 6) contacts, mm and degrees, that network outputs stand for."""
+        return contact_from_xi(self.labels.centre + self.labels.half_range * outputs[:, :6].astype(np.float64))
+
+    def _remaining_epochs(self, out: Path, recipe: dict[str, object]) -> None:
         for epoch in range(len(self.progress.history) + 1, self.settings.epochs + 1):
             if epoch - self.progress.best_epoch > self.settings.patience:
                 break
@@ -260,8 +294,8 @@ class _Run:
                 raise TrainingError("the validation loss is no number", epoch=epoch, hint="lower the learning rate")
             mae = np.abs(self.contacts(outputs) - contact_from_xi(self.validation.xi)).mean(axis=0)
             record = EpochRecord(epoch, train_loss, loss, dict(zip(CONTACT_NAMES, mae.tolist(), strict=True)))
-            self.progress.add(record, self.network)
-            save_checkpoint(out, recipe, self.network, self.optimizer, self.progress)
+            self.progress.add(record, self.average)
+            save_checkpoint(out, recipe, self.network, self.average, self.optimizer, self.progress)
             if self.observer is not None:
                 self.observer.epoch(record, best=self.progress.best_epoch == epoch)
         guess = torch.zeros(len(self.validation_labels), self.network.architecture.outputs)
@@ -271,22 +305,6 @@ class _Run:
                 epoch=self.progress.best_epoch,
                 hint="lower the learning rate",
             )
-        self.network.load_state_dict(self.progress.best_state)
-
-    def outputs(self, images: ImageArray) -> NDArray[np.float32]:
-        """Network outputs (n, 6 or 12) for preprocessed images."""
-        self.network.eval()
-        with torch.inference_mode():
-            return np.concatenate(
-                [
-                    self.network(_as_input(images[i : i + _EVALUATION_BATCH])).numpy()
-                    for i in range(0, len(images), _EVALUATION_BATCH)
-                ]
-            )
-
-    def contacts(self, outputs: NDArray[np.float32]) -> Array:
-        """(n, 6) contacts, mm and degrees, that network outputs stand for."""
-        return contact_from_xi(self.labels.centre + self.labels.half_range * outputs[:, :6].astype(np.float64))
 
     def _epoch(self, epoch: int) -> float:
         # Every epoch has its own random numbers, so that a resumed training draws those of an uninterrupted one.
@@ -308,10 +326,19 @@ class _Run:
             loss.backward()  # type: ignore[no-untyped-call]
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), 10.0)
             self.optimizer.step()
+            self._follow(step)
             total += loss.item()
             if self.observer is not None:
                 self.observer.batch(epoch, self.settings.epochs, i + 1, batches, total / (i + 1))
         return total / batches
+
+    @torch.no_grad()
+    def _follow(self, step: int) -> None:
+        # The first steps weigh more, so that the average soon forgets the untrained network.
+        share = max(1.0 - self.settings.memory, 9.0 / (10.0 + step))
+        for kept, new in zip(self.average.state_dict().values(), self.network.state_dict().values(), strict=True):
+            if kept.is_floating_point():
+                kept.lerp_(new, share)
 
     def _loss(self, outputs: Tensor, labels: Tensor) -> Tensor:
         if self.network.architecture.kind == "cnn":

@@ -11,8 +11,9 @@ from pydantic import PositiveFloat
 from geometry import se3
 from geometry.errors import TouchcellError
 from perception.estimate import ContactEstimate
-from tasks.interface import Action, Observation, TaskConfig, TaskContext, TaskSpec, TransitionRecord
-from tasks.machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
+from tasks.interface import Action, Observation, TaskConfig, TaskContext, TaskSpec
+from tasks.machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef
+from tasks.machine_task import MachineTask
 from tasks.servoing import SENSOR
 
 _LABELS = ("shear_x_mm", "shear_y_mm", "depth_mm", "tilt_alpha_deg", "tilt_beta_deg", "torsion_gamma_deg")
@@ -68,7 +69,7 @@ def observe_table(config: ObserveConfig) -> Table:
     )
 
 
-class Observe:
+class Observe(MachineTask):
     """The task in execution; see ``tasks.interface.Task``. It never commands anything."""
 
     def __init__(self, config: ObserveConfig, context: TaskContext) -> None:
@@ -77,30 +78,6 @@ class Observe:
         self._seq: int | None = None
         self._seen_ns = 0
         self._frames = 0
-
-    @property
-    def state(self) -> str:
-        """Name of the present state."""
-        return state_name(self._machine.state)
-
-    @property
-    def finished(self) -> bool:
-        """Whether a terminal state has been reached."""
-        return self._machine.finished
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether at least one frame was seen and nothing went wrong, or a person ended it."""
-        return self._machine.state is ObserveState.DONE
-
-    @property
-    def transitions(self) -> tuple[TransitionRecord, ...]:
-        """Every change of state so far."""
-        return self._machine.records
-
-    def trip(self, now_ns: int, reason: str) -> None:
-        """Go to the tripped state."""
-        self._machine.fire(TRIP, reason, now_ns=now_ns)
 
     def tick(self, observation: Observation) -> Action:
         """Advance by one cycle: no commands, only numbers."""

@@ -19,6 +19,7 @@ from geometry.types import Array
 from perception.estimate import ContactEstimate
 from tasks.interface import Action, Observation, TaskConfig, TaskContext, TransitionRecord
 from tasks.machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
+from tasks.machine_task import MachineTask
 
 ARM: Final = "arm"
 """Role of the arm in tasks with one arm."""
@@ -197,7 +198,7 @@ class _Sight:
         return None if self.contact.belief is None else self.contact.belief.mean
 
 
-class ServoTask:
+class ServoTask(MachineTask):
     """A task in execution; see ``tasks.interface.Task`` for what its members mean.
 
     While it looks for the surface or holds it, it moves only on a fresh frame, a fresh arm state and a valid belief.
@@ -230,30 +231,6 @@ class ServoTask:
         self._reapproaches = 0
         self._stop_seen = False
         self._finished_run = False
-
-    @property
-    def state(self) -> str:
-        """Name of the present state."""
-        return state_name(self._machine.state)
-
-    @property
-    def finished(self) -> bool:
-        """Whether a terminal state has been reached."""
-        return self._machine.finished
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether the work was done and the arm has withdrawn."""
-        return self._machine.state is ServoState.DONE
-
-    @property
-    def transitions(self) -> tuple[TransitionRecord, ...]:
-        """Every change of state so far."""
-        return self._machine.records
-
-    def trip(self, now_ns: int, reason: str) -> None:
-        """Go to the tripped state, from which nothing moves."""
-        self._machine.fire(TRIP, reason, now_ns=now_ns)
 
     def tick(self, observation: Observation) -> Action:
         """Advance by one cycle."""

@@ -12,6 +12,7 @@ from drivers.simulation.tip import Tip, TipParameters
 from geometry import se3
 from geometry.types import Array
 
+PUBLIC_DEPTH_MM = (0.5, 6.0)
 _IMAGES_PER_TIP = 16
 _ADDITIVE = {"centre_px", "image_rotation_rad", "layout_phase_rad"}
 
@@ -56,18 +57,20 @@ def contacts(
     n: int,
     seed: int,
     *,
+    depth_mm: tuple[float, float] = PUBLIC_DEPTH_MM,
     parameters: TipParameters | None = None,
     law: ContactLaw | None = None,
     variation: Variation | None = None,
 ) -> Iterator[SampledContact]:
     """Yield ``n`` random contacts, the same for the same seed.
 
-    Depth is even in 0.5-6 mm, tilt in a 25 deg disc, shear in a 5 mm disc, torsion in +-5 deg; what the depth cannot
-    hold slips, and the label is the pose that is left.
+    Depth is even in ``depth_mm``, tilt in a 25 deg disc, shear in a 5 mm disc, torsion in +-5 deg; what the depth
+    cannot hold slips, and the label is the pose that is left.
 
     Args:
         n: how many.
         seed: of everything random.
+        depth_mm: least and greatest depth.
         parameters: of the sensor around which the others scatter.
         law: how the tips slip.
         variation: how far they scatter.
@@ -77,7 +80,7 @@ def contacts(
     for start in range(0, n, _IMAGES_PER_TIP):
         count = min(_IMAGES_PER_TIP, n - start)
         tip = Tip(_scattered(middle, variation, rng))
-        T_f_s = np.stack([contact_at(pose, law).T_f_s for pose in random_poses(count, rng)])
+        T_f_s = np.stack([contact_at(pose, law).T_f_s for pose in random_poses(count, rng, depth_mm)])
         pixels = tip.pixels(T_f_s)
         pixels += rng.normal(0.0, variation.marker_px, pixels.shape)
         seen = rng.random(pixels.shape[:2]) >= variation.missing
@@ -86,10 +89,10 @@ def contacts(
             yield SampledContact(T_f_s[i], pixels[i][seen[i]], float(radius[i]))
 
 
-def random_poses(n: int, rng: np.random.Generator) -> Array:
+def random_poses(n: int, rng: np.random.Generator, depth_mm: tuple[float, float] = PUBLIC_DEPTH_MM) -> Array:
     """(n, 4, 4) contacts T_f_s over the ranges of the public data, before any slip."""
     tilt, shear = _disc(n, 25.0, rng), _disc(n, 5.0, rng)
-    depth, gamma = rng.uniform(0.5, 6.0, n), rng.uniform(-5.0, 5.0, n)
+    depth, gamma = rng.uniform(*depth_mm, n), rng.uniform(-5.0, 5.0, n)
     return se3.from_euler_mm_deg(np.column_stack([shear, depth, tilt, gamma]))
 
 
