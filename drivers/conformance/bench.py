@@ -33,10 +33,17 @@ _STILL_NS = 60_000_000
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Where the tool truly was: times (n,) ns and poses (n, 4, 4) in the base frame."""
+    """Where the tool truly was.
+
+    Attributes:
+        t_ns: (n,) times on the check's clock.
+        poses: (n, 4, 4) in the base frame.
+        t_true_s: (n,) the same times by the emulator's own clock, which counts for speeds.
+    """
 
     t_ns: Array
     poses: Array
+    t_true_s: Array
 
     def position_at(self, t_ns: float) -> Array:
         """Position (3,) at ``t_ns``, between samples by straight lines."""
@@ -45,7 +52,7 @@ class Track:
     def since(self, t_ns: float) -> Track:
         """The part from ``t_ns`` on."""
         late = self.t_ns >= t_ns
-        return Track(self.t_ns[late], self.poses[late])
+        return Track(self.t_ns[late], self.poses[late], self.t_true_s[late])
 
     def mean_twist(self, frame: TwistFrame) -> Array:
         """Mean twist (6,) of the tool centre point from the first sample to the last, along base or first tool axes."""
@@ -56,7 +63,33 @@ class Track:
         if frame is TwistFrame.TCP:
             R = first[:3, :3].T
             moved = np.concatenate([R @ moved[:3], R @ moved[3:]])
-        return cast(Array, moved / ((self.t_ns[-1] - self.t_ns[0]) * 1e-9))
+        return cast(Array, moved / (self.t_true_s[-1] - self.t_true_s[0]))
+
+
+class _Recorder:
+    """Makes a track."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        self.times: list[int] = []
+        self.poses: list[Array] = []
+        self._true: list[float] = []
+        self.truth: dict[str, Any] = {}
+
+    def note(self) -> None:
+        """Take a sample."""
+        bench = self._bench
+        before_ns = bench.clock.now_ns()
+        self.truth = {} if bench.is_real else bench.truth()
+        self.poses.append(bench.pose(self.truth))
+        t_ns = (before_ns + bench.clock.now_ns()) // 2
+        self.times.append(t_ns)
+        self._true.append(t_ns * 1e-9 if bench.rig.time is None or bench.is_real else self.truth[bench.rig.time])
+
+    def track(self, count: int | None = None) -> Track:
+        """The first ``count`` samples, or all."""
+        t_ns, poses, true = self.times[:count], self.poses[:count], self._true[:count]
+        return Track(np.array(t_ns, dtype=np.float64), np.array(poses), np.array(true))
 
 
 class Seat:
@@ -206,11 +239,11 @@ class Bench:
         """How many messages that change power, mode or zero have reached the emulator."""
         return int(self.truth()[self.rig.energising]) if self.rig.energising else 0
 
-    def pose(self) -> Array:
+    def pose(self, truth: dict[str, Any] | None = None) -> Array:
         """True pose (4, 4) of the tool centre point in the base frame; on a real bench what the arm says."""
         if self.is_real:
             return self.arm.tcp().value.T_base_tcp
-        truth = self.truth()
+        truth = truth or self.truth()
         if self.rig.pose is not None:
             return np.array(truth[self.rig.pose])
         T = self.arm.tcp().value.T_base_tcp.copy()
@@ -256,8 +289,7 @@ class Bench:
         ttl_s: float = _TTL_S,
     ) -> tuple[Track, Sent[TwistCommand]]:
         """Send ``twist`` at 50 Hz for a while; returns where the tool truly went, and the last command as it was sent."""
-        times: list[int] = []
-        poses: list[Array] = []
+        recorder = _Recorder(self)
         end_ns = self.clock.now_ns() + round(seconds * 1e9)
         while True:
             now_ns = self.clock.now_ns()
@@ -265,11 +297,9 @@ class Bench:
                 sent = self.arm.send_twist(self.command(twist, frame, ttl_s), lease)
             except DeviceError as error:
                 pytest.fail(f"{error}; fault: {self.device.fault}", pytrace=False)
-            before_ns = self.clock.now_ns()
-            poses.append(self.pose())
-            times.append((before_ns + self.clock.now_ns()) // 2)
+            recorder.note()
             if now_ns >= end_ns:
-                return Track(np.array(times, dtype=np.float64), np.array(poses)), sent
+                return recorder.track(), sent
             self.clock.sleep_until_ns(now_ns + _PERIOD_NS)
 
     def track_to_rest(self, within_s: float, ended: Callable[[dict[str, Any]], bool] | None = None) -> Track:
@@ -277,18 +307,16 @@ class Bench:
 
         The track ends where the rest began.
         """
-        times: list[int] = []
-        poses: list[Array] = []
+        recorder = _Recorder(self)
+        times, poses = recorder.times, recorder.poses
         deadline_ns = self.clock.now_ns() + round(within_s * 1e9) + _STILL_NS
         while True:
-            before_ns = self.clock.now_ns()
-            poses.append(self.pose())
-            times.append((before_ns + self.clock.now_ns()) // 2)
-            if ended is not None and ended(self.truth()):
-                return Track(np.array(times, dtype=np.float64), np.array(poses))
+            recorder.note()
+            if ended is not None and ended(recorder.truth):
+                return recorder.track()
             calm = next((i for i, t_ns in enumerate(times) if t_ns >= times[-1] - _STILL_NS), 0)
             if times[-1] - times[0] >= _STILL_NS and _spread(poses[calm:]):
-                return Track(np.array(times[: calm + 1], dtype=np.float64), np.array(poses[: calm + 1]))
+                return recorder.track(calm + 1)
             if times[-1] > deadline_ns:
                 pytest.fail(f"the tool still moves after {within_s:g} s", pytrace=False)
             self.sleep(0.003)

@@ -9,7 +9,7 @@ from drivers.conformance.bench import Bench
 from drivers.conformance.client import MovingClient
 from drivers.conformance.suite import check
 
-_STREAM_S = 0.6
+_STREAM_S = 0.8
 _STEADY_S = 0.3
 _HOST_DELAY_S = 0.06
 """How late a busy host may be, on top of what the record says."""
@@ -32,21 +32,20 @@ def _follows_all_axes(bench: Bench, frame: TwistFrame) -> None:
     lease = bench.leased()
     bench.settle()
     wrong = []
+    # Forth along base axes and back along the tool's, so that the two checks need little room.
+    sign = 1.0 if frame is TwistFrame.BASE else -1.0
     for axis, follows in enumerate(bench.rig.spec.capabilities.twist_axes):
         if not follows:
             continue
-        for sign in (1.0, -1.0):
-            asked = sign * bench.twist(axis)
-            track, sent = bench.stream(lease, asked, _STREAM_S, frame=frame)
-            assert not sent.adjustments
-            bench.arm.stop()
-            bench.settle()
-            steady = track.since(track.t_ns[-1] - _STEADY_S * 1e9)
-            got = steady.mean_twist(frame)
-            size = abs(asked[axis])
-            aside = np.delete(got[:3] if axis < 3 else got[3:], axis % 3)
-            if abs(got[axis] - asked[axis]) > 0.2 * size or np.abs(aside).max() > 0.2 * size:
-                wrong.append(f"{'vx vy vz wx wy wz'.split()[axis]} {asked[axis]:+.3f}: {np.round(got, 4).tolist()}")
+        asked = sign * bench.twist(axis)
+        track, sent = bench.stream(lease, asked, _STREAM_S, frame=frame)
+        bench.arm.stop()
+        bench.settle()
+        got = track.since(track.t_ns[-1] - _STEADY_S * 1e9).mean_twist(frame)
+        size = abs(asked[axis])
+        aside = np.delete(got[:3] if axis < 3 else got[3:], axis % 3)
+        if sent.adjustments or abs(got[axis] - asked[axis]) > 0.2 * size or np.abs(aside).max() > 0.2 * size:
+            wrong.append(f"{'vx vy vz wx wy wz'.split()[axis]} {asked[axis]:+.3f}: {np.round(got, 4).tolist()}")
     assert not wrong, "the tool truly moved otherwise:\n" + "\n".join(wrong)
 
 

@@ -45,6 +45,8 @@ def conformance_bench(request: pytest.FixtureRequest, conformance_seat: Any) -> 
     reason = needs.missing(conformance_seat.rig) if needs is not None else None
     if reason is not None:
         pytest.skip(reason)
+    if known := conformance_seat.rig.known.get(request.node.name.removeprefix("test_")):
+        request.applymarker(pytest.mark.xfail(reason=known, strict=True))
     bench = Bench(conformance_seat)
     yield bench
     report = request.node.stash.get(_FAILED, None)
@@ -75,7 +77,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 
 class _Table:
-    """Collects what became of each check and prints it: green, skipped, RED."""
+    """Collects what became of each check and prints it: green, skipped, known to fail, RED."""
 
     def __init__(self) -> None:
         self._marks: dict[str, dict[str, str]] = {}
@@ -92,7 +94,10 @@ class _Table:
     def _note(self, report: pytest.TestReport, driver: str, name: str) -> None:
         self._seconds[driver] = self._seconds.get(driver, 0.0) + report.duration
         marks = self._marks.setdefault(name, {})
-        if report.failed:
+        if hasattr(report, "wasxfail") and report.skipped:
+            marks[driver] = "known"
+            self._explain(f"known {driver} {name}", report.wasxfail)
+        elif report.failed:
             if marks.get(driver) != "RED":
                 self._explain(f"RED {driver} {name}", str(report.longrepr).strip().splitlines()[-1])
             marks[driver] = "RED"
@@ -122,12 +127,10 @@ class _Table:
         totals = (f"{self._seconds[d]:{width - 2}.1f} s" for d, width in zip(drivers, widths, strict=True))
         write(f"{'time':<{names}}" + "".join(totals))
         write("")
-        for title, lines in sorted(self._reasons.items(), key=lambda entry: not entry[0].startswith("RED")):
+        for title, lines in sorted(self._reasons.items(), key=lambda entry: entry[0].startswith("-")):
             write(title)
-            for line in lines if title.startswith("RED") else ():
+            for line in [_by_driver(lines)] if title.startswith("-") else lines:
                 write(f"    {line}")
-            if not title.startswith("RED"):
-                write(f"    {_by_driver(lines)}")
 
 
 def _by_driver(lines: list[str]) -> str:

@@ -63,11 +63,12 @@ def frames_are_stamped_and_numbered(bench: Bench) -> None:
 
 
 def _agrees_with_rate(bench: Bench, samples: list[Any]) -> None:
-    """New samples appear at no less than half the declared rate (a busy machine reads late), and no faster than it."""
+    """Numbers rise by no less than half the declared rate (a busy machine is slow); new samples come at most 2.5 times as often."""
     declared_hz = bench.rig.state_rate_hz or bench.rig.spec.capabilities.state_rate_hz
     first, last = samples[0], samples[-1]
-    numbered_hz = (last.seq - first.seq) / ((last.t_ns - first.t_ns) * 1e-9)
-    assert 0.5 * declared_hz <= numbered_hz <= 1.25 * declared_hz
+    passed_s = (last.t_ns - first.t_ns) * 1e-9
+    assert last.seq - first.seq >= 0.5 * declared_hz * passed_s
+    assert len({sample.seq for sample in samples}) - 1 <= 2.5 * declared_hz * passed_s
 
 
 @check(on_bench=True)

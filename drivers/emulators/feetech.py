@@ -259,9 +259,11 @@ class FeetechArm(Emulator):
         """The truth: angles, tool position, what is energised, what was received."""
         self._integrate()
         q = self._q()
+        T_base_tcp = self._chain.forward(q)
         return {
             "q_rad": q.tolist(),
-            "position_m": self._chain.forward(q)[:3, 3].tolist(),
+            "position_m": T_base_tcp[:3, 3].tolist(),
+            "T_base_tcp": T_base_tcp.tolist(),
             "ticks": [round(servo.position) for servo in self.servos],
             "still": all(abs(servo.velocity) < _STANDSTILL_TICKS_S for servo in self.servos),
             "energised": any(servo.torque for servo in self.servos),

@@ -133,6 +133,7 @@ class FrankaEmulator(Emulator):
             "connected": self._client is not None,
             "watchdog_s": _LOST_LIMIT * 1e-3,
             "time_ms": state.message_id,
+            "t_s": state.message_id * 1e-3,
             "last_command_ms": self._last_command_ms,
             "at_last_command_m": self._stopped_at,
             "force_threshold": arm.force_threshold.tolist(),
@@ -195,6 +196,8 @@ class FrankaEmulator(Emulator):
     def _accept(self) -> None:
         assert self._listener is not None
         client, _ = self._listener.accept()
+        # The one before may have hung up since the last tick.
+        self._read_requests()
         if self._client is not None:
             # The controller speaks to one client at a time.
             client.close()

@@ -56,8 +56,11 @@ class Rig:
             a device that has no such messages.
         position: entry with the tool's true position [x, y, z] in m (arms), or None for cameras.
         pose: entry with the tool's true pose (4, 4) in the base frame (arms), or None where only its position is told.
-        faults: emulator faults to try, each with the driver's lawful answer: "transient" (counted, goes on), "stale"
-            (StaleData), "fault" (FAULTED).
+        time: entry with the emulator's own time in s, which may lag behind the machine's where that is busy; None if it
+            keeps the machine's.
+        faults: emulator faults to try, each with the driver's lawful answer: "transient" (counted, goes on), "unseen"
+            (goes on; the vendor's library hides it), "stale" (StaleData), "fault" (FAULTED).
+        known: checks that this driver is known to fail, each with the reason.
         state_rate_hz: rate that ``build`` configures, where it is not the one in the capability record.
         clock: makes the clock that everything in a check runs on.
         process: whether the emulator is a process of its own, which can hang and vanish while the client lives.
@@ -70,7 +73,9 @@ class Rig:
     energising: str | None = "energising"
     position: str | None = "position_m"
     pose: str | None = None
+    time: str | None = None
     faults: dict[str, tuple[Any, str]] = field(default_factory=dict)
+    known: dict[str, str] = field(default_factory=dict)
     state_rate_hz: float | None = None
     clock: Callable[[], Clock] = MonotonicClock
     process: bool = True

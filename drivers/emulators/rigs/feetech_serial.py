@@ -48,6 +48,8 @@ def rig(folder: Path, address: int) -> Rig:
         spec=feetech_serial.SPEC,
         start=lambda: emulator(port).start(),
         build=lambda clock: feetech_serial.FeetechSerialArm("arm", config(port), clock),
+        pose="T_base_tcp",
+        state_rate_hz=40.0,
         faults={
             "drop": (3, "transient"),
             "corrupt": (3, "transient"),

@@ -27,10 +27,11 @@ def rig(folder: Path, address: int) -> Rig:
         spec=SPEC,
         start=start,
         build=build,
+        time="t_s",
         pose="T_base_ee",
         faults={
-            "drop_states": (5, "transient"),
-            "out_of_order": (5, "transient"),
+            "drop_states": (5, "unseen"),
+            "out_of_order": (5, "unseen"),
             "nan": (3, "transient"),
             "pause": (True, "fault"),
             "unplug": (True, "fault"),
