@@ -109,7 +109,7 @@ def health_is_told_by_name(bench: Bench) -> None:
         assert reading == reading, name
 
 
-@check("NativeWatchdog")
+@check("NativeWatchdog", on_bench=True)
 def watchdog_is_read_back(bench: Bench) -> None:
     """An active device tells a watchdog no longer than its record says."""
     device = bench.active()
@@ -119,7 +119,7 @@ def watchdog_is_read_back(bench: Bench) -> None:
     assert 0.0 < device.watchdog_s() <= longest_s
 
 
-@check("arm")
+@check("arm", on_bench=True)
 def record_of_the_watchdog_is_consistent(bench: Bench) -> None:
     """``max_watchdog_s`` is given exactly by devices that have a watchdog."""
     capabilities = bench.rig.spec.capabilities
@@ -171,7 +171,7 @@ def deactivation_rests_and_voids_the_lease(bench: Bench) -> None:
     assert bench.device.state is Lifecycle.READY
     before = bench.position()
     bench.sleep(0.2)
-    assert np.linalg.norm(bench.position() - before) < 5e-4
+    assert np.linalg.norm(bench.position() - before) < 1e-3
     bench.device.activate()
     with pytest.raises(CommandRejected) as caught:
         bench.arm.send_twist(bench.command(bench.twist(bench.axis())), lease)
