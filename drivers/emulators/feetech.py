@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from drivers import feetech_codec as codec
-from drivers.emulators.base import Emulator
+from drivers.emulators.base import CommandOnset, Emulator
 from drivers.feetech_codec import Instruction, Packet, Register
 from drivers.kinematics import ChainDescription, SerialChain, Tool
 
@@ -240,6 +240,7 @@ class FeetechArm(Emulator):
         self._stepped_s: float | None = None
         self._energising = 0
         self._commands = 0
+        self._onset = CommandOnset()
         self._requests = 0
         self._last_command_s: float | None = None
         self._log: deque[str] = deque(maxlen=_LOG_LENGTH)
@@ -274,6 +275,7 @@ class FeetechArm(Emulator):
             "energising": self._energising,
             "watchdog_s": None,
             "commands": self._commands,
+            "command_onset_ns": self._onset.t_ns,
             "requests": self._requests,
             "last_command_age_s": None if self._last_command_s is None else self._now_s() - self._last_command_s,
             "log": list(self._log),
@@ -405,6 +407,7 @@ class FeetechArm(Emulator):
         self._energising += bool(registers & _CHANGES_POWER_MODE_OR_ZERO)
         if Register.GOAL_POSITION in registers:
             self._commands += 1
+            self._onset.note(servo.number, data)
             self._last_command_s = self._now_s()
         servo.write(register, data)
         held = self.active.get("fault_bits")

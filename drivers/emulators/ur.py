@@ -201,6 +201,7 @@ class UrEmulator(Emulator):
             "watchdog_hz": controller.watchdog_hz,
             "watchdog_trips": controller.watchdog_trips,
             "commands": dict(controller.commands),
+            "command_onset_ns": controller.onset.t_ns,
             "last_command_age_s": controller.last_input_age_s,
             "travel_since_command_m": controller.travel_since_input_m,
             "clients": len(self._clients),
