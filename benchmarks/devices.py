@@ -1,6 +1,7 @@
-"""``touchcell bench devices``: every driver on its emulator: speed, latency, stopping, memory; vendors' clients beside.
+"""``touchcell bench devices``: every driver on its emulator, and the vendor's client beside it.
 
-All figures are of this machine and of emulators, never of metal. Needs pytest (extra ``dev``) for the conformance bench.
+All figures are of this machine and of emulators, never of metal. It works with the conformance suite's bench, so it
+needs pytest (extra ``dev``).
 """
 
 from __future__ import annotations
@@ -68,8 +69,8 @@ def run(arguments: Sequence[str], out: Path) -> None:
         cells = (f"{format(row[key], form) if row.get(key) is not None else '-':>11}" for key, _, form in _COLUMNS)
         print(f"{name:<24}" + "".join(cells) + (f"  {row['error']}" if "error" in row else ""))
     print(
-        "\nwire: from send_twist to the emulator's receive stamp, from rest. ttl, kill: from expiry or kill -9 until the tool"
-        "\nrests, or until the motors of an arm without brakes let go. frozen: until the driver refuses to go on."
+        "\nwire: from send_twist to the emulator's receive stamp, each time from rest. ttl, kill: from expiry or kill -9"
+        "\nuntil the tool rests, or the motors of an arm without brakes let go. frozen: until the driver is FAULTED."
     )
     out.mkdir(parents=True, exist_ok=True)
     (out / "devices.json").write_text(json.dumps({"provenance": provenance(), "rows": rows}, indent=1) + "\n")
@@ -106,7 +107,17 @@ def _client(who: str, seat: Seat, name: str) -> dict[str, Any]:
         environment |= shim(seat.folder)
     try:
         result = subprocess.run(
-            [sys.executable, "-W", "ignore", "-m", "benchmarks.device_client", who, name, seat.folder, str(seat.address)],
+            [
+                sys.executable,
+                "-W",
+                "ignore",
+                "-m",
+                "benchmarks.device_client",
+                who,
+                name,
+                seat.folder,
+                str(seat.address),
+            ],
             capture_output=True,
             text=True,
             timeout=_CLIENT_TIMEOUT_S,
@@ -131,10 +142,10 @@ def _wire(seat: Seat) -> dict[str, Any]:
         for trial in range(_TRIALS):
             bench.sleep(_CALM_S)
             sign = 1.0 if trial % 2 else -1.0
-            command = bench.command(sign * bench.twist(bench.axis()), ttl_s=0.05)
+            command = bench.command(sign * bench.twist(bench.axis()), ttl_s=0.04)
             before_ns = time.monotonic_ns()
             bench.arm.send_twist(command, lease)
-            bench.sleep(0.06)
+            bench.sleep(0.035)
             onset_ns = bench.truth()["command_onset_ns"]
             if onset_ns > before_ns:
                 latencies_ms.append((onset_ns - before_ns) * 1e-6)
@@ -164,7 +175,7 @@ def _ttl(seat: Seat) -> dict[str, Any]:
 
 
 def _kill(seat: Seat) -> dict[str, Any]:
-    """From kill -9 of the client until the tool rests, or the motors of an arm that falls let go; and how far it went."""
+    """From kill -9 of the client until the tool rests, or motors that carry an arm without brakes let go."""
     bench = Bench(seat)
     falls = seat.rig.spec.capabilities.falls_on_power_loss
     try:

@@ -16,7 +16,7 @@ EXIT_TRIPPED = 3
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0 done, 1 the task or a device failed, 2 bad input, 3 an interlock tripped."""
+    """Run one command; returns the exit code: 0 done, 1 task or device failed, 2 bad input, 3 an interlock tripped."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words[:1] == ["emulate"]:
         from drivers.emulators.launcher import main as emulate

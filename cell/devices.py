@@ -16,12 +16,6 @@ from drivers.device import Device
 from drivers.discovery import Found
 from drivers.errors import DeviceError, LifecycleError
 
-_FINDERS: tuple[tuple[str, Callable[[], Sequence[Found]]], ...] = (
-    ("cameras", discovery.cameras),
-    ("serial ports", discovery.serial_ports),
-    ("CAN interfaces", discovery.can_interfaces),
-)
-
 
 @dataclass(frozen=True, slots=True)
 class Probe:
@@ -41,7 +35,12 @@ class Probe:
 
 def print_devices() -> None:
     """Print every camera, serial port and CAN interface of this machine, and what is missing before it can be used."""
-    for title, find in _FINDERS:
+    finders: dict[str, Callable[[], Sequence[Found]]] = {
+        "cameras": discovery.cameras,
+        "serial ports": discovery.serial_ports,
+        "CAN interfaces": discovery.can_interfaces,
+    }
+    for title, find in finders.items():
         found = find()
         print(f"{title}{'' if found else ': none'}")
         for device in found:
@@ -111,4 +110,6 @@ def _frame(device: Device) -> list[tuple[str, str]]:
 def _health(device: Device) -> list[tuple[str, str]]:
     if not isinstance(device, HealthSource):
         return []
-    return [(name, f"{value:.6g}" if isinstance(value, float) else str(value)) for name, value in device.health().items()]
+    return [
+        (name, f"{value:.6g}" if isinstance(value, float) else str(value)) for name, value in device.health().items()
+    ]

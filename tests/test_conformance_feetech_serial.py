@@ -1,4 +1,4 @@
 from drivers.conformance.suite import suite
 from drivers.emulators.rigs.feetech_serial import rig
 
-TestDriver = suite(rig)
+TestFeetechSerial = suite(rig)

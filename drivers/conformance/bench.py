@@ -172,6 +172,10 @@ class Bench:
         """An operator's."""
         return OperatorToken("conformance suite", self.clock.now_ns())
 
+    def is_in(self, state: Lifecycle) -> bool:
+        """Whether the device is in ``state`` now."""
+        return self.device.state is state
+
     def another(self) -> Device:
         """One more DISCONNECTED device object for the same device."""
         device = self.rig.build(self.clock)
@@ -242,7 +246,8 @@ class Bench:
     def pose(self, truth: dict[str, Any] | None = None) -> Array:
         """True pose (4, 4) of the tool centre point in the base frame; on a real bench what the arm says."""
         if self.is_real:
-            return self.arm.tcp().value.T_base_tcp
+            told: Array = self.arm.tcp().value.T_base_tcp
+            return told
         truth = truth or self.truth()
         if self.rig.pose is not None:
             return np.array(truth[self.rig.pose])
@@ -288,7 +293,7 @@ class Bench:
         frame: TwistFrame = TwistFrame.BASE,
         ttl_s: float = _TTL_S,
     ) -> tuple[Track, Sent[TwistCommand]]:
-        """Send ``twist`` at 50 Hz for a while; returns where the tool truly went, and the last command as it was sent."""
+        """Send ``twist`` at 50 Hz for a while; returns where the tool truly went, and the last command as sent."""
         recorder = _Recorder(self)
         end_ns = self.clock.now_ns() + round(seconds * 1e9)
         while True:

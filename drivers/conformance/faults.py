@@ -160,16 +160,16 @@ def _is_latched(bench: Bench, lease: Lease | None, fault: str, value: Any) -> No
 def _serves_again(bench: Bench) -> None:
     """``recover`` leads to READY, never to ACTIVE; where it says that it cannot, connecting anew does."""
     deadline_ns = bench.clock.now_ns() + round(_RECOVERED_S * 1e9)
-    while bench.device.state is Lifecycle.FAULTED and bench.clock.now_ns() < deadline_ns:
+    while bench.is_in(Lifecycle.FAULTED) and bench.clock.now_ns() < deadline_ns:
         with suppress(DeviceError):
             bench.device.recover(bench.token)
-            assert bench.device.state is Lifecycle.READY
+            assert bench.is_in(Lifecycle.READY)
             assert bench.device.fault is None
         bench.sleep(0.05)
-    if bench.device.state is Lifecycle.READY:
+    if bench.is_in(Lifecycle.READY):
         with suppress(DeviceError):
             bench.device.activate()
-    if bench.device.state is not Lifecycle.ACTIVE:
+    if not bench.is_in(Lifecycle.ACTIVE):
         if bench.rig.spec.capabilities.falls_on_power_loss:
             # It fell; somebody has to lift it.
             bench.device.disconnect()

@@ -42,10 +42,10 @@ def lifecycle_in_order_only(bench: Bench) -> None:
             device.recover(bench.token)
         assert device.state is before
         getattr(device, step)()
-    assert device.state is Lifecycle.READY
+    assert bench.is_in(Lifecycle.READY)
     device.disconnect()
     device.disconnect()
-    assert device.state is Lifecycle.DISCONNECTED
+    assert bench.is_in(Lifecycle.DISCONNECTED)
 
 
 @check("truth")
@@ -70,10 +70,10 @@ def failed_connect_can_be_retried(bench: Bench) -> None:
     with pytest.raises(DeviceError):
         bench.device.connect()
     assert (bench.clock.now_ns() - start_ns) * 1e-9 < 15.0
-    assert bench.device.state is Lifecycle.DISCONNECTED
+    assert bench.is_in(Lifecycle.DISCONNECTED)
     assert bench.emulator
     bench.active()
-    assert bench.device.state is Lifecycle.ACTIVE
+    assert bench.is_in(Lifecycle.ACTIVE)
 
 
 @check(on_bench=True)

@@ -14,6 +14,7 @@ _STEADY_S = 0.3
 _HOST_DELAY_S = 0.06
 """How late a busy host may be, on top of what the record says."""
 _TTL_S = 0.2
+_AXES = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
 @check("TwistSink", on_bench=True)
@@ -45,7 +46,7 @@ def _follows_all_axes(bench: Bench, frame: TwistFrame) -> None:
         size = abs(asked[axis])
         aside = np.delete(got[:3] if axis < 3 else got[3:], axis % 3)
         if sent.adjustments or abs(got[axis] - asked[axis]) > 0.2 * size or np.abs(aside).max() > 0.2 * size:
-            wrong.append(f"{'vx vy vz wx wy wz'.split()[axis]} {asked[axis]:+.3f}: {np.round(got, 4).tolist()}")
+            wrong.append(f"{_AXES[axis]} {asked[axis]:+.3f}: {np.round(got, 4).tolist()}")
     assert not wrong, "the tool truly moved otherwise:\n" + "\n".join(wrong)
 
 

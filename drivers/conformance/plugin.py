@@ -6,7 +6,7 @@ Installed as an entry point of ``pytest11``. It imports nothing of touchcell unt
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from itertools import count
 from typing import Any
 
@@ -60,12 +60,12 @@ _NUMBERS = pytest.StashKey[Any]()
 
 def _address(config: pytest.Config) -> int:
     """A number that no other rig on this machine has, so that suites may run side by side."""
-    numbers = config.stash.setdefault(_NUMBERS, count(1))
-    return 1000 + (os.getpid() % 30_000) * 16 + next(numbers) % 16
+    number: int = next(config.stash.setdefault(_NUMBERS, count(1)))
+    return 1000 + (os.getpid() % 30_000) * 16 + number % 16
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, Any]:
     """Mark a failed check, so that it leaves nothing to the next one; name it for the table."""
     report: Any = yield
     driver = getattr(getattr(item, "cls", None), "driver", None)
@@ -73,7 +73,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
         if report.failed:
             item.stash[_FAILED] = True
         report.user_properties.append((_KEY, [driver, item.name.removeprefix("test_")]))
-    return report  # type: ignore[return-value]
+    return report
 
 
 class _Table:
@@ -87,8 +87,9 @@ class _Table:
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Note one phase of one check."""
         for key, value in report.user_properties:
-            if key == _KEY:
-                self._note(report, *value)
+            if key == _KEY and isinstance(value, list):
+                driver, name = value
+                self._note(report, driver, name)
                 return
 
     def _note(self, report: pytest.TestReport, driver: str, name: str) -> None:

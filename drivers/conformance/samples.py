@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -29,7 +31,7 @@ def states_are_stamped_and_numbered(bench: Bench) -> None:
         bench.sleep(0.002)
     # What was underway before the connection may be a little older than it.
     assert samples[0].t_ns > before_ns - round(0.1e9)
-    for older, newer in zip(samples, samples[1:], strict=False):
+    for older, newer in pairwise(samples):
         assert newer.t_ns >= older.t_ns
         assert newer.seq >= older.seq
         assert (newer.seq > older.seq) == (newer.t_ns > older.t_ns)
@@ -54,7 +56,7 @@ def frames_are_stamped_and_numbered(bench: Bench) -> None:
         frames.append(bench.camera.next(frames[-1].seq, 1.0))
         assert frames[-1].t_ns <= bench.clock.now_ns()
     assert frames[0].t_ns >= before_ns - round(0.1e9)
-    for older, newer in zip(frames, frames[1:], strict=False):
+    for older, newer in pairwise(frames):
         assert newer.seq > older.seq
         assert newer.t_ns > older.t_ns
         assert newer.value.image.dtype == np.uint8
@@ -63,7 +65,9 @@ def frames_are_stamped_and_numbered(bench: Bench) -> None:
 
 
 def _agrees_with_rate(bench: Bench, samples: list[Any]) -> None:
-    """Numbers rise by no less than half the declared rate (a busy machine is slow); new samples come at most 2.5 times as often."""
+    """Numbers rise by no less than half the declared rate, for machines are busy; samples come no more than 2.5 times
+    as often, for some drivers read more often at rest.
+    """
     declared_hz = bench.rig.state_rate_hz or bench.rig.spec.capabilities.state_rate_hz
     first, last = samples[0], samples[-1]
     passed_s = (last.t_ns - first.t_ns) * 1e-9
@@ -114,11 +118,9 @@ def frozen_device_never_looks_fresh(bench: Bench) -> None:
     bench.sleep(_FROZEN_S)
     with pytest.raises(DeviceError):
         bench.read(max_age_s=_FROZEN_S / 2)
-    try:
+    # Refusing altogether is lawful as well.
+    with suppress(DeviceError):
         assert bench.read().t_ns <= frozen_ns + round(0.05e9)
-    except DeviceError:
-        # Refusing altogether is lawful as well.
-        pass
 
 
 def _newest_is_there(bench: Bench) -> bool:

@@ -65,8 +65,8 @@ def rig(folder: Path, address: int) -> Rig:
             "power_off": (True, "fault"),
         },
         known={
-            "ten_cycles_leak_nothing": "ur-rtde's destructors hold the interpreter's lock for 0.5 s, so the driver never runs "
-            "them: each activation leaves 21 open files",
+            "ten_cycles_leak_nothing": "ur-rtde's destructors hold the interpreter's lock for 0.5 s, so the driver "
+            "never runs them: each connection with activation leaves 21 open files",
         },
         notes=(
             "how fast the controller stops the arm after its watchdog has stopped the program",
