@@ -267,6 +267,9 @@ class UrArm(Arm):
         self._state = Lifecycle.DISCONNECTED
         self._fault_error = None
         self._drop_program()
+        if self._power_off_by is not None:
+            with suppress(DeviceError), dashboard(self.name, self._config.host) as client:
+                client.powerOff()
         self._power_off_by = None
         self._stop_receiving()
         self._reader = None

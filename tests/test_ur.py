@@ -499,6 +499,15 @@ def test_stops_that_remove_power(arm: UrArm, lease: Lease, emulator: EmulatorPro
         push(arm, lease, [0.05, 0, 0, 0, 0, 0])
 
 
+def test_disconnecting_does_not_cancel_the_removal_of_power(
+    arm: UrArm, lease: Lease, emulator: EmulatorProcess
+) -> None:
+    drive(arm, lease, [0.05, 0, 0, 0, 0, 0], emulator)
+    arm.stop(StopCategory.STOP_THEN_REMOVE_POWER)
+    arm.disconnect()
+    assert emulator.state()["robot_mode"] == "POWER_OFF"
+
+
 def test_joint_goal_arrives_refuses_twists_and_can_be_stopped(
     arm: UrArm, lease: Lease, emulator: EmulatorProcess
 ) -> None:
