@@ -6,6 +6,7 @@ no receive thread is needed, nothing can overflow unseen, and an answer is never
 Answers carry no time. Each is stamped with the moment at which its request was sent, so its age is never understated: a
 motor's requests wait in a queue and its answers come in order (CAN keeps the order of one sender). After a loss the
 queue would stay one entry too long; then a register is read as well, whose answer names itself and so marks the place.
+Such fences take turns among four registers, so that one that was lost is not taken for the next.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from drivers.clock import Clock
 from drivers.damiao_codec import CodecError, Feedback, Ranges, Register
 from drivers.errors import ConnectError, DeviceFault, DeviceGone, FaultClass, Remedy, TransportTimeout
 
-_REGISTER_TIMEOUT_S = 0.1
-_REGISTER_TRIES = 3
+_ANSWER_S = 0.1
+_TRIES = 3
 _FENCE_EVERY_NS = 20_000_000
+_FENCES = (Register.TIMEOUT, Register.CTRL_MODE, Register.MST_ID, Register.ESC_ID)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +64,10 @@ class Counters:
 
 @dataclass(slots=True)
 class _Pending:
+    """A request under way; ``fence`` is the register that it reads, or None if it is answered by the motor's state."""
+
     t_ns: int
-    is_fence: bool
+    fence: Register | None = None
 
 
 class MotorBus:
@@ -74,6 +78,7 @@ class MotorBus:
         addresses: the motors.
         connect: opens the python-can bus.
         clock: injected time.
+        max_silence_s: a motor silent for longer is given up by the caller; requests twice as old are forgotten.
         fd: send CAN FD frames with bit rate switching.
 
     Attributes:
@@ -83,13 +88,21 @@ class MotorBus:
     """
 
     def __init__(
-        self, device: str, addresses: Sequence[Address], connect: Callable[[], Any], clock: Clock, *, fd: bool = False
+        self,
+        device: str,
+        addresses: Sequence[Address],
+        connect: Callable[[], Any],
+        clock: Clock,
+        *,
+        max_silence_s: float,
+        fd: bool = False,
     ) -> None:
         self._device = device
         self._addresses = tuple(addresses)
         self._by_mst_id = {address.mst_id: index for index, address in enumerate(addresses)}
         self._connect = connect
         self._clock = clock
+        self._forget_after_ns = round(2e9 * max_silence_s)
         self._fd = fd
         self._bus: Any = None
         self._forget()
@@ -103,6 +116,7 @@ class MotorBus:
         self._registers: dict[tuple[int, int], float | int] = {}
         self._wanted_register: tuple[int, int] | None = None
         self._bus_off = False
+        self._fence_turn = 0
         self.counters = Counters()
         self.last_error = ""
         self.timeout_ticks: list[int | None] = [None] * n
@@ -157,15 +171,16 @@ class MotorBus:
         return self.read(index, register)
 
     def command(self, index: int, data: bytes) -> Feedback:
-        """Send one frame to one motor and wait for its answer. Raises TransportTimeout, DeviceGone."""
+        """Send one frame to one motor until it answers, a few times. Raises TransportTimeout, DeviceGone."""
         self._settle()
-        self._send(index, self._addresses[index].esc_id, data)
-        until_ns = self._clock.now_ns() + round(_REGISTER_TIMEOUT_S * 1e9)
-        while (answer := self._newest[index]) is None and self._receive(until_ns):
-            pass
-        if answer is None:
-            raise self._no_answer(index)
-        return answer.feedback
+        for _ in range(_TRIES):
+            self._send(index, self._addresses[index].esc_id, data)
+            until_ns = self._clock.now_ns() + round(_ANSWER_S * 1e9)
+            while (answer := self._newest[index]) is None and self._receive(until_ns):
+                pass
+            if answer is not None:
+                return answer.feedback
+        raise self._no_answer(index)
 
     def exchange(self, data: Sequence[bytes | None], until_ns: int) -> list[Answer | None]:
         """Send every motor its frame, or a request for its state where there is none, and collect answers.
@@ -213,9 +228,9 @@ class MotorBus:
         self._settle()
         self._wanted_register = (index, register)
         try:
-            for _ in range(_REGISTER_TRIES):
+            for _ in range(_TRIES):
                 self._put(codec.PARAMETER_ID, request)
-                until_ns = self._clock.now_ns() + round(_REGISTER_TIMEOUT_S * 1e9)
+                until_ns = self._clock.now_ns() + round(_ANSWER_S * 1e9)
                 while (index, register) not in self._registers and self._receive(until_ns):
                     pass
                 if (index, register) in self._registers:
@@ -226,7 +241,7 @@ class MotorBus:
 
     def _no_answer(self, index: int) -> TransportTimeout:
         what = f"answer of motor {self._addresses[index].esc_id}"
-        return TransportTimeout(self._device, what, _REGISTER_TIMEOUT_S)
+        return TransportTimeout(self._device, what, _TRIES * _ANSWER_S)
 
     def _settle(self) -> None:
         """Take in what is under way, so that the next answer belongs to the next request."""
@@ -240,15 +255,19 @@ class MotorBus:
     def _fence(self) -> None:
         now_ns = self._clock.now_ns()
         for index, queue in enumerate(self._pending):
-            fences = [entry for entry in queue if entry.is_fence]
-            if queue and (not fences or now_ns - fences[-1].t_ns > _FENCE_EVERY_NS):
-                queue.append(_Pending(now_ns, is_fence=True))
-                self._put(codec.PARAMETER_ID, codec.read_register(self._addresses[index].esc_id, Register.TIMEOUT))
+            while queue and now_ns - queue[0].t_ns > self._forget_after_ns:
+                queue.popleft()
+            newest = max((entry.t_ns for entry in queue if entry.fence is not None), default=0)
+            if queue and now_ns - newest > _FENCE_EVERY_NS:
+                self._fence_turn += 1
+                register = _FENCES[self._fence_turn % len(_FENCES)]
+                queue.append(_Pending(now_ns, register))
+                self._put(codec.PARAMETER_ID, codec.read_register(self._addresses[index].esc_id, register))
 
     def _send(self, index: int, arbitration_id: int, data: bytes) -> None:
         now_ns = self._clock.now_ns()
         if self._put(arbitration_id, data):
-            self._pending[index].append(_Pending(now_ns, is_fence=False))
+            self._pending[index].append(_Pending(now_ns))
 
     def _put(self, arbitration_id: int, data: bytes) -> bool:
         import can
@@ -295,29 +314,34 @@ class MotorBus:
         if index is None:
             self.counters.unexpected += 1
             return
-        if not self._take_register(index, data):
+        if not (self._take_wanted(index, data) or self._take_fence(index, data)):
             self._take_feedback(index, data)
 
-    def _take_register(self, index: int, data: bytes) -> bool:
-        queue = self._pending[index]
-        fenced = any(entry.is_fence for entry in queue)
+    def _take_wanted(self, index: int, data: bytes) -> bool:
         wanted = self._wanted_register
-        if not fenced and (wanted is None or wanted[0] != index):
+        if wanted is None or wanted[0] != index:
             return False
-        register = wanted[1] if wanted and wanted[0] == index else int(Register.TIMEOUT)
-        try:
-            reply = codec.decode_register_reply(data, self._addresses[index].esc_id, register)
-        except CodecError as error:
-            if error.field.startswith("register reply") or error.field == "data":
-                return False
-            raise
-        if wanted == (index, register):
-            self._registers[wanted] = reply.value
-        else:
-            self.timeout_ticks[index] = int(reply.value)
-            while queue and not queue.popleft().is_fence:
-                pass
+        reply = codec.decode_register_reply(data, self._addresses[index].esc_id, wanted[1])
+        if reply is None:
+            return False
+        self._registers[wanted] = reply.value
         return True
+
+    def _take_fence(self, index: int, data: bytes) -> bool:
+        queue = self._pending[index]
+        for entry in queue:
+            if entry.fence is None:
+                continue
+            reply = codec.decode_register_reply(data, self._addresses[index].esc_id, entry.fence)
+            if reply is None:
+                continue
+            if entry.fence is Register.TIMEOUT:
+                self.timeout_ticks[index] = int(reply.value)
+            # Whatever was asked for before has been answered or lost.
+            while queue.popleft() is not entry:
+                pass
+            return True
+        return False
 
     def _take_feedback(self, index: int, data: bytes) -> None:
         ranges = self._ranges[index]
@@ -330,7 +354,7 @@ class MotorBus:
             self.counters.corrupt += 1
             return
         queue = self._pending[index]
-        while queue and queue[0].is_fence:
+        while queue and queue[0].fence is not None:
             queue.popleft()
         if not queue:
             self.counters.unexpected += 1

@@ -262,16 +262,17 @@ def encode_register_reply(motor: int, register: int, value: float | int, *, writ
     return head + (struct.pack("<f", value) if is_float else struct.pack("<I", value))
 
 
-def decode_register_reply(data: bytes, motor: int, register: int) -> RegisterReply:
-    """Read the answer of ``motor`` about ``register``.
+def decode_register_reply(data: bytes, motor: int, register: int) -> RegisterReply | None:
+    """Read the answer of ``motor`` about ``register``; None if the bytes are something else, such as its state.
 
     Raises:
-        CodecError: it is something else, or a float that is not finite.
+        CodecError: it is a float that is not finite.
     """
-    _require_length(data)
+    if len(data) != 8:
+        return None
     sender, operation, number = struct.unpack_from("<HBB", data)
     if (sender, number) != (motor, register) or operation not in (_READ, _WRITE):
-        raise CodecError("register reply", data.hex(), f"is no answer of motor {motor} about register {register}")
+        return None
     if register in _FLOAT_REGISTERS:
         (real,) = struct.unpack_from("<f", data, 4)
         if not math.isfinite(real):
