@@ -6,7 +6,8 @@ no receive thread is needed, nothing can overflow unseen, and an answer is never
 Answers carry no time. Each is stamped with the moment at which its request was sent, so its age is never understated: a
 motor's requests wait in a queue and its answers come in order (CAN keeps the order of one sender). After a loss the
 queue would stay one entry too long; then a register is read as well, whose answer names itself and so marks the place.
-Such fences take turns among four registers, so that one that was lost is not taken for the next.
+Of such fences a motor has one under way at a time, and they take turns among four registers: an answer that comes after
+its fence was given up is not taken for the next.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from drivers.errors import ConnectError, DeviceFault, DeviceGone, FaultClass, Re
 
 _ANSWER_S = 0.1
 _TRIES = 3
-_FENCE_EVERY_NS = 20_000_000
+_SETTLE_NS = 20_000_000
 _FENCES = (Register.TIMEOUT, Register.CTRL_MODE, Register.MST_ID, Register.ESC_ID)
 
 
@@ -62,7 +63,7 @@ class Counters:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Pending:
     """A request under way; ``fence`` is the register that it reads, or None if it is answered by the motor's state."""
 
@@ -103,6 +104,7 @@ class MotorBus:
         self._connect = connect
         self._clock = clock
         self._forget_after_ns = round(2e9 * max_silence_s)
+        self._fence_lost_after_ns = round(0.5e9 * max_silence_s)
         self._fd = fd
         self._bus: Any = None
         self._forget()
@@ -113,10 +115,11 @@ class MotorBus:
         self._ranges: list[Ranges | None] = [None] * n
         self._pending: list[deque[_Pending]] = [deque() for _ in range(n)]
         self._newest: list[Answer | None] = [None] * n
-        self._registers: dict[tuple[int, int], float | int] = {}
-        self._wanted_register: tuple[int, int] | None = None
+        self._wanted_register: tuple[int, int, bool] | None = None
+        self._replies: list[codec.RegisterReply] = []
         self._bus_off = False
-        self._fence_turn = 0
+        self._fences: list[_Pending | None] = [None] * n
+        self._fence_turns = [0] * n
         self.counters = Counters()
         self.last_error = ""
         self.timeout_ticks: list[int | None] = [None] * n
@@ -167,7 +170,7 @@ class MotorBus:
 
     def write(self, index: int, register: int, value: float | int) -> float | int:
         """Change a register until the next power cycle; returns what a read afterwards says."""
-        self._ask(index, register, codec.write_register(self._addresses[index].esc_id, register, value))
+        self._ask(index, register, codec.write_register(self._addresses[index].esc_id, register, value), written=True)
         return self.read(index, register)
 
     def command(self, index: int, data: bytes) -> Feedback:
@@ -224,17 +227,18 @@ class MotorBus:
             float(self.read(index, Register.TMAX)),
         )
 
-    def _ask(self, index: int, register: int, request: bytes) -> float | int:
+    def _ask(self, index: int, register: int, request: bytes, *, written: bool = False) -> float | int:
         self._settle()
-        self._wanted_register = (index, register)
+        self._replies.clear()
+        self._wanted_register = (index, register, written)
         try:
             for _ in range(_TRIES):
                 self._put(codec.PARAMETER_ID, request)
                 until_ns = self._clock.now_ns() + round(_ANSWER_S * 1e9)
-                while (index, register) not in self._registers and self._receive(until_ns):
+                while not self._replies and self._receive(until_ns):
                     pass
-                if (index, register) in self._registers:
-                    return self._registers.pop((index, register))
+                if self._replies:
+                    return self._replies[0].value
         finally:
             self._wanted_register = None
         raise self._no_answer(index)
@@ -245,7 +249,7 @@ class MotorBus:
 
     def _settle(self) -> None:
         """Take in what is under way, so that the next answer belongs to the next request."""
-        until_ns = self._clock.now_ns() + _FENCE_EVERY_NS
+        until_ns = self._clock.now_ns() + _SETTLE_NS
         while any(self._pending) and self._receive(until_ns):
             pass
         for queue in self._pending:
@@ -257,11 +261,13 @@ class MotorBus:
         for index, queue in enumerate(self._pending):
             while queue and now_ns - queue[0].t_ns > self._forget_after_ns:
                 queue.popleft()
-            newest = max((entry.t_ns for entry in queue if entry.fence is not None), default=0)
-            if queue and now_ns - newest > _FENCE_EVERY_NS:
-                self._fence_turn += 1
-                register = _FENCES[self._fence_turn % len(_FENCES)]
-                queue.append(_Pending(now_ns, register))
+            fence = self._fences[index]
+            under_way = fence in queue and fence is not None and now_ns - fence.t_ns <= self._fence_lost_after_ns
+            if queue and not under_way:
+                self._fence_turns[index] += 1
+                register = _FENCES[self._fence_turns[index] % len(_FENCES)]
+                fence = self._fences[index] = _Pending(now_ns, register)
+                queue.append(fence)
                 self._put(codec.PARAMETER_ID, codec.read_register(self._addresses[index].esc_id, register))
 
     def _send(self, index: int, arbitration_id: int, data: bytes) -> None:
@@ -314,7 +320,11 @@ class MotorBus:
         if index is None:
             self.counters.unexpected += 1
             return
-        if not (self._take_wanted(index, data) or self._take_fence(index, data)):
+        if self._take_wanted(index, data) or self._take_fence(index, data):
+            return
+        if codec.is_register_reply(data, self._addresses[index].esc_id):
+            self.counters.unexpected += 1
+        else:
             self._take_feedback(index, data)
 
     def _take_wanted(self, index: int, data: bytes) -> bool:
@@ -322,26 +332,25 @@ class MotorBus:
         if wanted is None or wanted[0] != index:
             return False
         reply = codec.decode_register_reply(data, self._addresses[index].esc_id, wanted[1])
-        if reply is None:
+        # A second answer to a repeated write must not pass for the read that proves it.
+        if reply is None or reply.written != wanted[2]:
             return False
-        self._registers[wanted] = reply.value
+        self._replies.append(reply)
         return True
 
     def _take_fence(self, index: int, data: bytes) -> bool:
-        queue = self._pending[index]
-        for entry in queue:
-            if entry.fence is None:
-                continue
-            reply = codec.decode_register_reply(data, self._addresses[index].esc_id, entry.fence)
-            if reply is None:
-                continue
-            if entry.fence is Register.TIMEOUT:
-                self.timeout_ticks[index] = int(reply.value)
-            # Whatever was asked for before has been answered or lost.
-            while queue.popleft() is not entry:
-                pass
-            return True
-        return False
+        queue, fence = self._pending[index], self._fences[index]
+        if fence is None or fence.fence is None or fence not in queue:
+            return False
+        reply = codec.decode_register_reply(data, self._addresses[index].esc_id, fence.fence)
+        if reply is None:
+            return False
+        if fence.fence is Register.TIMEOUT:
+            self.timeout_ticks[index] = int(reply.value)
+        # Whatever was asked for before has been answered or lost.
+        while queue.popleft() is not fence:
+            pass
+        return True
 
     def _take_feedback(self, index: int, data: bytes) -> None:
         ranges = self._ranges[index]

@@ -42,7 +42,7 @@ def test_register_golden() -> None:
     reply = codec.decode_register_reply(bytes.fromhex("0100 33 15 00004841"), 1, Register.PMAX)
     assert reply == codec.RegisterReply(1, 21, 12.5)
     reply = codec.decode_register_reply(bytes.fromhex("0100 55 09 D0070000"), 1, Register.TIMEOUT)
-    assert reply == codec.RegisterReply(1, 9, 2000)
+    assert reply == codec.RegisterReply(1, 9, 2000, written=True)
 
 
 @given(
