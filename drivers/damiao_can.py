@@ -163,7 +163,14 @@ class DamiaoCanArm(Arm):
         self._direction = np.array([motor.direction for motor in motors], dtype=np.float64)
         self._offset = np.deg2rad([motor.offset_deg for motor in motors])
         addresses = [Address(motor.esc_id, motor.mst_id) for motor in motors]
-        self._bus = MotorBus(name, addresses, partial(_open_bus, name, config), clock, fd=config.fd)
+        self._bus = MotorBus(
+            name,
+            addresses,
+            partial(_open_bus, name, config),
+            clock,
+            max_silence_s=config.max_silence_s,
+            fd=config.fd,
+        )
         self._enabled = [False] * len(motors)
         self._thread: threading.Thread | None = None
         self._closing = threading.Event()

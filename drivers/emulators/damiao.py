@@ -134,9 +134,13 @@ class DamiaoArm(Emulator):
         self._steps = 0
         self._start_s = 0.0
         self._ticker: asyncio.Task[None] | None = None
+        self._under_way: set[asyncio.TimerHandle] = set()
         self._reset()
 
     def _reset(self) -> None:
+        for handle in self._under_way:
+            handle.cancel()
+        self._under_way.clear()
         for motor in self.motors:
             motor.power_up()
             motor.rotor_c = _ROOM_TEMPERATURE_C
@@ -375,7 +379,7 @@ class DamiaoArm(Emulator):
         overtaken = self._held_back.pop(index, None)
         for message in (answer, overtaken):
             if message is not None and delay_s > 0.0:
-                asyncio.get_running_loop().call_later(delay_s, self._hub.send, message)
+                self._under_way.add(asyncio.get_running_loop().call_later(delay_s, self._hub.send, message))
             elif message is not None:
                 self._hub.send(message)
 
