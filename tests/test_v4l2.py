@@ -137,14 +137,15 @@ def test_connecting_changes_nothing_and_configuring_moves_nothing(
 def test_frames_are_stamped_numbered_and_show_what_the_sensor_saw(
     make: Callable[..., V4l2Camera], emulator: EmulatorProcess
 ) -> None:
+    began_ns = time.monotonic_ns()
     frames = read(ready(make(pixel_format="GREY")), 20)
+    ended_ns = time.monotonic_ns()
     for frame in frames:
         assert_number_is_true(frame)
         assert frame.quality is Quality.GOOD
         assert (frame.value.exposure, frame.value.gain) == (0.0157, 10.0)
-    stamps = np.array([frame.t_ns for frame in frames])
+    stamps = np.array([began_ns, *(frame.t_ns for frame in frames), ended_ns])
     assert (np.diff(stamps) > 0).all()
-    assert 0 <= time.monotonic_ns() - stamps[-1] < 1_000_000_000
 
 
 @pytest.mark.parametrize(
