@@ -123,6 +123,7 @@ class Camera(Device):
         self._last_seq = -1
         self._decoded: Stamped[Frame] | None = None
         self._since_ns = 0
+        self._overflowed = False
 
     @final
     def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
@@ -180,6 +181,7 @@ class Camera(Device):
     def _begin_stream(self) -> None:
         """To be called once frames flow: waits for the first good one. Raises TransportTimeout, DeviceGone."""
         self._watch.forgive()
+        self._overflowed = False
         self._since_ns = self._clock.now_ns()
         before = self._last_seq
         self._await_after(before, _FIRST_FRAME_S, _FIRST_FRAME_S)
@@ -200,13 +202,20 @@ class Camera(Device):
         self._judge(self._config.stall_s)
 
     def _silence_s(self) -> float:
-        # Since the stream began, as the newest frame may be from before a recovery.
+        # At most since it could deliver: the newest frame may be from before a recovery or an overflow.
         return min(self._age_s(), (self._clock.now_ns() - self._since_ns) * 1e-9)
 
     def _empty_queue(self) -> None:
-        give_up_ns = self._clock.now_ns() + round(_UNREAD_PERIODS / self._config.rate_hz * 1e9)
-        while self._collect() and (left_ns := give_up_ns - self._clock.now_ns()) > 0:
+        now_ns = self._clock.now_ns()
+        give_up_ns = now_ns + round(_UNREAD_PERIODS / self._config.rate_hz * 1e9)
+        overflowed = self._collect()
+        if overflowed and not self._overflowed:
+            # A full queue silences the camera, so its silence counts from now.
+            self._since_ns = now_ns
+        while overflowed and (left_ns := give_up_ns - self._clock.now_ns()) > 0:
             self._wait(left_ns * 1e-9)
+            overflowed = self._collect()
+        self._overflowed = overflowed
 
     def _await_after(self, after_seq: int, timeout_s: float, stall_s: float) -> None:
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)

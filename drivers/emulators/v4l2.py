@@ -223,10 +223,17 @@ class V4l2Emulator(Emulator):
         if self._stream is not None:
             self._stream.cancel()
             self._stream = None
+            self._wake_waiting()
         if begins:
             self._sequence = -1
             self._shown = b""
             self._stream = asyncio.create_task(self._run_sensor())
+
+    def _wake_waiting(self) -> None:
+        # A thread that blocks in DQBUF must return when another ends the stream.
+        if self.model.owner in self._clients:
+            with contextlib.suppress(OSError):
+                self._clients[self.model.owner].frames.send(b"\0")
 
     async def _run_sensor(self) -> None:
         loop = asyncio.get_running_loop()

@@ -166,6 +166,8 @@ static int dequeue(int fd, struct device *device, struct v4l2_buffer *wanted)
     count = recv(fd, &filled, sizeof filled, 0);
     if (count < 0)
         return fail(errno == EAGAIN || errno == EINTR ? errno : ENODEV);
+    if (count == 1) /* streaming has ended while this thread waited */
+        return fail(EINVAL);
     if (count != sizeof filled || filled.index >= VIDEO_MAX_FRAME)
         return fail(ENODEV);
     device->queued[filled.index] = 0;
