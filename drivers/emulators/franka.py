@@ -94,7 +94,7 @@ class FrankaEmulator(Emulator):
         self._first_command_seen = False
         self._lost = 0
         self._last_command_ms: int | None = None
-        self._stopped_at: list[float] | None = None
+        self._at_last_command: list[float] | None = None
         self._reflex_detail = ""
         self._ticker: Ticker | None = None
 
@@ -134,7 +134,7 @@ class FrankaEmulator(Emulator):
             "watchdog_s": _LOST_LIMIT * 1e-3,
             "time_ms": state.message_id,
             "last_command_ms": self._last_command_ms,
-            "at_last_command_m": self._stopped_at,
+            "at_last_command_m": self._at_last_command,
             "force_threshold": arm.force_threshold.tolist(),
             "received": self._received,
             "active": self.active,
@@ -354,7 +354,7 @@ class FrankaEmulator(Emulator):
         else:
             self._lost, self._first_command_seen = 0, True
             self._last_command_ms = self._state.message_id
-            self._stopped_at = self._arm.T_base_ee[:3, 3].tolist()
+            self._at_last_command = self._arm.T_base_ee[:3, 3].tolist()
         try:
             self._arm.step(command, _PERIOD_NS * 1e-9)
         except Reflex as reflex:
