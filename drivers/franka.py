@@ -161,8 +161,9 @@ class FrankaArm(Arm):
         return _stamped(reading.wrench, reading)
 
     def at_rest(self) -> bool:
-        """Whether a fresh state shows it standing still and no motion is running."""
+        """Whether a fresh state shows it standing still and no motion is running. Raises what ended a motion."""
         self._require("tell whether it is at rest", *_READABLE)
+        self._surface()
         reader, reading = self._open_reader(), self._newest()
         if self._age_s(reading) > _FRESH_S:
             return False

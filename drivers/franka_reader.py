@@ -164,7 +164,8 @@ class StateReader:
         except franky.ProtocolException as error:
             self._count_bad(str(error))
         # Only now, so that the newest reading tells why the motion died.
-        self._aborted = said or self._aborted
+        if said is not None:
+            self._aborted = said
 
     def _take(self, state: Any, t_ns: int) -> None:
         device_ms = state.time.to_msec()

@@ -29,7 +29,7 @@ from drivers.errors import (
     Rejection,
     Remedy,
     StaleData,
-    TransportTimeout,
+    TransportError,
 )
 from drivers.franka import CAPABILITIES, FrankaConfig
 from drivers.franka_errors import ERRORS
@@ -297,6 +297,14 @@ def test_joint_goals_arrive(bench: Bench) -> None:
     np.testing.assert_allclose(bench.truth()["q"], goal, atol=1e-6)
 
 
+def test_a_goal_that_was_aborted_does_not_look_reached(bench: Bench) -> None:
+    lease = bench.active()
+    bench.arm.go_to_joints(np.array([0.3, -0.75, 0.05, -2.3, 0.05, 1.6, 0.75]), lease)
+    bench.moved()
+    bench.emulator.fault("reflex", "joint_reflex")
+    assert until(DeviceFault, bench.rested).name == "joint_reflex"
+
+
 def test_pose_goals_arrive_and_keep_the_speed_limit(benches: Callable[..., Bench]) -> None:
     bench = benches(dynamics_factor=0.3, limits={"tcp_speed_m_s": 0.05})
     lease = bench.active()
@@ -436,7 +444,7 @@ def test_states_that_stay_bad_are_a_fault(bench: Bench) -> None:
     bench.active()
     bench.emulator.fault("nan", 1_000_000)
     until(StaleData, lambda: bench.arm.tcp(0.02))
-    until(CorruptMessage, lambda: bench.arm.tcp())
+    until(CorruptMessage, bench.arm.tcp)
     assert bench.arm.state is Lifecycle.FAULTED
     with pytest.raises(CorruptMessage):
         bench.arm.recover(OPERATOR)
@@ -459,18 +467,29 @@ def test_a_silent_arm_is_stale_and_then_a_fault(bench: Bench, fault: str, moving
         bench.moved()
     bench.emulator.fault(fault)
     until(StaleData, lambda: bench.arm.tcp(0.3))
-    assert not bench.arm.at_rest()
-    until(TransportTimeout, lambda: bench.arm.tcp())
+    until(TransportError, bench.arm.at_rest)
     assert bench.arm.state is Lifecycle.FAULTED
+    assert not bench.arm.at_rest()
     if fault == "unplug":
         truth = bench.emulator.wait_for(moving=False)
         assert truth["mode"] == ("reflex" if moving else "idle")
 
 
+def test_a_link_that_is_late_still_moves_it(bench: Bench) -> None:
+    lease = bench.active()
+    bench.emulator.fault("delay", 0.005)
+    before = bench.position()
+    bench.send([0.05, 0, 0, 0, 0, 0], lease)
+    bench.moved()
+    bench.rested()
+    assert bench.truth()["reflexes"] == 0
+    assert (bench.position() - before)[0] == pytest.approx(TTL_DISTANCE_M, abs=2e-4)
+
+
 def test_after_a_restart_it_connects_anew(bench: Bench) -> None:
     bench.active()
     bench.emulator.fault("restart")
-    until(TransportTimeout, lambda: bench.arm.tcp())
+    until(TransportError, bench.arm.tcp)
     bench.arm.disconnect()
     bench.active()
     assert bench.arm.tcp(1.0).value.T_base_tcp[0, 3] == pytest.approx(bench.position()[0], abs=1e-6)

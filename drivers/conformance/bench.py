@@ -246,8 +246,7 @@ class Bench:
     def pose(self, truth: dict[str, Any] | None = None) -> Array:
         """True pose (4, 4) of the tool centre point in the base frame; on a real bench what the arm says."""
         if self.is_real:
-            told: Array = self.arm.tcp().value.T_base_tcp
-            return told
+            return self.arm.tcp().value.T_base_tcp
         truth = truth or self.truth()
         if self.rig.pose is not None:
             return np.array(truth[self.rig.pose])
@@ -275,8 +274,9 @@ class Bench:
 
     def twist(self, axis: int, *, speed: float | None = None) -> Array:
         """(6,) along one axis at test speed."""
-        value = speed if speed is not None else self.speed() if axis < 3 else self.rot_speed()
-        return value * np.eye(6)[axis]
+        twist = np.zeros(6)
+        twist[axis] = speed if speed is not None else self.speed() if axis < 3 else self.rot_speed()
+        return twist
 
     def command(
         self, twist: Array, frame: TwistFrame = TwistFrame.BASE, ttl_s: float = _TTL_S, *, age_s: float = 0.0

@@ -95,7 +95,7 @@ class FrankaEmulator(Emulator):
         self._lost = 0
         self._last_command_ms: int | None = None
         self._onset = CommandOnset()
-        self._stopped_at: list[float] | None = None
+        self._at_last_command: list[float] | None = None
         self._reflex_detail = ""
         self._ticker: Ticker | None = None
 
@@ -137,7 +137,7 @@ class FrankaEmulator(Emulator):
             "t_s": state.message_id * 1e-3,
             "command_onset_ns": self._onset.t_ns,
             "last_command_ms": self._last_command_ms,
-            "at_last_command_m": self._stopped_at,
+            "at_last_command_m": self._at_last_command,
             "force_threshold": arm.force_threshold.tolist(),
             "received": self._received,
             "active": self.active,
@@ -360,7 +360,7 @@ class FrankaEmulator(Emulator):
             self._lost, self._first_command_seen = 0, True
             self._last_command_ms = self._state.message_id
             self._onset.note("arm", (command.q, command.O_dP_EE))
-            self._stopped_at = self._arm.T_base_ee[:3, 3].tolist()
+            self._at_last_command = self._arm.T_base_ee[:3, 3].tolist()
         try:
             self._arm.step(command, _PERIOD_NS * 1e-9)
         except Reflex as reflex:
