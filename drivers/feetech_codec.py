@@ -73,7 +73,6 @@ class Register(IntEnum):
     MODE = 33
     TORQUE_ENABLE = 40
     GOAL_POSITION = 42
-    GOAL_SPEED = 46
     TORQUE_LIMIT = 48
     LOCK = 55
     POSITION = 56
@@ -161,7 +160,6 @@ class ServoState:
 
     torque_enable: int
     goal: int
-    goal_speed: int
     torque_limit: int
     position: int
     speed: int
@@ -274,6 +272,17 @@ def sync_write(register: int, data: Mapping[int, bytes]) -> bytes:
     return encode(Packet(BROADCAST_ID, Instruction.SYNC_WRITE, bytes([register, lengths.pop()]) + body))
 
 
+def goal(ticks: int, speed: int) -> bytes:
+    """Registers from ``Register.GOAL_POSITION`` on that send a servo to ``ticks`` at ``speed`` in its own unit.
+
+    Raises:
+        CodecError: they do not fit, or the speed is zero, which some servos take for their fastest.
+    """
+    if speed <= 0:
+        raise CodecError("speed", speed, "is not positive")
+    return signed_word(ticks) + word(0) + signed_word(speed)
+
+
 def word(value: int) -> bytes:
     """An unsigned 16-bit number. Raises CodecError."""
     if not 0 <= value <= 0xFFFF:
@@ -338,7 +347,6 @@ def decode_state(data: bytes) -> ServoState:
     return ServoState(
         torque_enable=at(Register.TORQUE_ENABLE)[0],
         goal=from_signed_word(at(Register.GOAL_POSITION)),
-        goal_speed=from_signed_word(at(Register.GOAL_SPEED)),
         torque_limit=int.from_bytes(at(Register.TORQUE_LIMIT), "little"),
         position=position,
         speed=from_signed_word(at(Register.SPEED)),
@@ -361,7 +369,7 @@ def cycle_time_s(servos: int, baudrate: int, return_delay_s: float) -> float:
 
     ``return_delay_s`` is the sum over the servos.
     """
-    goals = _OVERHEAD + 2 + 3 * servos
+    goals = _OVERHEAD + 2 + 7 * servos
     request = _OVERHEAD + 2 + servos
     answers = servos * (_OVERHEAD + state_length(STATE_STARTS[0]))
     return 10.0 * (goals + request + answers) / baudrate + return_delay_s

@@ -1,7 +1,8 @@
 """Arms of Feetech STS3215 bus servos (SO-100, SO-101 and home-made ones) on a serial port, over pyserial.
 
 The servos take goal positions only, so this driver owns the motion: a loop of its own turns expiring twists into joint
-setpoints (``drivers.joint_setpoint``) and sends the servos one small step per cycle; the same loop reads them.
+setpoints (``drivers.joint_setpoint``) and sends the servos one small step per cycle, each with the speed that it needs;
+the same loop reads them.
 
 What stops the arm: an expired twist, by slowing down in the loop; a dead host process, by there being no next step. The
 bus has **no watchdog**: each servo goes on to its last goal, which lies at most ``tracking_error_deg`` plus one step
@@ -64,9 +65,11 @@ _MAX_BUS_LOAD = 0.8
 _REST_SPEED_RAD_S = 0.03
 _FIRST_SAMPLE_S = 1.0
 _MISS_WINDOW = 50
+_ASKED_IN_VAIN = 3
 _TRIES = 3
 _PLAUSIBLE_JUMP_RAD = 0.1
 _SPEED_MARGIN = 1.25
+_SLOWEST_RAD_S = 0.1
 _SHORTEST_RANGE_RAD = np.deg2rad(10.0)
 _MOVED_BY_HAND_TICKS = 20
 
@@ -143,8 +146,8 @@ class FeetechSerialConfig(DriverConfig):
                 f"max_silence_s {self.max_silence_s:g} is more than {len(codec.STATE_STARTS)} cycles of "
                 f"{self.rate_hz:g} Hz, within which a late answer can be told from a fresh one"
             )
-        if self.max_silence_s * self.rate_hz < 2:
-            raise ValueError(f"max_silence_s {self.max_silence_s:g} is less than two cycles of {self.rate_hz:g} Hz")
+        if self.max_silence_s * self.rate_hz < _ASKED_IN_VAIN:
+            raise ValueError(f"max_silence_s {self.max_silence_s:g} is less than three cycles of {self.rate_hz:g} Hz")
         if self.park_deg is not None and len(self.park_deg) != len(self.servos):
             raise ValueError(f"park_deg has {len(self.park_deg)} angles for {len(self.servos)} servos")
         if self.on_disconnect == "park_then_off" and self.park_deg is None:
@@ -228,7 +231,9 @@ class FeetechSerialArm(Arm):
         self._overruns = 0
         self._latest_s = 0.0
         self._missed: deque[bool] = deque(maxlen=_MISS_WINDOW)
+        self._in_vain = [0] * len(self._ids)
         self._lost: tuple[Adjustment, ...] = ()
+        self._follows_until_ns = 0
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
         """Newest joint angles and velocities, stamped when they were asked for. Servos measure no torque.
@@ -254,7 +259,9 @@ class FeetechSerialArm(Arm):
         """Whether setpoint and joints stand still."""
         sample = self._joints
         fresh = sample is not None and sample.age_s(self._clock.now_ns()) <= self._config.max_silence_s
-        if sample is None or not fresh or self._setpoint.moving:
+        # A twist that has just been taken over moves the setpoint in the next cycle only.
+        due = self._clock.now_ns() < self._follows_until_ns
+        if sample is None or not fresh or due or self._setpoint.moving:
             return False
         return bool((np.abs(sample.value.dq) <= _REST_SPEED_RAD_S).all())
 
@@ -334,8 +341,8 @@ class FeetechSerialArm(Arm):
                 )
             for index in range(len(self._ids)):
                 self._check_servo(index)
-                for register, value in self._settings(index).items():
-                    self._bus.write(self._ids[index], register, codec.word(value))
+            for servo in self._ids:
+                self._bus.write(servo, Register.TORQUE_LIMIT, codec.word(self._torque_limit))
 
     def _activate(self) -> None:
         with self._lock:
@@ -398,18 +405,24 @@ class FeetechSerialArm(Arm):
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
         if self._trouble is not None:
             raise CommandRejected(self.name, Rejection.MODE, "device is faulted", hint=str(self._trouble))
-        self._setpoint.follow(twist_base, now_ns + round(ttl_s * 1e9))
+        expires_ns = now_ns + round(ttl_s * 1e9)
+        self._setpoint.follow(twist_base, expires_ns)
+        self._follows_until_ns = expires_ns if twist_base.any() else 0
 
     def _begin_stop(self, category: StopCategory) -> None:
+        self._follows_until_ns = 0
         self._setpoint.stop()
 
-    def _settings(self, index: int) -> dict[Register, int]:
-        """What the servo must be told before it is used; a loss of power makes it forget."""
+    @property
+    def _torque_limit(self) -> int:
+        """As the servos count it. A loss of power makes them forget it."""
+        return round(self._config.torque_limit_percent * 10.0)
+
+    def _speed(self, index: int, dq: float) -> int:
+        """How fast a servo may turn to its goal, in its own unit: no faster than the motion asks for, lest every step
+        become a jerk and a wrong one a blow."""
         unit = self._bus.identity(self._ids[index]).speed_unit_ticks_s * codec.RAD_PER_TICK
-        return {
-            Register.GOAL_SPEED: int(np.ceil(_SPEED_MARGIN * self._chain.speed[index] / unit)),
-            Register.TORQUE_LIMIT: round(self._config.torque_limit_percent * 10.0),
-        }
+        return int(np.ceil(max(_SPEED_MARGIN * abs(dq), _SLOWEST_RAD_S) / unit))
 
     def _check_servo(self, index: int) -> None:
         servo, told = self._config.servos[index], self._bus.identity(self._ids[index])
@@ -444,8 +457,7 @@ class FeetechSerialArm(Arm):
         servo = self._ids[index]
         if found := codec.faults(state.status):
             raise _servo_fault(self.name, servo, state.status, found[0])
-        wanted = self._settings(index)
-        if (state.goal_speed, state.torque_limit) != (wanted[Register.GOAL_SPEED], wanted[Register.TORQUE_LIMIT]):
+        if state.torque_limit != self._torque_limit:
             raise _lost_power(self.name, servo)
         angle = self._angle(index, state.position)
         if not self._chain.lower[index] <= angle <= self._chain.upper[index]:
@@ -464,7 +476,7 @@ class FeetechSerialArm(Arm):
 
     def _enable(self, goals: list[int]) -> None:
         """Give every servo its goal, see that it has it and is there, then switch on; undone if anything fails."""
-        self._bus.write_goals(dict(zip(self._ids, goals, strict=True)))
+        self._bus.write_goals({s: (goals[i], self._speed(i, 0.0)) for i, s in enumerate(self._ids)})
         for (servo, answer), goal in zip(self._fresh_answers(), goals, strict=True):
             on = self._enabled[self._ids.index(servo)]
             if answer.state.goal != goal or (not on and abs(answer.state.position - goal) > _MOVED_BY_HAND_TICKS):
@@ -547,12 +559,12 @@ class FeetechSerialArm(Arm):
         if self._trouble is not None:
             self._latch(self._trouble)
         if self._driving and any(self._enabled):
-            q, _ = self._setpoint.step(now_ns, dt_s)
+            q, dq = self._setpoint.step(now_ns, dt_s)
             self._bus.write_goals(
                 {
-                    servo.id: servo.ticks(angle)
-                    for servo, angle, on in zip(self._config.servos, q, self._enabled, strict=True)
-                    if on
+                    servo.id: (servo.ticks(q[index]), self._speed(index, dq[index]))
+                    for index, servo in enumerate(self._config.servos)
+                    if self._enabled[index]
                 }
             )
         self._take(self._bus.read_states(until_ns))
@@ -560,7 +572,9 @@ class FeetechSerialArm(Arm):
     def _take(self, answers: list[Answer | None]) -> None:
         good = [self._plausible(index, answer) for index, answer in enumerate(answers)]
         for index, answer in enumerate(good):
+            self._in_vain[index] += 1
             if answer is not None:
+                self._in_vain[index] = 0
                 self._answers[index] = answer
                 self._check_servo_in_use(index, answer.state)
         complete = [answer for answer in good if answer is not None]
@@ -610,8 +624,9 @@ class FeetechSerialArm(Arm):
     def _check_silence(self) -> None:
         now_ns = self._clock.now_ns()
         limit_s = self._config.max_silence_s
-        for servo, answer in zip(self._ids, self._answers, strict=True):
-            if answer is not None and (now_ns - answer.t_ns) * 1e-9 > limit_s:
+        for servo, answer, asked in zip(self._ids, self._answers, self._in_vain, strict=True):
+            # A host that was busy elsewhere has heard nothing either: it must have asked.
+            if answer is not None and asked >= _ASKED_IN_VAIN and (now_ns - answer.t_ns) * 1e-9 > limit_s:
                 self._latch(TransportTimeout(self.name, f"answer of servo {servo}", limit_s))
         full = len(self._missed) == self._missed.maxlen
         if full and sum(self._missed) > self._config.max_missed_fraction * len(self._missed):

@@ -25,8 +25,8 @@ def config(port: Path, **changes: object) -> feetech_serial.FeetechSerialConfig:
         "servos": servos,
         "tool": TOOL,
         "park_deg": PARK_DEG,
-        "rate_hz": 40.0,
-        "max_silence_s": 0.2,
+        "rate_hz": 20.0,
+        "max_silence_s": 0.4,
     }
     return feetech_serial.FeetechSerialConfig.model_validate(settings | changes)
 
