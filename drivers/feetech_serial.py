@@ -5,7 +5,7 @@ setpoints (``drivers.joint_setpoint``) and sends the servos one small step per c
 the same loop reads them.
 
 What stops the arm: an expired twist, by slowing down in the loop; a dead host process, by there being no next step. The
-bus has **no watchdog**: each servo goes on to its last goal, which lies at most ``tracking_error_deg`` plus one step
+bus has **no watchdog**: each servo goes on to its last goal, which lies at most ``tracking_error_deg`` and two steps
 from where it was last seen, and holds there until somebody switches it off. Without power the arm sinks.
 
 Five joints cannot follow every twist. The tip's velocity comes first, rotation as far as it is left; what is lost
@@ -558,8 +558,12 @@ class FeetechSerialArm(Arm):
     def _cycle(self, now_ns: int, dt_s: float, until_ns: int) -> None:
         if self._trouble is not None:
             self._latch(self._trouble)
+        due = self._setpoint.q
         if self._driving and any(self._enabled):
-            q, dq = self._setpoint.step(now_ns, dt_s)
+            q, dq = due, np.zeros_like(due)
+            # No step into the dark: whoever was not seen in the last cycle gets its old goal again.
+            if not (self._missed and self._missed[-1]):
+                q, dq = self._setpoint.step(now_ns, dt_s)
             self._bus.write_goals(
                 {
                     servo.id: (servo.ticks(q[index]), self._speed(index, dq[index]))
@@ -567,9 +571,9 @@ class FeetechSerialArm(Arm):
                     if self._enabled[index]
                 }
             )
-        self._take(self._bus.read_states(until_ns))
+        self._take(self._bus.read_states(until_ns), due)
 
-    def _take(self, answers: list[Answer | None]) -> None:
+    def _take(self, answers: list[Answer | None], due: Array) -> None:
         good = [self._plausible(index, answer) for index, answer in enumerate(answers)]
         for index, answer in enumerate(good):
             self._in_vain[index] += 1
@@ -578,11 +582,10 @@ class FeetechSerialArm(Arm):
                 self._answers[index] = answer
                 self._check_servo_in_use(index, answer.state)
         complete = [answer for answer in good if answer is not None]
-        if len(complete) == len(good):
-            self._publish(complete)
         self._missed.append(len(complete) < len(good))
         self._check_silence()
-        self._check_tracking()
+        if len(complete) == len(good):
+            self._check_tracking(self._publish(complete), due)
 
     def _plausible(self, index: int, answer: Answer | None) -> Answer | None:
         """The answer, unless the servo cannot have turned that far since the last one."""
@@ -596,7 +599,7 @@ class FeetechSerialArm(Arm):
         self._implausible += 1
         return None
 
-    def _publish(self, answers: list[Answer]) -> None:
+    def _publish(self, answers: list[Answer]) -> Array:
         q = np.array([self._angle(index, answer.state.position) for index, answer in enumerate(answers)])
         units = [self._bus.identity(servo).speed_unit_ticks_s for servo in self._ids]
         dq = np.array(
@@ -613,6 +616,7 @@ class FeetechSerialArm(Arm):
             self._seq,
             quality=Quality.GOOD if inside.all() else Quality.SUSPECT,
         )
+        return q
 
     def _check_servo_in_use(self, index: int, state: ServoState) -> None:
         if found := codec.faults(state.status):
@@ -633,14 +637,13 @@ class FeetechSerialArm(Arm):
             what = f"complete state in {sum(self._missed)} of {len(self._missed)} cycles"
             self._latch(TransportTimeout(self.name, what, 1.0 / self._config.rate_hz, hint="check plugs and supply"))
 
-    def _check_tracking(self) -> None:
-        if self._joints is None or not self._driving:
-            return
-        error = np.where(self._enabled, np.abs(self._joints.value.q - self._setpoint.q), 0.0)
+    def _check_tracking(self, q: Array, due: Array) -> None:
+        """Compare ``q`` with the goals of the cycle before, which the servos have had time to reach."""
+        error = np.where(self._enabled, np.abs(q - due), 0.0)
         worst = int(np.argmax(error))
-        if error[worst] > np.deg2rad(self._config.tracking_error_deg):
+        if self._driving and error[worst] > np.deg2rad(self._config.tracking_error_deg):
             # Hold where the arm is, so that whatever blocks it is no longer pushed against.
-            self._setpoint.reset(self._joints.value.q)
+            self._setpoint.reset(q)
             self._latch(
                 DeviceFault(
                     self.name,
