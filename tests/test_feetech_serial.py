@@ -252,6 +252,19 @@ def test_a_silent_servo_is_a_fault_and_the_others_hold(arm: FeetechSerialArm, se
     assert (servos.state()["enabled"], servos.state()["energising"]) == (5, energising)
 
 
+def test_no_step_is_sent_while_a_servo_is_not_seen(arm: FeetechSerialArm, servos: EmulatorProcess) -> None:
+    lease = activate(arm)
+    sideways = np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.0])
+    stream(arm, lease, sideways, 0.5)
+    before = servos.fault("silent", 4)["goals"][0]
+    with suppress(CommandRejected):
+        while not faulted(arm):
+            send(arm, lease, sideways)
+            time.sleep(0.01)
+    # Eight cycles of 18 ticks would be 144; the step under way and one more, of two periods at most, are 72.
+    assert 0 <= servos.state()["goals"][0] - before <= 72
+
+
 @pytest.mark.parametrize(
     ("bits", "fault_class", "needs"),
     [(0x20, FaultClass.OVERLOAD, Remedy.RECOVER), (0x01, FaultClass.ELECTRICAL, Remedy.OPERATOR)],
