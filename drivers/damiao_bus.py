@@ -6,12 +6,13 @@ no receive thread is needed, nothing can overflow unseen, and an answer is never
 Answers carry no time. Each is stamped with the moment at which its request was sent, so its age is never understated: a
 motor's requests wait in a queue and its answers come in order (CAN keeps the order of one sender). After a loss the
 queue would stay one entry too long; then a register is read as well, whose answer names itself and so marks the place.
+Of such fences a motor has one under way at a time, and they take turns among four registers: an answer that comes after
+its fence was given up is not taken for the next.
 """
 
 from __future__ import annotations
 
 import errno
-import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -23,9 +24,10 @@ from drivers.clock import Clock
 from drivers.damiao_codec import CodecError, Feedback, Ranges, Register
 from drivers.errors import ConnectError, DeviceFault, DeviceGone, FaultClass, Remedy, TransportTimeout
 
-_REGISTER_TIMEOUT_S = 0.1
-_REGISTER_TRIES = 3
-_FENCE_EVERY_NS = 20_000_000
+_ANSWER_S = 0.1
+_TRIES = 3
+_SETTLE_NS = 20_000_000
+_FENCES = (Register.TIMEOUT, Register.CTRL_MODE, Register.MST_ID, Register.ESC_ID)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,20 +63,23 @@ class Counters:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Pending:
+    """A request under way; ``fence`` is the register that it reads, or None if it is answered by the motor's state."""
+
     t_ns: int
-    is_fence: bool
+    fence: Register | None = None
 
 
 class MotorBus:
-    """The motors of one arm on one CAN bus. Every public call takes the bus for itself while it lasts.
+    """The motors of one arm on one CAN bus. One thread at a time.
 
     Args:
         device: name for errors.
         addresses: the motors.
         connect: opens the python-can bus.
         clock: injected time.
+        max_silence_s: a motor silent for longer is given up by the caller; requests twice as old are forgotten.
         fd: send CAN FD frames with bit rate switching.
 
     Attributes:
@@ -84,25 +89,40 @@ class MotorBus:
     """
 
     def __init__(
-        self, device: str, addresses: Sequence[Address], connect: Callable[[], Any], clock: Clock, *, fd: bool = False
+        self,
+        device: str,
+        addresses: Sequence[Address],
+        connect: Callable[[], Any],
+        clock: Clock,
+        *,
+        max_silence_s: float,
+        fd: bool = False,
     ) -> None:
         self._device = device
         self._addresses = tuple(addresses)
         self._by_mst_id = {address.mst_id: index for index, address in enumerate(addresses)}
         self._connect = connect
         self._clock = clock
+        self._forget_after_ns = round(2e9 * max_silence_s)
+        self._fence_lost_after_ns = round(0.5e9 * max_silence_s)
         self._fd = fd
         self._bus: Any = None
-        self._lock = threading.RLock()
-        self._ranges: list[Ranges | None] = [None] * len(addresses)
-        self._pending: list[deque[_Pending]] = [deque() for _ in addresses]
-        self._newest: list[Answer | None] = [None] * len(addresses)
-        self._registers: dict[tuple[int, int], float | int] = {}
-        self._wanted_register: tuple[int, int] | None = None
+        self._forget()
+
+    def _forget(self) -> None:
+        """Start as on a bus that was never open."""
+        n = len(self._addresses)
+        self._ranges: list[Ranges | None] = [None] * n
+        self._pending: list[deque[_Pending]] = [deque() for _ in range(n)]
+        self._newest: list[Answer | None] = [None] * n
+        self._wanted_register: tuple[int, int, bool] | None = None
+        self._replies: list[codec.RegisterReply] = []
         self._bus_off = False
+        self._fences: list[_Pending | None] = [None] * n
+        self._fence_turns = [0] * n
         self.counters = Counters()
         self.last_error = ""
-        self.timeout_ticks: list[int | None] = [None] * len(addresses)
+        self.timeout_ticks: list[int | None] = [None] * n
 
     @property
     def state(self) -> str:
@@ -117,6 +137,7 @@ class MotorBus:
         Raises:
             ConnectError: no bus, or motors that do not answer or not as configured; ``causes`` names each.
         """
+        self._forget()
         self._bus = self._connect()
         causes: list[Exception] = []
         for index, address in enumerate(self._addresses):
@@ -133,10 +154,9 @@ class MotorBus:
 
     def close(self) -> None:
         """Leave the bus; without effect on one that was never opened."""
-        with self._lock:
-            if self._bus is not None:
-                self._bus.shutdown()
-                self._bus = None
+        if self._bus is not None:
+            self._bus.shutdown()
+            self._bus = None
 
     def ranges(self, index: int) -> Ranges:
         """Full scales of a motor, as it told."""
@@ -150,20 +170,20 @@ class MotorBus:
 
     def write(self, index: int, register: int, value: float | int) -> float | int:
         """Change a register until the next power cycle; returns what a read afterwards says."""
-        self._ask(index, register, codec.write_register(self._addresses[index].esc_id, register, value))
+        self._ask(index, register, codec.write_register(self._addresses[index].esc_id, register, value), written=True)
         return self.read(index, register)
 
     def command(self, index: int, data: bytes) -> Feedback:
-        """Send one frame to one motor and wait for its answer. Raises TransportTimeout, DeviceGone."""
-        with self._lock:
-            self._settle()
+        """Send one frame to one motor until it answers, a few times. Raises TransportTimeout, DeviceGone."""
+        self._settle()
+        for _ in range(_TRIES):
             self._send(index, self._addresses[index].esc_id, data)
-            until_ns = self._clock.now_ns() + round(_REGISTER_TIMEOUT_S * 1e9)
+            until_ns = self._clock.now_ns() + round(_ANSWER_S * 1e9)
             while (answer := self._newest[index]) is None and self._receive(until_ns):
                 pass
-            if answer is None:
-                raise self._no_answer(index)
-            return answer.feedback
+            if answer is not None:
+                return answer.feedback
+        raise self._no_answer(index)
 
     def exchange(self, data: Sequence[bytes | None], until_ns: int) -> list[Answer | None]:
         """Send every motor its frame, or a request for its state where there is none, and collect answers.
@@ -175,28 +195,27 @@ class MotorBus:
             DeviceGone: the bus has gone.
             DeviceFault: the controller is bus-off.
         """
-        with self._lock:
-            self._newest = [None] * len(self._addresses)
-            self._fence()
-            start_ns = self._clock.now_ns()
-            for index, (address, frame) in enumerate(zip(self._addresses, data, strict=True)):
-                if frame is None:
-                    self._send(index, codec.PARAMETER_ID, codec.request_feedback(address.esc_id))
-                else:
-                    self._send(index, address.esc_id, frame)
-            while not self._all_since(start_ns) and self._receive(until_ns):
-                pass
-            self.counters.missed += sum(answer is None for answer in self._newest)
-            if self._bus_off:
-                raise DeviceFault(
-                    self._device,
-                    "bus-off",
-                    vendor_code="bus-off",
-                    fault_class=FaultClass.COMMUNICATION,
-                    needs=Remedy.OPERATOR,
-                    hint="check wiring, termination and bit rates, then restart the interface",
-                )
-            return list(self._newest)
+        self._newest = [None] * len(self._addresses)
+        self._fence()
+        start_ns = self._clock.now_ns()
+        for index, (address, frame) in enumerate(zip(self._addresses, data, strict=True)):
+            if frame is None:
+                self._send(index, codec.PARAMETER_ID, codec.request_feedback(address.esc_id))
+            else:
+                self._send(index, address.esc_id, frame)
+        while not self._all_since(start_ns) and self._receive(until_ns):
+            pass
+        self.counters.missed += sum(answer is None for answer in self._newest)
+        if self._bus_off:
+            raise DeviceFault(
+                self._device,
+                "bus-off",
+                vendor_code="bus-off",
+                fault_class=FaultClass.COMMUNICATION,
+                needs=Remedy.OPERATOR,
+                hint="check wiring, termination and bit rates, then restart the interface",
+            )
+        return list(self._newest)
 
     def _all_since(self, start_ns: int) -> bool:
         return all(answer is not None and answer.t_ns >= start_ns for answer in self._newest)
@@ -208,29 +227,29 @@ class MotorBus:
             float(self.read(index, Register.TMAX)),
         )
 
-    def _ask(self, index: int, register: int, request: bytes) -> float | int:
-        with self._lock:
-            self._settle()
-            self._wanted_register = (index, register)
-            try:
-                for _ in range(_REGISTER_TRIES):
-                    self._put(codec.PARAMETER_ID, request)
-                    until_ns = self._clock.now_ns() + round(_REGISTER_TIMEOUT_S * 1e9)
-                    while (index, register) not in self._registers and self._receive(until_ns):
-                        pass
-                    if (index, register) in self._registers:
-                        return self._registers.pop((index, register))
-            finally:
-                self._wanted_register = None
-            raise self._no_answer(index)
+    def _ask(self, index: int, register: int, request: bytes, *, written: bool = False) -> float | int:
+        self._settle()
+        self._replies.clear()
+        self._wanted_register = (index, register, written)
+        try:
+            for _ in range(_TRIES):
+                self._put(codec.PARAMETER_ID, request)
+                until_ns = self._clock.now_ns() + round(_ANSWER_S * 1e9)
+                while not self._replies and self._receive(until_ns):
+                    pass
+                if self._replies:
+                    return self._replies[0].value
+        finally:
+            self._wanted_register = None
+        raise self._no_answer(index)
 
     def _no_answer(self, index: int) -> TransportTimeout:
         what = f"answer of motor {self._addresses[index].esc_id}"
-        return TransportTimeout(self._device, what, _REGISTER_TIMEOUT_S)
+        return TransportTimeout(self._device, what, _TRIES * _ANSWER_S)
 
     def _settle(self) -> None:
         """Take in what is under way, so that the next answer belongs to the next request."""
-        until_ns = self._clock.now_ns() + _FENCE_EVERY_NS
+        until_ns = self._clock.now_ns() + _SETTLE_NS
         while any(self._pending) and self._receive(until_ns):
             pass
         for queue in self._pending:
@@ -240,15 +259,21 @@ class MotorBus:
     def _fence(self) -> None:
         now_ns = self._clock.now_ns()
         for index, queue in enumerate(self._pending):
-            fences = [entry for entry in queue if entry.is_fence]
-            if queue and (not fences or now_ns - fences[-1].t_ns > _FENCE_EVERY_NS):
-                queue.append(_Pending(now_ns, is_fence=True))
-                self._put(codec.PARAMETER_ID, codec.read_register(self._addresses[index].esc_id, Register.TIMEOUT))
+            while queue and now_ns - queue[0].t_ns > self._forget_after_ns:
+                queue.popleft()
+            fence = self._fences[index]
+            under_way = fence in queue and fence is not None and now_ns - fence.t_ns <= self._fence_lost_after_ns
+            if queue and not under_way:
+                self._fence_turns[index] += 1
+                register = _FENCES[self._fence_turns[index] % len(_FENCES)]
+                fence = self._fences[index] = _Pending(now_ns, register)
+                queue.append(fence)
+                self._put(codec.PARAMETER_ID, codec.read_register(self._addresses[index].esc_id, register))
 
     def _send(self, index: int, arbitration_id: int, data: bytes) -> None:
         now_ns = self._clock.now_ns()
         if self._put(arbitration_id, data):
-            self._pending[index].append(_Pending(now_ns, is_fence=False))
+            self._pending[index].append(_Pending(now_ns))
 
     def _put(self, arbitration_id: int, data: bytes) -> bool:
         import can
@@ -295,28 +320,36 @@ class MotorBus:
         if index is None:
             self.counters.unexpected += 1
             return
-        if not self._take_register(index, data):
+        if self._take_wanted(index, data) or self._take_fence(index, data):
+            return
+        if codec.is_register_reply(data, self._addresses[index].esc_id):
+            self.counters.unexpected += 1
+        else:
             self._take_feedback(index, data)
 
-    def _take_register(self, index: int, data: bytes) -> bool:
-        queue = self._pending[index]
-        fenced = any(entry.is_fence for entry in queue)
+    def _take_wanted(self, index: int, data: bytes) -> bool:
         wanted = self._wanted_register
-        if not fenced and (wanted is None or wanted[0] != index):
+        if wanted is None or wanted[0] != index:
             return False
-        register = wanted[1] if wanted and wanted[0] == index else int(Register.TIMEOUT)
-        try:
-            reply = codec.decode_register_reply(data, self._addresses[index].esc_id, register)
-        except CodecError as error:
-            if error.field.startswith("register reply") or error.field == "data":
-                return False
-            raise
-        if wanted == (index, register):
-            self._registers[wanted] = reply.value
-        else:
+        reply = codec.decode_register_reply(data, self._addresses[index].esc_id, wanted[1])
+        # A second answer to a repeated write must not pass for the read that proves it.
+        if reply is None or reply.written != wanted[2]:
+            return False
+        self._replies.append(reply)
+        return True
+
+    def _take_fence(self, index: int, data: bytes) -> bool:
+        queue, fence = self._pending[index], self._fences[index]
+        if fence is None or fence.fence is None or fence not in queue:
+            return False
+        reply = codec.decode_register_reply(data, self._addresses[index].esc_id, fence.fence)
+        if reply is None:
+            return False
+        if fence.fence is Register.TIMEOUT:
             self.timeout_ticks[index] = int(reply.value)
-            while queue and not queue.popleft().is_fence:
-                pass
+        # Whatever was asked for before has been answered or lost.
+        while queue.popleft() is not fence:
+            pass
         return True
 
     def _take_feedback(self, index: int, data: bytes) -> None:
@@ -330,7 +363,7 @@ class MotorBus:
             self.counters.corrupt += 1
             return
         queue = self._pending[index]
-        while queue and queue[0].is_fence:
+        while queue and queue[0].fence is not None:
             queue.popleft()
         if not queue:
             self.counters.unexpected += 1

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers import damiao_codec as codec
 from drivers.abilities import StopCategory
-from drivers.arm import Arm
+from drivers.arm import Arm, LimitsConfig
 from drivers.clock import Clock
 from drivers.damiao_bus import Address, Answer, MotorBus
 from drivers.damiao_codec import MitCommand, Register
@@ -40,7 +40,6 @@ from drivers.errors import (
     StaleData,
     TransportTimeout,
 )
-from drivers.gate import TwistLimits
 from drivers.joint_setpoint import JointSetpoint
 from drivers.kinematics import GRAVITY_M_S2, ChainDescription, DifferentialIk, SerialChain, Tool, Vector3
 from drivers.lease import Lease
@@ -55,6 +54,13 @@ _REST_SPEED_RAD_S = 0.03
 _FIRST_SAMPLE_S = 1.0
 _MISS_WINDOW = 100
 _PLAUSIBLE_JUMP_RAD = 0.1
+
+_DOES_NOT_ENABLE = codec.StatusCode(
+    "does not enable", FaultClass.INTERNAL, Remedy.OPERATOR, "check power and emergency stop"
+)
+_DISABLED_ITSELF = codec.StatusCode(
+    "disabled itself", FaultClass.ELECTRICAL, Remedy.OPERATOR, "did it lose power, or has it a second host?"
+)
 
 
 class MotorConfig(BaseModel):
@@ -95,10 +101,7 @@ class DamiaoCanConfig(DriverConfig):
     max_missed_fraction: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.25
     tracking_error_deg: Positive = 8.0
 
-    tcp_speed_m_s: Positive = 0.10
-    tcp_accel_m_s2: Positive = 0.5
-    tcp_rot_speed_deg_s: Positive = 30.0
-    tcp_rot_accel_deg_s2: Positive = 150.0
+    limits: LimitsConfig = LimitsConfig()
 
     park_deg: tuple[float, ...] | None = None
     park_tolerance_deg: Positive = 5.0
@@ -128,15 +131,6 @@ class DamiaoCanConfig(DriverConfig):
         """Largest part of the bus that commands and answers take."""
         return codec.bus_load(len(self.motors), self.rate_hz, self.bitrate, self.data_bitrate if self.fd else None)
 
-    def limits(self) -> TwistLimits:
-        """What the gate allows."""
-        return TwistLimits(
-            self.tcp_speed_m_s,
-            self.tcp_accel_m_s2,
-            float(np.deg2rad(self.tcp_rot_speed_deg_s)),
-            float(np.deg2rad(self.tcp_rot_accel_deg_s2)),
-        )
-
     def describe(self) -> ChainDescription:
         """The arm. Raises ConfigError if there is none or it has another number of joints."""
         is_file = Path(self.chain).suffix in (".yaml", ".yml")
@@ -145,6 +139,9 @@ class DamiaoCanConfig(DriverConfig):
             raise ConfigError(
                 f"chain {found.name!r} has {len(found.joints)} joints", key="motors", value=len(self.motors)
             )
+        for joint, angle_deg in zip(found.joints, self.park_deg or (), strict=False):
+            if not joint.lower_deg <= angle_deg <= joint.upper_deg:
+                raise ConfigError(f"is outside the limits of joint {joint.name!r}", key="park_deg", value=angle_deg)
         return found
 
 
@@ -158,15 +155,22 @@ class DamiaoCanArm(Arm):
     """
 
     def __init__(self, name: str, config: DamiaoCanConfig, clock: Clock) -> None:
-        super().__init__(name, clock, config.limits())
+        super().__init__(name, clock, config.limits.build())
         self._config = config
         self._chain = SerialChain(config.describe(), config.tool, config.gravity_m_s2)
-        self._setpoint = JointSetpoint(self._chain, DifferentialIk(self._chain), config.limits())
+        self._setpoint = JointSetpoint(self._chain, DifferentialIk(self._chain), self.limits)
         motors = config.motors
         self._direction = np.array([motor.direction for motor in motors], dtype=np.float64)
         self._offset = np.deg2rad([motor.offset_deg for motor in motors])
         addresses = [Address(motor.esc_id, motor.mst_id) for motor in motors]
-        self._bus = MotorBus(name, addresses, partial(_open_bus, name, config), clock, fd=config.fd)
+        self._bus = MotorBus(
+            name,
+            addresses,
+            partial(_open_bus, name, config),
+            clock,
+            max_silence_s=config.max_silence_s,
+            fd=config.fd,
+        )
         self._enabled = [False] * len(motors)
         self._thread: threading.Thread | None = None
         self._closing = threading.Event()
@@ -211,10 +215,10 @@ class DamiaoCanArm(Arm):
 
     def watchdog_s(self) -> float:
         """Silence after which the motors let go, as read back from them; the longest of them."""
-        ticks = [self._bus.timeout_ticks[index] for index in range(len(self._config.motors))]
-        if any(tick is None for tick in ticks):
+        known = [ticks for ticks in self._bus.timeout_ticks if ticks is not None]
+        if len(known) < len(self._enabled):
             raise LifecycleError(self.name, "tell the watchdog", self.state.value, [Lifecycle.READY.value])
-        return max(tick or 0 for tick in ticks) * codec.TIMEOUT_TICK_S
+        return max(known) * codec.TIMEOUT_TICK_S
 
     def go_to_joints(self, q: Array, lease: Lease, *, speed_fraction: float = 0.1) -> None:
         """Start moving to ``q`` (n,) rad in a straight line in joint space, within the limits of the tool centre point.
@@ -308,12 +312,9 @@ class DamiaoCanArm(Arm):
                 self._check_watchdog(index, int(self._bus.read(index, Register.TIMEOUT)))
             if all(self._enabled):
                 return
-            self._setpoint.reset(q)
-            try:
-                self._enable(q)
-            except DeviceError:
-                self._power_off()
-                raise
+            # Motors that hold already keep their setpoint, whatever load makes them sag.
+            self._setpoint.reset(np.where(self._enabled, self._setpoint.q, q))
+            self._enable([index for index, on in enumerate(self._enabled) if not on])
 
     def _after_rest(self, policy: DeactivatePolicy) -> None:
         if policy is DeactivatePolicy.HOLD:
@@ -406,25 +407,29 @@ class DamiaoCanArm(Arm):
                 hint="did it lose power? configure again; without the timeout a dead host leaves the arm pushing",
             )
 
-    def _enable(self, q: Array) -> None:
-        frames = self._frames(q, np.zeros_like(q))
-        for index, motor in enumerate(self._config.motors):
-            self._bus.command(index, codec.ENABLE)
-            # Enabled without gains the motor is limp: give it its setpoint before the next one is enabled.
-            status = self._bus.command(index, frames[index]).status
-            if status != codec.ENABLED:
-                code = codec.fault(status) or codec.StatusCode(
-                    "does not enable", FaultClass.INTERNAL, Remedy.OPERATOR, "check power and emergency stop"
-                )
-                raise _motor_fault(self.name, motor.esc_id, status, code)
-            self._enabled[index] = True
+    def _enable(self, indices: list[int]) -> None:
+        """Enable these motors at the setpoint; if one does not obey, none of them stays enabled."""
+        frames = self._frames(self._setpoint.q, np.zeros_like(self._setpoint.q))
+        try:
+            for index in indices:
+                self._enabled[index] = True
+                self._bus.command(index, codec.ENABLE)
+                # Enabled without gains the motor is limp: give it its setpoint before the next one is enabled.
+                status = self._bus.command(index, frames[index]).status
+                if status != codec.ENABLED:
+                    code = codec.fault(status) or _DOES_NOT_ENABLE
+                    raise _motor_fault(self.name, self._config.motors[index].esc_id, status, code)
+        except DeviceError:
+            self._power_off(indices)
+            raise
 
-    def _power_off(self) -> None:
+    def _power_off(self, indices: list[int] | None = None) -> None:
+        """Disable these motors, or all, as far as they can still be reached."""
         with self._lock:
-            for index, enabled in enumerate(self._enabled):
-                self._enabled[index] = False
-                if not enabled:
+            for index in range(len(self._enabled)) if indices is None else indices:
+                if not self._enabled[index]:
                     continue
+                self._enabled[index] = False
                 try:
                     self._bus.command(index, codec.DISABLE)
                 except DeviceGone:
@@ -490,7 +495,8 @@ class DamiaoCanArm(Arm):
         self._take(self._bus.exchange(frames, until_ns))
 
     def _frames(self, q: Array, dq: Array) -> list[bytes]:
-        tau = np.clip(self._chain.gravity_torques(q), -self._chain.torque, self._chain.torque)
+        strongest = np.minimum(self._chain.torque, [self._bus.ranges(i).torque_n_m for i in range(len(q))])
+        tau = np.clip(self._chain.gravity_torques(q), -strongest, strongest)
         motor_q = self._direction * (q - self._offset)
         motor_dq, motor_tau = self._direction * dq, self._direction * tau
         return [
@@ -539,9 +545,7 @@ class DamiaoCanArm(Arm):
         esc_id = self._config.motors[index].esc_id
         code = codec.fault(status)
         if code is None and self._enabled[index] and status == codec.DISABLED:
-            code = codec.StatusCode(
-                "disabled itself", FaultClass.ELECTRICAL, Remedy.OPERATOR, "did it lose power, or has it a second host?"
-            )
+            code = _DISABLED_ITSELF
         if code is not None:
             self._enabled[index] = False
             self._latch(_motor_fault(self.name, esc_id, status, code))

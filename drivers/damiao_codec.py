@@ -111,11 +111,12 @@ class Feedback:
 
 @dataclass(frozen=True, slots=True)
 class RegisterReply:
-    """Answer to a register read or write."""
+    """Answer to a register read, or to a write, which only repeats what was to be written."""
 
     motor: int
     register: int
     value: float | int
+    written: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,23 +263,30 @@ def encode_register_reply(motor: int, register: int, value: float | int, *, writ
     return head + (struct.pack("<f", value) if is_float else struct.pack("<I", value))
 
 
-def decode_register_reply(data: bytes, motor: int, register: int) -> RegisterReply:
-    """Read the answer of ``motor`` about ``register``.
+def is_register_reply(data: bytes, motor: int) -> bool:
+    """Whether ``motor`` answers about any register: its id in 16 bits, then read or write.
+
+    The state of a disabled motor at the lower end of its range (within 0.03 rad of -12.5) can look the same.
+    """
+    return len(data) == 8 and data[:2] == struct.pack("<H", motor) and data[2] in (_READ, _WRITE)
+
+
+def decode_register_reply(data: bytes, motor: int, register: int) -> RegisterReply | None:
+    """Read the answer of ``motor`` about ``register``; None if the bytes are something else, such as its state.
 
     Raises:
-        CodecError: it is something else, or a float that is not finite.
+        CodecError: it is a float that is not finite.
     """
-    _require_length(data)
-    sender, operation, number = struct.unpack_from("<HBB", data)
-    if (sender, number) != (motor, register) or operation not in (_READ, _WRITE):
-        raise CodecError("register reply", data.hex(), f"is no answer of motor {motor} about register {register}")
+    if not is_register_reply(data, motor) or data[3] != register:
+        return None
+    written = data[2] == _WRITE
     if register in _FLOAT_REGISTERS:
         (real,) = struct.unpack_from("<f", data, 4)
         if not math.isfinite(real):
             raise CodecError(f"register {register}", real, "is not finite")
-        return RegisterReply(sender, number, real)
+        return RegisterReply(motor, register, real, written)
     (whole,) = struct.unpack_from("<I", data, 4)
-    return RegisterReply(sender, number, whole)
+    return RegisterReply(motor, register, whole, written)
 
 
 def decode_parameter_request(data: bytes) -> tuple[int, int, int, bytes]:

@@ -37,6 +37,11 @@ class JointSetpoint:
         chain: the arm.
         ik: turns twists into joint velocities within joint limits.
         limits: speeds and accelerations of the tool centre point, for twists and joint goals alike.
+
+    Attributes:
+        q, dq: the setpoint (n,) rad and its velocity (n,) rad/s.
+        twist: (6,) along base axes that the setpoint follows now, zero on the way to a joint goal.
+        adjustments: the limits that hold it back now.
     """
 
     def __init__(self, chain: SerialChain, ik: DifferentialIk, limits: TwistLimits) -> None:
@@ -51,7 +56,7 @@ class JointSetpoint:
         self.q = np.array(q, dtype=np.float64)
         self.dq = np.zeros_like(self.q)
         self.adjustments: tuple[Adjustment, ...] = ()
-        self._twist = np.zeros(6)
+        self.twist = np.zeros(6)
         # Joint goals are straight lines in joint space; this is the speed along the line, rad/s.
         self._line = np.zeros_like(self.q)
         self._line_speed = 0.0
@@ -77,7 +82,7 @@ class JointSetpoint:
         """Move on by ``dt_s``; returns setpoint (n,) rad and its velocity (n,) rad/s."""
         task = self._task
         on_line = self._line_speed > 0.0
-        if isinstance(task, _Goal) and not self._twist.any():
+        if isinstance(task, _Goal) and not self.twist.any():
             self._step_to_goal(task, dt_s)
         elif on_line:
             self._slow_on_line(dt_s)
@@ -91,20 +96,21 @@ class JointSetpoint:
         limits = self._limits
         twist = np.concatenate(
             [
-                _towards(self._twist[:3], wanted[:3], limits.accel_m_s2 * dt_s),
-                _towards(self._twist[3:], wanted[3:], limits.rot_accel_rad_s2 * dt_s),
+                _towards(self.twist[:3], wanted[:3], limits.accel_m_s2 * dt_s),
+                _towards(self.twist[3:], wanted[3:], limits.rot_accel_rad_s2 * dt_s),
             ]
         )
         if not twist.any():
-            self._twist = twist
+            self.twist = twist
             self.dq = np.zeros_like(self.q)
             self.adjustments = ()
             return
-        motion = self._ik.solve(self.q, twist)
+        # Solved for where the joints will be half-way, so that a curved path drifts by the second order only.
+        motion = self._ik.solve(self.q + 0.5 * dt_s * self.dq, twist)
         self.dq = motion.dq
         self.adjustments = motion.adjustments
         # A motion held back by a limit goes on from the speed that it really has.
-        self._twist = motion.twist if motion.adjustments else twist
+        self.twist = motion.twist if motion.adjustments else twist
 
     def _step_to_goal(self, goal: _Goal, dt_s: float) -> None:
         way = goal.q - self.q

@@ -41,7 +41,8 @@ def test_register_golden() -> None:
     # 12.5 is 0x41480000.
     reply = codec.decode_register_reply(bytes.fromhex("0100 33 15 00004841"), 1, Register.PMAX)
     assert reply == codec.RegisterReply(1, 21, 12.5)
-    assert codec.decode_register_reply(bytes.fromhex("0100 55 09 D0070000"), 1, Register.TIMEOUT).value == 2000
+    reply = codec.decode_register_reply(bytes.fromhex("0100 55 09 D0070000"), 1, Register.TIMEOUT)
+    assert reply == codec.RegisterReply(1, 9, 2000, written=True)
 
 
 @given(
@@ -96,7 +97,10 @@ def test_a_changed_register_reply_is_never_taken_for_another(position: int, chan
         reply = codec.decode_register_reply(bytes(good), 3, Register.VMAX)
     except CodecError:
         return
-    assert (reply.motor, reply.register) == (3, Register.VMAX)
+    if reply is None:
+        return
+    # Only the value may have changed, or a read reply become a write's.
+    assert position >= 4 or (position, good[2]) == (2, 0x55)
     assert math.isfinite(reply.value)
 
 

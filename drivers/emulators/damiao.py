@@ -28,6 +28,7 @@ from geometry.types import Array
 _STEP_S = 0.5e-3
 _TICK_S = 2e-3
 _GRAVITY_EVERY = 8
+_ROOM_TEMPERATURE_C = 35.0
 _OVER_TEMPERATURE_C = 100.0
 
 MODELS: Mapping[str, codec.Ranges] = {
@@ -53,7 +54,7 @@ class Motor:
         self.esc_id = esc_id
         self.mst_id = mst_id
         self.ranges = ranges
-        self.rotor_c = 35.0
+        self.rotor_c = _ROOM_TEMPERATURE_C
         self.power_up()
 
     def power_up(self) -> None:
@@ -106,8 +107,10 @@ class DamiaoArm(Emulator):
         "fault_bits": "[motor index, status nibble]: the motor reports it and lets go",
         "hot": "[motor index, degrees Celsius] of the winding; at 100 the motor lets go",
         "push": "[motor index, N m]: somebody pushes that joint",
+        "refuse": "this motor (index from 0) does not enable",
         "nan": "the full-scale registers read as NaN",
         "restart": "the motors lose power for a moment",
+        "reset": "everything is as it was when the emulator started",
     }
 
     def __init__(
@@ -125,17 +128,28 @@ class DamiaoArm(Emulator):
         self._hub = Hub(path, self._on_frame)
         self.motors = [Motor(first_id + i, first_id + i + 0x10, MODELS[model]) for i, model in enumerate(models)]
         n = len(self.motors)
-        self._q = np.deg2rad(np.array(start_deg, dtype=np.float64))
-        self._dq = np.zeros(n)
-        self._tau = np.zeros(n)
+        self._start_q = np.deg2rad(np.array(start_deg, dtype=np.float64))
         self._inertia = np.geomspace(0.25, 0.02, n) if inertia is None else inertia
         self._friction = np.geomspace(0.6, 0.1, n) if friction is None else friction
-        self._weight = chain.gravity_torques(self._q)
-        self._on_stand = True
         self._steps = 0
         self._start_s = 0.0
-        self._held_back: dict[int, can.Message] = {}
         self._ticker: asyncio.Task[None] | None = None
+        self._under_way: set[asyncio.TimerHandle] = set()
+        self._reset()
+
+    def _reset(self) -> None:
+        for handle in self._under_way:
+            handle.cancel()
+        self._under_way.clear()
+        for motor in self.motors:
+            motor.power_up()
+            motor.rotor_c = _ROOM_TEMPERATURE_C
+        self._q = self._start_q.copy()
+        self._dq = np.zeros_like(self._q)
+        self._tau = np.zeros_like(self._q)
+        self._weight = self._chain.gravity_torques(self._q)
+        self._on_stand = True
+        self._held_back: dict[int, can.Message] = {}
         self._energising = 0
         self._commands = 0
         self._last_command_s: float | None = None
@@ -199,6 +213,10 @@ class DamiaoArm(Emulator):
             for motor in self.motors:
                 motor.power_up()
             del self.active[fault]
+        elif fault == "reset":
+            for name in list(self.active):
+                self.end(name)
+            self._reset()
 
     def on_clear(self, fault: str) -> None:
         """Plug in again; leave bus-off."""
@@ -288,6 +306,8 @@ class DamiaoArm(Emulator):
 
     def _on_special(self, index: int, data: bytes) -> None:
         motor = self.motors[index]
+        if data == codec.ENABLE and self.active.get("refuse") == index:
+            return
         if data == codec.ENABLE and motor.status in (codec.DISABLED, codec.ENABLED):
             motor.status = codec.ENABLED
             motor.command = codec.MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -355,7 +375,7 @@ class DamiaoArm(Emulator):
         overtaken = self._held_back.pop(index, None)
         for message in (answer, overtaken):
             if message is not None and delay_s > 0.0:
-                asyncio.get_running_loop().call_later(delay_s, self._hub.send, message)
+                self._under_way.add(asyncio.get_running_loop().call_later(delay_s, self._hub.send, message))
             elif message is not None:
                 self._hub.send(message)
 

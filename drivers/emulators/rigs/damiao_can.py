@@ -25,9 +25,10 @@ def config(channel: Path, **changes: object) -> damiao_can.DamiaoCanConfig:
         "motors": motors,
         "tool": TOOL,
         "park_deg": PARK_DEG,
-        "rate_hz": 200.0,
-        "watchdog_s": 0.2,
-        "max_silence_s": 0.2,
+        "rate_hz": 125.0,
+        "watchdog_s": 0.35,
+        "max_silence_s": 0.5,
+        "max_missed_fraction": 0.9,
     }
     return damiao_can.DamiaoCanConfig.model_validate(settings | changes)
 
@@ -50,7 +51,7 @@ def rig(folder: Path, address: int) -> Rig:
             "foreign": (3, "transient"),
             "out_of_order": (3, "transient"),
             "error_frames": (3, "transient"),
-            "delay": (0.5, "fault"),
+            "delay": (1.0, "fault"),
             "pause": (True, "fault"),
             "silent": (2, "fault"),
             "fault_bits": ([1, 0xA], "fault"),
