@@ -2,7 +2,7 @@
 
 Servos speak only when asked, so one thread at a time owns the line and no receive thread is needed. An answer carries
 neither time nor number. It is stamped with the moment at which it was asked for, so its age is never understated, and
-the requests for states ask for blocks of eight lengths in turn: an answer that comes cycles too late has the wrong
+the requests for states ask for blocks of sixteen lengths in turn: an answer that comes cycles too late has the wrong
 length and is counted as late instead of being taken for a fresh one.
 """
 

@@ -88,10 +88,10 @@ TORQUE_OFF, TORQUE_ON = 0, 1
 POSITION_MODE = 0
 """Value of ``Register.MODE``."""
 
-IDENTITY_LENGTH = 40
-"""Bytes from ``Register.FIRMWARE`` that ``decode_identity`` takes."""
+IDENTITY_LENGTH = 50
+"""Bytes from ``Register.FIRMWARE`` that ``decode_identity`` takes; more than any state block has."""
 
-STATE_STARTS = tuple(range(Register.MODE, Register.TORQUE_ENABLE + 1))
+STATE_STARTS = tuple(range(Register.TORQUE_ENABLE - 15, Register.TORQUE_ENABLE + 1))
 """First addresses of the blocks that ``decode_state`` takes; all end behind ``Register.CURRENT``, so that the length of
 an answer tells which request it belongs to."""
 
@@ -305,7 +305,7 @@ def from_signed_word(data: bytes, sign_bit: int = 15) -> int:
 
 
 def decode_identity(data: bytes) -> Identity:
-    """The first 40 registers of a servo. Raises CodecError."""
+    """The first 50 registers of a servo. Raises CodecError."""
     if len(data) != IDENTITY_LENGTH:
         raise CodecError("identity", len(data), f"is not {IDENTITY_LENGTH} bytes long")
     phase = data[Register.PHASE]

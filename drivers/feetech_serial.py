@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers import feetech_codec as codec
 from drivers.abilities import StopCategory
-from drivers.arm import Arm
+from drivers.arm import Arm, LimitsConfig
 from drivers.clock import Clock
 from drivers.commands import Adjustment
 from drivers.device import DeactivatePolicy, Lifecycle, OperatorToken
@@ -49,7 +49,6 @@ from drivers.errors import (
 )
 from drivers.feetech_bus import Answer, ServoBus
 from drivers.feetech_codec import FaultBit, Register, ServoState
-from drivers.gate import TwistLimits
 from drivers.joint_setpoint import JointSetpoint
 from drivers.kinematics import ChainDescription, DifferentialIk, SerialChain, Tool
 from drivers.lease import Lease
@@ -127,10 +126,7 @@ class FeetechSerialConfig(DriverConfig):
     tracking_error_deg: Annotated[float, Field(gt=0.0, le=20.0)] = 8.0
     torque_limit_percent: Annotated[float, Field(ge=5.0, le=100.0)] = 60.0
 
-    tcp_speed_m_s: Positive = 0.10
-    tcp_accel_m_s2: Positive = 0.5
-    tcp_rot_speed_deg_s: Positive = 30.0
-    tcp_rot_accel_deg_s2: Positive = 150.0
+    limits: LimitsConfig = LimitsConfig()
 
     park_deg: tuple[float, ...] | None = None
     park_tolerance_deg: Positive = 5.0
@@ -160,20 +156,12 @@ class FeetechSerialConfig(DriverConfig):
         told = "\n".join(servo.model_dump_json() for servo in self.servos)
         return hashlib.sha256(told.encode()).hexdigest()[:12]
 
-    def limits(self) -> TwistLimits:
-        """What the gate allows."""
-        return TwistLimits(
-            self.tcp_speed_m_s,
-            self.tcp_accel_m_s2,
-            float(np.deg2rad(self.tcp_rot_speed_deg_s)),
-            float(np.deg2rad(self.tcp_rot_accel_deg_s2)),
-        )
-
     def describe(self) -> ChainDescription:
         """The arm, with its joints' ranges narrowed to the calibrated ones.
 
         Raises:
-            ConfigError: there is no such arm, it has another number of joints, or a joint has no range left.
+            ConfigError: there is no such arm, it has another number of joints, a joint has no range left, or the park
+                pose is outside it.
         """
         is_file = Path(self.chain).suffix in (".yaml", ".yml")
         found = ChainDescription.read(Path(self.chain)) if is_file else ChainDescription.shipped(self.chain)
@@ -192,6 +180,10 @@ class FeetechSerialConfig(DriverConfig):
                     key=f"servos[{index}]",
                     hint="correct zero_ticks, direction, min_ticks and max_ticks",
                 )
+            if self.park_deg is not None and not lower <= self.park_deg[index] <= upper:
+                raise ConfigError(
+                    f"is outside the limits of joint {joint.name}", key=f"park_deg[{index}]", value=self.park_deg[index]
+                )
             joints.append(joint.model_copy(update={"lower_deg": lower, "upper_deg": upper}))
         return found.model_copy(update={"joints": tuple(joints)})
 
@@ -206,10 +198,10 @@ class FeetechSerialArm(Arm):
     """
 
     def __init__(self, name: str, config: FeetechSerialConfig, clock: Clock) -> None:
-        super().__init__(name, clock, config.limits(), max_state_age_s=config.max_silence_s)
+        super().__init__(name, clock, config.limits.build(), max_state_age_s=config.max_silence_s)
         self._config = config
         self._chain = SerialChain(config.describe(), config.tool)
-        self._setpoint = JointSetpoint(self._chain, DifferentialIk(self._chain), config.limits())
+        self._setpoint = JointSetpoint(self._chain, DifferentialIk(self._chain), self.limits)
         self._ids = [servo.id for servo in config.servos]
         self._bus = ServoBus(name, self._ids, partial(_open_port, name, config), clock, echo=config.echo)
         self._thread: threading.Thread | None = None
@@ -309,8 +301,7 @@ class FeetechSerialArm(Arm):
     def _open(self) -> None:
         self._forget()
         self._bus.open()
-        for answer in self._fresh_answers():
-            self._enabled[self._ids.index(answer[0])] = answer[1].state.torque_enable == codec.TORQUE_ON
+        self._enabled = [answer.state.torque_enable == codec.TORQUE_ON for _, answer in self._fresh_answers()]
         self._closing.clear()
         self._thread = threading.Thread(target=self._run, name=f"{self.name} servos", daemon=True)
         self._thread.start()
@@ -508,6 +499,7 @@ class FeetechSerialArm(Arm):
             found = [(servo, a) for servo, a in zip(self._ids, answers, strict=True) if a is not None]
             if len(found) == len(self._ids):
                 self._answers = list(answers)
+                self._in_vain = [0] * len(self._ids)
                 return found
             silent = [servo for servo, answer in zip(self._ids, answers, strict=True) if answer is None]
         raise TransportTimeout(self.name, f"state of servos {silent}", _TRIES * self._config.max_silence_s)

