@@ -23,7 +23,7 @@ from drivers.emulators.base import Emulator
 from drivers.feetech_codec import Instruction, Packet, Register
 from drivers.kinematics import ChainDescription, SerialChain, Tool
 
-_TICK_S = 2e-3
+_TICK_S = 5e-3
 _RESPONSE_S = 0.03
 _FASTEST_TICKS_S = 3073.0
 _STANDSTILL_TICKS_S = 1.0
