@@ -66,6 +66,7 @@ _FIRST_SAMPLE_S = 1.0
 _MISS_WINDOW = 50
 _ASKED_IN_VAIN = 3
 _TRIES = 3
+_ANSWER_TIMEOUT_S = 0.15
 _PLAUSIBLE_JUMP_RAD = 0.1
 _SPEED_MARGIN = 1.25
 _SLOWEST_RAD_S = 0.1
@@ -494,15 +495,14 @@ class FeetechSerialArm(Arm):
         """Every servo with its state, asked for now. Raises TransportTimeout."""
         silent = list(self._ids)
         for _ in range(_TRIES):
-            until_ns = self._clock.now_ns() + round(self._config.max_silence_s * 1e9)
-            answers = self._bus.read_states(until_ns)
+            answers = self._bus.read_states(self._clock.now_ns() + round(_ANSWER_TIMEOUT_S * 1e9))
             found = [(servo, a) for servo, a in zip(self._ids, answers, strict=True) if a is not None]
             if len(found) == len(self._ids):
                 self._answers = list(answers)
                 self._in_vain = [0] * len(self._ids)
                 return found
             silent = [servo for servo, answer in zip(self._ids, answers, strict=True) if answer is None]
-        raise TransportTimeout(self.name, f"state of servos {silent}", _TRIES * self._config.max_silence_s)
+        raise TransportTimeout(self.name, f"state of servos {silent}", _TRIES * _ANSWER_TIMEOUT_S)
 
     def _park(self) -> None:
         if self._config.park_deg is None:

@@ -155,7 +155,7 @@ def test_a_twist_moves_the_tool_and_its_expiry_stops_it(arm: FeetechSerialArm, s
     assert 0.03 < moved[2] < 0.075
     np.testing.assert_allclose(moved[:2], 0.0, atol=1.5e-3)
     goals, commands = state["goals"], state["commands"]
-    wait(lambda: servos.state()["commands"] > commands + 50)
+    wait(lambda: servos.state()["commands"] > commands + 25)
     assert servos.state()["goals"] == goals
     assert arm.state is Lifecycle.ACTIVE
 
@@ -209,7 +209,7 @@ def test_a_few_losses_are_counted_and_survived(
     seq = arm.joints().seq
     servos.fault(fault, 3)
     wait(lambda: int(arm.health()[counter]) >= before + 3)
-    wait(lambda: arm.joints().seq > seq + 10)
+    wait(lambda: arm.joints().seq > seq + 4)
     stream(arm, lease, UP, 0.1)
     assert arm.state is Lifecycle.ACTIVE
     wait(arm.at_rest)
