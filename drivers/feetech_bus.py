@@ -2,7 +2,7 @@
 
 Servos speak only when asked, so one thread at a time owns the line and no receive thread is needed. An answer carries
 neither time nor number. It is stamped with the moment at which it was asked for, so its age is never understated, and
-the requests for states ask for blocks of eight lengths in turn: an answer that comes cycles too late has the wrong
+the requests for states ask for blocks of sixteen lengths in turn: an answer that comes cycles too late has the wrong
 length and is counted as late instead of being taken for a fresh one.
 """
 
@@ -132,11 +132,11 @@ class ServoBus:
                     self._device, f"servo {servo} has {found.hex(' ')} in register {register}, not {data.hex(' ')}"
                 )
 
-    def write_goals(self, ticks: Mapping[int, int]) -> None:
-        """Send each servo its goal, in ticks; none answers."""
-        goals = {servo: codec.signed_word(goal) for servo, goal in ticks.items()}
+    def write_goals(self, goals: Mapping[int, tuple[int, int]]) -> None:
+        """Send each servo its goal in ticks and its speed there in its own unit; none answers."""
+        data = {servo: codec.goal(ticks, speed) for servo, (ticks, speed) in goals.items()}
         with self._lock:
-            self._send(codec.sync_write(Register.GOAL_POSITION, goals))
+            self._send(codec.sync_write(Register.GOAL_POSITION, data))
 
     def read_states(self, until_ns: int) -> list[Answer | None]:
         """Ask all servos for their state; returns when all have answered, and at ``until_ns`` at the latest.
@@ -163,11 +163,11 @@ class ServoBus:
             return [answers.get(servo) for servo in self._ids]
 
     def _take_state(self, packet: Packet, length: int, asked_ns: int, answers: dict[int, Answer]) -> None:
+        if packet.servo in self._ids and len(packet.data) != length:
+            self.counters.late += 1
+            return
         if packet.servo not in self._ids or packet.servo in answers:
             self.counters.unexpected += 1
-            return
-        if len(packet.data) != length:
-            self.counters.late += 1
             return
         try:
             answers[packet.servo] = Answer(codec.decode_state(packet.data), asked_ns)

@@ -73,7 +73,6 @@ class Register(IntEnum):
     MODE = 33
     TORQUE_ENABLE = 40
     GOAL_POSITION = 42
-    GOAL_SPEED = 46
     TORQUE_LIMIT = 48
     LOCK = 55
     POSITION = 56
@@ -89,10 +88,10 @@ TORQUE_OFF, TORQUE_ON = 0, 1
 POSITION_MODE = 0
 """Value of ``Register.MODE``."""
 
-IDENTITY_LENGTH = 40
-"""Bytes from ``Register.FIRMWARE`` that ``decode_identity`` takes."""
+IDENTITY_LENGTH = 50
+"""Bytes from ``Register.FIRMWARE`` that ``decode_identity`` takes; more than any state block has."""
 
-STATE_STARTS = tuple(range(Register.MODE, Register.TORQUE_ENABLE + 1))
+STATE_STARTS = tuple(range(Register.TORQUE_ENABLE - 15, Register.TORQUE_ENABLE + 1))
 """First addresses of the blocks that ``decode_state`` takes; all end behind ``Register.CURRENT``, so that the length of
 an answer tells which request it belongs to."""
 
@@ -161,7 +160,6 @@ class ServoState:
 
     torque_enable: int
     goal: int
-    goal_speed: int
     torque_limit: int
     position: int
     speed: int
@@ -274,6 +272,17 @@ def sync_write(register: int, data: Mapping[int, bytes]) -> bytes:
     return encode(Packet(BROADCAST_ID, Instruction.SYNC_WRITE, bytes([register, lengths.pop()]) + body))
 
 
+def goal(ticks: int, speed: int) -> bytes:
+    """Registers from ``Register.GOAL_POSITION`` on that send a servo to ``ticks`` at ``speed`` in its own unit.
+
+    Raises:
+        CodecError: they do not fit, or the speed is zero, which some servos take for their fastest.
+    """
+    if speed <= 0:
+        raise CodecError("speed", speed, "is not positive")
+    return signed_word(ticks) + word(0) + signed_word(speed)
+
+
 def word(value: int) -> bytes:
     """An unsigned 16-bit number. Raises CodecError."""
     if not 0 <= value <= 0xFFFF:
@@ -296,7 +305,7 @@ def from_signed_word(data: bytes, sign_bit: int = 15) -> int:
 
 
 def decode_identity(data: bytes) -> Identity:
-    """The first 40 registers of a servo. Raises CodecError."""
+    """The first 50 registers of a servo. Raises CodecError."""
     if len(data) != IDENTITY_LENGTH:
         raise CodecError("identity", len(data), f"is not {IDENTITY_LENGTH} bytes long")
     phase = data[Register.PHASE]
@@ -338,7 +347,6 @@ def decode_state(data: bytes) -> ServoState:
     return ServoState(
         torque_enable=at(Register.TORQUE_ENABLE)[0],
         goal=from_signed_word(at(Register.GOAL_POSITION)),
-        goal_speed=from_signed_word(at(Register.GOAL_SPEED)),
         torque_limit=int.from_bytes(at(Register.TORQUE_LIMIT), "little"),
         position=position,
         speed=from_signed_word(at(Register.SPEED)),
@@ -361,7 +369,7 @@ def cycle_time_s(servos: int, baudrate: int, return_delay_s: float) -> float:
 
     ``return_delay_s`` is the sum over the servos.
     """
-    goals = _OVERHEAD + 2 + 3 * servos
+    goals = _OVERHEAD + 2 + 7 * servos
     request = _OVERHEAD + 2 + servos
     answers = servos * (_OVERHEAD + state_length(STATE_STARTS[0]))
     return 10.0 * (goals + request + answers) / baudrate + return_delay_s

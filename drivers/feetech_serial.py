@@ -1,10 +1,11 @@
 """Arms of Feetech STS3215 bus servos (SO-100, SO-101 and home-made ones) on a serial port, over pyserial.
 
 The servos take goal positions only, so this driver owns the motion: a loop of its own turns expiring twists into joint
-setpoints (``drivers.joint_setpoint``) and sends the servos one small step per cycle; the same loop reads them.
+setpoints (``drivers.joint_setpoint``) and sends the servos one small step per cycle, each with the speed that it needs;
+the same loop reads them.
 
 What stops the arm: an expired twist, by slowing down in the loop; a dead host process, by there being no next step. The
-bus has **no watchdog**: each servo goes on to its last goal, which lies at most ``tracking_error_deg`` plus one step
+bus has **no watchdog**: each servo goes on to its last goal, which lies at most ``tracking_error_deg`` and two steps
 from where it was last seen, and holds there until somebody switches it off. Without power the arm sinks.
 
 Five joints cannot follow every twist. The tip's velocity comes first, rotation as far as it is left; what is lost
@@ -27,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers import feetech_codec as codec
 from drivers.abilities import StopCategory
-from drivers.arm import Arm
+from drivers.arm import Arm, LimitsConfig
 from drivers.clock import Clock
 from drivers.commands import Adjustment
 from drivers.device import DeactivatePolicy, Lifecycle, OperatorToken
@@ -48,7 +49,6 @@ from drivers.errors import (
 )
 from drivers.feetech_bus import Answer, ServoBus
 from drivers.feetech_codec import FaultBit, Register, ServoState
-from drivers.gate import TwistLimits
 from drivers.joint_setpoint import JointSetpoint
 from drivers.kinematics import ChainDescription, DifferentialIk, SerialChain, Tool
 from drivers.lease import Lease
@@ -64,9 +64,12 @@ _MAX_BUS_LOAD = 0.8
 _REST_SPEED_RAD_S = 0.03
 _FIRST_SAMPLE_S = 1.0
 _MISS_WINDOW = 50
+_ASKED_IN_VAIN = 3
 _TRIES = 3
+_ANSWER_TIMEOUT_S = 0.15
 _PLAUSIBLE_JUMP_RAD = 0.1
 _SPEED_MARGIN = 1.25
+_SLOWEST_RAD_S = 0.1
 _SHORTEST_RANGE_RAD = np.deg2rad(10.0)
 _MOVED_BY_HAND_TICKS = 20
 
@@ -124,10 +127,7 @@ class FeetechSerialConfig(DriverConfig):
     tracking_error_deg: Annotated[float, Field(gt=0.0, le=20.0)] = 8.0
     torque_limit_percent: Annotated[float, Field(ge=5.0, le=100.0)] = 60.0
 
-    tcp_speed_m_s: Positive = 0.10
-    tcp_accel_m_s2: Positive = 0.5
-    tcp_rot_speed_deg_s: Positive = 30.0
-    tcp_rot_accel_deg_s2: Positive = 150.0
+    limits: LimitsConfig = LimitsConfig()
 
     park_deg: tuple[float, ...] | None = None
     park_tolerance_deg: Positive = 5.0
@@ -143,8 +143,8 @@ class FeetechSerialConfig(DriverConfig):
                 f"max_silence_s {self.max_silence_s:g} is more than {len(codec.STATE_STARTS)} cycles of "
                 f"{self.rate_hz:g} Hz, within which a late answer can be told from a fresh one"
             )
-        if self.max_silence_s * self.rate_hz < 2:
-            raise ValueError(f"max_silence_s {self.max_silence_s:g} is less than two cycles of {self.rate_hz:g} Hz")
+        if self.max_silence_s * self.rate_hz < _ASKED_IN_VAIN:
+            raise ValueError(f"max_silence_s {self.max_silence_s:g} is less than three cycles of {self.rate_hz:g} Hz")
         if self.park_deg is not None and len(self.park_deg) != len(self.servos):
             raise ValueError(f"park_deg has {len(self.park_deg)} angles for {len(self.servos)} servos")
         if self.on_disconnect == "park_then_off" and self.park_deg is None:
@@ -157,20 +157,12 @@ class FeetechSerialConfig(DriverConfig):
         told = "\n".join(servo.model_dump_json() for servo in self.servos)
         return hashlib.sha256(told.encode()).hexdigest()[:12]
 
-    def limits(self) -> TwistLimits:
-        """What the gate allows."""
-        return TwistLimits(
-            self.tcp_speed_m_s,
-            self.tcp_accel_m_s2,
-            float(np.deg2rad(self.tcp_rot_speed_deg_s)),
-            float(np.deg2rad(self.tcp_rot_accel_deg_s2)),
-        )
-
     def describe(self) -> ChainDescription:
         """The arm, with its joints' ranges narrowed to the calibrated ones.
 
         Raises:
-            ConfigError: there is no such arm, it has another number of joints, or a joint has no range left.
+            ConfigError: there is no such arm, it has another number of joints, a joint has no range left, or the park
+                pose is outside it.
         """
         is_file = Path(self.chain).suffix in (".yaml", ".yml")
         found = ChainDescription.read(Path(self.chain)) if is_file else ChainDescription.shipped(self.chain)
@@ -189,6 +181,10 @@ class FeetechSerialConfig(DriverConfig):
                     key=f"servos[{index}]",
                     hint="correct zero_ticks, direction, min_ticks and max_ticks",
                 )
+            if self.park_deg is not None and not lower <= self.park_deg[index] <= upper:
+                raise ConfigError(
+                    f"is outside the limits of joint {joint.name}", key=f"park_deg[{index}]", value=self.park_deg[index]
+                )
             joints.append(joint.model_copy(update={"lower_deg": lower, "upper_deg": upper}))
         return found.model_copy(update={"joints": tuple(joints)})
 
@@ -203,10 +199,10 @@ class FeetechSerialArm(Arm):
     """
 
     def __init__(self, name: str, config: FeetechSerialConfig, clock: Clock) -> None:
-        super().__init__(name, clock, config.limits(), max_state_age_s=config.max_silence_s)
+        super().__init__(name, clock, config.limits.build(), max_state_age_s=config.max_silence_s)
         self._config = config
         self._chain = SerialChain(config.describe(), config.tool)
-        self._setpoint = JointSetpoint(self._chain, DifferentialIk(self._chain), config.limits())
+        self._setpoint = JointSetpoint(self._chain, DifferentialIk(self._chain), self.limits)
         self._ids = [servo.id for servo in config.servos]
         self._bus = ServoBus(name, self._ids, partial(_open_port, name, config), clock, echo=config.echo)
         self._thread: threading.Thread | None = None
@@ -228,7 +224,9 @@ class FeetechSerialArm(Arm):
         self._overruns = 0
         self._latest_s = 0.0
         self._missed: deque[bool] = deque(maxlen=_MISS_WINDOW)
+        self._in_vain = [0] * len(self._ids)
         self._lost: tuple[Adjustment, ...] = ()
+        self._follows_until_ns = 0
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
         """Newest joint angles and velocities, stamped when they were asked for. Servos measure no torque.
@@ -254,7 +252,9 @@ class FeetechSerialArm(Arm):
         """Whether setpoint and joints stand still."""
         sample = self._joints
         fresh = sample is not None and sample.age_s(self._clock.now_ns()) <= self._config.max_silence_s
-        if sample is None or not fresh or self._setpoint.moving:
+        # A twist that has just been taken over moves the setpoint in the next cycle only.
+        due = self._clock.now_ns() < self._follows_until_ns
+        if sample is None or not fresh or due or self._setpoint.moving:
             return False
         return bool((np.abs(sample.value.dq) <= _REST_SPEED_RAD_S).all())
 
@@ -302,8 +302,7 @@ class FeetechSerialArm(Arm):
     def _open(self) -> None:
         self._forget()
         self._bus.open()
-        for answer in self._fresh_answers():
-            self._enabled[self._ids.index(answer[0])] = answer[1].state.torque_enable == codec.TORQUE_ON
+        self._enabled = [answer.state.torque_enable == codec.TORQUE_ON for _, answer in self._fresh_answers()]
         self._closing.clear()
         self._thread = threading.Thread(target=self._run, name=f"{self.name} servos", daemon=True)
         self._thread.start()
@@ -334,8 +333,8 @@ class FeetechSerialArm(Arm):
                 )
             for index in range(len(self._ids)):
                 self._check_servo(index)
-                for register, value in self._settings(index).items():
-                    self._bus.write(self._ids[index], register, codec.word(value))
+            for servo in self._ids:
+                self._bus.write(servo, Register.TORQUE_LIMIT, codec.word(self._torque_limit))
 
     def _activate(self) -> None:
         with self._lock:
@@ -398,18 +397,24 @@ class FeetechSerialArm(Arm):
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
         if self._trouble is not None:
             raise CommandRejected(self.name, Rejection.MODE, "device is faulted", hint=str(self._trouble))
-        self._setpoint.follow(twist_base, now_ns + round(ttl_s * 1e9))
+        expires_ns = now_ns + round(ttl_s * 1e9)
+        self._setpoint.follow(twist_base, expires_ns)
+        self._follows_until_ns = expires_ns if twist_base.any() else 0
 
     def _begin_stop(self, category: StopCategory) -> None:
+        self._follows_until_ns = 0
         self._setpoint.stop()
 
-    def _settings(self, index: int) -> dict[Register, int]:
-        """What the servo must be told before it is used; a loss of power makes it forget."""
+    @property
+    def _torque_limit(self) -> int:
+        """As the servos count it. A loss of power makes them forget it."""
+        return round(self._config.torque_limit_percent * 10.0)
+
+    def _speed(self, index: int, dq: float) -> int:
+        """How fast a servo may turn to its goal, in its own unit: no faster than the motion asks for, lest every step
+        become a jerk and a wrong one a blow."""
         unit = self._bus.identity(self._ids[index]).speed_unit_ticks_s * codec.RAD_PER_TICK
-        return {
-            Register.GOAL_SPEED: int(np.ceil(_SPEED_MARGIN * self._chain.speed[index] / unit)),
-            Register.TORQUE_LIMIT: round(self._config.torque_limit_percent * 10.0),
-        }
+        return int(np.ceil(max(_SPEED_MARGIN * abs(dq), _SLOWEST_RAD_S) / unit))
 
     def _check_servo(self, index: int) -> None:
         servo, told = self._config.servos[index], self._bus.identity(self._ids[index])
@@ -444,8 +449,7 @@ class FeetechSerialArm(Arm):
         servo = self._ids[index]
         if found := codec.faults(state.status):
             raise _servo_fault(self.name, servo, state.status, found[0])
-        wanted = self._settings(index)
-        if (state.goal_speed, state.torque_limit) != (wanted[Register.GOAL_SPEED], wanted[Register.TORQUE_LIMIT]):
+        if state.torque_limit != self._torque_limit:
             raise _lost_power(self.name, servo)
         angle = self._angle(index, state.position)
         if not self._chain.lower[index] <= angle <= self._chain.upper[index]:
@@ -464,7 +468,7 @@ class FeetechSerialArm(Arm):
 
     def _enable(self, goals: list[int]) -> None:
         """Give every servo its goal, see that it has it and is there, then switch on; undone if anything fails."""
-        self._bus.write_goals(dict(zip(self._ids, goals, strict=True)))
+        self._bus.write_goals({s: (goals[i], self._speed(i, 0.0)) for i, s in enumerate(self._ids)})
         for (servo, answer), goal in zip(self._fresh_answers(), goals, strict=True):
             on = self._enabled[self._ids.index(servo)]
             if answer.state.goal != goal or (not on and abs(answer.state.position - goal) > _MOVED_BY_HAND_TICKS):
@@ -491,14 +495,14 @@ class FeetechSerialArm(Arm):
         """Every servo with its state, asked for now. Raises TransportTimeout."""
         silent = list(self._ids)
         for _ in range(_TRIES):
-            until_ns = self._clock.now_ns() + round(self._config.max_silence_s * 1e9)
-            answers = self._bus.read_states(until_ns)
+            answers = self._bus.read_states(self._clock.now_ns() + round(_ANSWER_TIMEOUT_S * 1e9))
             found = [(servo, a) for servo, a in zip(self._ids, answers, strict=True) if a is not None]
             if len(found) == len(self._ids):
                 self._answers = list(answers)
+                self._in_vain = [0] * len(self._ids)
                 return found
             silent = [servo for servo, answer in zip(self._ids, answers, strict=True) if answer is None]
-        raise TransportTimeout(self.name, f"state of servos {silent}", _TRIES * self._config.max_silence_s)
+        raise TransportTimeout(self.name, f"state of servos {silent}", _TRIES * _ANSWER_TIMEOUT_S)
 
     def _park(self) -> None:
         if self._config.park_deg is None:
@@ -546,29 +550,34 @@ class FeetechSerialArm(Arm):
     def _cycle(self, now_ns: int, dt_s: float, until_ns: int) -> None:
         if self._trouble is not None:
             self._latch(self._trouble)
+        due = self._setpoint.q
         if self._driving and any(self._enabled):
-            q, _ = self._setpoint.step(now_ns, dt_s)
+            q, dq = due, np.zeros_like(due)
+            # No step into the dark: whoever was not seen in the last cycle gets its old goal again.
+            if not (self._missed and self._missed[-1]):
+                q, dq = self._setpoint.step(now_ns, dt_s)
             self._bus.write_goals(
                 {
-                    servo.id: servo.ticks(angle)
-                    for servo, angle, on in zip(self._config.servos, q, self._enabled, strict=True)
-                    if on
+                    servo.id: (servo.ticks(q[index]), self._speed(index, dq[index]))
+                    for index, servo in enumerate(self._config.servos)
+                    if self._enabled[index]
                 }
             )
-        self._take(self._bus.read_states(until_ns))
+        self._take(self._bus.read_states(until_ns), due)
 
-    def _take(self, answers: list[Answer | None]) -> None:
+    def _take(self, answers: list[Answer | None], due: Array) -> None:
         good = [self._plausible(index, answer) for index, answer in enumerate(answers)]
         for index, answer in enumerate(good):
+            self._in_vain[index] += 1
             if answer is not None:
+                self._in_vain[index] = 0
                 self._answers[index] = answer
                 self._check_servo_in_use(index, answer.state)
         complete = [answer for answer in good if answer is not None]
-        if len(complete) == len(good):
-            self._publish(complete)
         self._missed.append(len(complete) < len(good))
         self._check_silence()
-        self._check_tracking()
+        if len(complete) == len(good):
+            self._check_tracking(self._publish(complete), due)
 
     def _plausible(self, index: int, answer: Answer | None) -> Answer | None:
         """The answer, unless the servo cannot have turned that far since the last one."""
@@ -582,7 +591,7 @@ class FeetechSerialArm(Arm):
         self._implausible += 1
         return None
 
-    def _publish(self, answers: list[Answer]) -> None:
+    def _publish(self, answers: list[Answer]) -> Array:
         q = np.array([self._angle(index, answer.state.position) for index, answer in enumerate(answers)])
         units = [self._bus.identity(servo).speed_unit_ticks_s for servo in self._ids]
         dq = np.array(
@@ -599,6 +608,7 @@ class FeetechSerialArm(Arm):
             self._seq,
             quality=Quality.GOOD if inside.all() else Quality.SUSPECT,
         )
+        return q
 
     def _check_servo_in_use(self, index: int, state: ServoState) -> None:
         if found := codec.faults(state.status):
@@ -610,22 +620,22 @@ class FeetechSerialArm(Arm):
     def _check_silence(self) -> None:
         now_ns = self._clock.now_ns()
         limit_s = self._config.max_silence_s
-        for servo, answer in zip(self._ids, self._answers, strict=True):
-            if answer is not None and (now_ns - answer.t_ns) * 1e-9 > limit_s:
+        for servo, answer, asked in zip(self._ids, self._answers, self._in_vain, strict=True):
+            # A host that was busy elsewhere has heard nothing either: it must have asked.
+            if answer is not None and asked >= _ASKED_IN_VAIN and (now_ns - answer.t_ns) * 1e-9 > limit_s:
                 self._latch(TransportTimeout(self.name, f"answer of servo {servo}", limit_s))
         full = len(self._missed) == self._missed.maxlen
         if full and sum(self._missed) > self._config.max_missed_fraction * len(self._missed):
             what = f"complete state in {sum(self._missed)} of {len(self._missed)} cycles"
             self._latch(TransportTimeout(self.name, what, 1.0 / self._config.rate_hz, hint="check plugs and supply"))
 
-    def _check_tracking(self) -> None:
-        if self._joints is None or not self._driving:
-            return
-        error = np.where(self._enabled, np.abs(self._joints.value.q - self._setpoint.q), 0.0)
+    def _check_tracking(self, q: Array, due: Array) -> None:
+        """Compare ``q`` with the goals of the cycle before, which the servos have had time to reach."""
+        error = np.where(self._enabled, np.abs(q - due), 0.0)
         worst = int(np.argmax(error))
-        if error[worst] > np.deg2rad(self._config.tracking_error_deg):
+        if self._driving and error[worst] > np.deg2rad(self._config.tracking_error_deg):
             # Hold where the arm is, so that whatever blocks it is no longer pushed against.
-            self._setpoint.reset(self._joints.value.q)
+            self._setpoint.reset(q)
             self._latch(
                 DeviceFault(
                     self.name,

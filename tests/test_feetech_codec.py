@@ -57,6 +57,13 @@ def test_signed_words_round_trip(case: tuple[int, int]) -> None:
     assert codec.from_signed_word(codec.signed_word(value, bit), bit) == value
 
 
+def test_goal_golden() -> None:
+    # 2048 ticks, no time, 150 units of speed: never 0, which is the fastest or none, as the servo likes.
+    assert codec.goal(2048, 150) == bytes.fromhex("0008 0000 9600")
+    with pytest.raises(CodecError):
+        codec.goal(2048, 0)
+
+
 @pytest.mark.parametrize("value", [32768, -32768, 10**9])
 def test_what_does_not_fit_is_refused(value: int) -> None:
     with pytest.raises(CodecError):
@@ -117,7 +124,6 @@ def state_block(start: int) -> bytes:
     table = bytearray(128)
     table[40] = 1
     table[42:44] = (3001).to_bytes(2, "little")
-    table[46:48] = (1280).to_bytes(2, "little")
     table[48:50] = (600).to_bytes(2, "little")
     table[56:58] = (3000).to_bytes(2, "little")
     table[58:60] = (0x8000 | 50).to_bytes(2, "little")
@@ -132,11 +138,12 @@ def test_every_state_block_tells_the_same(start: int) -> None:
     data = state_block(start)
     assert len(data) == codec.state_length(start)
     state = codec.decode_state(data)
-    assert state == codec.ServoState(1, 3001, 1280, 600, 3000, -50, -0.25, 12.1, 31, 0x20, pytest.approx(0.065))
+    assert state == codec.ServoState(1, 3001, 600, 3000, -50, -0.25, 12.1, 31, 0x20, pytest.approx(0.065))
 
 
-def test_state_blocks_have_eight_lengths() -> None:
-    assert sorted(codec.state_length(start) for start in codec.STATE_STARTS) == list(range(31, 39))
+def test_state_blocks_have_sixteen_lengths_and_no_other_answer_has_them() -> None:
+    assert sorted(codec.state_length(start) for start in codec.STATE_STARTS) == list(range(31, 47))
+    assert codec.IDENTITY_LENGTH not in range(31, 47)
 
 
 @pytest.mark.parametrize("position", [4096, 32767, 0x8001])
@@ -154,13 +161,13 @@ def test_any_block_is_a_state_within_bounds_or_refused(data: bytes) -> None:
         state = codec.decode_state(data)
     except CodecError:
         return
-    assert 31 <= len(data) <= 38
+    assert 31 <= len(data) <= 46
     assert 0 <= state.position < 4096
     assert -1.024 < state.load < 1.024
 
 
 def test_identity_golden() -> None:
-    table = bytearray(40)
+    table = bytearray(50)
     table[3:5] = b"\x09\x03"  # 777
     table[5], table[7], table[8], table[18], table[33] = 4, 250, 1, 0x0C, 0
     table[9:11], table[11:13] = (100).to_bytes(2, "little"), (4000).to_bytes(2, "little")
@@ -173,7 +180,7 @@ def test_identity_golden() -> None:
     told = codec.decode_identity(bytes(table))
     assert (told.multi_turn, told.speed_unit_ticks_s) == (True, 50)
     with pytest.raises(CodecError):
-        codec.decode_identity(bytes(39))
+        codec.decode_identity(bytes(40))
 
 
 def test_every_bit_of_the_status_is_a_known_fault() -> None:
@@ -199,5 +206,5 @@ def test_unwrapping_finds_the_count_nearest_to_the_middle(true: int, centre: flo
 
 
 def test_a_cycle_of_five_servos_on_the_wire() -> None:
-    # Goals 8 + 15, request 8 + 5, answers 5 * (6 + 38) bytes at 10 us each, and five times 500 us of waiting.
-    assert codec.cycle_time_s(5, 1_000_000, 2.5e-3) == pytest.approx(256 * 10e-6 + 2.5e-3)
+    # Goals 8 + 35, request 8 + 5, answers 5 * (6 + 46) bytes at 10 us each, and five times 500 us of waiting.
+    assert codec.cycle_time_s(5, 1_000_000, 2.5e-3) == pytest.approx(316 * 10e-6 + 2.5e-3)

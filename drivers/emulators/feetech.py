@@ -23,7 +23,7 @@ from drivers.emulators.base import CommandOnset, Emulator
 from drivers.feetech_codec import Instruction, Packet, Register
 from drivers.kinematics import ChainDescription, SerialChain, Tool
 
-_TICK_S = 2e-3
+_TICK_S = 5e-3
 _RESPONSE_S = 0.03
 _FASTEST_TICKS_S = 3073.0
 _STANDSTILL_TICKS_S = 1.0
@@ -33,7 +33,9 @@ _CALIBRATE_HERE = 128
 _LOG_LENGTH = 64
 _EEPROM_LENGTH = 40
 _TABLE_LENGTH = 128
+_GOAL_SPEED = 46
 _OVERLOAD = 1 << 5
+_LATCHED = _OVERLOAD | 1 << 3
 _CHANGES_POWER_MODE_OR_ZERO = frozenset(
     {
         Register.ID,
@@ -42,8 +44,6 @@ _CHANGES_POWER_MODE_OR_ZERO = frozenset(
         Register.HOMING_OFFSET + 1,
         Register.MODE,
         Register.TORQUE_ENABLE,
-        Register.GOAL_POSITION,
-        Register.GOAL_POSITION + 1,
     }
 )
 
@@ -148,15 +148,15 @@ class Servo:
             self.put(Register.HOMING_OFFSET, codec.signed_word(offset, 11))
             self._saved = bytes(self._table[:_EEPROM_LENGTH])
             self._table[Register.TORQUE_ENABLE] = codec.TORQUE_ON if was_on else codec.TORQUE_OFF
-        if was_on and command == codec.TORQUE_OFF:
-            self.status = 0
+        if register <= Register.TORQUE_ENABLE < register + len(data) and command == codec.TORQUE_OFF:
+            self.status &= ~_LATCHED
             self._strained_s = 0.0
 
     def step(self, dt_s: float) -> None:
         """Let time pass."""
         lowest, highest = (int.from_bytes(self.get(r, 2), "little") for r in (Register.MIN_TICKS, Register.MAX_TICKS))
         left = min(max(self.goal, lowest), highest) - self.position
-        speed = codec.from_signed_word(self.get(Register.GOAL_SPEED, 2)) or _FASTEST_TICKS_S
+        speed = codec.from_signed_word(self.get(_GOAL_SPEED, 2)) or _FASTEST_TICKS_S
         pushes = self.torque and not self.status & _OVERLOAD
         wanted = float(np.clip(left / _RESPONSE_S, -speed, speed)) if pushes else 0.0
         self.velocity = 0.0 if self.blocked else wanted
@@ -198,9 +198,10 @@ class FeetechArm(Emulator):
         "out_of_order": "this many answers are overtaken by the same servo's next one",
         "foreign": "this many answers carry an id that nobody asked for",
         "unplug": "the adapter vanishes",
-        "fault_bits": "[servo index, status bits]: the servo reports them",
+        "fault_bits": "[servo index, status bits]: the servo reports them; bits 3 and 5 until its torque is off",
         "block": "this servo (index) cannot turn",
         "carry": "[servo index, ticks]: somebody turns that servo's shaft by so much at once",
+        "registers": "[servo index, address, hexadecimal bytes]: what that servo has in its memory",
         "restart": "the servos lose power for a moment; or only that one, if the value is an index",
         "reset": "everything is as it was when the emulator started",
     }
@@ -295,6 +296,10 @@ class FeetechArm(Emulator):
             index, ticks = value
             self.servos[index].encoder += ticks
             del self.active[fault]
+        elif fault == "registers":
+            index, register, data = value
+            self.servos[index].put(register, bytes.fromhex(data))
+            del self.active[fault]
         elif fault == "restart":
             for servo in self.servos if value is True else [self.servos[value]]:
                 servo.power_up()
@@ -305,12 +310,15 @@ class FeetechArm(Emulator):
             self._plug_in()
 
     def on_clear(self, fault: str) -> None:
-        """Plug in again; let the servos turn."""
+        """Plug in again; let the servos turn; end the faults that are not latched."""
         if fault == "unplug" and self._master is None:
             self._plug_in()
         elif fault == "block":
             for servo in self.servos:
                 servo.blocked = False
+        elif fault == "fault_bits":
+            for servo in self.servos:
+                servo.status &= _LATCHED
 
     def _plug_in(self) -> None:
         self._master, self._slave = pty.openpty()
@@ -403,8 +411,11 @@ class FeetechArm(Emulator):
 
     def _write(self, servo: Servo, register: int, data: bytes) -> None:
         registers = set(range(register, register + len(data)))
-        self._log.append(f"{servo.number}:{register}={data.hex()}")
-        self._energising += bool(registers & _CHANGES_POWER_MODE_OR_ZERO)
+        if servo.get(register, len(data)) != data:
+            self._log.append(f"{servo.number}:{register}={data.hex()}")
+        # Some servos switch on when they are given a goal.
+        may_switch_on = Register.GOAL_POSITION in registers and not servo.torque
+        self._energising += may_switch_on or bool(registers & _CHANGES_POWER_MODE_OR_ZERO)
         if Register.GOAL_POSITION in registers:
             self._commands += 1
             self._onset.note(servo.number, data)
