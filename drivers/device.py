@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from types import TracebackType
 from typing import Self, final
 
 from drivers.clock import Clock
-from drivers.errors import DeviceError, LifecycleError
+from drivers.errors import CommandRejected, DeviceError, LifecycleError, TransportError
 
 
 class Lifecycle(Enum):
@@ -89,14 +90,14 @@ class Device(ABC):
         """PASSIVE -> READY: check and set parameters; nothing is energised."""
         self._require("configure", Lifecycle.PASSIVE)
         self._configure()
-        self._state = Lifecycle.READY
+        self._enter(Lifecycle.READY)
 
     @final
     def activate(self) -> None:
         """READY -> ACTIVE: the only call that energises; the setpoint starts at the present state."""
         self._require("activate", Lifecycle.READY)
         self._activate()
-        self._state = Lifecycle.ACTIVE
+        self._enter(Lifecycle.ACTIVE)
 
     @final
     def deactivate(self, policy: DeactivatePolicy = DeactivatePolicy.HOLD) -> None:
@@ -105,7 +106,7 @@ class Device(ABC):
             return
         self._require("deactivate", Lifecycle.ACTIVE)
         self._deactivate(policy)
-        self._state = Lifecycle.READY
+        self._enter(Lifecycle.READY)
 
     @final
     def recover(self, token: OperatorToken) -> None:
@@ -122,7 +123,9 @@ class Device(ABC):
             return
         try:
             if self._state is Lifecycle.ACTIVE:
-                self._deactivate(self._disconnect_policy())
+                # A device that cannot be reached cannot be stopped from here either.
+                with suppress(TransportError):
+                    self._deactivate(self._disconnect_policy())
         finally:
             self._state = Lifecycle.DISCONNECTED
             self._fault_error = None
@@ -143,17 +146,26 @@ class Device(ABC):
             hint = str(self._fault_error) if self._fault_error else ""
             raise LifecycleError(self.name, operation, self._state.value, [s.value for s in allowed], hint=hint)
 
+    def _enter(self, state: Lifecycle) -> None:
+        """Enter ``state``, unless a thread of the driver has latched a fault on the way: then raise that."""
+        if self._fault_error is not None:
+            raise self._fault_error
+        self._state = state
+
     def _to_faulted(self, error: DeviceError) -> DeviceError:
         """Latch the first fault; returns it so that callers can raise it."""
         if self._state is not Lifecycle.FAULTED:
-            self._state = Lifecycle.FAULTED
+            # The error first: who reads the state from another thread finds it.
             self._fault_error = error
+            self._state = Lifecycle.FAULTED
         return error
 
     def _attempt(self, step: Callable[[], None]) -> None:
-        """Run a step and latch FAULTED if the device fails in it."""
+        """Run a step and latch FAULTED if the device fails in it; a refused command is no failure."""
         try:
             step()
+        except CommandRejected:
+            raise
         except DeviceError as error:
             raise self._to_faulted(error) from None
 
