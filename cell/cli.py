@@ -84,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
     bench = commands.add_parser("bench", help="run time against error")
     bench.add_argument("name", nargs="?", help="which; `touchcell list` names them")
     bench.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for tables and plots")
-    bench.add_argument("rest", nargs=argparse.REMAINDER, help="arguments of the benchmark")
+    bench.add_argument("rest", nargs="*", help="arguments of the benchmark")
     bench.set_defaults(run=_bench)
 
     commands.add_parser("emulate", help="emulate a device on the wire", add_help=False)

@@ -32,7 +32,7 @@ def test_a_cell_that_ships_is_found_from_anywhere(tmp_path: Path, monkeypatch: p
 
 
 def test_unknown_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "--out", str(tmp_path), "nothing"]) == EXIT_BAD_INPUT
+    assert main(["bench", "nothing", "--out", str(tmp_path)]) == EXIT_BAD_INPUT
     assert "se3" in capsys.readouterr().err
 
 
