@@ -150,12 +150,21 @@ def _train_sim(options: argparse.Namespace) -> int:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
+    from rich.progress import Progress
+
     from perception.evaluate import evaluate, print_table
 
-    result = evaluate(options.data, options.split, options.model)
+    with Progress(transient=True, disable=not sys.stdout.isatty()) as bar:
+        images = bar.add_task("images", total=None)
+        result = evaluate(
+            options.data,
+            options.split,
+            options.model,
+            progress=lambda done, total: bar.update(images, completed=done, total=total),
+        )
     print_table(result)
     if options.json is not None:
-        options.json.write_text(result.to_json() + "\n")
+        result.write(options.json)
     return EXIT_OK
 
 
