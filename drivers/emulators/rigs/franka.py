@@ -1,0 +1,45 @@
+"""The Franka driver beside an emulated controller."""
+
+from __future__ import annotations
+
+from ipaddress import IPv4Address
+from pathlib import Path
+
+from drivers.clock import Clock
+from drivers.emulators.process import EmulatorProcess
+from drivers.emulators.rig import Rig
+from drivers.franka import SPEC, FrankaArm, FrankaConfig
+
+
+def rig(folder: Path, address: int) -> Rig:
+    """An arm at a loopback address of its own, since libfranka's port is fixed; it keeps nothing in ``folder``."""
+    host = str(IPv4Address("127.96.0.1") + address)
+    # Emulators run where no real-time kernel is.
+    config = FrankaConfig(host=host, enforce_realtime=False)
+
+    def start() -> EmulatorProcess:
+        return EmulatorProcess("franka", "--host", host).start()
+
+    def build(clock: Clock) -> FrankaArm:
+        return FrankaArm("arm", config, clock)
+
+    return Rig(
+        spec=SPEC,
+        start=start,
+        build=build,
+        faults={
+            "drop_states": (5, "transient"),
+            "out_of_order": (5, "transient"),
+            "nan": (3, "transient"),
+            "pause": (True, "fault"),
+            "unplug": (True, "fault"),
+            "restart": (True, "fault"),
+            "reflex": ("cartesian_reflex", "fault"),
+            "user_stop": (True, "fault"),
+        },
+        notes=(
+            "reflex thresholds, modes and recovery are as Franka documents them; a real arm brakes, this one stops",
+            "a state packet cut short is counted while the arm rests, but ends a motion: libfranka gives up",
+            "20 lost command packets stop the arm, as Franka documents it",
+        ),
+    )

@@ -1,0 +1,65 @@
+"""A periodic timer for emulators that must keep a device's rate: Linux timerfd in the asyncio loop.
+
+asyncio's own timers are rounded to a millisecond, which is the period of some robots.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import os
+import time
+from collections.abc import Callable
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
+
+
+class _Itimerspec(ctypes.Structure):
+    _fields_ = (("it_interval", _Timespec), ("it_value", _Timespec))
+
+
+class Ticker:
+    """Calls ``on_tick(late)`` from the running loop each period.
+
+    A late tick shifts the ones after it, so that two are never closer than three quarters of a period.
+
+    Args:
+        period_ns: below one second.
+        on_tick: called in the loop's thread with whether this tick was late.
+    """
+
+    def __init__(self, period_ns: int, on_tick: Callable[[bool], None]) -> None:
+        self._period_ns = period_ns
+        self._on_tick = on_tick
+        self._libc = ctypes.CDLL(None, use_errno=True)
+        self._fd: int = self._libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
+        if self._fd < 0:
+            raise OSError(ctypes.get_errno(), "timerfd_create")
+        self._arm()
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(self._fd, self._expired)
+
+    def close(self) -> None:
+        """Stop ticking."""
+        self._loop.remove_reader(self._fd)
+        os.close(self._fd)
+
+    def _arm(self) -> None:
+        period = _Timespec(0, self._period_ns)
+        if self._libc.timerfd_settime(self._fd, 0, ctypes.byref(_Itimerspec(period, period)), None):
+            raise OSError(ctypes.get_errno(), "timerfd_settime")
+        self._due_ns = time.monotonic_ns() + self._period_ns
+
+    def _expired(self) -> None:
+        try:
+            os.read(self._fd, 8)
+        except BlockingIOError:
+            return
+        late = time.monotonic_ns() - self._due_ns > self._period_ns // 4
+        if late:
+            self._arm()
+        else:
+            self._due_ns += self._period_ns
+        self._on_tick(late)
