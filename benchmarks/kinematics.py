@@ -1,0 +1,127 @@
+"""``touchcell bench kinematics``: what our kinematics cost and how well they follow.
+
+Prints the time per call, how far open-loop integration strays from an exact path, and what happens at a singularity.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.provenance import provenance
+from drivers.gate import TwistLimits
+from drivers.joint_setpoint import JointSetpoint
+from drivers.kinematics import ChainDescription, DifferentialIk, SerialChain, Tool
+from geometry.types import Array
+
+_CALLS = 5000
+_RATE_HZ = 250.0
+_DIAMETER_M = 0.15
+_LAP_S = 8.0
+_LIMITS = TwistLimits(0.10, 0.5, 0.5, 2.5)
+
+
+def run(arguments: Sequence[str], out: Path) -> None:
+    """Print the figures and write ``kinematics.json`` into ``out``."""
+    argparse.ArgumentParser(prog="touchcell bench kinematics", description=__doc__.partition("\n")[0]).parse_args(
+        arguments
+    )
+    chain = SerialChain(ChainDescription.shipped("generic_6r"), Tool(origin_mm=(0, 0, 80), mass_kg=0.15))
+    ik = DifferentialIk(chain)
+    working = np.deg2rad([0.0, 40.0, 90.0, 0.0, 50.0, 0.0])
+    times_us = _times(chain, ik, working)
+    path_mm, turn_deg = _circle(chain, ik, working)
+    fastest, smallest_m, reach_mm, off_mm = _reach_out(chain, ik, working)
+    print(f"{'call, six joints':32s}{'median us':>12s}{'p99 us':>10s}")
+    for name, (median_us, p99_us) in times_us.items():
+        print(f"{name:32s}{median_us:12.1f}{p99_us:10.1f}")
+    print(
+        f"\ncircle of {_DIAMETER_M * 1e3:.0f} mm in {_LAP_S:g} s at {_RATE_HZ:g} Hz, open loop: off the path at most "
+        f"{path_mm:.4f} mm, {turn_deg:.5f} deg"
+        f"\nreaching out at 0.1 m/s until it stops: fastest joint {fastest:.2f} rad/s, smallest singular value "
+        f"{smallest_m:.4f} m, {reach_mm:.0f} mm further out, off the line at most {off_mm:.2f} mm"
+    )
+    result = {
+        "provenance": provenance(),
+        "times_us": times_us,
+        "circle": {"off_mm": path_mm, "off_deg": turn_deg},
+        "reach_out": {
+            "fastest_joint_rad_s": fastest,
+            "smallest_singular_value_m": smallest_m,
+            "way_mm": reach_mm,
+            "off_mm": off_mm,
+        },
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "kinematics.json").write_text(json.dumps(result, indent=1) + "\n")
+    print(f"\nwritten: {out / 'kinematics.json'}")
+
+
+def _times(chain: SerialChain, ik: DifferentialIk, q: Array) -> dict[str, tuple[float, float]]:
+    """Median and 99th percentile of each call, microseconds."""
+    twist = np.array([0.05, 0.02, 0.0, 0.1, 0.0, 0.2])
+    near_singular = q * np.array([1.0, 1.0, 1.0, 1.0, 0.1, 1.0])
+    setpoint = JointSetpoint(chain, ik, _LIMITS)
+    setpoint.reset(q)
+    setpoint.follow(twist, 1 << 62)
+    for _ in range(60):
+        setpoint.step(0, 1.0 / _RATE_HZ)
+    calls: dict[str, Callable[[], object]] = {
+        "forward": lambda: chain.forward(q),
+        "forward and Jacobian": lambda: chain.forward_and_jacobian(q),
+        "gravity torques": lambda: chain.gravity_torques(q),
+        "differential IK": lambda: ik.solve(q, twist),
+        "differential IK near singular": lambda: ik.solve(near_singular, twist),
+        "setpoint step": lambda: setpoint.step(0, 0.0),
+    }
+    return {name: _time(call) for name, call in calls.items()}
+
+
+def _time(call: Callable[[], object]) -> tuple[float, float]:
+    taken = np.empty(_CALLS)
+    for k in range(_CALLS):
+        start_ns = time.perf_counter_ns()
+        call()
+        taken[k] = time.perf_counter_ns() - start_ns
+    median, p99 = np.percentile(taken, [50, 99]) * 1e-3
+    return float(median), float(p99)
+
+
+def _circle(chain: SerialChain, ik: DifferentialIk, q: Array) -> tuple[float, float]:
+    """Largest distance mm and angle deg from where the twists lead that the setpoint followed."""
+    dt_s, rate = 1.0 / _RATE_HZ, 2 * np.pi / _LAP_S
+    speed_m_s = rate * _DIAMETER_M / 2
+    setpoint = JointSetpoint(chain, ik, _LIMITS)
+    setpoint.reset(q)
+    start = chain.forward(q)
+    exact_m = start[:3, 3].copy()
+    worst_m = worst_rad = 0.0
+    for k in range(round(_LAP_S * _RATE_HZ)):
+        angle = rate * k * dt_s
+        setpoint.follow(speed_m_s * np.array([-np.sin(angle), np.cos(angle), 0.0, 0.0, 0.0, 0.0]), 1 << 62)
+        setpoint.step(0, dt_s)
+        exact_m += setpoint.twist[:3] * dt_s
+        reached = chain.forward(setpoint.q)
+        cosine = (np.trace(start[:3, :3].T @ reached[:3, :3]) - 1.0) / 2.0
+        worst_m = max(worst_m, float(np.linalg.norm(reached[:3, 3] - exact_m)))
+        worst_rad = max(worst_rad, float(np.arccos(min(cosine, 1.0))))
+    return worst_m * 1e3, float(np.rad2deg(worst_rad))
+
+
+def _reach_out(chain: SerialChain, ik: DifferentialIk, q: Array) -> tuple[float, float, float, float]:
+    """Fastest joint rad/s, smallest singular value m, way mm, and largest distance mm from the straight line."""
+    start_m = chain.forward(q)[:3, 3]
+    fastest, smallest_m, off_m = 0.0, np.inf, 0.0
+    for _ in range(round(10 * _RATE_HZ)):
+        motion = ik.solve(q, np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        q = q + motion.dq / _RATE_HZ
+        fastest = max(fastest, float(np.abs(motion.dq).max()))
+        smallest_m = min(smallest_m, motion.smallest_singular_value)
+        moved_m = chain.forward(q)[:3, 3] - start_m
+        off_m = max(off_m, float(np.linalg.norm(moved_m[1:])))
+    return fastest, smallest_m, float(moved_m[0]) * 1e3, off_m * 1e3

@@ -1,0 +1,38 @@
+"""What CAN error frames say, after linux/can/error.h (classes in the id, detail in the data)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+CONTROLLER = 0x004
+BUS_OFF = 0x040
+BUS_ERROR = 0x080
+RESTARTED = 0x100
+
+CLASSES: Mapping[int, str] = MappingProxyType(
+    {
+        0x001: "transmit timeout",
+        0x002: "lost arbitration",
+        CONTROLLER: "controller problem",
+        0x008: "protocol violation",
+        0x010: "transceiver status",
+        0x020: "no acknowledgement",
+        BUS_OFF: "bus-off",
+        BUS_ERROR: "bus error",
+        RESTARTED: "controller restarted",
+        0x200: "error counters changed",
+    }
+)
+
+_PASSIVE = 0x30
+
+
+def describe(arbitration_id: int) -> str:
+    """The error classes of an error frame, in words."""
+    return ", ".join(name for bit, name in CLASSES.items() if arbitration_id & bit) or "unspecified error"
+
+
+def is_error_passive(arbitration_id: int, data: bytes) -> bool:
+    """Whether the controller has become error-passive (data byte 1, receiver or transmitter)."""
+    return bool(arbitration_id & CONTROLLER) and len(data) > 1 and bool(data[1] & _PASSIVE)

@@ -1,0 +1,1 @@
+"""Descriptions of arms for ``drivers.kinematics``."""
