@@ -28,7 +28,9 @@ check: .venv/dev
 
 .venv/dev: .venv/core
 	$(BIN)/python -m pip install --quiet "$(TORCH)"
-	$(BIN)/python -m pip install --quiet --editable ".[train,dev,ur,franka,peers]"
+	$(BIN)/python -m pip install --quiet --editable ".[train,dev]"
+	$(BIN)/python -m pip install --quiet --editable ".[ur,franka,peers]" \
+		|| echo "the vendors' clients cannot be installed here: tests that need them are skipped"
 	touch $@
 
 clean:
