@@ -56,15 +56,12 @@ def plot_contact(run: Run, sensor: str, path: Path) -> Path:
     return path
 
 
-def plot_trajectory(run: Run, path: Path) -> Path | None:
+def plot_trajectory(run: Run, path: Path) -> Path:
     """The arms' paths from the side and from above with the tool's axis, coloured by the task's state."""
-    arms = run.roles("arms", "tcp")
-    if not arms:
-        return None
     figure, axes = plt.subplots(1, 2, figsize=(15, 6), layout="constrained")
     states = _states(run)
     colours = {state: _STATE_COLOURS[i % len(_STATE_COLOURS)] for i, state in enumerate(states)}
-    for arm in arms:
+    for arm in run.roles("arms", "tcp"):
         series = run.series(f"/arms/{arm}/tcp")
         assert series is not None
         T = tip_points(series)

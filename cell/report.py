@@ -96,8 +96,8 @@ def write_report(folder: Path) -> str:
 
     sensors = run.roles("sensors", "contact")
     pictures = [plot_contact(run, sensor, folder / f"contact_{sensor}.png") for sensor in sensors]
-    if (picture := plot_trajectory(run, folder / "trajectory.png")) is not None:
-        pictures.append(picture)
+    if run.roles("arms", "command"):
+        pictures.append(plot_trajectory(run, folder / "trajectory.png"))
     text = _text(folder, result, summary, pictures, run)
     (folder / "summary.txt").write_text(text + "\n")
     return text
@@ -139,9 +139,9 @@ def _sensor_errors(run: Run, sensor: str) -> dict[str, dict[str, dict[str, float
 
 
 def _difference(series: Series, selected: NDArray[np.bool_], truth: Series) -> dict[str, dict[str, float]] | None:
-    """Error of ``series`` against the nearest-in-time truth, RMS and mean absolute, per component."""
+    """Error of ``series`` against the truth of its time, RMS and mean absolute, per component."""
     poses, true = series.poses(), truth.poses()
-    index = np.clip(np.searchsorted(truth.t_s, series.t_s - 1e-6), 0, len(truth.t_s) - 1)
+    index = np.clip(np.searchsorted(truth.t_s, series.t_s + 1e-6, side="right") - 1, 0, len(truth.t_s) - 1)
     error = (poses - true[index])[selected]
     error = error[np.isfinite(error).all(axis=1)]
     return _statistics(error) if len(error) else None
