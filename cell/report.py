@@ -92,15 +92,23 @@ def write_report(folder: Path) -> str:
     result = json.loads(result_file.read_text()) if result_file.exists() else {}
     summary = summarise(run)
     (folder / "summary.json").write_text(json.dumps({**result, **summary}, indent=1) + "\n")
-    from cell.plots import plot_contact, plot_trajectory
-
-    sensors = run.roles("sensors", "contact")
-    pictures = [plot_contact(run, sensor, folder / f"contact_{sensor}.png") for sensor in sensors]
-    if run.roles("arms", "command"):
-        pictures.append(plot_trajectory(run, folder / "trajectory.png"))
-    text = _text(folder, result, summary, pictures, run)
+    text = _text(folder, result, summary, _pictures(run, folder), run)
     (folder / "summary.txt").write_text(text + "\n")
     return text
+
+
+def _pictures(run: Run, folder: Path) -> list[Path]:
+    from cell.plots import plot_agreement, plot_contact, plot_trajectory
+
+    moved = bool(run.roles("arms", "command"))
+    pictures = []
+    for sensor in run.roles("sensors", "contact"):
+        pictures.append(plot_contact(run, sensor, folder / f"contact_{sensor}.png", last_s=None if moved else 2.0))
+        if not moved and run.series(f"/sensors/{sensor}/truth") is not None:
+            pictures.append(plot_agreement(run, sensor, folder / f"agreement_{sensor}.png"))
+    if moved:
+        pictures.append(plot_trajectory(run, folder / "trajectory.png"))
+    return pictures
 
 
 def summarise(run: Run) -> dict[str, Any]:
