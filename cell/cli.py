@@ -91,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     bench = commands.add_parser("bench", help="run time against error")
     bench.add_argument("name", nargs="?", help="which; `touchcell list` names them")
     bench.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for tables and plots")
-    bench.add_argument("rest", nargs=argparse.REMAINDER, help="arguments of the benchmark")
+    bench.add_argument("rest", nargs="*", help="arguments of the benchmark")
     bench.set_defaults(run=_bench)
 
     commands.add_parser("emulate", help="emulate a device on the wire", add_help=False)
@@ -172,12 +172,21 @@ def _train_sim(options: argparse.Namespace) -> int:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
+    from rich.progress import Progress
+
     from perception.evaluate import evaluate, print_table
 
-    result = evaluate(options.data, options.split, options.model)
+    with Progress(transient=True, disable=not sys.stdout.isatty()) as bar:
+        images = bar.add_task("images", total=None)
+        result = evaluate(
+            options.data,
+            options.split,
+            options.model,
+            progress=lambda done, total: bar.update(images, completed=done, total=total),
+        )
     print_table(result)
     if options.json is not None:
-        options.json.write_text(result.to_json() + "\n")
+        result.write(options.json)
     return EXIT_OK
 
 

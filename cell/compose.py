@@ -46,7 +46,7 @@ class Sensor:
         source: tells its contact.
         arm_role: role of the arm that carries it, None where nothing moves it.
         T_tcp_sensor: (4, 4) its pose in that arm's tool frame.
-        truth: the simulator's own contact state, where there is one.
+        truth: what is known to be true: the simulator's own contact, or the label of a replayed image.
         frames: how images are recorded.
     """
 
@@ -223,11 +223,8 @@ def _sensor(
     plan: CellPlan, name: str, devices: Mapping[str, Device], scene: Scene | None, arm_of: Mapping[str, str]
 ) -> Sensor:
     section = plan.cell.sensors[name]
-    truth = None
-    if scene is not None:
-        from cell.truth import TrueContactSource
-
-        truth = TrueContactSource(scene, name)
+    T_tcp_sensor = se3.from_euler_mm_deg(np.array(section.tcp_to_sensor_mm_deg))
+    truth = _truth(name, devices.get(section.mounted_on or ""), scene, T_tcp_sensor)
     source: ContactSource
     if isinstance(section.estimator, NetworkEstimator):
         source = _pipeline(section, section.estimator, devices[name])
@@ -237,10 +234,19 @@ def _sensor(
     return Sensor(
         source=source,
         arm_role=arm_of[section.mounted_on] if section.mounted_on else None,
-        T_tcp_sensor=se3.from_euler_mm_deg(np.array(section.tcp_to_sensor_mm_deg)),
+        T_tcp_sensor=T_tcp_sensor,
         truth=truth,
         frames=plan.cell.recording.frames,
     )
+
+
+def _truth(name: str, mount: Device | None, scene: Scene | None, T_tcp_sensor: Array) -> ContactSource | None:
+    from cell.truth import LabelledContactSource, TrueContactSource
+    from drivers.replay_arm import ReplayArm
+
+    if scene is not None:
+        return TrueContactSource(scene, name)
+    return LabelledContactSource(mount, T_tcp_sensor) if isinstance(mount, ReplayArm) else None
 
 
 def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Device) -> ContactPipeline:

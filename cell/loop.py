@@ -179,7 +179,7 @@ class RunLoop:
                 contacts[role] = estimate
         perceived = time.perf_counter_ns()
         ended = bool(cell.sensors) and all(sensor.source.ended for sensor in cell.sensors.values())
-        observation = Observation(now_ns, states, contacts, operator_stop=self._stop.count > 0 or ended)
+        observation = Observation(now_ns, states, contacts, operator_stop=self._stop.count > 0, ended=ended)
         action = cell.task.tick(observation)
         thought = time.perf_counter_ns()
         verdict = cell.supervisor.review(_view(now_ns, states, contacts, action))

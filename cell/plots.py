@@ -28,8 +28,11 @@ _TIP_RADIUS_MM = 20.0
 _STATE_COLOURS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52", "#8172b3", "#937860", "#da8bc3", "#8c8c8c")
 
 
-def plot_contact(run: Run, sensor: str, path: Path) -> Path:
-    """Contact pose and shear over time: the estimate with two standard deviations, the truth, and the reference."""
+def plot_contact(run: Run, sensor: str, path: Path, *, last_s: float | None = None) -> Path:
+    """Contact pose and shear over time: the estimate with two standard deviations, the truth, and the reference.
+
+    ``last_s`` shows only the end of the run, for replayed images, of which each is another contact.
+    """
     contact = run.series(f"/sensors/{sensor}/contact")
     truth = run.series(f"/sensors/{sensor}/truth")
     task = run.series("/task")
@@ -50,21 +53,51 @@ def plot_contact(run: Run, sensor: str, path: Path) -> Path:
     axes.flat[0].legend(loc="best", fontsize=9)
     for axis in axes[-1]:
         axis.set_xlabel("time (s)")
+        if last_s is not None:
+            axis.set_xlim(contact.t_s[-1] - last_s, contact.t_s[-1])
     figure.suptitle(f"{sensor}: contact pose and shear of the sensor in the surface frame")
     figure.savefig(path, dpi=100)
     plt.close(figure)
     return path
 
 
-def plot_trajectory(run: Run, path: Path) -> Path | None:
+def plot_agreement(run: Run, sensor: str, path: Path) -> Path:
+    """Estimates against what is true, of single frames and of the filter, with the mean absolute error of each."""
+    truth = run.series(f"/sensors/{sensor}/truth")
+    assert truth is not None
+    figure, axes = plt.subplots(2, 3, figsize=(14, 9), layout="constrained")
+    for topic, label, colour, size in (
+        ("measurement", "one frame", "#c44e52", 5),
+        ("contact", "filtered", "#4c72b0", 5),
+    ):
+        series = run.series(f"/sensors/{sensor}/{topic}")
+        if series is None:
+            continue
+        index = np.clip(np.searchsorted(truth.t_s, series.t_s + 1e-6, side="right") - 1, 0, len(truth.t_s) - 1)
+        for axis, name in zip(axes.flat, _PANELS, strict=True):
+            true, value = truth.column(name)[index], series.column(name)
+            error = np.nanmean(np.abs(value - true))
+            axis.plot(true, value, ".", ms=size, alpha=0.35, color=colour, mew=0, label=f"{label}: {error:.3f}")
+    for axis, name in zip(axes.flat, _PANELS, strict=True):
+        low, high = axis.get_xlim()
+        axis.plot([low, high], [low, high], color="black", lw=0.8)
+        axis.set_title(_TITLES[name])
+        axis.set_xlabel("true")
+        axis.grid(alpha=0.3)
+        axis.legend(title="mean absolute error", fontsize=9, markerscale=2)
+    axes[0, 0].set_ylabel("estimate")
+    axes[1, 0].set_ylabel("estimate")
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+    return path
+
+
+def plot_trajectory(run: Run, path: Path) -> Path:
     """The arms' paths from the side and from above with the tool's axis, coloured by the task's state."""
-    arms = run.roles("arms", "tcp")
-    if not arms:
-        return None
     figure, axes = plt.subplots(1, 2, figsize=(15, 6), layout="constrained")
     states = _states(run)
     colours = {state: _STATE_COLOURS[i % len(_STATE_COLOURS)] for i, state in enumerate(states)}
-    for arm in arms:
+    for arm in run.roles("arms", "tcp"):
         series = run.series(f"/arms/{arm}/tcp")
         assert series is not None
         T = tip_points(series)

@@ -92,15 +92,23 @@ def write_report(folder: Path) -> str:
     result = json.loads(result_file.read_text()) if result_file.exists() else {}
     summary = summarise(run)
     (folder / "summary.json").write_text(json.dumps({**result, **summary}, indent=1) + "\n")
-    from cell.plots import plot_contact, plot_trajectory
-
-    sensors = run.roles("sensors", "contact")
-    pictures = [plot_contact(run, sensor, folder / f"contact_{sensor}.png") for sensor in sensors]
-    if (picture := plot_trajectory(run, folder / "trajectory.png")) is not None:
-        pictures.append(picture)
-    text = _text(folder, result, summary, pictures, run)
+    text = _text(folder, result, summary, _pictures(run, folder), run)
     (folder / "summary.txt").write_text(text + "\n")
     return text
+
+
+def _pictures(run: Run, folder: Path) -> list[Path]:
+    from cell.plots import plot_agreement, plot_contact, plot_trajectory
+
+    moved = bool(run.roles("arms", "command"))
+    pictures = []
+    for sensor in run.roles("sensors", "contact"):
+        pictures.append(plot_contact(run, sensor, folder / f"contact_{sensor}.png", last_s=None if moved else 2.0))
+        if not moved and run.series(f"/sensors/{sensor}/truth") is not None:
+            pictures.append(plot_agreement(run, sensor, folder / f"agreement_{sensor}.png"))
+    if moved:
+        pictures.append(plot_trajectory(run, folder / "trajectory.png"))
+    return pictures
 
 
 def summarise(run: Run) -> dict[str, Any]:
@@ -139,9 +147,9 @@ def _sensor_errors(run: Run, sensor: str) -> dict[str, dict[str, dict[str, float
 
 
 def _difference(series: Series, selected: NDArray[np.bool_], truth: Series) -> dict[str, dict[str, float]] | None:
-    """Error of ``series`` against the nearest-in-time truth, RMS and mean absolute, per component."""
+    """Error of ``series`` against the truth of its time, RMS and mean absolute, per component."""
     poses, true = series.poses(), truth.poses()
-    index = np.clip(np.searchsorted(truth.t_s, series.t_s - 1e-6), 0, len(truth.t_s) - 1)
+    index = np.clip(np.searchsorted(truth.t_s, series.t_s + 1e-6, side="right") - 1, 0, len(truth.t_s) - 1)
     error = (poses - true[index])[selected]
     error = error[np.isfinite(error).all(axis=1)]
     return _statistics(error) if len(error) else None

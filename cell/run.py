@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cell.cli import EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
-from cell.compose import compose
+from cell.compose import Cell, compose
 from cell.config import CellPlan, plan_cell
 from cell.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
 from cell.recording import Recorder
@@ -43,19 +43,19 @@ def run_cell(
         ConfigError, ModelError, ConnectError: before anything moves.
     """
     plan = plan_cell(path, {} if data is None else {"data": data}, model=model)
+    cell = compose(plan)
     folder = out or Path("runs") / f"{plan.cell.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(path, folder / "cell.yaml")
-    result = _run(plan, folder, live)
+    result = _run(cell, folder, live)
     (folder / "result.json").write_text(json.dumps(_result_json(plan, result), indent=1) + "\n")
     print(write_report(folder))
     return _EXIT[result.outcome]
 
 
-def _run(plan: CellPlan, folder: Path, live: bool) -> RunResult:
+def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
     stop = StopRequest()
-    cell = compose(plan)
-    with Recorder(folder / "run.mcap") as recorder, cell, _stop_on_signals(stop), _live_line(plan, live) as show:
+    with Recorder(folder / "run.mcap") as recorder, cell, _stop_on_signals(stop), _live_line(cell.plan, live) as show:
         return RunLoop(cell, recorder, stop=stop, on_cycle=show).run()
 
 

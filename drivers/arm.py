@@ -35,10 +35,10 @@ _SHORTEST_TTL_S = 1e-3
 class LimitsConfig(DriverConfig):
     """The ``limits:`` of an arm in the cell file: speeds and accelerations of the tool centre point."""
 
-    tcp_speed_m_s: float = Field(default=0.10, gt=0.0)
-    tcp_accel_m_s2: float = Field(default=0.5, gt=0.0)
-    tcp_rot_speed_rad_s: float = Field(default=0.5, gt=0.0)
-    tcp_rot_accel_rad_s2: float = Field(default=2.5, gt=0.0)
+    tcp_speed_m_s: float = Field(default=0.10, gt=0.0, le=1.0)
+    tcp_accel_m_s2: float = Field(default=0.5, gt=0.0, le=10.0)
+    tcp_rot_speed_rad_s: float = Field(default=0.5, gt=0.0, le=4.0)
+    tcp_rot_accel_rad_s2: float = Field(default=2.5, gt=0.0, le=20.0)
 
     def build(self) -> TwistLimits:
         """The gate's limits."""

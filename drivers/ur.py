@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from drivers import ur_codec
 from drivers.abilities import StopCategory
-from drivers.arm import Arm
+from drivers.arm import Arm, LimitsConfig
 from drivers.clock import Clock
 from drivers.device import DeactivatePolicy, Lifecycle, OperatorToken
 from drivers.errors import (
@@ -36,7 +36,6 @@ from drivers.errors import (
     TransportError,
     TransportTimeout,
 )
-from drivers.gate import TwistLimits
 from drivers.lease import Lease
 from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
 from drivers.samples import JointState, Stamped, TcpState
@@ -74,7 +73,7 @@ class UrConfig(DriverConfig):
     Attributes:
         host: address of the controller.
         flange_to_tcp_mm_deg: [x y z alpha beta gamma] of the tool centre point in the flange's frame, extrinsic xyz.
-        tcp_speed_m_s, tcp_accel_m_s2, tcp_rot_speed_deg_s, tcp_rot_accel_deg_s2: limits of streamed twists.
+        limits: of the tool centre point.
         stop_accel_m_s2: how hard it brakes, m/s2 and rad/s2; no gentler than the accelerations above.
         joint_speed_deg_s, joint_accel_deg_s2: of a joint goal at ``speed_fraction`` 1.
         watchdog_hz: the controller stops the program after silence of ``1 / watchdog_hz``.
@@ -84,11 +83,8 @@ class UrConfig(DriverConfig):
 
     host: str = Field(min_length=1)
     flange_to_tcp_mm_deg: tuple[float, float, float, float, float, float]
-    tcp_speed_m_s: Annotated[float, Field(gt=0.0, le=1.0)] = 0.10
-    tcp_accel_m_s2: Annotated[float, Field(gt=0.0, le=5.0)] = 0.5
-    tcp_rot_speed_deg_s: Annotated[float, Field(gt=0.0, le=180.0)] = 20.0
-    tcp_rot_accel_deg_s2: Annotated[float, Field(gt=0.0, le=500.0)] = 60.0
-    stop_accel_m_s2: Annotated[float, Field(gt=0.0, le=10.0)] = 2.0
+    limits: LimitsConfig = LimitsConfig()
+    stop_accel_m_s2: Annotated[float, Field(gt=0.0, le=10.0)] = 3.0
     joint_speed_deg_s: Annotated[float, Field(gt=0.0, le=180.0)] = 30.0
     joint_accel_deg_s2: Annotated[float, Field(gt=0.0, le=800.0)] = 60.0
     watchdog_hz: Annotated[float, Field(ge=_MIN_WATCHDOG_HZ, le=50.0)] = 10.0
@@ -106,17 +102,7 @@ class UrConfig(DriverConfig):
     @property
     def accel(self) -> float:
         """The one acceleration that speedL takes, m/s2 and rad/s2: large enough for both limits of the gate."""
-        return max(self.tcp_accel_m_s2, math.radians(self.tcp_rot_accel_deg_s2))
-
-    @property
-    def limits(self) -> TwistLimits:
-        """What the gate allows."""
-        return TwistLimits(
-            self.tcp_speed_m_s,
-            self.tcp_accel_m_s2,
-            math.radians(self.tcp_rot_speed_deg_s),
-            math.radians(self.tcp_rot_accel_deg_s2),
-        )
+        return max(self.limits.tcp_accel_m_s2, self.limits.tcp_rot_accel_rad_s2)
 
 
 class UrArm(Arm):
@@ -136,7 +122,7 @@ class UrArm(Arm):
     """
 
     def __init__(self, name: str, config: UrConfig, clock: Clock) -> None:
-        super().__init__(name, clock, config.limits, stop_categories=_STOPS)
+        super().__init__(name, clock, config.limits.build(), stop_categories=_STOPS)
         self._config = config
         self._flange_to_tcp = _pose_vector(se3.from_euler_mm_deg(np.array(config.flange_to_tcp_mm_deg)))
         self._receive: Any = None

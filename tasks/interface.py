@@ -34,12 +34,14 @@ class Observation:
         contacts: newest estimate of each tactile sensor, by role ("sensor", ...); a role is missing until its first
             frame has been processed.
         operator_stop: whether a person asked for an orderly end.
+        ended: whether no sensor will deliver anything more, because recordings have been played.
     """
 
     now_ns: int
     arms: Mapping[str, Stamped[TcpState]]
     contacts: Mapping[str, ContactEstimate]
     operator_stop: bool = False
+    ended: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -60,6 +60,7 @@ def observe_table(config: ObserveConfig) -> Table:
         (
             TransitionDef("frame", s.WAIT, s.OBSERVE),
             TransitionDef("timeout", s.WAIT, s.FAILED),
+            TransitionDef("ended", s.WAIT, s.FAILED),
             TransitionDef("ended", s.OBSERVE, s.DONE),
             TransitionDef("timeout", s.OBSERVE, s.DONE),
             TransitionDef(STOP, None, s.DONE),
@@ -90,6 +91,8 @@ class Observe(MachineTask):
             self._seq = contact.seq
             self._seen_ns = observation.now_ns
             self._frames += 1
+        if observation.ended:
+            self._machine.post("ended", "the recording has been played")
         if self._machine.state is ObserveState.WAIT and self._frames:
             self._machine.post("frame")
         idle_s = (observation.now_ns - self._seen_ns) * 1e-9

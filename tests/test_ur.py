@@ -149,9 +149,9 @@ def test_abilities_are_those_of_the_record() -> None:
     "wrong",
     [
         {"host": ""},
-        {"tcp_speed_m_s": 0.0},
-        {"tcp_speed_m_s": math.nan},
-        {"tcp_accel_m_s2": -1.0},
+        {"limits": {"tcp_speed_m_s": 0.0}},
+        {"limits": {"tcp_speed_m_s": math.nan}},
+        {"limits": {"tcp_accel_m_s2": -1.0}},
         {"stop_accel_m_s2": 0.2},
         {"watchdog_hz": 0.0},
         {"watchdog_hz": 1.0},

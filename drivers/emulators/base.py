@@ -15,7 +15,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import signal
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -146,8 +148,12 @@ def read_fault_script(path: Path) -> list[FaultEvent]:
     return sorted(events, key=lambda event: event.at_s)
 
 
-async def serve(emulator: Emulator, control: Path | None = None, script: Sequence[FaultEvent] = ()) -> None:
+async def serve(
+    emulator: Emulator, control: Path | None = None, script: Sequence[FaultEvent] = (), *, lifeline: bool = False
+) -> None:
     """Run ``emulator`` with its control channel and fault script until ``quit``, SIGTERM or SIGINT.
+
+    With ``lifeline`` it also ends when its standard input closes, which is when whoever started it is gone.
 
     Prints one line ``ready`` on standard output once the wire and the control channel are open.
     """
@@ -155,6 +161,8 @@ async def serve(emulator: Emulator, control: Path | None = None, script: Sequenc
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, done.set)
+    if lifeline:
+        loop.add_reader(sys.stdin.fileno(), _end_at_eof, done)
     await emulator.start()
     server = await asyncio.start_unix_server(_control(emulator, done), path=str(control)) if control else None
     player = asyncio.create_task(_play(emulator, script))
@@ -168,6 +176,11 @@ async def serve(emulator: Emulator, control: Path | None = None, script: Sequenc
         await emulator.stop()
         if control is not None:
             control.unlink(missing_ok=True)
+
+
+def _end_at_eof(done: asyncio.Event) -> None:
+    if not os.read(sys.stdin.fileno(), 4096):
+        done.set()
 
 
 def _control(emulator: Emulator, done: asyncio.Event) -> Any:

@@ -39,10 +39,11 @@ def main(arguments: Sequence[str]) -> int:
         child = parsers.add_parser(name)
         child.add_argument("--control", type=Path, help="UNIX socket of the control channel")
         child.add_argument("--fault-script", type=Path, help="YAML list of faults and when they happen")
+        child.add_argument("--lifeline", action="store_true", help="end when standard input closes")
         if name == wanted:
             cast(EmulatorModule, point.load()).add_arguments(child)
     options = parser.parse_args(arguments)
     script = read_fault_script(options.fault_script) if options.fault_script else ()
     emulator = cast(EmulatorModule, modules[options.name].load()).build(options)
-    asyncio.run(serve(emulator, options.control, script))
+    asyncio.run(serve(emulator, options.control, script, lifeline=options.lifeline))
     return 0

@@ -49,7 +49,12 @@ class EmulatorProcess:
         log_path = Path(self._folder.name) / "log"
         with log_path.open("wb") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "drivers.emulators", self._name, *self._arguments, "--control", str(control)],
+                [
+                    *(sys.executable, "-m", "drivers.emulators", self._name, *self._arguments),
+                    *("--control", str(control), "--lifeline"),
+                ],
+                # Closed by the kernel when this process dies, however it dies.
+                stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
                 env=os.environ | self._environment,
@@ -121,8 +126,9 @@ class EmulatorProcess:
             self._channel = None
         if self._process is not None:
             self._process.wait()
-            if self._process.stdout is not None:
-                self._process.stdout.close()
+            for stream in (self._process.stdin, self._process.stdout):
+                if stream is not None:
+                    stream.close()
         self._folder.cleanup()
 
     def __enter__(self) -> Self:
