@@ -132,6 +132,7 @@ class Bench:
         rig: short for the seat's.
         clock: what everything runs on; a virtual one passes only when somebody sleeps.
         device: the device under test, DISCONNECTED at first.
+        changed: set it if the emulator has to be put back to how it started.
         spoiled: set it if the emulator cannot serve another check.
     """
 
@@ -145,7 +146,8 @@ class Bench:
             seat.emulator()
         self.device = self.another()
         # An arm that falls when it is let go begins each check where it began the first.
-        self.spoiled = self.rig.spec.capabilities.falls_on_power_loss or not self.rig.process
+        self.changed = self.rig.spec.capabilities.falls_on_power_loss or not self.rig.process
+        self.spoiled = False
 
     @property
     def arm(self) -> Arm:
@@ -195,6 +197,16 @@ class Bench:
             device.disconnect()
         if self.spoiled and not self.is_real:
             self.seat.clear()
+        elif self.changed and not self.is_real:
+            self.restore()
+
+    def restore(self) -> None:
+        """Put the emulator back to how it started, or start another."""
+        if self.rig.reset is not None:
+            self.emulator.fault(self.rig.reset)
+            return
+        self.seat.clear()
+        self.seat.emulator()
 
     def begin(self, fault: str, value: Any) -> None:
         """Begin a fault in the emulator; it ends with the check at the latest."""

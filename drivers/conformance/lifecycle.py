@@ -212,8 +212,7 @@ def _cycle(bench: Bench) -> None:
     bench.active()
     bench.device.disconnect()
     if bench.rig.spec.capabilities.falls_on_power_loss:
-        bench.seat.clear()
-        bench.seat.emulator()
+        bench.restore()
 
 
 def _threads() -> int:

@@ -60,6 +60,7 @@ class Rig:
             keeps the machine's.
         faults: emulator faults to try, each with the driver's lawful answer: "transient" (counted, goes on), "unseen"
             (goes on; the vendor's library hides it), "stale" (StaleData), "fault" (FAULTED).
+        reset: fault that puts the emulator back to how it started, where a check would need a fresh one.
         known: checks that this driver is known to fail, each with the reason.
         state_rate_hz: rate that ``build`` configures, where it is not the one in the capability record.
         clock: makes the clock that everything in a check runs on.
@@ -75,6 +76,7 @@ class Rig:
     pose: str | None = None
     time: str | None = None
     faults: dict[str, tuple[Any, str]] = field(default_factory=dict)
+    reset: str | None = None
     known: dict[str, str] = field(default_factory=dict)
     state_rate_hz: float | None = None
     clock: Callable[[], Clock] = MonotonicClock

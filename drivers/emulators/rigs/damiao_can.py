@@ -47,6 +47,7 @@ def rig(folder: Path, address: int) -> Rig:
         build=lambda clock: damiao_can.DamiaoCanArm("arm", config(channel), clock),
         state_rate_hz=200.0,
         pose="T_base_tcp",
+        reset="reset",
         faults={
             "drop": (3, "transient"),
             "corrupt": (3, "transient"),

@@ -49,6 +49,7 @@ def rig(folder: Path, address: int) -> Rig:
         start=lambda: emulator(port).start(),
         build=lambda clock: feetech_serial.FeetechSerialArm("arm", config(port), clock),
         pose="T_base_tcp",
+        reset="reset",
         state_rate_hz=40.0,
         faults={
             "drop": (3, "transient"),
