@@ -16,7 +16,7 @@ EXIT_TRIPPED = 3
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0 done, 1 the task failed, 2 bad input, 3 an interlock tripped."""
+    """Run one command; returns the exit code: 0 done, 1 task or device failed, 2 bad input, 3 an interlock tripped."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words[:1] == ["emulate"]:
         from drivers.emulators.launcher import main as emulate
@@ -50,6 +50,13 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("cell", type=Path)
     check.add_argument("--data", type=Path, help=argparse.SUPPRESS)
     check.set_defaults(run=_check)
+
+    devices = commands.add_parser("devices", help="cameras, serial ports and CAN interfaces, and what they still need")
+    devices.set_defaults(run=_devices)
+
+    probe = commands.add_parser("probe", help="connect a cell's devices without energising any; print what they tell")
+    probe.add_argument("cell", type=Path)
+    probe.set_defaults(run=_probe)
 
     listing = commands.add_parser("list", help="known drivers, tasks, interlocks, emulators, benchmarks and cells")
     listing.set_defaults(run=_list)
@@ -116,6 +123,21 @@ def _check(options: argparse.Namespace) -> int:
     if plan.skipped:
         print(f"  not needed by this task and not built: {', '.join(plan.skipped)}")
     return EXIT_OK
+
+
+def _devices(options: argparse.Namespace) -> int:
+    from cell.devices import print_devices
+
+    print_devices()
+    return EXIT_OK
+
+
+def _probe(options: argparse.Namespace) -> int:
+    from cell.devices import print_probes, probe_cell
+
+    probes = probe_cell(find_cell(options.cell))
+    print_probes(probes)
+    return EXIT_TASK_FAILED if any(probe.error for probe in probes) else EXIT_OK
 
 
 def _list(options: argparse.Namespace) -> int:

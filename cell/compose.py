@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
 import numpy as np
 
-from cell.config import CellPlan, NetworkEstimator, SensorSection
+from cell.config import CellPlan, DevicePlan, NetworkEstimator, SensorSection
 from cell.messages import belief_message, pose_message
 from control.interlocks import build_interlocks
 from control.latch import Latch
@@ -163,12 +163,9 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
         ConfigError: an interlock names what is not there.
         ModelError: a model file cannot be used.
     """
-    cell_clock: Clock = clock or (VirtualClock() if plan.cell.time == "simulated" else MonotonicClock())
+    cell_clock = clock or _clock(plan)
     scene = _scene(plan, cell_clock)
-    devices: dict[str, Device] = {}
-    context = DriverContext(cell_clock, devices, scene, plan.cell.seed)
-    for device_plan in [*plan.arms.values(), *plan.sensors.values()]:
-        devices[device_plan.name] = device_plan.spec.build(device_plan.name, device_plan.config, context)
+    devices = build_devices(plan, {**plan.arms, **plan.sensors}, cell_clock, scene)
     arm_of = {name: role for role, name in plan.arm_roles.items()}
     arm_of |= {name: name for name in plan.arms if name not in arm_of}
     sensors = {role: _sensor(plan, name, devices, scene, arm_of) for role, name in plan.sensor_roles.items()}
@@ -186,9 +183,32 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
     )
 
 
+def build_devices(
+    plan: CellPlan, wanted: Mapping[str, DevicePlan], clock: Clock | None = None, scene: Scene | None = None
+) -> dict[str, Device]:
+    """Make the ``wanted`` devices of ``plan``, DISCONNECTED, each after those that it depends on.
+
+    Args:
+        plan: a checked cell file.
+        wanted: arms before the sensors that they carry.
+        clock: in place of the one that the file asks for.
+        scene: the simulated scene, if it is there already.
+    """
+    clock = clock or _clock(plan)
+    devices: dict[str, Device] = {}
+    context = DriverContext(clock, devices, scene or _scene(plan, clock), plan.cell.seed)
+    for name, device in wanted.items():
+        devices[name] = device.spec.build(name, device.config, context)
+    return devices
+
+
 def model_path(name: str) -> Path:
     """The file behind a cell file's ``model:``: a path, or ``builtin:NAME`` for one that ships with touchcell."""
     return MODELS / f"{name.removeprefix(BUILTIN)}.safetensors" if name.startswith(BUILTIN) else Path(name)
+
+
+def _clock(plan: CellPlan) -> Clock:
+    return VirtualClock() if plan.cell.time == "simulated" else MonotonicClock()
 
 
 def _scene(plan: CellPlan, clock: Clock) -> Scene | None:

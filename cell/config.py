@@ -137,6 +137,7 @@ class CellPlan:
         task: the task's spec.
         task_config: its validated parameters.
         skipped: devices of the file that this task does not need and that are not built.
+        devices: every device of the file, whether the task needs it or not.
     """
 
     file: Path
@@ -148,6 +149,7 @@ class CellPlan:
     task: TaskSpec
     task_config: TaskConfig
     skipped: tuple[str, ...]
+    devices: Mapping[str, DevicePlan]
 
 
 def plan_cell(path: Path, overrides: Mapping[str, Any] | None = None, *, model: str | None = None) -> CellPlan:
@@ -185,8 +187,10 @@ class _Planner:
         needed_sensors = set(sensor_roles.values())
         mounts = {cell.sensors[name].mounted_on for name in needed_sensors} - {None}
         needed_arms = set(arm_roles.values()) | mounts
-        arms = {name: plan for name in cell.arms if (plan := self._arm(cell, name)) and name in needed_arms}
-        sensors = {name: plan for name in cell.sensors if (plan := self._sensor(cell, name)) and name in needed_sensors}
+        devices = {name: plan for name in cell.arms if (plan := self._arm(cell, name))}
+        devices |= {name: plan for name in cell.sensors if (plan := self._sensor(cell, name))}
+        arms = {name: plan for name, plan in devices.items() if name in needed_arms}
+        sensors = {name: plan for name, plan in devices.items() if name in needed_sensors}
         if task:
             self._require_abilities(task, arm_roles, arms)
             self._require_interlocks(cell, task)
@@ -195,7 +199,9 @@ class _Planner:
         assert task is not None
         assert task_config is not None
         skipped = sorted((set(cell.arms) - set(arms)) | (set(cell.sensors) - set(sensors)))
-        return CellPlan(file.path, cell, arms, sensors, arm_roles, sensor_roles, task, task_config, tuple(skipped))
+        return CellPlan(
+            file.path, cell, arms, sensors, arm_roles, sensor_roles, task, task_config, tuple(skipped), devices
+        )
 
     @cached_property
     def _scene_model(self) -> type[BaseModel]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from geometry.gaussian import PoseGaussian
 
 from drivers.commands import Sent, TwistCommand
 from drivers.samples import Stamped, TcpState
 from geometry import se3
+from geometry.gaussian import PoseGaussian
 from geometry.types import Array
 from perception.estimate import ContactEstimate
 

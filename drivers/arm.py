@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import replace
 from typing import final
 
 import numpy as np
@@ -17,7 +18,7 @@ from pydantic import Field
 
 from drivers.abilities import StopCategory
 from drivers.clock import Clock
-from drivers.commands import Sent, TwistCommand, TwistFrame
+from drivers.commands import Adjustment, Sent, TwistCommand, TwistFrame
 from drivers.device import DeactivatePolicy, Device, Lifecycle
 from drivers.errors import CommandRejected, DeviceError, DeviceFault, FaultClass, LifecycleError, Rejection
 from drivers.gate import TwistGate, TwistLimits
@@ -109,6 +110,9 @@ class Arm(Device):
             StaleData: the pose is too old to turn a twist along tool axes.
         """
         sent = self._gate.admit(command, lease, self.state, self._tool_pose(command))
+        twist, lost = self._followable(sent.command.twist)
+        if lost:
+            sent = replace(sent, command=replace(sent.command, twist=twist), adjustments=sent.adjustments + lost)
         left_s = command.ttl_s - (sent.t_ns - command.t_ns) * 1e-9
         self._stream_twist(sent.command.twist, max(left_s, _SHORTEST_TTL_S), sent.t_ns)
         return sent
@@ -158,6 +162,10 @@ class Arm(Device):
     @abstractmethod
     def _begin_stop(self, category: StopCategory) -> None:
         """Begin to stop at once and return; called in ACTIVE and FAULTED, with an offered category only."""
+
+    def _followable(self, twist_base: Array) -> tuple[Array, tuple[Adjustment, ...]]:
+        """What the arm can follow of an admitted twist, and why it differs: all of it, unless a driver knows better."""
+        return twist_base, ()
 
     def _after_rest(self, policy: DeactivatePolicy) -> None:
         """Obey ``policy``; called when the arm stands still."""

@@ -18,6 +18,7 @@ import json
 import os
 import signal
 import sys
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -37,6 +38,31 @@ class FaultEvent:
     fault: str
     value: Any = True
     clear: bool = False
+
+
+class CommandOnset:
+    """When motion commands on the wire last began to change, for measuring how long a command takes to get there.
+
+    Attributes:
+        t_ns: CLOCK_MONOTONIC time of the last change that followed at least 50 ms without one; 0 before the first.
+    """
+
+    _CALM_NS = 50_000_000
+
+    def __init__(self) -> None:
+        self.t_ns = 0
+        self._content: dict[object, object] = {}
+        self._changed_ns = 0
+
+    def note(self, addressee: object, content: object) -> None:
+        """To be called with each motion command that arrives."""
+        if self._content.get(addressee) == content:
+            return
+        now_ns = time.monotonic_ns()
+        if now_ns - self._changed_ns >= self._CALM_NS:
+            self.t_ns = now_ns
+        self._content[addressee] = content
+        self._changed_ns = now_ns
 
 
 class Emulator(ABC):

@@ -20,7 +20,7 @@ import numpy as np
 
 from drivers import can_errors
 from drivers import damiao_codec as codec
-from drivers.emulators.base import Emulator
+from drivers.emulators.base import CommandOnset, Emulator
 from drivers.emulators.can_hub import Hub
 from drivers.kinematics import ChainDescription, SerialChain, Tool
 from geometry.types import Array
@@ -152,6 +152,7 @@ class DamiaoArm(Emulator):
         self._held_back: dict[int, can.Message] = {}
         self._energising = 0
         self._commands = 0
+        self._onset = CommandOnset()
         self._last_command_s: float | None = None
         self._let_go_position: list[float] | None = None
 
@@ -177,6 +178,7 @@ class DamiaoArm(Emulator):
             "dq_rad_s": self._dq.tolist(),
             "tau_n_m": self._tau.tolist(),
             "position_m": T_base_tcp[:3, 3].tolist(),
+            "T_base_tcp": T_base_tcp.tolist(),
             "still": bool((np.abs(self._dq) < 5e-3).all()),
             "energised": any(motor.status == codec.ENABLED for motor in self.motors),
             "enabled": sum(motor.status == codec.ENABLED for motor in self.motors),
@@ -186,6 +188,7 @@ class DamiaoArm(Emulator):
             "kp": [motor.command.kp for motor in self.motors],
             "target_rad": [motor.command.q for motor in self.motors],
             "commands": self._commands,
+            "command_onset_ns": self._onset.t_ns,
             "last_command_age_s": None if self._last_command_s is None else self._now_s() - self._last_command_s,
             "let_go_position_m": self._let_go_position,
             "clients": self._hub.client_count,
@@ -302,6 +305,7 @@ class DamiaoArm(Emulator):
             self._on_special(index, data)
         elif motor.status == codec.ENABLED:
             motor.command = codec.decode_mit(data, motor.ranges)
+            self._onset.note(index, data[:5])
         return self._feedback(index)
 
     def _on_special(self, index: int, data: bytes) -> None:

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from drivers.emulators.base import Emulator
+from drivers.emulators.base import CommandOnset, Emulator
 from drivers.emulators.franka_arm import EmulatedArm, Reflex, urdf
 from drivers.emulators.franka_codec import (
     PORT,
@@ -94,6 +94,7 @@ class FrankaEmulator(Emulator):
         self._first_command_seen = False
         self._lost = 0
         self._last_command_ms: int | None = None
+        self._onset = CommandOnset()
         self._at_last_command: list[float] | None = None
         self._reflex_detail = ""
         self._ticker: Ticker | None = None
@@ -133,6 +134,8 @@ class FrankaEmulator(Emulator):
             "connected": self._client is not None,
             "watchdog_s": _LOST_LIMIT * 1e-3,
             "time_ms": state.message_id,
+            "t_s": state.message_id * 1e-3,
+            "command_onset_ns": self._onset.t_ns,
             "last_command_ms": self._last_command_ms,
             "at_last_command_m": self._at_last_command,
             "force_threshold": arm.force_threshold.tolist(),
@@ -195,6 +198,8 @@ class FrankaEmulator(Emulator):
     def _accept(self) -> None:
         assert self._listener is not None
         client, _ = self._listener.accept()
+        # The one before may have hung up since the last tick.
+        self._read_requests()
         if self._client is not None:
             # The controller speaks to one client at a time.
             client.close()
@@ -354,6 +359,7 @@ class FrankaEmulator(Emulator):
         else:
             self._lost, self._first_command_seen = 0, True
             self._last_command_ms = self._state.message_id
+            self._onset.note("arm", (command.q, command.O_dP_EE))
             self._at_last_command = self._arm.T_base_ee[:3, 3].tolist()
         try:
             self._arm.step(command, _PERIOD_NS * 1e-9)

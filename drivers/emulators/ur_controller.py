@@ -9,6 +9,7 @@ from collections import Counter, deque
 import numpy as np
 
 from drivers.emulators import ur_model
+from drivers.emulators.base import CommandOnset
 from drivers.emulators.ur_motion import ArmState, Brake, Motion
 from drivers.emulators.ur_program import NAMES, PERIOD_S, ControlProgram, ProgramError
 from drivers.ur_codec import Value
@@ -47,6 +48,7 @@ class Controller:
         self._unlock_after_s = unlock_after_s
         self.energising = 0
         self.commands: Counter[str] = Counter()
+        self.onset = CommandOnset()
         self.messages: deque[str] = deque(maxlen=20)
         self.watchdog_trips = 0
         self.remote_control = True
@@ -128,6 +130,9 @@ class Controller:
     def write_inputs(self, values: dict[str, Value]) -> None:
         """Take over a data packet. Registers keep their values when a program stops or a client goes."""
         self.inputs.update(values)
+        speeds = tuple(value for name, value in values.items() if "double" in name)
+        if speeds:
+            self.onset.note("arm", speeds)
         for register in ("input_int_register_0", "input_int_register_24"):
             command = values.get(register)
             if isinstance(command, int):

@@ -45,6 +45,8 @@ def rig(folder: Path, address: int) -> Rig:
         spec=damiao_can.SPEC,
         start=start,
         build=lambda clock: damiao_can.DamiaoCanArm("arm", config(channel), clock),
+        state_rate_hz=200.0,
+        pose="T_base_tcp",
         faults={
             "drop": (3, "transient"),
             "corrupt": (3, "transient"),

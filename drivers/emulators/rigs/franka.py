@@ -11,9 +11,14 @@ from drivers.emulators.rig import Rig
 from drivers.franka import SPEC, FrankaArm, FrankaConfig
 
 
+def host_of(address: int) -> str:
+    """The loopback address of emulator ``address``: libfranka's port is fixed, so each needs its own."""
+    return str(IPv4Address("127.96.0.1") + address)
+
+
 def rig(folder: Path, address: int) -> Rig:
-    """An arm at a loopback address of its own, since libfranka's port is fixed; it keeps nothing in ``folder``."""
-    host = str(IPv4Address("127.96.0.1") + address)
+    """An arm at a loopback address of its own; it keeps nothing in ``folder``."""
+    host = host_of(address)
     # Emulators run where no real-time kernel is.
     config = FrankaConfig(host=host, enforce_realtime=False)
 
@@ -27,9 +32,11 @@ def rig(folder: Path, address: int) -> Rig:
         spec=SPEC,
         start=start,
         build=build,
+        time="t_s",
+        pose="T_base_ee",
         faults={
-            "drop_states": (5, "transient"),
-            "out_of_order": (5, "transient"),
+            "drop_states": (5, "unseen"),
+            "out_of_order": (5, "unseen"),
             "nan": (3, "transient"),
             "pause": (True, "fault"),
             "unplug": (True, "fault"),

@@ -31,6 +31,7 @@ def rig(folder: Path, address: int) -> Rig:
         start=start,
         build=build,
         position=None,
+        state_rate_hz=_RATE_HZ,
         faults={
             "drop": (2, "transient"),
             "corrupt": (2, "transient"),
