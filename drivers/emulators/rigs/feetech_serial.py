@@ -25,8 +25,8 @@ def config(port: Path, **changes: object) -> feetech_serial.FeetechSerialConfig:
         "servos": servos,
         "tool": TOOL,
         "park_deg": PARK_DEG,
-        "rate_hz": 20.0,
-        "max_silence_s": 0.8,
+        "rate_hz": 40.0,
+        "max_silence_s": 0.4,
     }
     return feetech_serial.FeetechSerialConfig.model_validate(settings | changes)
 
@@ -58,7 +58,7 @@ def rig(folder: Path, address: int) -> Rig:
             "jump": (3, "transient"),
             "foreign": (3, "transient"),
             "out_of_order": (3, "transient"),
-            "delay": (1.0, "fault"),
+            "delay": (0.6, "fault"),
             "pause": (True, "fault"),
             "silent": (2, "fault"),
             "fault_bits": ([1, 0x20], "fault"),
