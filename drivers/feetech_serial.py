@@ -5,7 +5,7 @@ setpoints (``drivers.joint_setpoint``) and sends the servos one small step per c
 the same loop reads them.
 
 What stops the arm: an expired twist, by slowing down in the loop; a dead host process, by there being no next step. The
-bus has **no watchdog**: each servo goes on to its last goal, which lies at most ``tracking_error_deg`` and two steps
+bus has **no watchdog**: each servo goes on to its last goal, which lies at most ``tracking_error_deg`` and three steps
 from where it was last seen, and holds there until somebody switches it off. Without power the arm sinks.
 
 Five joints cannot follow every twist. The tip's velocity comes first, rotation as far as it is left; what is lost
@@ -65,6 +65,7 @@ _REST_SPEED_RAD_S = 0.03
 _FIRST_SAMPLE_S = 1.0
 _MISS_WINDOW = 50
 _ASKED_IN_VAIN = 3
+_UNSEEN_CYCLES = 2
 _TRIES = 3
 _ANSWER_TIMEOUT_S = 0.15
 _PLAUSIBLE_JUMP_RAD = 0.1
@@ -553,8 +554,8 @@ class FeetechSerialArm(Arm):
         due = self._setpoint.q
         if self._driving and any(self._enabled):
             q, dq = due, np.zeros_like(due)
-            # No step into the dark: whoever was not seen in the last cycle gets its old goal again.
-            if not (self._missed and self._missed[-1]):
+            # One lost answer must not jerk the arm, but no further step goes into the dark.
+            if max(self._in_vain) < _UNSEEN_CYCLES:
                 q, dq = self._setpoint.step(now_ns, dt_s)
             self._bus.write_goals(
                 {
