@@ -69,8 +69,8 @@ def run(arguments: Sequence[str], out: Path) -> None:
         cells = (f"{format(row[key], form) if row.get(key) is not None else '-':>11}" for key, _, form in _COLUMNS)
         print(f"{name:<24}" + "".join(cells) + (f"  {row['error']}" if "error" in row else ""))
     print(
-        "\nwire: from send_twist to the emulator's receive stamp, always from rest. ttl, kill: from expiry or kill"
-        "\n-9 until the tool rests, or the motors of an arm without brakes let go. frozen: until the driver is FAULTED."
+        "\nwire: from send_twist to the emulator's receive stamp, always from rest. ttl, kill: from expiry or kill -9"
+        "\nuntil the tool rests, or the motors of an arm without brakes let go. frozen: until the driver is FAULTED."
     )
     out.mkdir(parents=True, exist_ok=True)
     (out / "devices.json").write_text(json.dumps({"provenance": provenance(), "rows": rows}, indent=1) + "\n")

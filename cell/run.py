@@ -85,7 +85,8 @@ def _live_line(plan: CellPlan, live: bool) -> Iterator[Any]:
         def show(progress: Progress) -> None:
             wall_s = time.monotonic() - started
             parts = [f"{plan.cell.name}  {progress.state:<10} t {progress.t_s:6.2f} s"]
-            parts += [f"{name} {value:.2f}" for name, value in list(progress.telemetry.items())[:4]]
+            errors = [item for item in progress.telemetry.items() if item[0].startswith("error_")]
+            parts += [f"{name.removeprefix('error_')} {value:+.2f}" for name, value in errors[:3]]
             parts.append(f"{progress.t_s / max(wall_s, 1e-3):.1f}x real time")
             display.update(Text("  ".join(parts)))
 

@@ -24,6 +24,14 @@ def test_control_channel_begins_and_ends_faults_and_refuses_unknown_ones() -> No
             emulator.fault("no_such_fault")
 
 
+def test_a_started_emulator_is_not_started_twice() -> None:
+    emulator = EmulatorProcess("ur", "--host", "127.77.0.3").start()
+    pid = emulator.pid
+    with emulator as same:
+        assert same.pid == pid
+    assert not _alive(pid)
+
+
 def test_an_emulator_dies_with_its_parent(tmp_path: Path) -> None:
     program = (
         "import os, signal\n"

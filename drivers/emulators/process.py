@@ -132,7 +132,7 @@ class EmulatorProcess:
         self._folder.cleanup()
 
     def __enter__(self) -> Self:
-        return self.start()
+        return self if self._process is not None else self.start()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
