@@ -1,7 +1,7 @@
 """Tests against emulators run beside processes with clocks of their own.
 
-A machine that is starved for a tenth of a second can make a lawful driver fault, as the real device would. Such tests are
-tried again, twice at most, and pytest counts every such case in its summary; all others have to pass at once.
+A machine that is starved for a tenth of a second can make a lawful driver fault, as the real device would. Such tests
+are tried again, twice at most, and pytest counts every such case in its summary; all others have to pass at once.
 """
 
 from __future__ import annotations
