@@ -42,7 +42,7 @@ from drivers.samples import JointState, Stamped, TcpState
 from drivers.ur_control import ControlLink
 from drivers.ur_modes import RobotMode, RuntimeState, SafetyMode, power_fault, program_fault, safety_fault
 from drivers.ur_registers import RtdeWire
-from drivers.ur_sdk import dashboard, retire
+from drivers.ur_sdk import dashboard
 from drivers.ur_state import RATE_HZ, VARIABLES, Snapshot, StateReader
 from geometry import se3
 from geometry.types import Array
@@ -258,7 +258,6 @@ class UrArm(Arm):
                 client.powerOff()
         self._power_off_by = None
         self._stop_receiving()
-        self._reader = None
 
     def _configure(self) -> None:
         self._refuse_if_unsafe()
@@ -301,8 +300,8 @@ class UrArm(Arm):
     def _recover(self, token: OperatorToken) -> None:
         self._drop_program()
         if not self._opened().connected:
-            self._stop_receiving()
             _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
+            # The old reader serves the thread until the new one has its first state.
             self._start_receiving()
         self._opened().forget()
         if self._program_is_ours:
@@ -437,9 +436,9 @@ class UrArm(Arm):
         self._reader = reader
 
     def _stop_receiving(self) -> None:
-        receive, self._receive = self._receive, None
-        if receive is not None:
-            retire(self.name, receive)
+        # Dropping the last reference closes the connection. Its own ``disconnect`` would leave descriptors behind.
+        self._reader = None
+        self._receive = None
 
     def _opened(self) -> StateReader:
         if self._reader is None:

@@ -1,14 +1,13 @@
 """What touchcell calls in ur-rtde 1.6.5 besides its state stream, and how it is kept from doing harm.
 
 Its constructors and destructors hold the interpreter's lock: call a constructor only right after the controller has
-answered, and never let a destructor run, because it sleeps 0.5 s during which no thread of the process would move.
+answered, and let a destructor run only when no arm moves, because it sleeps 0.5 s.
 """
 
 from __future__ import annotations
 
-import ctypes
-import threading
-import time
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -16,8 +15,7 @@ from typing import Any
 from drivers.errors import DeviceGone
 
 _DASHBOARD_S = 1.0
-_GOODBYE_S = 0.1
-_POLL_S = 0.001
+_UPLOAD_S = 10.0
 
 
 @contextmanager
@@ -36,39 +34,18 @@ def dashboard(device: str, host: str) -> Iterator[Any]:
 
 
 def upload_control_program(device: str, host: str) -> None:
-    """Send ur-rtde's control program to a controller on which none is playing, and let go of it.
-
-    The command register is cleared first, for it outlives programs and clients: a program that starts while it still
-    says speedL would move at once. ur-rtde's control interface does that on construction. It serves for nothing else,
-    since it reconnects by itself when the link drops, racing with its own threads: that repeats commands, takes the
-    registers from others, and was seen to crash the process.
+    """Send ur-rtde's control program to a controller on which none is playing, through ``drivers.ur_upload``.
 
     Raises:
         DeviceGone: the controller did not take it, or another client owns the registers.
     """
-    from rtde_control import RTDEControlInterface
-
+    command = [sys.executable, "-m", "drivers.ur_upload", host]
     try:
-        control = RTDEControlInterface(host, flags=RTDEControlInterface.FLAG_NO_WAIT)
-    except RuntimeError as error:
-        raise DeviceGone(device, f"RTDE control of {host}: {error}") from error
-    try:
-        control.reuploadScript()
-    except RuntimeError as error:
-        raise DeviceGone(device, f"upload to {host}: {error}") from error
-    finally:
-        retire(device, control)
-
-
-def retire(device: str, interface: Any) -> None:
-    """Disconnect an RTDE interface and never destroy it.
-
-    Disconnecting sleeps 0.5 s after the socket has been closed, which nobody needs to wait for. The reference that is
-    kept costs some kilobytes per activation.
-    """
-    ctypes.pythonapi.Py_IncRef(ctypes.py_object(interface))
-    goodbye = threading.Thread(target=interface.disconnect, name=f"{device} goodbye")
-    goodbye.start()
-    deadline_s = time.monotonic() + _GOODBYE_S
-    while interface.isConnected() and time.monotonic() < deadline_s:
-        goodbye.join(_POLL_S)
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_UPLOAD_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise DeviceGone(device, f"upload to {host}: no end within {_UPLOAD_S:g} s") from None
+    if done.returncode != 0:
+        reason = done.stderr.strip().rpartition("\n")[2] or f"ended with {done.returncode}"
+        raise DeviceGone(device, f"upload to {host}: {reason}")
