@@ -502,9 +502,10 @@ def test_nothing_leaks_over_fifty_sessions(make: Callable[..., V4l2Camera], emul
     emulator.wait_for(clients=0, streaming=False)
 
 
-def test_reading_starts_no_thread(camera: V4l2Camera) -> None:
-    read(camera, 3)
-    assert threading.active_count() == 1
+def test_reading_starts_no_thread(make: Callable[..., V4l2Camera]) -> None:
+    before = set(threading.enumerate())
+    read(ready(make()), 3)
+    assert set(threading.enumerate()) == before
 
 
 CLIENT = """
