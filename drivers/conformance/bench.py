@@ -132,6 +132,7 @@ class Bench:
         rig: short for the seat's.
         clock: what everything runs on; a virtual one passes only when somebody sleeps.
         device: the device under test, DISCONNECTED at first.
+        late_s: by how much the host overslept at worst while the last ``stream`` was sent.
         changed: set it if the emulator has to be put back to how it started.
         spoiled: set it if the emulator cannot serve another check.
     """
@@ -140,6 +141,7 @@ class Bench:
         self.seat = seat
         self.rig = seat.rig
         self.clock = self.rig.clock()
+        self.late_s = 0.0
         self._devices: list[Device] = []
         self._began: set[str] = set()
         if self.rig.start is not None:
@@ -307,9 +309,12 @@ class Bench:
     ) -> tuple[Track, Sent[TwistCommand]]:
         """Send ``twist`` at 50 Hz for a while; returns where the tool truly went, and the last command as sent."""
         recorder = _Recorder(self)
-        end_ns = self.clock.now_ns() + round(seconds * 1e9)
+        self.late_s = 0.0
+        due_ns = self.clock.now_ns()
+        end_ns = due_ns + round(seconds * 1e9)
         while True:
             now_ns = self.clock.now_ns()
+            self.late_s = max(self.late_s, (now_ns - due_ns) * 1e-9)
             try:
                 sent = self.arm.send_twist(self.command(twist, frame, ttl_s), lease)
             except DeviceError as error:
@@ -317,7 +322,8 @@ class Bench:
             recorder.note()
             if now_ns >= end_ns:
                 return recorder.track(), sent
-            self.clock.sleep_until_ns(now_ns + _PERIOD_NS)
+            due_ns = now_ns + _PERIOD_NS
+            self.clock.sleep_until_ns(due_ns)
 
     def track_to_rest(self, within_s: float, ended: Callable[[dict[str, Any]], bool] | None = None) -> Track:
         """Watch the true pose until it rests (or ``ended`` says so of the truth); fails the check if it does not.

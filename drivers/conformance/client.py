@@ -25,7 +25,7 @@ from drivers.arm import Arm
 from drivers.clock import MonotonicClock
 from drivers.commands import TwistCommand, TwistFrame
 from drivers.emulators.rig import RigFunction
-from drivers.errors import TransportTimeout
+from drivers.errors import DeviceGone, TransportTimeout
 
 _PERIOD_NS = 20_000_000
 _WARM_UP = 20
@@ -66,7 +66,7 @@ class MovingClient:
             selector.register(self._process.stdout, selectors.EVENT_READ)
             line = self._process.stdout.readline() if selector.select(_START_TIMEOUT_S) else ""
         if not line:
-            self.kill()
+            self._reap()
             raise TransportTimeout("client", "motion of the client process", _START_TIMEOUT_S)
         self.silence_s = float(line)
         return self
@@ -74,11 +74,20 @@ class MovingClient:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.kill()
+        self._reap()
 
     def kill(self) -> None:
-        """SIGKILL."""
+        """SIGKILL. Raises DeviceGone if it had ended by itself, so that there was nothing to kill."""
         process = self._process
+        if process is None:
+            return
+        ended = process.poll()
+        self._reap()
+        if ended is not None:
+            raise DeviceGone("client", f"ended by itself with code {ended} before it was killed")
+
+    def _reap(self) -> None:
+        process, self._process = self._process, None
         if process is not None:
             process.kill()
             process.wait()

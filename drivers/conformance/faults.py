@@ -15,7 +15,8 @@ from drivers.lease import Lease
 
 _NOTICED_S = 3.0
 _CALM_S = 0.25
-_RECOVERED_S = 5.0
+_RECOVERED_S = 2.0
+_RECONNECTED_S = 5.0
 _SLOW_M_S = 0.01
 _BEYOND_ANY_BUDGET = 2000
 _BUDGETED = ("drop", "drop_states", "corrupt", "nan", "error_flag", "out_of_order")
@@ -176,7 +177,7 @@ def _serves_again(bench: Bench) -> None:
             # It fell; somebody has to lift it.
             bench.device.disconnect()
             bench.restore()
-        bench.reconnect(_RECOVERED_S)
+        bench.reconnect(_RECONNECTED_S)
 
 
 def _reads(bench: Bench) -> bool:

@@ -14,6 +14,8 @@ _STEADY_S = 0.3
 _HOST_DELAY_S = 0.06
 """How late a busy host may be, on top of what the record says."""
 _TTL_S = 0.2
+_ATTEMPTS = 3
+_LATE_S = 0.01
 _AXES = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
@@ -39,14 +41,20 @@ def _follows_all_axes(bench: Bench, frame: TwistFrame) -> None:
         if not follows:
             continue
         asked = sign * bench.twist(axis)
-        track, sent = bench.stream(lease, asked, _STREAM_S, frame=frame)
-        bench.arm.stop()
-        bench.settle()
-        got = track.since(track.t_ns[-1] - _STEADY_S * 1e9).mean_twist(frame)
-        size = abs(asked[axis])
-        aside = np.delete(got[:3] if axis < 3 else got[3:], axis % 3)
-        if sent.adjustments or abs(got[axis] - asked[axis]) > 0.2 * size or np.abs(aside).max() > 0.2 * size:
-            wrong.append(f"{_AXES[axis]} {asked[axis]:+.3f}: {np.round(got, 4).tolist()}")
+        for _ in range(_ATTEMPTS):
+            track, sent = bench.stream(lease, asked, _STREAM_S, frame=frame)
+            bench.arm.stop()
+            bench.settle()
+            got = track.since(track.t_ns[-1] - _STEADY_S * 1e9).mean_twist(frame)
+            size = abs(asked[axis])
+            aside = np.delete(got[:3] if axis < 3 else got[3:], axis % 3)
+            followed = abs(got[axis] - asked[axis]) <= 0.2 * size and np.abs(aside).max() <= 0.2 * size
+            good = followed and not sent.adjustments
+            # What was measured while the host overslept says nothing about the driver.
+            if good or bench.late_s < _LATE_S:
+                break
+        if not good:
+            wrong.append(f"{_AXES[axis]} {asked[axis]:+.3f}: {np.round(got, 4).tolist()} {sent.adjustments}")
     assert not wrong, "the tool truly moved otherwise:\n" + "\n".join(wrong)
 
 
@@ -67,7 +75,10 @@ def time_to_live_stops_the_motion(bench: Bench) -> None:
     lease = bench.leased()
     bench.settle()
     asked = bench.twist(bench.axis())
-    track, _ = bench.stream(lease, asked, _STREAM_S, ttl_s=_TTL_S)
+    for _ in range(_ATTEMPTS):
+        track, _sent = bench.stream(lease, asked, _STREAM_S, ttl_s=_TTL_S)
+        if bench.late_s < _LATE_S:
+            break
     expires_ns = track.t_ns[-1] + _TTL_S * 1e9
     steady = track.since(track.t_ns[-1] - _STEADY_S * 1e9).mean_twist(TwistFrame.BASE)
     assert np.linalg.norm(steady[:3]) > 0.5 * bench.speed()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import math
 import select
 import socket
 import struct
@@ -100,7 +101,10 @@ class HubBus(can.BusABC):  # type: ignore[misc]
             raise can.CanOperationError(f"adapter is gone: {error}", error.errno) from error
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        if not select.select([self._socket], [], [], timeout)[0]:
+        # Not select(), which knows no file beyond number 1023.
+        poller = select.poll()
+        poller.register(self._socket, select.POLLIN)
+        if not poller.poll(None if timeout is None else math.ceil(1e3 * timeout)):
             return None, False
         try:
             packet = self._socket.recv(128)

@@ -45,7 +45,7 @@ def rig(folder: Path, address: int) -> Rig:
         spec=damiao_can.SPEC,
         start=start,
         build=lambda clock: damiao_can.DamiaoCanArm("arm", config(channel), clock),
-        state_rate_hz=200.0,
+        state_rate_hz=125.0,
         pose="T_base_tcp",
         reset="reset",
         faults={
