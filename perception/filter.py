@@ -8,7 +8,7 @@ of two Gaussians on the manifold. Training poses are drawn evenly, so dividing b
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -27,8 +27,24 @@ class FilterState:
     nis: float | None = None
 
 
+class ContactFilter(Protocol):
+    """What a pipeline asks of a filter; ``PoseFilter`` and ``moving_surface.MovingSurfaceFilter`` offer it."""
+
+    def reset(self) -> None:
+        """Forget everything: the next observation starts a new contact."""
+        ...
+
+    def predict(self, T_base_sensor: Array, t_ns: int) -> PoseGaussian:
+        """Belief after the sensor has moved to ``T_base_sensor`` at ``t_ns``; the state itself stays."""
+        ...
+
+    def update(self, observation: PoseGaussian, T_base_sensor: Array, t_ns: int) -> FilterState:
+        """Fuse an observation made at ``t_ns`` with the sensor at ``T_base_sensor``; returns the new state."""
+        ...
+
+
 class PoseFilter:
-    """Filters observations of ``T_s_f`` from a moving sensor.
+    """Filters observations of ``T_s_f`` of a still surface, from a moving sensor.
 
     Args:
         noise_density: (6, 6) growth of the covariance per second, [v, w], m^2/s and rad^2/s, sensor frame. It stands
