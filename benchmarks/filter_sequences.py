@@ -130,9 +130,7 @@ def single_frames(sequence: ContactSequence) -> Track:
     return Track(contact_from_xi(sequence.xi), sequence.sigma, np.array(nees), np.empty(0))
 
 
-def filtered(
-    sequence: ContactSequence, level: float, make: Callable[[Array], PoseFilter] = PoseFilter
-) -> Track:
+def filtered(sequence: ContactSequence, level: float, make: Callable[[Array], PoseFilter] = PoseFilter) -> Track:
     """A filter over the sequence.
 
     Args:

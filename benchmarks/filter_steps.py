@@ -28,9 +28,9 @@ CORRECTIONS: dict[str, Correction] = {
 
 
 def corrections(draws: int, seed: int = 0) -> list[dict[str, Any]]:
-    """Rows of method and sigma: time, distance from the optimum in posterior sigmas, NEES of truth drawn from the prior.
+    """Rows of method and sigma: time, distance from the optimum in posterior sigmas, and NEES of the truth.
 
-    The NEES of the exact product of two Gaussians on the manifold is 6.
+    Prior and observation each miss the truth by a draw of their own covariance, so an exact product has a NEES of 6.
     """
     rows = []
     for sigma in SIGMAS_RAD:
@@ -74,7 +74,9 @@ def predictions(draws: int, seed: int = 0) -> list[dict[str, Any]]:
         for order in orders:
             prior = PoseGaussian(mean, P)
 
-            def step(order: Literal[2, 4] = order, prior: PoseGaussian = prior, U: Array = U, Q: Array = Q) -> PoseGaussian:
+            def step(
+                order: Literal[2, 4] = order, prior: PoseGaussian = prior, U: Array = U, Q: Array = Q
+            ) -> PoseGaussian:
                 return gaussian.compound(U, prior, Q, order)
 
             error = float(np.linalg.norm((step().covariance - exact) * scale) / size)
