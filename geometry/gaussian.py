@@ -176,7 +176,7 @@ def fuse(
 
     Args:
         prior, observation: over the same pose, in the same frames.
-        tolerance: stop when the next step is shorter than this, in standard deviations of the result.
+        tolerance: stop when the next step is shorter than this, in standard deviations of the result, or than rounding.
         max_iterations: updates allowed. Filters take 2 to 7, means 3 rad apart 20.
 
     Raises:
