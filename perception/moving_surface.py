@@ -32,10 +32,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry import gaussian, se3
-from geometry.errors import GeometryError
 from geometry.gaussian import NotPositiveDefinite, PoseGaussian
 from geometry.types import Array
-from perception.filter import FilterState
+from perception.filter import FilterState, require_noise_density, require_pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,9 +63,7 @@ class MovingSurfaceFilter:
     """
 
     def __init__(self, noise_density: Array, twist_noise_density: Array, first_twist_covariance: Array) -> None:
-        # compound and PoseGaussian know what makes a covariance.
-        identity = PoseGaussian(np.eye(4), np.eye(6))
-        gaussian.compound(np.eye(4), identity, noise_density)
+        require_noise_density(noise_density)
         self._noise_density = noise_density
         self._twist_noise_density = PoseGaussian(np.eye(4), twist_noise_density).covariance
         self._first_twist_covariance = PoseGaussian(np.eye(4), first_twist_covariance).covariance
@@ -96,12 +93,17 @@ class MovingSurfaceFilter:
         return self._moved(T_base_sensor, t_ns)[0]
 
     def update(self, observation: PoseGaussian, T_base_sensor: Array, t_ns: int) -> FilterState:
-        """Fuse an observation made at ``t_ns`` with the sensor at ``T_base_sensor``; returns the new state."""
+        """Fuse an observation made at ``t_ns`` with the sensor at ``T_base_sensor``; returns the new state.
+
+        Raises:
+            GeometryError: ``T_base_sensor`` is no pose, or the fusion did not converge; the state stays as it was.
+            ValueError: ``t_ns`` lies before the state's time.
+        """
         if self._state is None:
             covariance = np.zeros((12, 12))
             covariance[:6, :6], covariance[6:, 6:] = observation.covariance, self._first_twist_covariance
             self._motion = SurfaceMotion(np.zeros(6), covariance)
-            self._state = FilterState(observation, _checked(T_base_sensor), t_ns)
+            self._state = FilterState(observation, require_pose(T_base_sensor), t_ns)
             return self._state
         prior, motion = self._moved(T_base_sensor, t_ns)
         fused, record = gaussian.fuse(prior, observation)
@@ -148,10 +150,3 @@ def _corrected(motion: SurfaceMotion, prior: PoseGaussian, fused: PoseGaussian) 
     rest = N @ N.T + KS @ K.T
     covariance = np.block([[S, KS.T], [KS, 0.5 * (rest + rest.T)]])
     return SurfaceMotion(motion.twist + G @ e, covariance)
-
-
-def _checked(T_base_sensor: Array) -> Array:
-    if np.shape(T_base_sensor) != (4, 4):
-        raise GeometryError("MovingSurfaceFilter.update", "T_base_sensor", "is not one (4, 4) pose")
-    se3.inverse(T_base_sensor)
-    return T_base_sensor
