@@ -55,7 +55,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
         _print_steps(result)
         _plot_steps(result, out / "filter_steps.png")
     if "tracking" in options.only:
-        result["tracking"] = _tracking(options.seconds)
+        result["tracking"] = _tracking(options.seconds, options.sim_model)
         _plot_tracking(result["tracking"], out / "filter_tracking.png")
     (out / "filter.json").write_text(json.dumps(result, indent=1) + "\n")
     print(f"\nwritten: {', '.join(sorted(str(path) for path in out.glob('filter*')))}")
@@ -70,6 +70,7 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--contacts", type=int, default=400, help="length of a simulated sequence")
     parser.add_argument("--draws", type=int, default=1000, help="random pairs for each row of the steps")
     parser.add_argument("--seconds", type=float, default=20.0, help="how long the plate is tracked")
+    parser.add_argument("--sim-model", type=Path, help="network for the tracking, in place of Gaussian errors")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     options = parser.parse_args(arguments)
     if (options.data is None) != (options.model is None):
@@ -160,12 +161,12 @@ def _print_steps(result: Mapping[str, Any]) -> None:
         )
 
 
-def _tracking(seconds: float) -> list[dict[str, Any]]:
+def _tracking(seconds: float, network: Path | None) -> list[dict[str, Any]]:
     print(f"\n{'plate':<8}{'filter':<18}{'RMS':<18}" + "".join(f"{name:>11}" for name in _ORDER))
     rows = []
     for moving in (True, False):
         for name in filter_tracking.FILTERS:
-            row = filter_tracking.track(name, moving=moving, duration_s=seconds, seed=0)
+            row = filter_tracking.track(name, moving=moving, duration_s=seconds, seed=0, network=network)
             rows.append(row)
             for what, title in (("estimation", "estimate - true"), ("control", "true - reference")):
                 cells = "".join(f"{row[what][component]:11.3f}" for component in _ORDER)

@@ -31,7 +31,7 @@ def gauss_newton(prior: PoseGaussian, observation: PoseGaussian) -> PoseGaussian
         if b @ step < 1e-12:
             break
         T = se3.compose(se3.exp(-step), T)
-    return PoseGaussian(T, np.linalg.inv(A))
+    return PoseGaussian(T, np.asarray(np.linalg.inv(A), dtype=np.float64))
 
 
 def extended_kalman(prior: PoseGaussian, observation: PoseGaussian) -> PoseGaussian:

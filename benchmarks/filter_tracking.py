@@ -1,4 +1,5 @@
-"""Tracking a moving plate with each surface model in the loop, behind a sensor whose errors are exactly Gaussian."""
+"""Tracking a moving plate with each surface model in the loop, behind a sensor whose errors are exactly Gaussian, or
+behind the simulated camera and a network."""
 
 from __future__ import annotations
 
@@ -96,26 +97,38 @@ class GaussianContact:
         return ContactEstimate(True, belief, t_ns, self._seq, t_ns, nis=nis)
 
 
-def track(name: str, *, moving: bool, duration_s: float, seed: int) -> dict[str, Any]:
+def track(name: str, *, moving: bool, duration_s: float, seed: int, network: Path | None = None) -> dict[str, Any]:
     """Run the shipped tracking cell with one of ``FILTERS``; the plate stands still unless ``moving``.
+
+    Args:
+        name: of the filter.
+        moving: whether the plate does.
+        duration_s: of the task.
+        seed: of the sensor's errors.
+        network: model that sees the simulated camera's images, in place of the sensor with Gaussian errors.
 
     Returns:
         ``outcome``, and RMS errors of ``estimation`` (estimate - true) and ``control`` (true - reference), mm and deg.
     """
     cell_file = yaml.safe_load(find_cell(Path("configs/object_track_sim.yaml")).read_text())
-    cell_file["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
     cell_file["task"]["duration_s"] = duration_s
     if not moving:
         del cell_file["scene"]["surfaces"]["plate"]["motion"]
     settings = FILTERS[name]
+    estimator = cell_file["sensors"]["sensor"]["estimator"]
+    if network is not None:
+        estimator |= {"model": str(network), "filter": None if settings is None else dict(settings)}
+    else:
+        cell_file["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
     pose_filter = None if settings is None else build_filter(TypeAdapter(FilterSection).validate_python(settings))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cell.yaml"
         path.write_text(yaml.safe_dump(cell_file))
         cell = compose(plan_cell(path))
         sensor = cell.sensors["sensor"]
-        assert sensor.truth is not None
-        sensor.source = GaussianContact(sensor.truth, pose_filter, seed)
+        if network is None:
+            assert sensor.truth is not None
+            sensor.source = GaussianContact(sensor.truth, pose_filter, seed)
         with Recorder(Path(folder) / "run.mcap") as recorder, cell:
             result = RunLoop(cell, recorder).run()
         errors = summarise(load_run(Path(folder) / "run.mcap"))["errors"]["sensor"]

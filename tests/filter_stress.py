@@ -136,15 +136,12 @@ def _hat(xi: Any) -> Any:
 
 
 def _log(T: Any) -> Any:
-    """Mercator's series of the matrix logarithm, after square roots that bring T near the identity."""
-    halvings = 6
-    for _ in range(halvings):
-        T = mpmath.sqrtm(T)
+    """Mercator's series of the matrix logarithm, for the small innovations of a filter."""
     X, power, total = T - mpmath.eye(4), mpmath.eye(4), mpmath.zeros(4)
-    for n in range(1, 40):
+    assert mpmath.norm(X) < 0.2
+    for n in range(1, 50):
         power = power * X
         total += power * (mpmath.mpf((-1) ** (n + 1)) / n)
-    total *= 2**halvings
     return mpmath.matrix([total[0, 3], total[1, 3], total[2, 3], total[2, 1], total[0, 2], total[1, 0]])
 
 
@@ -162,7 +159,7 @@ def _inverse_left_jacobian(xi: Any) -> Any:
     ad[:3, :3] = ad[3:, 3:] = _cross(xi[3:])
     ad[:3, 3:] = _cross(xi[:3])
     power, total = mpmath.eye(6), mpmath.zeros(6)
-    for n in range(30):
+    for n in range(25):
         total += power * (mpmath.bernoulli(n) / mpmath.factorial(n))
         power = power * ad
     return total
