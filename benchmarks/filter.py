@@ -52,6 +52,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
     if "steps" in options.only:
         result["corrections"] = filter_steps.corrections(options.draws)
         result["predictions"] = filter_steps.predictions(400 * options.draws)
+        result["update_us"] = filter_steps.updates()
         _print_steps(result)
         _plot_steps(result, out / "filter_steps.png")
     if "tracking" in options.only:
@@ -159,6 +160,8 @@ def _print_steps(result: Mapping[str, Any]) -> None:
             f"{'order ' + str(row['order']):<24}{row['sigma_rad']:10.2f}{row['us']:9.1f}{row['error']:22.4f}"
             f"{row['left']:14.4f}"
         )
+    times = ", ".join(f"{name} surface {us:.1f}" for name, us in result["update_us"].items())
+    print(f"\none whole update of a filter, us: {times}")
 
 
 def _tracking(seconds: float, network: Path | None) -> list[dict[str, Any]]:
@@ -227,18 +230,19 @@ def _plot_steps(result: Mapping[str, Any], path: Path) -> None:
     left, right = figure.subplots(1, 2)
     for method in filter_steps.CORRECTIONS:
         rows = [row for row in result["corrections"] if row["method"] == method]
-        # The rows of the exact iteration differ by its tolerance alone.
-        left.plot(
-            [row["us"] for row in rows], [max(row["from_optimum_sigmas"], 1e-6) for row in rows], "o-", label=method
-        )
-        for row in rows:
-            left.annotate(f"{row['sigma_rad']:g}", (row["us"], max(row["from_optimum_sigmas"], 1e-6)), fontsize=7)
+        # The exact iterations differ by their tolerance alone.
+        errors = [max(row["from_optimum_sigmas"], 1e-6) for row in rows]
+        left.plot([row["us"] for row in rows], errors, "o-", label=method)
+        for row, error in zip(rows, errors, strict=True):
+            if error > 1e-6:
+                left.annotate(f"{row['sigma_rad']:g}", (row["us"], error), fontsize=7)
     left.set(title="correction; labels: sigma (rad)", xlabel="us", ylabel="distance from the optimum (sigmas)")
     for order in (2, 4):
         rows = [row for row in result["predictions"] if row["order"] == order]
         right.plot([row["us"] for row in rows], [row["error"] for row in rows], "o-", label=f"order {order}")
         for row in rows:
-            right.annotate(f"{row['sigma_rad']:g}", (row["us"], row["error"]), fontsize=7)
+            if row["error"] > 1.05 * row["left"]:
+                right.annotate(f"{row['sigma_rad']:g}", (row["us"], row["error"]), fontsize=7)
     right.axhline(max(row["left"] for row in result["predictions"]), color="0.5", ls=":", label="error of sampling")
     right.set(title="prediction; labels: sigma (rad)", xlabel="us", ylabel="relative error of the covariance")
     for axes in (left, right):

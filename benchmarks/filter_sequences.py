@@ -156,8 +156,7 @@ def filtered(sequence: ContactSequence, level: float, make: Callable[[Array], Po
 def summary(sequences: list[ContactSequence], tracks: list[Track]) -> dict[str, Any]:
     """MAE and mean sigma per component, NEES and NIS with 95 % bounds, over sequences of one kind.
 
-    Consecutive errors of a filter are not independent, so the bounds count n (1 - r) / (1 + r) of the n values, r being
-    their correlation from one contact to the next.
+    Consecutive errors of a filter are not independent, so the bounds count only as many values as are.
     """
     truth = np.concatenate([se3.to_euler_mm_deg(se3.inverse(sequence.T_s_f)) for sequence in sequences])
     contact = np.concatenate([track.contact for track in tracks])
@@ -172,12 +171,10 @@ def summary(sequences: list[ContactSequence], tracks: list[Track]) -> dict[str, 
 
 
 def _consistency(series: list[Array]) -> dict[str, float]:
-    correlation = np.mean([np.corrcoef(values[:-1], values[1:])[0, 1] for values in series])
-    correlation = float(np.clip(correlation, 0.0, 0.999))
     values = np.concatenate(series)
-    independent = max(1.0, len(values) * (1.0 - correlation) / (1.0 + correlation))
+    independent = sum(len(one) for one in series) / _correlation_length(series)
     # The mean of many chi-squared variables of 6 degrees of freedom, variance 12 each, is nearly normal.
-    half = 1.96 * np.sqrt(12.0 / independent)
+    half = 1.96 * np.sqrt(12.0 / max(1.0, independent))
     return {
         "mean": float(values.mean()),
         "median": float(np.median(values)),
@@ -185,6 +182,19 @@ def _consistency(series: list[Array]) -> dict[str, float]:
         "high": float(6.0 + half),
         "below_95": float((values <= 12.592).mean()),
     }
+
+
+def _correlation_length(series: list[Array]) -> float:
+    """1 + 2 (r_1 + r_2 + ...) with r_k the correlation of values k apart, summed while it is positive."""
+    centred = [one - np.mean(np.concatenate(series)) for one in series]
+    variance = np.mean(np.concatenate(centred) ** 2)
+    length = 1.0
+    for k in range(1, min(len(one) for one in series) // 2):
+        r = np.mean([np.mean(one[:-k] * one[k:]) for one in centred]) / variance
+        if r <= 0.0:
+            break
+        length += 2.0 * float(r)
+    return length
 
 
 def _sequence(T_base_s: Array, T_s_f: Array, xi: Array, sigma: Array) -> ContactSequence:

@@ -65,6 +65,7 @@ def test_options_follow_the_dashes(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "order 4" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_labelled_split_is_a_sequence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_split(tmp_path / "data", "val", n=12, seed=0)
     model = tmp_path / "model.safetensors"
