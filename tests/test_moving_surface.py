@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from cell.compose import build_filter
 from cell.config import NetworkEstimator
@@ -174,6 +176,21 @@ def test_it_says_how_sure_it_is() -> None:
     # The mean of 40 chi-squared variables of 12 degrees of freedom has a standard deviation of 0.77.
     assert abs(np.mean(nees) - 12.0) < 2.5
     assert abs(np.mean(nis) - 6.0) < 0.25
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10_000))
+def test_the_choice_of_the_base_frame_does_not_matter(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T_other_base = se3.exp(rng.normal(0.0, [1.0] * 3 + [2.0] * 3))
+    poses = sensor_poses(8, seed)
+    root, here, there = np.linalg.cholesky(OBSERVED), moving_filter(), moving_filter()
+    for k, true in enumerate(contacts(poses, TWIST_BASE)):
+        observation = observe(true, root, rng)
+        a = here.update(observation, poses[k], k * STEP_NS).belief
+        b = there.update(observation, se3.compose(T_other_base, poses[k]), k * STEP_NS).belief
+        np.testing.assert_allclose(b.mean, a.mean, atol=1e-9)
+        np.testing.assert_allclose(b.covariance, a.covariance, rtol=1e-6, atol=1e-15)
 
 
 def test_covariance_stays_positive_definite_and_the_two_halves_agree() -> None:

@@ -114,6 +114,29 @@ def test_sigmas_of_eighteen_orders(backend: str, prior_sigma: float, observed_si
         assert mahalanobis_squared(given, fused.mean) < 100.0
 
 
+@pytest.mark.parametrize("sigma", SIGMAS)
+@pytest.mark.parametrize("kind", ["still", "moving"])
+def test_filters_of_eighteen_orders(kind: str, sigma: float) -> None:
+    """Noise and motion of one size, whatever that is: as consistent as ever where a standard deviation is small, and
+    sound where it is larger than a turn."""
+    drift = isotropic_noise(sigma, sigma)
+    pose_filter: Filter = PoseFilter(drift) if kind == "still" else MovingSurfaceFilter(drift, drift, drift)
+    rng = np.random.default_rng(13)
+    S, nees = np.eye(6) * sigma**2, []
+    reach = min(sigma, 1e-3)
+    for k in range(200):
+        T_base_s = se3.exp(rng.normal(0.0, [0.01] * 3 + [0.2] * 3))
+        truth = se3.inverse(T_base_s)
+        observed = PoseGaussian(se3.compose(se3.exp(reach * rng.normal(size=6)), truth), S)
+        state = pose_filter.update(observed, T_base_s, k * STEP_NS)
+        require_sound(state.belief)
+        assert state.nis is None or 0.0 <= state.nis < 60.0
+        nees.append(mahalanobis_squared(state.belief, truth))
+    assert max(nees) < 60.0
+    if sigma <= 1e-3:
+        assert 0.5 < np.mean(nees[20:]) < 10.0
+
+
 def test_axes_of_any_two_precisions_side_by_side(backend: str) -> None:
     """Standard deviations from 1e-12 to 1e6 in one covariance: sound, or refused as not positive definite."""
     rng, sound = np.random.default_rng(8), 0
