@@ -15,7 +15,8 @@ from geometry.types import Array
 SMALLEST_PIVOT = 32.0 * float(np.finfo(np.float64).eps)
 """Of a Cholesky factorisation, in units of the variance: below, a covariance cannot be told from a singular one.
 
-Above, every order of summation finds it positive definite, LAPACK's too. Conditions up to 1e14 pass.
+Conditions up to 1e14 pass, and scales of the axes however different. Where those make several pivots small at once,
+another order of summation, such as LAPACK's, may still find none: so every kernel factorises as ``cholesky`` does.
 """
 
 ASYMMETRY = 1e-6
@@ -70,7 +71,9 @@ def fuse(
     when it is below the tolerance, or below what the rounding of the poses looks like in standard deviations, which for
     those below 1e-9 rad is more.
     """
-    C1, C2 = np.linalg.cholesky(S1), np.linalg.cholesky(S2)
+    C1, C2 = cholesky(S1), cholesky(S2)
+    if C1 is None or C2 is None:
+        return None
     inverse1, inverse2 = se3.inverse(T1), se3.inverse(T2)
     T, nis = T1, 0.0
     scale = np.full(6, ROUNDING)
