@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return emulate(words[1:])
     passed_on: list[str] = []
     if words[:1] == ["bench"] and "--" in words:
-        # argparse would look for options of its own behind the dashes that a subcommand's parser sees.
+        # argparse hands the dashes on to the subcommand's parser, which then claims the words behind them.
         at = words.index("--")
         words, passed_on = words[:at], words[at + 1 :]
     options = _parser().parse_args(words)

@@ -100,10 +100,10 @@ class MovingSurfaceFilter:
             ValueError: ``t_ns`` lies before the state's time.
         """
         if self._state is None:
+            self._state = FilterState(observation, require_pose(T_base_sensor), t_ns)
             covariance = np.zeros((12, 12))
             covariance[:6, :6], covariance[6:, 6:] = observation.covariance, self._first_twist_covariance
             self._motion = SurfaceMotion(np.zeros(6), covariance)
-            self._state = FilterState(observation, require_pose(T_base_sensor), t_ns)
             return self._state
         prior, motion = self._moved(T_base_sensor, t_ns)
         fused, record = gaussian.fuse(prior, observation)

@@ -226,6 +226,7 @@ def test_what_is_no_pose_or_covariance_is_refused_at_once() -> None:
     with pytest.raises(GeometryError):
         moving.update(PoseGaussian(CONTACT, OBSERVED), np.full((4, 4), np.nan), 0)
     assert moving.state is None
+    assert moving.motion is None
     moving.update(PoseGaussian(CONTACT, OBSERVED), np.eye(4), STEP_NS)
     with pytest.raises(ValueError, match="back"):
         moving.predict(np.eye(4), 0)
