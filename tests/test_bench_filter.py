@@ -10,7 +10,7 @@ import pytest
 from tactile_samples import write_split
 from test_inference import constant_model
 
-from benchmarks import filter_rivals
+from benchmarks import filter_rivals, filter_tracking
 from benchmarks.filter_sequences import filtered, single_frames, summary, synthetic
 from cell.cli import EXIT_OK, main
 from geometry import gaussian, se3
@@ -79,3 +79,13 @@ def test_a_labelled_split_is_a_sequence(tmp_path: Path, capsys: pytest.CaptureFi
     assert ordered == pytest.approx(shuffled)
     assert (tmp_path / "out" / "filter_consistency.png").is_file()
     assert "order of the data set: 1 x 12 contacts" in capsys.readouterr().out
+
+
+def test_behind_a_moving_plate_the_moving_surface_model_does_not_lag() -> None:
+    rows = {
+        name: filter_tracking.track(name, moving=True, duration_s=6.0, seed=0) for name in ("still, drift 4", "moving")
+    }
+    assert [row["outcome"] for row in rows.values()] == ["done", "done"]
+    for component, factor in (("x_mm", 0.6), ("y_mm", 0.6), ("alpha_deg", 0.9), ("gamma_deg", 0.9)):
+        still, moving = (row["estimation"][component] for row in rows.values())
+        assert moving < factor * still, component
