@@ -4,7 +4,7 @@ TORCH ?= torch==2.13.0
 BIN := .venv/bin
 SOURCES := pyproject.toml setup.py $(wildcard geometry/*.c geometry/*.h)
 
-.PHONY: demo test check fast clean
+.PHONY: demo test check fast stress clean
 
 demo: .venv/core
 	$(BIN)/touchcell run configs/surface_follow_sim.yaml
@@ -13,7 +13,10 @@ test: check
 	$(BIN)/python -m pytest
 
 fast: .venv/dev
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow and not stress"
+
+stress: .venv/dev
+	$(BIN)/python -m pytest -m "stress or not stress" tests/test_stress_*.py
 
 check: .venv/dev
 	$(BIN)/ruff check .

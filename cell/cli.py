@@ -22,7 +22,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from drivers.emulators.launcher import main as emulate
 
         return emulate(words[1:])
+    passed_on: list[str] = []
+    if words[:1] == ["bench"] and "--" in words:
+        # argparse hands the dashes on to the subcommand's parser, which then claims the words behind them.
+        at = words.index("--")
+        words, passed_on = words[:at], words[at + 1 :]
     options = _parser().parse_args(words)
+    options.passed_on = passed_on
     try:
         code: int = options.run(options)
         return code
@@ -91,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     bench = commands.add_parser("bench", help="run time against error")
     bench.add_argument("name", nargs="?", help="which; `touchcell list` names them")
     bench.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for tables and plots")
-    bench.add_argument("rest", nargs="*", help="arguments of the benchmark")
+    bench.add_argument("rest", nargs="*", help="arguments of the benchmark; its options follow after --")
     bench.set_defaults(run=_bench)
 
     commands.add_parser("emulate", help="emulate a device on the wire", add_help=False)
@@ -205,7 +211,7 @@ def _bench(options: argparse.Namespace) -> int:
         print(f"benchmarks: {', '.join(sorted(known))}", file=sys.stderr)
         return EXIT_BAD_INPUT
     options.out.mkdir(parents=True, exist_ok=True)
-    known[options.name].load()(options.rest, options.out)
+    known[options.name].load()([*options.rest, *options.passed_on], options.out)
     return EXIT_OK
 
 

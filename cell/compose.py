@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
 import numpy as np
 
-from cell.config import CellPlan, DevicePlan, NetworkEstimator, SensorSection
+from cell.config import (
+    CellPlan,
+    DevicePlan,
+    MovingSurfaceSection,
+    NetworkEstimator,
+    SensorSection,
+    StillSurfaceSection,
+)
 from cell.messages import belief_message, pose_message
 from control.interlocks import build_interlocks
 from control.latch import Latch
@@ -29,6 +36,7 @@ from tasks.interface import Task, TaskContext
 
 if TYPE_CHECKING:
     from drivers.simulation.scene import Scene
+    from perception.filter import ContactFilter
 
 BUILTIN = "builtin:"
 MODELS = Path(__file__).parent.parent / "perception" / "models"
@@ -251,16 +259,10 @@ def _truth(name: str, mount: Device | None, scene: Scene | None, T_tcp_sensor: A
 
 def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Device) -> ContactPipeline:
     from perception.contact_gate import ContactGate
-    from perception.filter import PoseFilter, isotropic_noise
     from perception.inference import ContactModel
 
     model = ContactModel.load(model_path(estimator.model))
-    settings = estimator.filter
-    pose_filter = (
-        PoseFilter(isotropic_noise(1e-3 * settings.drift_mm_per_sqrt_s, np.deg2rad(settings.drift_deg_per_sqrt_s)))
-        if settings
-        else None
-    )
+    pose_filter = None if estimator.filter is None else build_filter(estimator.filter)
     contact_gate = None
     if (gate := estimator.gate) is not None:
         if model.reference is None:
@@ -272,6 +274,22 @@ def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Devic
             )
         contact_gate = ContactGate(model.reference, enter=gate.touch_percent / 100, leave=gate.release_percent / 100)
     return ContactPipeline(cast(FrameSource, camera), model, contact_gate=contact_gate, pose_filter=pose_filter)
+
+
+def build_filter(settings: StillSurfaceSection | MovingSurfaceSection) -> ContactFilter:
+    """The filter that a cell file's ``filter:`` describes."""
+    from perception.filter import PoseFilter, isotropic_noise
+
+    drift = isotropic_noise(1e-3 * settings.drift_mm_per_sqrt_s, np.deg2rad(settings.drift_deg_per_sqrt_s))
+    if isinstance(settings, StillSurfaceSection):
+        return PoseFilter(drift)
+    from perception.moving_surface import MovingSurfaceFilter
+
+    return MovingSurfaceFilter(
+        drift,
+        isotropic_noise(1e-3 * settings.accel_mm_s_per_sqrt_s, np.deg2rad(settings.accel_deg_s_per_sqrt_s)),
+        isotropic_noise(1e-3 * settings.speed_mm_s, np.deg2rad(settings.speed_deg_s)),
+    )
 
 
 def _image_message(image: Any, kind: str, seq: int, t_ns: int) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag
 
 from cell.yaml_file import InvalidCell, KeyPath, YamlFile, load, suggest
 from control.interlocks import INTERLOCKS, InterlocksConfig
@@ -37,11 +37,45 @@ class _OpenSection(BaseModel):
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
 
 
-class FilterSection(_Section):
+class StillSurfaceSection(_Section):
     """The SE(3) Bayesian filter: how fast certainty is lost when no frame comes (slip, curvature)."""
 
+    model: Literal["still_surface"] = "still_surface"
     drift_mm_per_sqrt_s: PositiveFloat
     drift_deg_per_sqrt_s: PositiveFloat
+
+
+class MovingSurfaceSection(_Section):
+    """The filter that also estimates the surface's velocity, for surfaces that move steadily.
+
+    ``speed_*`` is how fast a surface may be when it is first touched (one standard deviation), ``accel_*`` how fast its
+    velocity stops being known.
+    """
+
+    model: Literal["moving_surface"]
+    drift_mm_per_sqrt_s: PositiveFloat
+    drift_deg_per_sqrt_s: PositiveFloat
+    speed_mm_s: PositiveFloat
+    speed_deg_s: PositiveFloat
+    accel_mm_s_per_sqrt_s: PositiveFloat
+    accel_deg_s_per_sqrt_s: PositiveFloat
+
+
+def _filter_model(value: Any) -> str | None:
+    """Which model a filter section means: a file that names none means a still surface."""
+    if isinstance(value, Mapping):
+        return str(value.get("model", "still_surface"))
+    return getattr(value, "model", None)
+
+
+FilterSection = Annotated[
+    Annotated[StillSurfaceSection, Tag("still_surface")] | Annotated[MovingSurfaceSection, Tag("moving_surface")],
+    Discriminator(
+        _filter_model,
+        custom_error_type="filter_model",
+        custom_error_message="must say `model: still_surface` or `model: moving_surface`",
+    ),
+]
 
 
 class GateSection(_Section):

@@ -12,6 +12,7 @@
 #define SMALLEST_PIVOT (32.0 * DBL_EPSILON)
 #define SMALLEST_VARIANCE 1e-60
 #define ASYMMETRY 1e-6
+#define ROUNDING (8.0 * DBL_EPSILON)
 
 /* Lower factor L with S = L L'; the entries above its diagonal are not touched. */
 static int cholesky(const double *S, double *L)
@@ -155,6 +156,27 @@ static void covariance_of(double a[12][7], double *S)
         }
 }
 
+/* Largest component of the two translations. */
+static double reach(const double *T1, const double *T2)
+{
+    double largest = 0.0;
+    for (int i = 0; i < 3; i++)
+        largest = fmax(largest, fmax(fabs(T1[4 * i + 3]), fabs(T2[4 * i + 3])));
+    return largest;
+}
+
+/* Square of the step that the rounding of poses with such translations looks like, in standard deviations. */
+static double rounding_squared(double a[12][7], double metres)
+{
+    double sum = 0.0;
+    for (int i = 0; i < 6; i++)
+        for (int j = i; j < 6; j++) {
+            double entry = j < 3 ? a[i][j] * metres : a[i][j];
+            sum += entry * entry;
+        }
+    return ROUNDING * ROUNDING * sum;
+}
+
 /* Gauss-Newton; 0 if the step is not below the tolerance after max_iterations updates. */
 static int fuse_kernel(
     const double *T1, const double *S1, const double *T2, const double *S2, double tolerance, int max_iterations,
@@ -166,6 +188,7 @@ static int fuse_kernel(
     inverse_kernel(T1, inverse1);
     inverse_kernel(T2, inverse2);
     memcpy(T, T1, 16 * sizeof(double));
+    double metres = reach(T1, T2);
     for (*iterations = 0;; ++*iterations) {
         whitened(T, inverse1, C1, stack);
         whitened(T, inverse2, C2, stack + 6);
@@ -179,7 +202,7 @@ static int fuse_kernel(
             for (int i = 6; i < 12; i++)
                 *nis += stack[i][6] * stack[i][6];
         }
-        if (length < tolerance * tolerance) {
+        if (length < fmax(tolerance * tolerance, rounding_squared(stack, metres))) {
             covariance_of(stack, S);
             return 1;
         }

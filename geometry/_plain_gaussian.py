@@ -15,7 +15,8 @@ from geometry.types import Array
 SMALLEST_PIVOT = 32.0 * float(np.finfo(np.float64).eps)
 """Of a Cholesky factorisation, in units of the variance: below, a covariance cannot be told from a singular one.
 
-Above, every order of summation finds it positive definite, LAPACK's too. Conditions up to 1e14 pass.
+Conditions up to 1e14 pass, and scales of the axes however different. Where those make several pivots small at once,
+another order of summation, such as LAPACK's, may still find none: so every kernel factorises as ``cholesky`` does.
 """
 
 ASYMMETRY = 1e-6
@@ -23,6 +24,9 @@ ASYMMETRY = 1e-6
 
 SMALLEST_VARIANCE = 1e-60
 """Squares of whitened residuals stay finite above this and below ``_check.LARGEST``."""
+
+ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
+"""Of a fusion: a step below this, in rad or relative to the translations, is the rounding of the poses themselves."""
 
 
 def admit(mean: Array, covariance: Array) -> tuple[Array, Array] | None:
@@ -63,11 +67,17 @@ def fuse(
     """Gauss-Newton on whitened residuals. Returns mean, covariance, updates made and normalised innovation squared.
 
     With S_i = C_i C_i', e_i = log(T T_i^-1) and G_i = J_l^-1(e_i), each step solves C_i^-1 (e_i + G_i x) = 0 in the
-    least squares sense by QR, so no covariance is inverted and no normal equations are formed.
+    least squares sense by QR, so no covariance is inverted and no normal equations are formed. A step counts as none
+    when it is below the tolerance, or below what the rounding of the poses looks like in standard deviations, which for
+    those below 1e-9 rad is more.
     """
-    C1, C2 = np.linalg.cholesky(S1), np.linalg.cholesky(S2)
+    C1, C2 = cholesky(S1), cholesky(S2)
+    if C1 is None or C2 is None:
+        return None
     inverse1, inverse2 = se3.inverse(T1), se3.inverse(T2)
     T, nis = T1, 0.0
+    scale = np.full(6, ROUNDING)
+    scale[:3] *= max(np.abs(T1[:3, 3]).max(), np.abs(T2[:3, 3]).max())
     for iteration in range(max_iterations + 1):
         stack = np.concatenate([_whitened(T, inverse1, C1), _whitened(T, inverse2, C2)])
         triangle = np.asarray(np.linalg.qr(stack, mode="r"))
@@ -75,7 +85,7 @@ def fuse(
         if iteration == 0:
             # What no x can explain: e' (G P1 G' + P2)^-1 e, without forming the sum.
             nis = float(triangle[6, 6] ** 2)
-        if y @ y < tolerance * tolerance:
+        if y @ y < max(tolerance * tolerance, float(np.square(R * scale).sum())):
             root = np.linalg.inv(R)
             return T, root @ root.T, iteration, nis
         T = se3.compose(se3.exp(-np.linalg.solve(R, y)), T)

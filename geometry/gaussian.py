@@ -176,7 +176,7 @@ def fuse(
 
     Args:
         prior, observation: over the same pose, in the same frames.
-        tolerance: stop when the next step is shorter than this, in standard deviations of the result.
+        tolerance: stop when the next step is shorter than this, in standard deviations of the result, or than rounding.
         max_iterations: updates allowed. Filters take 2 to 7, means 3 rad apart 20.
 
     Raises:
@@ -194,9 +194,17 @@ def fuse(
 
 
 def mahalanobis_squared(g: PoseGaussian, T: ArrayLike) -> float:
-    """e' S^-1 e of a pose T = exp(e) mean. Chi-squared with 6 degrees of freedom for poses drawn from ``g``."""
+    """e' S^-1 e of a pose T = exp(e) mean. Chi-squared with 6 degrees of freedom for poses drawn from ``g``.
+
+    Raises:
+        GeometryError: ``T`` is no pose.
+        NotPositiveDefinite: the covariance is so near a singular one that the other backend alone admits it.
+    """
     e = se3.log(se3.compose(_single_pose("mahalanobis_squared", "T", T), se3.inverse(g.mean)))
-    whitened = np.linalg.solve(np.linalg.cholesky(g.covariance), e)
+    root = _plain_gaussian.cholesky(g.covariance)
+    if root is None:
+        raise NotPositiveDefinite("mahalanobis_squared", "g", "is singular to double precision")
+    whitened = np.linalg.solve(root, e)
     return float(whitened @ whitened)
 
 

@@ -8,7 +8,7 @@ of two Gaussians on the manifold. Training poses are drawn evenly, so dividing b
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -27,16 +27,36 @@ class FilterState:
     nis: float | None = None
 
 
+class ContactFilter(Protocol):
+    """What a pipeline asks of a filter; ``PoseFilter`` and ``moving_surface.MovingSurfaceFilter`` offer it."""
+
+    def reset(self) -> None:
+        """Forget everything: the next observation starts a new contact."""
+        ...
+
+    def predict(self, T_base_sensor: Array, t_ns: int) -> PoseGaussian:
+        """Belief after the sensor has moved to ``T_base_sensor`` at ``t_ns``; the state itself stays."""
+        ...
+
+    def update(self, observation: PoseGaussian, T_base_sensor: Array, t_ns: int) -> FilterState:
+        """Fuse an observation made at ``t_ns`` with the sensor at ``T_base_sensor``; returns the new state."""
+        ...
+
+
 class PoseFilter:
-    """Filters observations of ``T_s_f`` from a moving sensor.
+    """Filters observations of ``T_s_f`` of a still surface, from a moving sensor.
 
     Args:
         noise_density: (6, 6) growth of the covariance per second, [v, w], m^2/s and rad^2/s, sensor frame. It stands
             for slip, surface curvature and whatever else the still-surface model leaves out.
         order: 2 or 4, order of the covariance's prediction (NUMERICS: 2 suffices below 0.1 rad of uncertainty).
+
+    Raises:
+        NotPositiveDefinite: the noise density is not finite or not positive semidefinite.
     """
 
     def __init__(self, noise_density: Array, *, order: Literal[2, 4] = 2) -> None:
+        require_noise_density(noise_density)
         self._noise_density = noise_density
         self._order = order
         self._state: FilterState | None = None
@@ -66,9 +86,14 @@ class PoseFilter:
         return gaussian.compound(U, state.belief, noise=noise, order=self._order)
 
     def update(self, observation: PoseGaussian, T_base_sensor: Array, t_ns: int) -> FilterState:
-        """Fuse an observation made at ``t_ns`` with the sensor at ``T_base_sensor``; returns the new state."""
+        """Fuse an observation made at ``t_ns`` with the sensor at ``T_base_sensor``; returns the new state.
+
+        Raises:
+            GeometryError: ``T_base_sensor`` is no pose, or the fusion did not converge; the state stays as it was.
+            ValueError: ``t_ns`` lies before the state's time.
+        """
         if self._state is None:
-            self._state = FilterState(observation, T_base_sensor, t_ns)
+            self._state = FilterState(observation, require_pose(T_base_sensor), t_ns)
         else:
             fused, record = gaussian.fuse(self.predict(T_base_sensor, t_ns), observation)
             self._state = FilterState(fused, T_base_sensor, t_ns, record.nis)
@@ -78,3 +103,13 @@ class PoseFilter:
 def isotropic_noise(translation_m_per_sqrt_s: float, rotation_rad_per_sqrt_s: float) -> Array:
     """(6, 6) noise density of independent random walks, equal along all axes."""
     return np.diag([translation_m_per_sqrt_s**2] * 3 + [rotation_rad_per_sqrt_s**2] * 3)
+
+
+def require_noise_density(noise_density: Array) -> None:
+    """Raise NotPositiveDefinite unless it can be the growth of a covariance: at once, not at the second frame."""
+    gaussian.compound(np.eye(4), PoseGaussian(np.eye(4), np.eye(6)), noise_density)
+
+
+def require_pose(T_base_sensor: Array) -> Array:
+    """The pose itself. Raises GeometryError unless it is one: a first frame is stored before anything is computed."""
+    return PoseGaussian(T_base_sensor, np.eye(6)).mean

@@ -21,7 +21,7 @@ from geometry.gaussian import PoseGaussian
 from geometry.types import Array
 from perception.contact_gate import ContactGate
 from perception.estimate import ContactEstimate
-from perception.filter import PoseFilter
+from perception.filter import ContactFilter
 from perception.inference import ContactModel
 from perception.motion import PoseHistory
 
@@ -81,7 +81,7 @@ class ContactPipeline:
         model: ContactModel,
         *,
         contact_gate: ContactGate | None = None,
-        pose_filter: PoseFilter | None = None,
+        pose_filter: ContactFilter | None = None,
         timer: Timer = time.perf_counter_ns,
     ) -> None:
         self._camera = camera

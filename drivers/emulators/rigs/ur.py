@@ -64,10 +64,6 @@ def rig(folder: Path, address: int) -> Rig:
             "program_stop": (True, "fault"),
             "power_off": (True, "fault"),
         },
-        known={
-            "ten_cycles_leak_nothing": "ur-rtde's destructors hold the interpreter's lock for 0.5 s, so the driver "
-            "never runs them: each connection with activation leaves 21 open files",
-        },
         notes=(
             "how fast the controller stops the arm after its watchdog has stopped the program",
             "that speedl's time argument only says when it returns",

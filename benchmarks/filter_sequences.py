@@ -1,0 +1,202 @@
+"""Sequences of contacts with known motion, filtered (Lloyd & Lepora 2024, 5.3), and what comes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers.simulation.samples import random_poses
+from drivers.tactile_data import natural_order, read_split
+from geometry import gaussian, se3
+from geometry.gaussian import PoseGaussian, mahalanobis_squared
+from geometry.types import Array
+from perception.filter import FilterState, PoseFilter
+from perception.inference import ContactModel
+from perception.labels import CONTACT_NAMES, XI_UNITS, contact_from_xi
+
+STEP_NS = 1_000_000_000
+"""Between two contacts, so that a noise density per second is one per contact."""
+
+SYNTHETIC_SIGMA = np.array([0.3, 0.3, 0.12, 0.8, 0.8, 1.0]) * XI_UNITS
+"""Standard deviations of the synthetic sensor's xi: about those of a good network without slip."""
+
+
+@dataclass(frozen=True)
+class ContactSequence:
+    """n contacts of one sensor with one surface, as a filter meets them.
+
+    Attributes:
+        T_base_s: (n, 4, 4) where the sensor was, exactly.
+        T_s_f: (n, 4, 4) true contacts.
+        observed: Gaussians of the single frames.
+        xi: (n, 6) and
+        sigma: (n, 6), the means and standard deviations of xi that they came from, m and rad.
+    """
+
+    T_base_s: Array
+    T_s_f: Array
+    observed: tuple[PoseGaussian, ...]
+    xi: Array
+    sigma: Array
+
+    def shuffled(self, seed: int) -> ContactSequence:
+        """The same contacts in another order. A labelled surface stands still, so any order is a possible motion."""
+        order = np.random.default_rng(seed).permutation(len(self.observed))
+        return ContactSequence(
+            self.T_base_s[order],
+            self.T_s_f[order],
+            tuple(self.observed[i] for i in order),
+            self.xi[order],
+            self.sigma[order],
+        )
+
+
+@dataclass(frozen=True)
+class Track:
+    """What a filter, or the single frames, made of a sequence.
+
+    Attributes:
+        contact: (n, 6) estimated contacts, mm and degrees, named as ``CONTACT_NAMES``.
+        sigma: (n, 6) standard deviations of xi, m and rad.
+        nees: (n,) squared Mahalanobis distances of the truth, 6 degrees of freedom.
+        nis: (n - 1,) normalised innovations squared, or empty.
+    """
+
+    contact: Array
+    sigma: Array
+    nees: Array
+    nis: Array
+
+
+def labelled(data: Path, split: str, model: Path, progress: Callable[[int, int], None]) -> ContactSequence:
+    """A labelled split as a sequence in the order of its images' names; the sensor moves as the labels say.
+
+    Raises:
+        DataError, ModelError, ImageError: as ``perception.evaluate.evaluate``.
+    """
+    split_data = read_split(data, split)
+    network = ContactModel.load(model)
+    predictions = []
+    for image in split_data.read():
+        predictions.append(network.predict(image))
+        progress(len(predictions), len(split_data.images))
+    order = sorted(range(len(predictions)), key=lambda i: natural_order(split_data.images[i]))
+    # The base is the surface frame, as in drivers.replay_arm.
+    T_f_s = se3.from_euler_mm_deg(split_data.contact_mm_deg[order])
+    return _sequence(
+        T_f_s,
+        se3.inverse(T_f_s),
+        np.stack([predictions[i].xi for i in order]),
+        np.stack([predictions[i].sigma for i in order]),
+    )
+
+
+def synthetic(
+    n: int, seed: int, drift: float, *, slip_share: float = 0.0, outlier_share: float = 0.0
+) -> ContactSequence:
+    """Random contacts over the public data's ranges, seen by a sensor with exactly Gaussian errors.
+
+    Args:
+        n: contacts.
+        seed: of everything random.
+        drift: standard deviation of the surface's own random walk per contact, in mm and degrees.
+        slip_share: share of contacts before which the surface frame jumps by 1 mm and 2 deg in x, y, gamma.
+        outlier_share: share of frames that err six times as much as they say.
+    """
+    rng = np.random.default_rng(seed)
+    T_base_s = random_poses(n, rng)
+    T_s_f = np.empty((n, 4, 4))
+    T_base_f = np.eye(4)
+    for k in range(n):
+        T = se3.compose(se3.inverse(T_base_s[k]), T_base_f)
+        moves = drift * XI_UNITS * rng.normal(size=6)
+        if rng.random() < slip_share:
+            moves += np.array([1.0, 1.0, 0.0, 0.0, 0.0, 2.0]) * XI_UNITS * rng.normal(size=6)
+        T_s_f[k] = se3.compose(se3.exp(moves), T)
+        T_base_f = se3.project(T_base_s[k] @ T_s_f[k])
+    sigma = np.broadcast_to(SYNTHETIC_SIGMA, (n, 6))
+    scale = np.where(rng.random(n) < outlier_share, 6.0, 1.0)
+    xi = se3.log(T_s_f) + sigma * scale[:, None] * rng.normal(size=(n, 6))
+    return _sequence(T_base_s, T_s_f, xi, np.array(sigma))
+
+
+def single_frames(sequence: ContactSequence) -> Track:
+    """No filter."""
+    nees = [mahalanobis_squared(g, T) for g, T in zip(sequence.observed, sequence.T_s_f, strict=True)]
+    return Track(contact_from_xi(sequence.xi), sequence.sigma, np.array(nees), np.empty(0))
+
+
+def filtered(sequence: ContactSequence, level: float, make: Callable[[Array], PoseFilter] = PoseFilter) -> Track:
+    """A filter over the sequence.
+
+    Args:
+        level: standard deviation of the dynamics noise per contact, in mm and degrees.
+        make: builds the filter from its noise density.
+    """
+    pose_filter = make(np.diag((level * XI_UNITS) ** 2))
+    states: list[FilterState] = [
+        pose_filter.update(observation, T, k * STEP_NS)
+        for k, (observation, T) in enumerate(zip(sequence.observed, sequence.T_base_s, strict=True))
+    ]
+    means = np.stack([state.belief.mean for state in states])
+    inverses = se3.left_jacobian_inverse(se3.log(means))
+    covariances = inverses @ np.stack([state.belief.covariance for state in states]) @ np.swapaxes(inverses, 1, 2)
+    return Track(
+        se3.to_euler_mm_deg(se3.inverse(means)),
+        np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)),
+        np.array([mahalanobis_squared(s.belief, T) for s, T in zip(states, sequence.T_s_f, strict=True)]),
+        np.array([state.nis for state in states if state.nis is not None]),
+    )
+
+
+def summary(sequences: list[ContactSequence], tracks: list[Track]) -> dict[str, Any]:
+    """MAE and mean sigma per component, NEES and NIS with 95 % bounds, over sequences of one kind.
+
+    Consecutive errors of a filter are not independent, so the bounds count only as many values as are.
+    """
+    truth = np.concatenate([se3.to_euler_mm_deg(se3.inverse(sequence.T_s_f)) for sequence in sequences])
+    contact = np.concatenate([track.contact for track in tracks])
+    sigma = np.concatenate([track.sigma for track in tracks]) / XI_UNITS
+    mae = dict(zip(CONTACT_NAMES, np.abs(contact - truth).mean(axis=0).tolist(), strict=True))
+    return {
+        "mae": mae,
+        "sigma": dict(zip(CONTACT_NAMES, sigma.mean(axis=0).tolist(), strict=True)),
+        "nees": _consistency([track.nees for track in tracks]),
+        "nis": _consistency([track.nis for track in tracks]) if len(tracks[0].nis) else None,
+    }
+
+
+def _consistency(series: list[Array]) -> dict[str, float]:
+    values = np.concatenate(series)
+    independent = sum(len(one) for one in series) / _correlation_length(series)
+    # The mean of many chi-squared variables of 6 degrees of freedom, variance 12 each, is nearly normal.
+    half = 1.96 * np.sqrt(12.0 / max(1.0, independent))
+    return {
+        "mean": float(values.mean()),
+        "median": float(np.median(values)),
+        "low": float(6.0 - half),
+        "high": float(6.0 + half),
+        "below_95": float((values <= 12.592).mean()),
+    }
+
+
+def _correlation_length(series: list[Array]) -> float:
+    """1 + 2 (r_1 + r_2 + ...) with r_k the correlation of values k apart, summed while it is positive."""
+    centred = [one - np.mean(np.concatenate(series)) for one in series]
+    variance = np.mean(np.concatenate(centred) ** 2)
+    length = 1.0
+    for k in range(1, min(len(one) for one in series) // 2):
+        r = np.mean([np.mean(one[:-k] * one[k:]) for one in centred]) / variance
+        if r <= 0.0:
+            break
+        length += 2.0 * float(r)
+    return length
+
+
+def _sequence(T_base_s: Array, T_s_f: Array, xi: Array, sigma: Array) -> ContactSequence:
+    observed = tuple(gaussian.from_exponential(x, np.diag(s**2)) for x, s in zip(xi, sigma, strict=True))
+    return ContactSequence(T_base_s, T_s_f, observed, xi, sigma)
