@@ -70,10 +70,14 @@ EstimatorSection = Annotated[NetworkEstimator | TrueContact, Field(discriminator
 
 
 class ArmSection(_OpenSection):
-    """An arm: its driver, what happens when it is deactivated, and the driver's own keys."""
+    """An arm: its driver, what happens when it is deactivated or has to stop, and the driver's own keys.
+
+    ``stop_category`` is by IEC 60204-1: 2 stops and holds with power, 1 stops and then removes it.
+    """
 
     driver: str
     deactivate: DeactivatePolicy
+    stop_category: Literal[1, 2] = 2
 
 
 class SensorSection(_OpenSection):
@@ -238,7 +242,16 @@ class _Planner:
 
     def _arm(self, cell: CellFile, name: str) -> DevicePlan | None:
         section = cell.arms[name]
-        return self._device(cell, ("arms", name), section, {"deactivate": section.deactivate}, "arm")
+        plan = self._device(cell, ("arms", name), section, {"deactivate": section.deactivate}, "arm")
+        offered = plan.spec.capabilities.stop_categories if plan else ()
+        if plan and offered and section.stop_category not in offered:
+            self._add(
+                ("arms", name, "stop_category"),
+                f"{plan.spec.name} does not offer stop category {section.stop_category}",
+                value=section.stop_category,
+                hint=f"it offers {', '.join(str(int(category)) for category in sorted(offered))}",
+            )
+        return plan
 
     def _sensor(self, cell: CellFile, name: str) -> DevicePlan | None:
         section = cell.sensors[name]
@@ -289,10 +302,11 @@ class _Planner:
         required = {"workspace", "tcp_speed", "arm_state_age"} if moves else set()
         if moves and task.sensors:
             required |= {"depth", "frame_age"}
-        for kind in sorted(required - {entry.kind for entry in cell.interlocks.values()}):
+        stopping = {entry.kind for entry in cell.interlocks.values() if entry.severity != "limit"}
+        for kind in sorted(required - stopping):
             self._add(
                 ("interlocks",),
-                f"no interlock of kind {kind!r}, which a task that moves an arm must have",
+                f"no interlock of kind {kind!r} that stops, which a task that moves an arm must have",
                 hint=f"add one: {INTERLOCKS[kind].summary}",
             )
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+
 from drivers.simulation.scene import Scene
 from geometry.gaussian import PoseGaussian
-
 from geometry.types import Array
 from perception.estimate import ContactEstimate
 
