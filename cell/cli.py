@@ -112,7 +112,8 @@ def _check(options: argparse.Namespace) -> int:
     for device in [*plan.arms.values(), *plan.sensors.values()]:
         print(f"  {device.spec.capabilities.kind:<8} {device.name}: {device.spec.name}, {device.spec.summary}")
     for name, interlock in plan.cell.interlocks.items():
-        print(f"  interlock {name}: {interlock.kind}")
+        way = plan.overshoots.get(name)
+        print(f"  interlock {name}: {interlock.kind}" + (f"; beyond the box, {way}" if way else ""))
     if plan.skipped:
         print(f"  not needed by this task and not built: {', '.join(plan.skipped)}")
     return EXIT_OK

@@ -7,16 +7,19 @@ task fit, and says which devices the task does not need, so that they are not ev
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
+from cell.margins import Overshoot, overshoot
 from cell.yaml_file import InvalidCell, KeyPath, YamlFile, load, suggest
-from control.interlocks import INTERLOCKS, InterlocksConfig
+from control.interlocks import INTERLOCKS, InterlocksConfig, WorkspaceConfig
 from drivers import registry as driver_registry
+from drivers.arm import LimitsConfig
 from drivers.device import DeactivatePolicy
 from drivers.errors import ConfigError
 from drivers.registry import DriverConfig, DriverSpec
@@ -141,6 +144,7 @@ class CellPlan:
         task: the task's spec.
         task_config: its validated parameters.
         skipped: devices of the file that this task does not need and that are not built.
+        overshoots: how far beyond each workspace, by the interlock's name, its arm may get before it stands.
     """
 
     file: Path
@@ -152,6 +156,7 @@ class CellPlan:
     task: TaskSpec
     task_config: TaskConfig
     skipped: tuple[str, ...]
+    overshoots: Mapping[str, Overshoot] = field(default_factory=dict)
 
 
 def plan_cell(path: Path, overrides: Mapping[str, Any] | None = None, *, model: str | None = None) -> CellPlan:
@@ -194,12 +199,15 @@ class _Planner:
         if task:
             self._require_abilities(task, arm_roles, arms)
             self._require_interlocks(cell, task)
+        overshoots = self._require_margins(cell, arm_roles, sensor_roles, arms)
         if self._problems:
             raise InvalidCell(self._problems)
         assert task is not None
         assert task_config is not None
         skipped = sorted((set(cell.arms) - set(arms)) | (set(cell.sensors) - set(sensors)))
-        return CellPlan(file.path, cell, arms, sensors, arm_roles, sensor_roles, task, task_config, tuple(skipped))
+        return CellPlan(
+            file.path, cell, arms, sensors, arm_roles, sensor_roles, task, task_config, tuple(skipped), overshoots
+        )
 
     @cached_property
     def _scene_model(self) -> type[BaseModel]:
@@ -309,6 +317,36 @@ class _Planner:
                 f"no interlock of kind {kind!r} that stops, which a task that moves an arm must have",
                 hint=f"add one: {INTERLOCKS[kind].summary}",
             )
+
+    def _require_margins(
+        self,
+        cell: CellFile,
+        arm_roles: Mapping[str, str],
+        sensor_roles: Mapping[str, str],
+        arms: Mapping[str, DevicePlan],
+    ) -> dict[str, Overshoot]:
+        """What an arm may get beyond its workspace before it stands has to fit the margin that there is."""
+        found = {}
+        for name, entry in cell.interlocks.items():
+            if not isinstance(entry, WorkspaceConfig):
+                continue
+            arm = arms.get(arm_roles.get(entry.arm, entry.arm))
+            limits = getattr(arm.config, "limits", None) if arm else None
+            if arm is None or not isinstance(limits, LimitsConfig):
+                continue
+            section = cell.sensors.get(sensor_roles.get(entry.sensor or "", ""))
+            lever_m = 0.0 if section is None else 1e-3 * float(np.linalg.norm(section.tcp_to_sensor_mm_deg[:3]))
+            able = arm.spec.capabilities
+            latency_s = able.command_latency_s + (1.0 / able.state_rate_hz if able.state_rate_hz else 0.0)
+            found[name] = overshoot(limits.build(), lever_m, cell.rate_hz, latency_s)
+            if entry.margin_mm is not None and found[name].total_m > 1e-3 * entry.margin_mm:
+                self._add(
+                    ("interlocks", name, "margin_mm"),
+                    f"the arm may get further out than the margin of {entry.margin_mm:g} mm: {found[name]}",
+                    value=entry.margin_mm,
+                    hint=f"lower arms.{arm.name}.limits.tcp_speed_m_s, or make the box smaller and the margin larger",
+                )
+        return found
 
     def _require_abilities(self, task: TaskSpec, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]) -> None:
         for role, abilities in task.arms.items():
