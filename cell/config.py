@@ -199,6 +199,7 @@ class _Planner:
         if task:
             self._require_abilities(task, arm_roles, arms)
             self._require_interlocks(cell, task)
+        self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
         overshoots = self._require_margins(cell, arm_roles, sensor_roles, arms)
         if self._problems:
             raise InvalidCell(self._problems)
@@ -317,6 +318,17 @@ class _Planner:
                 f"no interlock of kind {kind!r} that stops, which a task that moves an arm must have",
                 hint=f"add one: {INTERLOCKS[kind].summary}",
             )
+
+    def _require_guarded_arms(self, cell: CellFile, roles: set[str]) -> None:
+        for name, entry in cell.interlocks.items():
+            role = getattr(entry, "arm", None)
+            if role is not None and roles and role not in roles:
+                self._add(
+                    ("interlocks", name, "arm"),
+                    f"the task has no arm {role!r}",
+                    value=role,
+                    hint=suggest(role, sorted(roles)),
+                )
 
     def _require_margins(
         self,

@@ -123,6 +123,12 @@ def test_a_workspace_whose_arm_cannot_stop_within_its_margin(tmp_path: Path) -> 
     plan_cell(written(tmp_path, ("margin_mm: 15", "margin_mm: 11.3")))
 
 
+def test_an_interlock_on_an_arm_that_is_not_there(tmp_path: Path) -> None:
+    error = refused(written(tmp_path, ("kind: tilt, arm: arm", "kind: tilt, arm: amr")))
+    assert error.key == "interlocks.tilt.arm"
+    assert "'arm'" in error.hint
+
+
 def test_a_slower_arm_needs_less_margin(tmp_path: Path) -> None:
     plan_cell(written(tmp_path, ("margin_mm: 15", "margin_mm: 4"), ("tcp_speed_m_s: 0.10", "tcp_speed_m_s: 0.05")))
 
