@@ -92,7 +92,7 @@ class RunResult:
 
 
 class StopRequest:
-    """Set by a signal handler or a key; the first asks for an orderly end, the second for a stop at once."""
+    """Set by a signal handler or a key. The first asks for an orderly end, the second for a stop at once."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -100,6 +100,10 @@ class StopRequest:
     def ask(self) -> None:
         """Ask once more."""
         self.count += 1
+
+    def ask_at_once(self) -> None:
+        """Ask for a stop at once."""
+        self.count += 2
 
 
 class Box(Protocol):
