@@ -58,7 +58,7 @@ def test_a_trip_is_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "first cause" in told
     assert "workspace (trip): arm: x = -71." in told
     assert "limit -72 mm" in told
-    assert "task: settle -> run" in told
+    assert "settle -> run" in told
     assert "sensor: 3.0" in told
     assert "stopped by category 2 from 2" in told
     assert "at rest after 0.0" in told
