@@ -59,7 +59,7 @@ def test_a_trip_is_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "workspace (trip): arm: x = -71." in told
     assert "limit -72 mm" in told
     assert "settle -> run" in told
-    assert "sensor: 3.0" in told
+    assert "mm deep, frames up to" in told
     assert "stopped by category 2 from 2" in told
     assert "at rest after 0.0" in told
     assert (folder / "why.png").stat().st_size > 10_000
