@@ -159,10 +159,11 @@ class Stopper:
         start = speed_m_s = None
         turn_s = limits.rot_speed_rad_s / limits.rot_accel_rad_s2
         try:
-            state = arm.tcp().value
+            sample = arm.tcp()
         except DeviceError:
-            state = None
-        if state is not None and np.isfinite(state.T_base_tcp).all() and np.isfinite(state.twist).all():
+            sample = None
+        if sample is not None and self._tells(sample, now_ns):
+            state = sample.value
             start, speed_m_s = state.T_base_tcp[:3, 3].copy(), math.hypot(*state.twist[:3])
             turn_s = math.hypot(*state.twist[3:]) / limits.rot_accel_rad_s2
         # An arm that cannot tell its speed is given the time that its fastest motion would need.
@@ -172,6 +173,11 @@ class Stopper:
         deadline_ns = now_ns + round(1e9 * declared_s)
         farthest = None if start is None else 0.0
         return _Stopping(arm, category, now_ns, start, speed_m_s, declared_s, declared_m, deadline_ns, farthest)
+
+    def _tells(self, state: Stamped[TcpState], now_ns: int) -> bool:
+        """Whether a state says where its arm is now: it is finite and not much older than a cycle."""
+        finite = np.isfinite(state.value.T_base_tcp).all() and np.isfinite(state.value.twist).all()
+        return bool(finite) and now_ns - state.t_ns <= 2 * self._period_ns
 
     def _look(
         self,
@@ -183,10 +189,9 @@ class Stopper:
         now_ns, arm = self._clock.now_ns(), stopping.arm
         state = arm.tcp()
         on_state(role, state)
-        if stopping.start is not None:
+        if stopping.start is not None and self._tells(state, now_ns):
             way_m = math.dist(state.value.T_base_tcp[:3, 3], stopping.start)
-            if math.isfinite(way_m):
-                stopping.farthest_m = max(stopping.farthest_m or 0.0, way_m)
+            stopping.farthest_m = max(stopping.farthest_m or 0.0, way_m)
         if arm.at_rest():
             stopping.rest_ns = now_ns
         elif now_ns >= stopping.deadline_ns:

@@ -144,7 +144,7 @@ class Tilt:
     def check(self, view: CellView) -> Violation | None:
         arm = view.arms[self.arm]
         axis = arm.state.value.T_base_tcp[:3, :3] @ self.axis_tcp
-        tilt_rad = math.atan2(float(np.linalg.norm(np.cross(axis, self.direction))), float(axis @ self.direction))
+        tilt_rad = math.acos(max(-1.0, min(1.0, float(axis @ self.direction))))
         if tilt_rad <= self.limit_rad:
             return None
         twist = arm.commanded_twist()
