@@ -281,17 +281,22 @@ class RunLoop:
         for role, error in failed.items():
             self._event("stop failed", f"{role}: {error}")
 
-    def _escalated(self, role: str, report: StopReport) -> None:
-        late_s = report.declared_s
-        reason = f"still moving {late_s:.3f} s after a stop by category {int(report.category)}"
+    def _escalated(self, role: str, report: StopReport, waited_s: float) -> None:
+        reason = f"not seen at rest {waited_s:.3f} s after a stop by category {int(report.category)}"
         now_ns = self._cell.clock.now_ns()
         self._cell.supervisor.latch.update(
-            [Violation("stop", Severity.FAULT, role, reason, now_ns, value=late_s, limit=late_s, unit="s")]
+            [Violation("stop", Severity.FAULT, role, reason, now_ns, value=waited_s, limit=report.declared_s, unit="s")]
         )
         self._event("escalated", f"{role}: {reason}")
 
     def _record_state(self, role: str, state: Stamped[TcpState]) -> None:
-        self._write(f"/arms/{role}/tcp", state.t_ns, tcp_message(state))
+        try:
+            message = tcp_message(state)
+        except TouchcellError as error:
+            # What cannot be put on file does not keep an arm from being watched.
+            self._event("no pose", f"{role}: {error}")
+        else:
+            self._write(f"/arms/{role}/tcp", state.t_ns, message)
 
     def _event(self, event: str, reason: str) -> None:
         self._write("/events", self._cell.clock.now_ns(), {"event": event, "reason": reason})

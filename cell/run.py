@@ -110,7 +110,8 @@ def _live_line(plan: CellPlan, live: bool) -> Iterator[Any]:
             parts = [f"{plan.cell.name}  {progress.state:<10} t {progress.t_s:6.2f} s"]
             parts += [f"{name} {value:.2f}" for name, value in list(progress.telemetry.items())[:4]]
             parts.append(f"{progress.t_s / max(wall_s, 1e-3):.1f}x real time")
-            parts.append("[space stops, q ends]")
+            if sys.stdin.isatty():
+                parts.append("[space stops, q ends]")
             display.update(Text("  ".join(parts)))
 
         yield show

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -118,36 +119,38 @@ class Stopper:
             strongest: role of an arm that can no longer be trusted and gets the strongest category that it offers.
         """
         failed: dict[str, DeviceError] = {}
+        told: dict[str, StopCategory] = {}
         for role, arm in self._arms.items():
-            category = self._categories[role] if tripped else StopCategory.STOP_AND_HOLD
+            told[role] = (
+                self._categories.get(role, StopCategory.STOP_AND_HOLD) if tripped else StopCategory.STOP_AND_HOLD
+            )
             if role == strongest:
-                category = min(arm.stop_categories)
-            # Told first, measured after: reading must not delay the stop.
+                told[role] = min(arm.stop_categories)
             try:
-                arm.stop(category)
+                arm.stop(told[role])
             except DeviceError as error:
                 failed[role] = error
+        # Measured only now: reading one arm must not delay the stop of the next.
+        for role, category in told.items():
             if role not in self._stopping:
-                self._stopping[role] = self._begin(arm, category)
+                self._stopping[role] = self._begin(self._arms[role], category)
         return failed
 
     def watch(
         self,
         on_state: Callable[[str, Stamped[TcpState]], None],
-        on_escalation: Callable[[str, StopReport], None],
+        on_escalation: Callable[[str, StopReport, float], None],
     ) -> Mapping[str, StopReport]:
         """Look at every stopping arm until it stands or has had its time twice over; returns a report for each.
 
         Args:
             on_state: called with every state that is read on the way.
-            on_escalation: called when an arm has not come to rest in time, before it is stopped by stronger means.
+            on_escalation: called with the time (s) that it was given when an arm has not come to rest, or cannot be
+                seen at rest, before it is stopped by stronger means.
         """
         while pending := {role: s for role, s in self._stopping.items() if s.rest_ns is None and not s.problem}:
             for role, stopping in pending.items():
-                try:
-                    self._look(role, stopping, on_state, on_escalation)
-                except DeviceError as error:
-                    stopping.problem = str(error)
+                self._look(role, stopping, on_state, on_escalation)
             if any(s.rest_ns is None and not s.problem for s in pending.values()):
                 self._clock.sleep_until_ns(self._clock.now_ns() + self._period_ns)
         reports = {role: stopping.report() for role, stopping in self._stopping.items()}
@@ -184,21 +187,32 @@ class Stopper:
         role: str,
         stopping: _Stopping,
         on_state: Callable[[str, Stamped[TcpState]], None],
-        on_escalation: Callable[[str, StopReport], None],
+        on_escalation: Callable[[str, StopReport, float], None],
     ) -> None:
         now_ns, arm = self._clock.now_ns(), stopping.arm
-        state = arm.tcp()
-        on_state(role, state)
-        if stopping.start is not None and self._tells(state, now_ns):
-            way_m = math.dist(state.value.T_base_tcp[:3, 3], stopping.start)
-            stopping.farthest_m = max(stopping.farthest_m or 0.0, way_m)
-        if arm.at_rest():
-            stopping.rest_ns = now_ns
-        elif now_ns >= stopping.deadline_ns:
-            if stopping.escalated:
-                stopping.problem = "does not come to rest by any means that its driver has: use the emergency stop"
+        unseen = ""
+        try:
+            state = arm.tcp()
+            on_state(role, state)
+            if stopping.start is not None and self._tells(state, now_ns):
+                way_m = math.dist(state.value.T_base_tcp[:3, 3], stopping.start)
+                stopping.farthest_m = max(stopping.farthest_m or 0.0, way_m)
+            if arm.at_rest():
+                stopping.rest_ns = now_ns
                 return
-            stopping.escalated = True
-            stopping.deadline_ns = now_ns + round(1e9 * stopping.declared_s)
-            on_escalation(role, stopping.report())
+        except DeviceError as error:
+            # An arm that cannot be seen is not known to stand.
+            unseen = str(error)
+        if now_ns < stopping.deadline_ns:
+            return
+        if stopping.escalated:
+            stopping.problem = (
+                unseen or "does not come to rest by any means that its driver has: use the emergency stop"
+            )
+            return
+        stopping.escalated = True
+        stopping.deadline_ns = now_ns + round(1e9 * stopping.declared_s)
+        on_escalation(role, stopping.report(), (now_ns - stopping.told_ns) * 1e-9)
+        # It has its second deadline all the same.
+        with suppress(DeviceError):
             arm.stop(min(arm.stop_categories))
