@@ -94,6 +94,15 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("folder", type=Path)
     report.set_defaults(run=_report)
 
+    why = commands.add_parser("why", help="explain why a run tripped, from its black box")
+    why.add_argument("folder", type=Path)
+    why.set_defaults(run=_why)
+
+    stop = commands.add_parser("stop", help="stop a run from another shell")
+    stop.add_argument("folder", type=Path, nargs="?", help="run folder (default: every run below runs/)")
+    stop.add_argument("--now", action="store_true", help="at once, without withdrawing first")
+    stop.set_defaults(run=_stop)
+
     bench = commands.add_parser("bench", help="run time against error")
     bench.add_argument("name", nargs="?", help="which; `touchcell list` names them")
     bench.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for tables and plots")
@@ -125,7 +134,8 @@ def _check(options: argparse.Namespace) -> int:
     for device in [*plan.arms.values(), *plan.sensors.values()]:
         print(f"  {device.spec.capabilities.kind:<8} {device.name}: {device.spec.name}, {device.spec.summary}")
     for name, interlock in plan.cell.interlocks.items():
-        print(f"  interlock {name}: {interlock.kind}")
+        way = plan.overshoots.get(name)
+        print(f"  interlock {name}: {interlock.kind}" + (f"; beyond the box, {way}" if way else ""))
     if plan.skipped:
         print(f"  not needed by this task and not built: {', '.join(plan.skipped)}")
     return EXIT_OK
@@ -201,6 +211,27 @@ def _report(options: argparse.Namespace) -> int:
 
     print(write_report(options.folder))
     return EXIT_OK
+
+
+def _why(options: argparse.Namespace) -> int:
+    from cell.why import explain
+
+    print(explain(options.folder))
+    return EXIT_OK
+
+
+def _stop(options: argparse.Namespace) -> int:
+    from cell.operator import NoSuchRun, ask_to_stop, await_end, running
+
+    folders = [options.folder] if options.folder else running(Path("runs"))
+    if not folders:
+        raise NoSuchRun(Path("runs"), "no run goes on here")
+    for folder in folders:
+        ask_to_stop(folder, at_once=options.now)
+    ended = {folder: await_end(folder) for folder in folders}
+    for folder, done in ended.items():
+        print(f"{folder}: {'stopped' if done else 'asked, and still going on'}")
+    return EXIT_OK if all(ended.values()) else EXIT_TASK_FAILED
 
 
 def _bench(options: argparse.Namespace) -> int:

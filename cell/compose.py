@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -23,7 +24,7 @@ from cell.messages import belief_message, pose_message
 from control.interlocks import build_interlocks
 from control.latch import Latch
 from control.supervisor import Supervisor
-from drivers.abilities import FrameSource, TcpSource
+from drivers.abilities import FrameSource, StopCategory, TcpSource
 from drivers.arm import Arm
 from drivers.clock import Clock, MonotonicClock, VirtualClock
 from drivers.device import Device
@@ -56,6 +57,7 @@ class Sensor:
         T_tcp_sensor: (4, 4) its pose in that arm's tool frame.
         truth: what is known to be true: the simulator's own contact, or the label of a replayed image.
         frames: how images are recorded.
+        watched: whether an interlock looks at the pictures.
     """
 
     source: ContactSource
@@ -63,7 +65,19 @@ class Sensor:
     T_tcp_sensor: Array
     truth: ContactSource | None = None
     frames: str = "none"
+    watched: bool = False
     _recorded_seq: int = field(default=-1, init=False)
+    _picture: tuple[int | None, float | None] = field(default=(None, None), init=False)
+    _picture_seq: int = field(default=-1, init=False)
+
+    def picture(self) -> tuple[int | None, float | None]:
+        """A checksum and the mean grey level of every third pixel of the newest frame; (None, None) if not watched."""
+        frame = self.source.frame if self.watched and isinstance(self.source, ContactPipeline) else None
+        if frame is not None and frame.seq != self._picture_seq:
+            sample = np.ascontiguousarray(frame.value.image[::3, ::3])
+            self._picture = zlib.crc32(sample.data), float(sample.mean())
+            self._picture_seq = frame.seq
+        return self._picture
 
     def stage_times(self) -> dict[str, int]:
         """Nanoseconds of each perception stage in this cycle; empty for a source that has none."""
@@ -105,6 +119,7 @@ class Cell:
         clock: its time.
         arms: by role in the task, and those that only carry a sensor by their own name.
         sensors: by role.
+        stop_categories: by which each arm stops when something is wrong, by role.
     """
 
     plan: CellPlan
@@ -114,6 +129,7 @@ class Cell:
     sensors: Mapping[str, Sensor]
     supervisor: Supervisor
     task: Task
+    stop_categories: Mapping[str, StopCategory] = field(default_factory=dict)
     start_ns: int = 0
     _exit: ExitStack = field(default_factory=ExitStack, init=False)
 
@@ -188,6 +204,7 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
         sensors=sensors,
         supervisor=supervisor,
         task=task,
+        stop_categories={role: StopCategory(plan.cell.arms[name].stop_category) for name, role in arm_of.items()},
     )
 
 
@@ -245,6 +262,7 @@ def _sensor(
         T_tcp_sensor=T_tcp_sensor,
         truth=truth,
         frames=plan.cell.recording.frames,
+        watched=any(interlock.kind in ("frame_frozen", "exposure") for interlock in plan.cell.interlocks.values()),
     )
 
 

@@ -7,16 +7,19 @@ task fit, and says which devices the task does not need, so that they are not ev
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag
 
+from cell.margins import Overshoot, overshoot
 from cell.yaml_file import InvalidCell, KeyPath, YamlFile, load, suggest
-from control.interlocks import INTERLOCKS, InterlocksConfig
+from control.interlocks import INTERLOCKS, InterlocksConfig, WorkspaceConfig
 from drivers import registry as driver_registry
+from drivers.arm import LimitsConfig
 from drivers.device import DeactivatePolicy
 from drivers.errors import ConfigError
 from drivers.registry import DriverConfig, DriverSpec
@@ -104,10 +107,14 @@ EstimatorSection = Annotated[NetworkEstimator | TrueContact, Field(discriminator
 
 
 class ArmSection(_OpenSection):
-    """An arm: its driver, what happens when it is deactivated, and the driver's own keys."""
+    """An arm: its driver, what happens when it is deactivated or has to stop, and the driver's own keys.
+
+    ``stop_category`` is by IEC 60204-1: 2 stops and holds with power, 1 stops and then removes it.
+    """
 
     driver: str
     deactivate: DeactivatePolicy
+    stop_category: Literal[1, 2] = 2
 
 
 class SensorSection(_OpenSection):
@@ -172,6 +179,7 @@ class CellPlan:
         task_config: its validated parameters.
         skipped: devices of the file that this task does not need and that are not built.
         devices: every device of the file, whether the task needs it or not.
+        overshoots: how far beyond each workspace, by the interlock's name, its arm may get before it stands.
     """
 
     file: Path
@@ -184,6 +192,7 @@ class CellPlan:
     task_config: TaskConfig
     skipped: tuple[str, ...]
     devices: Mapping[str, DevicePlan]
+    overshoots: Mapping[str, Overshoot] = field(default_factory=dict)
 
 
 def plan_cell(path: Path, overrides: Mapping[str, Any] | None = None, *, model: str | None = None) -> CellPlan:
@@ -228,13 +237,25 @@ class _Planner:
         if task:
             self._require_abilities(task, arm_roles, arms)
             self._require_interlocks(cell, task)
+        self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
+        overshoots = self._require_margins(cell, arm_roles, sensor_roles, arms)
         if self._problems:
             raise InvalidCell(self._problems)
         assert task is not None
         assert task_config is not None
         skipped = sorted((set(cell.arms) - set(arms)) | (set(cell.sensors) - set(sensors)))
         return CellPlan(
-            file.path, cell, arms, sensors, arm_roles, sensor_roles, task, task_config, tuple(skipped), devices
+            file.path,
+            cell,
+            arms,
+            sensors,
+            arm_roles,
+            sensor_roles,
+            task,
+            task_config,
+            tuple(skipped),
+            devices,
+            overshoots,
         )
 
     @cached_property
@@ -278,7 +299,16 @@ class _Planner:
 
     def _arm(self, cell: CellFile, name: str) -> DevicePlan | None:
         section = cell.arms[name]
-        return self._device(cell, ("arms", name), section, {"deactivate": section.deactivate}, "arm")
+        plan = self._device(cell, ("arms", name), section, {"deactivate": section.deactivate}, "arm")
+        offered = plan.spec.capabilities.stop_categories if plan else ()
+        if plan and offered and section.stop_category not in offered:
+            self._add(
+                ("arms", name, "stop_category"),
+                f"{plan.spec.name} does not offer stop category {section.stop_category}",
+                value=section.stop_category,
+                hint=f"it offers {', '.join(str(int(category)) for category in sorted(offered))}",
+            )
+        return plan
 
     def _sensor(self, cell: CellFile, name: str) -> DevicePlan | None:
         section = cell.sensors[name]
@@ -329,12 +359,54 @@ class _Planner:
         required = {"workspace", "tcp_speed", "arm_state_age"} if moves else set()
         if moves and task.sensors:
             required |= {"depth", "frame_age"}
-        for kind in sorted(required - {entry.kind for entry in cell.interlocks.values()}):
+        stopping = {entry.kind for entry in cell.interlocks.values() if entry.severity != "limit"}
+        for kind in sorted(required - stopping):
             self._add(
                 ("interlocks",),
-                f"no interlock of kind {kind!r}, which a task that moves an arm must have",
+                f"no interlock of kind {kind!r} that stops, which a task that moves an arm must have",
                 hint=f"add one: {INTERLOCKS[kind].summary}",
             )
+
+    def _require_guarded_arms(self, cell: CellFile, roles: set[str]) -> None:
+        for name, entry in cell.interlocks.items():
+            role = getattr(entry, "arm", None)
+            if role is not None and roles and role not in roles:
+                self._add(
+                    ("interlocks", name, "arm"),
+                    f"the task has no arm {role!r}",
+                    value=role,
+                    hint=suggest(role, sorted(roles)),
+                )
+
+    def _require_margins(
+        self,
+        cell: CellFile,
+        arm_roles: Mapping[str, str],
+        sensor_roles: Mapping[str, str],
+        arms: Mapping[str, DevicePlan],
+    ) -> dict[str, Overshoot]:
+        """What an arm may get beyond its workspace before it stands has to fit the margin that there is."""
+        found = {}
+        for name, entry in cell.interlocks.items():
+            if not isinstance(entry, WorkspaceConfig):
+                continue
+            arm = arms.get(arm_roles.get(entry.arm, entry.arm))
+            limits = getattr(arm.config, "limits", None) if arm else None
+            if arm is None or not isinstance(limits, LimitsConfig):
+                continue
+            section = cell.sensors.get(sensor_roles.get(entry.sensor or "", ""))
+            lever_m = 0.0 if section is None else 1e-3 * float(np.linalg.norm(section.tcp_to_sensor_mm_deg[:3]))
+            able = arm.spec.capabilities
+            latency_s = able.command_latency_s + (1.0 / able.state_rate_hz if able.state_rate_hz else 0.0)
+            found[name] = overshoot(limits.build(), lever_m, cell.rate_hz, latency_s)
+            if entry.margin_mm is not None and found[name].total_m > 1e-3 * entry.margin_mm:
+                self._add(
+                    ("interlocks", name, "margin_mm"),
+                    f"the arm may get further out than the margin of {entry.margin_mm:g} mm: {found[name]}",
+                    value=entry.margin_mm,
+                    hint=f"lower arms.{arm.name}.limits.tcp_speed_m_s, or make the box smaller and the margin larger",
+                )
+        return found
 
     def _require_abilities(self, task: TaskSpec, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]) -> None:
         for role, abilities in task.arms.items():

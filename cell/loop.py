@@ -1,33 +1,36 @@
 """The control cycle: read the arms, perceive, let the task think, let the supervisor judge, send, record.
 
-One thread. Whatever goes wrong, the arms are told to stop before anything else happens, and the run ends in a report.
+One thread. Whatever goes wrong, all arms are told to stop before anything else happens, each is watched until it
+stands, and the run ends in a report.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from cell.compose import Cell, Sensor
-from cell.messages import command_message, contact_message, tcp_message
+from cell.errors import RecordingError
+from cell.messages import command_message, contact_message, tcp_message, verdict_message
 from cell.recording import Recorder
+from cell.stopping import Stopper, StopReport
+from control.supervisor import Verdict
 from control.view import ArmView, CellView, SensorView
+from control.violation import Severity, Violation
 from drivers.arm import Arm
 from drivers.commands import Sent, TwistCommand
-from drivers.errors import DeviceError
 from drivers.lease import Lease
 from drivers.samples import Stamped, TcpState
 from geometry import se3
 from geometry.errors import TouchcellError
 from perception.estimate import ContactEstimate
 from tasks.interface import Action, Observation, TransitionRecord
-
-_REST_DEADLINE_NS = 2_000_000_000
 
 
 class Outcome(Enum):
@@ -73,6 +76,8 @@ class RunResult:
         cycles: control cycles.
         times: duration of each stage of each cycle.
         error: what was raised, where something was.
+        causes: what the supervisor latched, the first cause first.
+        stops: how each arm came to rest.
     """
 
     outcome: Outcome
@@ -82,10 +87,12 @@ class RunResult:
     cycles: int
     times: CycleTimes
     error: TouchcellError | None = None
+    causes: tuple[Violation, ...] = ()
+    stops: Mapping[str, StopReport] = field(default_factory=dict)
 
 
 class StopRequest:
-    """Set by a signal handler or a key; the first asks for an orderly end, the second for a stop at once."""
+    """Set by a signal handler or a key. The first asks for an orderly end, the second for a stop at once."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -94,13 +101,26 @@ class StopRequest:
         """Ask once more."""
         self.count += 1
 
+    def ask_at_once(self) -> None:
+        """Ask for a stop at once."""
+        self.count += 2
+
+
+class Box(Protocol):
+    """Something that keeps messages and never fails; see ``cell.blackbox``."""
+
+    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
+        """Keep one message."""
+        ...
+
 
 class RunLoop:
-    """Runs a composed cell's task to its end.
+    """Runs a composed cell's task to its end: ``run``, or ``begin``, ``step`` while it returns True, and ``end``.
 
     Args:
         cell: built and activated.
         recorder: where everything goes; None records nothing.
+        box: what keeps the latest messages in memory.
         stop: looked at in every cycle.
         on_cycle: called after every cycle, for a live display.
     """
@@ -110,63 +130,104 @@ class RunLoop:
         cell: Cell,
         recorder: Recorder | None,
         *,
+        box: Box | None = None,
         stop: StopRequest | None = None,
         on_cycle: Callable[[Progress], None] | None = None,
     ) -> None:
         self._cell = cell
         self._recorder = recorder
+        self._box = box
         self._stop = stop or StopRequest()
         self._on_cycle = on_cycle
         self._times = CycleTimes()
         self._transitions_written = 0
+        self._arms = {role: arm for role, arm in cell.arms.items() if isinstance(arm, Arm)}
+        self._stopper = Stopper(self._arms, cell.stop_categories, cell.clock, 1.0 / cell.rate_hz)
+        self._leases: dict[str, Lease] = {}
+        self._sent: Mapping[str, Sent[TwistCommand]] = {}
+        self._start_ns = cell.clock.now_ns()
+        self._cycles = 0
+        self._reason = ""
+        self._error: TouchcellError | None = None
+        self._ending = False
 
     def run(self) -> RunResult:
         """Run until the task has finished, the supervisor has tripped, or something has failed. Never raises for what
         devices, data or disk do: that ends in a result, with the arms told to stop."""
-        cell = self._cell
-        start_ns = cell.clock.now_ns()
-        period_ns = round(1e9 / cell.rate_hz)
-        leases: dict[str, Lease] = {}
-        cycles = 0
-        error: TouchcellError | None = None
-        reason = ""
         try:
-            for role, arm in cell.arms.items():
-                if isinstance(arm, Arm):
-                    leases[role] = arm.acquire(cell.task_name)
-            while not cell.task.finished:
-                now_ns = cell.clock.now_ns()
-                if now_ns - start_ns > cell.max_duration_s * 1e9:
-                    reason = f"longer than max_duration_s: {cell.max_duration_s:g}"
-                    break
-                if self._stop.count > 1:
-                    reason = "stopped at once by the operator"
-                    break
-                self._cycle(now_ns, leases)
-                cycles += 1
-                cell.clock.sleep_until_ns(start_ns + cycles * period_ns)
-        except TouchcellError as caught:
-            error = caught
-            reason = str(caught)
+            self.begin()
+            while self.step():
+                pass
         finally:
-            self._stop_arms()
-            self._watch_until_rest()
-            for role, lease in leases.items():
-                cell.arms[role].release(lease)
+            result = self.end()
+        return result
+
+    def begin(self) -> None:
+        """Take the arms' leases."""
+        self._start_ns = self._cell.clock.now_ns()
+        try:
+            for role, arm in self._arms.items():
+                self._leases[role] = arm.acquire(self._cell.task_name)
+        except TouchcellError as error:
+            self._error = error
+
+    def step(self) -> bool:
+        """One cycle, and the wait for the next; returns whether there is to be one."""
+        cell = self._cell
+        if self._error is not None or cell.task.finished:
+            return False
+        now_ns = cell.clock.now_ns()
+        if now_ns - self._start_ns > cell.max_duration_s * 1e9:
+            self._reason = f"longer than max_duration_s: {cell.max_duration_s:g}"
+            return False
+        if self._stop.count > 1:
+            self._reason = "stopped at once by the operator"
+            return False
+        try:
+            self._cycle(now_ns)
+        except TouchcellError as error:
+            self._error = error
+            return False
+        self._cycles += 1
+        cell.clock.sleep_until_ns(self._start_ns + self._cycles * round(1e9 / cell.rate_hz))
+        return not cell.task.finished
+
+    def end(self) -> RunResult:
+        """Bring the arms to rest, give them back, and say how it went."""
+        cell = self._cell
+        self._ending = True
+        self._stop_arms(tripped=self._error is not None or cell.supervisor.latch.first_cause is not None)
+        stops = self._stopper.watch(self._record_state, self._escalated)
+        for role, report in stops.items():
+            if report.problem:
+                self._event("stop failed", f"{role}: {report.problem}")
+        for role, lease in self._leases.items():
+            cell.arms[role].release(lease)
+        reason = self._reason or ("" if self._error is None else str(self._error))
         if (trip := cell.supervisor.latch.first_cause) is not None:
             outcome, reason = Outcome.TRIPPED, f"{trip.interlock}: {trip.subject}: {trip.reason}"
-        elif error is not None:
+        elif self._error is not None:
             outcome = Outcome.ERROR
         elif cell.task.finished:
             outcome = _OUTCOMES.get(cell.task.state, Outcome.DONE if cell.task.succeeded else Outcome.FAILED)
             reason = reason or _last_reason(cell.task.transitions)
         else:
             outcome = Outcome.STOPPED
-        duration_s = (cell.clock.now_ns() - start_ns) * 1e-9
-        self._record_end(outcome, reason)
-        return RunResult(outcome, reason, cell.task.state, duration_s, cycles, self._times, error)
+        duration_s = (cell.clock.now_ns() - self._start_ns) * 1e-9
+        self._write("/events", cell.clock.now_ns(), {"event": "end", "to": outcome.value, "reason": reason})
+        return RunResult(
+            outcome,
+            reason,
+            cell.task.state,
+            duration_s,
+            self._cycles,
+            self._times,
+            self._error,
+            cell.supervisor.latch.causes,
+            stops,
+        )
 
-    def _cycle(self, now_ns: int, leases: Mapping[str, Lease]) -> None:
+    def _cycle(self, now_ns: int) -> None:
         cell = self._cell
         started = time.perf_counter_ns()
         states = {role: arm.tcp() for role, arm in cell.arms.items()}
@@ -174,7 +235,10 @@ class RunLoop:
         for role, sensor in cell.sensors.items():
             if sensor.arm_role is not None:
                 state = states[sensor.arm_role]
-                sensor.source.record_pose(state.t_ns, se3.compose(state.value.T_base_tcp, sensor.T_tcp_sensor))
+                # A pose that is not finite is for the supervisor to see, not for the filter.
+                if np.isfinite(state.value.T_base_tcp).all():
+                    T_base_sensor = se3.compose(state.value.T_base_tcp, sensor.T_tcp_sensor)
+                    sensor.source.record_pose(state.t_ns, T_base_sensor)
             if (estimate := sensor.source.update(now_ns)) is not None:
                 contacts[role] = estimate
         perceived = time.perf_counter_ns()
@@ -182,18 +246,21 @@ class RunLoop:
         observation = Observation(now_ns, states, contacts, operator_stop=self._stop.count > 0, ended=ended)
         action = cell.task.tick(observation)
         thought = time.perf_counter_ns()
-        verdict = cell.supervisor.review(_view(now_ns, states, contacts, action))
+        verdict = cell.supervisor.review(self._view(now_ns, states, contacts, action))
         judged = time.perf_counter_ns()
         sent: dict[str, Sent[TwistCommand]] = {}
         if verdict.allow:
             for role, command in action.twists.items():
-                sent[role] = cell.arms[role].send_twist(command, leases[role])
-            for role in leases.keys() - action.twists.keys():
+                # A violation that only limits slows everything down, in the direction that it has.
+                slowed = command if verdict.speed == 1.0 else replace(command, twist=verdict.speed * command.twist)
+                sent[role] = cell.arms[role].send_twist(slowed, self._leases[role])
+            for role in self._leases.keys() - action.twists.keys():
                 cell.arms[role].stop()
         else:
-            self._stop_arms()
+            self._stop_arms(tripped=True)
             if verdict.trip is not None:
                 cell.task.trip(now_ns, str(verdict.trip))
+        self._sent = sent
         done = time.perf_counter_ns()
         self._count("sense", perceived - started)
         self._count("task and control", thought - perceived)
@@ -202,34 +269,51 @@ class RunLoop:
         self._count("cycle", done - started)
         for sensor in cell.sensors.values():
             self._count_stages(sensor)
-        self._record(now_ns, states, contacts, action, sent)
+        self._record(now_ns, states, contacts, action, sent, verdict)
         self._count("record", time.perf_counter_ns() - done)
         if self._on_cycle is not None:
             self._on_cycle(Progress((now_ns - cell.start_ns) * 1e-9, cell.task.state, contacts, action.telemetry))
 
-    def _watch_until_rest(self) -> None:
-        """Record the arms until they stand, so that the stopping distance is on file; then they are let go of."""
-        cell = self._cell
-        deadline_ns = cell.clock.now_ns() + _REST_DEADLINE_NS
-        try:
-            while cell.clock.now_ns() < deadline_ns and not all(
-                arm.at_rest() for arm in cell.arms.values() if isinstance(arm, Arm)
-            ):
-                cell.clock.sleep_until_ns(cell.clock.now_ns() + round(1e9 / cell.rate_hz))
-                for role, arm in cell.arms.items():
-                    state = arm.tcp()
-                    self._write(f"/arms/{role}/tcp", state.t_ns, tcp_message(state))
-        except TouchcellError as error:
-            self._write("/events", cell.clock.now_ns(), {"event": "lost sight while stopping", "reason": str(error)})
+    def _stop_arms(self, *, tripped: bool) -> None:
+        """Tell all arms to stop: as the cell file says when something is wrong, else holding where they are."""
+        distrusted = next((c.subject for c in self._cell.supervisor.latch.causes if c.severity is Severity.FAULT), None)
+        failed = self._stopper.stop(tripped=tripped, strongest=distrusted)
+        for role, error in failed.items():
+            self._event("stop failed", f"{role}: {error}")
 
-    def _stop_arms(self) -> None:
-        for arm in self._cell.arms.values():
-            if isinstance(arm, Arm):
-                try:
-                    arm.stop()
-                except DeviceError as error:
-                    # Every other arm must still be told; the device's own fault tells the story.
-                    self._write("/events", self._cell.clock.now_ns(), {"event": "stop failed", "reason": str(error)})
+    def _escalated(self, role: str, report: StopReport, waited_s: float) -> None:
+        reason = f"not seen at rest {waited_s:.3f} s after a stop by category {int(report.category)}"
+        now_ns = self._cell.clock.now_ns()
+        self._cell.supervisor.latch.update(
+            [Violation("stop", Severity.FAULT, role, reason, now_ns, value=waited_s, limit=report.declared_s, unit="s")]
+        )
+        self._event("escalated", f"{role}: {reason}")
+
+    def _record_state(self, role: str, state: Stamped[TcpState]) -> None:
+        try:
+            message = tcp_message(state)
+        except TouchcellError as error:
+            # What cannot be put on file does not keep an arm from being watched.
+            self._event("no pose", f"{role}: {error}")
+        else:
+            self._write(f"/arms/{role}/tcp", state.t_ns, message)
+
+    def _event(self, event: str, reason: str) -> None:
+        self._write("/events", self._cell.clock.now_ns(), {"event": event, "reason": reason})
+
+    def _view(
+        self,
+        now_ns: int,
+        states: Mapping[str, Stamped[TcpState]],
+        contacts: Mapping[str, ContactEstimate],
+        action: Action,
+    ) -> CellView:
+        return CellView(
+            now_ns,
+            {role: ArmView(state, action.twists.get(role), self._sent.get(role)) for role, state in states.items()},
+            {role: _sensor_view(estimate, self._cell.sensors[role]) for role, estimate in contacts.items()},
+            self._cell.task.state,
+        )
 
     def _count(self, stage: str, duration_ns: int) -> None:
         self._times.add(stage, duration_ns)
@@ -246,8 +330,9 @@ class RunLoop:
         contacts: Mapping[str, ContactEstimate],
         action: Action,
         sent: Mapping[str, Sent[TwistCommand]],
+        verdict: Verdict,
     ) -> None:
-        if self._recorder is None:
+        if self._recorder is None and self._box is None:
             return
         cell = self._cell
         for role, state in states.items():
@@ -256,9 +341,11 @@ class RunLoop:
             self._write(f"/sensors/{role}/contact", now_ns, contact_message(estimate))
         for role, sensor in cell.sensors.items():
             for topic, t_ns, message in sensor.extra_messages(now_ns):
-                self._write(f"/sensors/{role}/{topic}", t_ns, message)
+                self._write(f"/sensors/{role}/{topic}", t_ns, message, boxed=topic != "image")
         for role, command in sent.items():
             self._write(f"/arms/{role}/command", command.t_ns, command_message(command))
+        if verdict.violations or not verdict.allow:
+            self._write("/safety", now_ns, verdict_message(verdict))
         self._write("/task", now_ns, {"state": cell.task.state, **action.telemetry})
         for record in cell.task.transitions[self._transitions_written :]:
             self._write(
@@ -268,35 +355,32 @@ class RunLoop:
             )
             self._transitions_written += 1
 
-    def _record_end(self, outcome: Outcome, reason: str) -> None:
-        self._write("/events", self._cell.clock.now_ns(), {"event": "end", "to": outcome.value, "reason": reason})
-
-    def _write(self, topic: str, t_ns: int, message: Mapping[str, Any]) -> None:
-        if self._recorder is not None and not self._recorder.failed:
+    def _write(self, topic: str, t_ns: int, message: Mapping[str, Any], *, boxed: bool = True) -> None:
+        if boxed and self._box is not None:
+            self._box.add(topic, t_ns, message)
+        if self._recorder is None or self._recorder.failed:
+            return
+        try:
             self._recorder.write(topic, t_ns, message)
+        except RecordingError as error:
+            # Nothing keeps the arms from being watched until they stand.
+            if not self._ending:
+                raise
+            self._error = self._error or error
 
 
 _OUTCOMES = {"stopped": Outcome.STOPPED, "tripped": Outcome.TRIPPED, "faulted": Outcome.ERROR}
 
 
-def _view(
-    now_ns: int,
-    states: Mapping[str, Stamped[TcpState]],
-    contacts: Mapping[str, ContactEstimate],
-    action: Action,
-) -> CellView:
-    return CellView(
-        now_ns,
-        {role: ArmView(state, action.twists.get(role)) for role, state in states.items()},
-        {role: _sensor_view(estimate) for role, estimate in contacts.items()},
-    )
-
-
-def _sensor_view(estimate: ContactEstimate) -> SensorView:
-    depth_m = sigma_m = None
+def _sensor_view(estimate: ContactEstimate, sensor: Sensor) -> SensorView:
+    depth_m = sigma_m = shear_m = torsion_rad = None
     if estimate.belief is not None:
-        depth_m = float(se3.inverse(estimate.belief.mean)[2, 3])
-        sigma_m = float(np.sqrt(estimate.belief.covariance[2, 2]))
+        T_f_s = se3.inverse(estimate.belief.mean)
+        depth_m = float(T_f_s[2, 3])
+        sigma_m = math.sqrt(estimate.belief.covariance[2, 2])
+        shear_m = math.hypot(T_f_s[0, 3], T_f_s[1, 3])
+        torsion_rad = math.atan2(T_f_s[1, 0], T_f_s[0, 0])
+    content, brightness = sensor.picture()
     return SensorView(
         estimate.t_frame_ns,
         estimate.seq,
@@ -305,6 +389,10 @@ def _sensor_view(estimate: ContactEstimate) -> SensorView:
         estimate.in_range,
         estimate.nis,
         sigma_m,
+        shear_m,
+        torsion_rad,
+        content,
+        brightness,
     )
 
 

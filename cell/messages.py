@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from control.supervisor import Verdict
 from drivers.commands import Sent, TwistCommand
 from drivers.samples import Stamped, TcpState
 from geometry import se3
@@ -17,7 +18,9 @@ COMPONENTS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 
 
 def pose_message(T: Array) -> dict[str, float]:
-    """A pose (4, 4) as extrinsic-xyz Euler components (SPEC part 1)."""
+    """A pose (4, 4) as extrinsic-xyz Euler components (SPEC part 1); NaN for what is not finite, to be on file too."""
+    if not np.isfinite(T).all():
+        return dict.fromkeys(COMPONENTS, float("nan"))
     return dict(zip(COMPONENTS, se3.to_euler_mm_deg(T).tolist(), strict=True))
 
 
@@ -38,10 +41,22 @@ def command_message(sent: Sent[TwistCommand]) -> dict[str, Any]:
         "frame": command.frame.value,
         "ttl_s": command.ttl_s,
         "limited_by": [adjustment.limit for adjustment in sent.adjustments],
+        "asked": [adjustment.asked for adjustment in sent.adjustments],
+        "allowed": [adjustment.allowed for adjustment in sent.adjustments],
+        "speed_mm_s": 1e3 * float(np.linalg.norm(command.twist[:3])),
     }
     if command.t_cause_ns is not None:
         message["sensor_to_command_ms"] = (sent.t_ns - command.t_cause_ns) * 1e-6
     return message
+
+
+def verdict_message(verdict: Verdict) -> dict[str, Any]:
+    """What the supervisor found wrong in one cycle, and whether motion may go on."""
+    return {
+        "allow": verdict.allow,
+        "speed": verdict.speed,
+        "violations": [f"{v.severity.name.lower()} {v.interlock}: {v.subject}: {v.reason}" for v in verdict.violations],
+    }
 
 
 def contact_message(estimate: ContactEstimate) -> dict[str, Any]:

@@ -1,20 +1,24 @@
-"""``touchcell run``: plan, compose, run under signal handlers with a live line, and report."""
+"""``touchcell run``: plan, compose, run within the operator's reach and with a live line, and report."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import shutil
-import signal
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from cell.blackbox import BlackBox, stop_record
 from cell.cli import EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
 from cell.compose import Cell, compose
 from cell.config import CellPlan, plan_cell
+from cell.errors import RecordingError
 from cell.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
+from cell.operator import reachable, stop_on_keys, stop_on_signals
 from cell.recording import Recorder
 from cell.report import write_report
 
@@ -50,25 +54,44 @@ def run_cell(
     result = _run(cell, folder, live)
     (folder / "result.json").write_text(json.dumps(_result_json(plan, result), indent=1) + "\n")
     print(write_report(folder))
+    if result.outcome in (Outcome.TRIPPED, Outcome.ERROR):
+        print(f"`touchcell why {folder}` explains")
     return _EXIT[result.outcome]
 
 
 def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
     stop = StopRequest()
-    with Recorder(folder / "run.mcap") as recorder, cell, _stop_on_signals(stop), _live_line(cell.plan, live) as show:
-        return RunLoop(cell, recorder, stop=stop, on_cycle=show).run()
+    box = BlackBox()
+    with (
+        reachable(folder),
+        Recorder(folder / "run.mcap") as recorder,
+        cell,
+        stop_on_signals(stop),
+        stop_on_keys(stop) as look_at_keys,
+        _live_line(cell.plan, live) as show,
+    ):
 
+        def after_cycle(progress: Progress) -> None:
+            look_at_keys()
+            if show is not None:
+                show(progress)
 
-@contextlib.contextmanager
-def _stop_on_signals(stop: StopRequest) -> Iterator[None]:
-    """The first Ctrl-C, SIGTERM or lost terminal ends the task in an orderly way, the second stops at once."""
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, lambda *_: stop.ask()) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        result = RunLoop(cell, recorder, box=box, stop=stop, on_cycle=after_cycle).run()
+        start_ns = cell.start_ns
+    if result.outcome in (Outcome.TRIPPED, Outcome.ERROR):
+        file = folder / "cell.yaml"
+        about = {
+            "cell": cell.plan.cell.name,
+            "cell_file": file.name,
+            "cell_sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+            "start_ns": start_ns,
+        }
+        try:
+            box.dump(folder, result, about)
+        except RecordingError as error:
+            # What happened is told all the same.
+            print(f"touchcell: no black box: {error}", file=sys.stderr)
+    return result
 
 
 @contextlib.contextmanager
@@ -88,6 +111,8 @@ def _live_line(plan: CellPlan, live: bool) -> Iterator[Any]:
             errors = [item for item in progress.telemetry.items() if item[0].startswith("error_")]
             parts += [f"{name.removeprefix('error_')} {value:+.2f}" for name, value in errors[:3]]
             parts.append(f"{progress.t_s / max(wall_s, 1e-3):.1f}x real time")
+            if sys.stdin.isatty():
+                parts.append("[space stops, q ends]")
             display.update(Text("  ".join(parts)))
 
         yield show
@@ -102,6 +127,7 @@ def _result_json(plan: CellPlan, result: RunResult) -> dict[str, Any]:
         "state": result.state,
         "duration_s": round(result.duration_s, 6),
         "cycles": result.cycles,
+        "stops": {role: stop_record(report) for role, report in result.stops.items()},
         "skipped": list(plan.skipped),
         "stages_us": {stage: _quantiles_us(rows) for stage, rows in result.times.rows.items()},
     }

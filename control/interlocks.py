@@ -1,7 +1,8 @@
 """Interlocks: pure rules over a ``CellView``, and the section of the cell file that sets their limits.
 
 Each rule is a small frozen dataclass with a ``check``; each is configured by a model whose keys carry their units.
-None of them changes a command: that is the work of the arm's gate. They say when motion has to end.
+None of them changes a command: they say when motion has to slow down or to end. Rules that need a past are in
+``control.timed`` and the modules named after what they watch.
 """
 
 from __future__ import annotations
@@ -13,8 +14,21 @@ from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal, Protocol
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, TypeAdapter, ValidationError, model_validator
+from pydantic import BaseModel, Field, PositiveFloat, TypeAdapter, ValidationError, model_validator
 
+from control.motion_interlocks import LimitedConfig, StandstillConfig, TrackingConfig
+from control.settings import GradedSettings, InterlockSettings
+from control.tactile_interlocks import (
+    ContactLostConfig,
+    ExposureConfig,
+    FrameFrozenConfig,
+    InconsistentConfig,
+    OutOfRangeConfig,
+    ShearConfig,
+    TorsionConfig,
+    UncertainConfig,
+)
+from control.timed import TimedInterlock
 from control.view import CellView
 from control.violation import Severity, Violation
 from drivers.errors import ConfigError
@@ -65,6 +79,9 @@ class Finite:
                 ("depth", sensor.depth_m),
                 ("depth deviation", sensor.sigma_depth_m),
                 ("innovation", sensor.nis),
+                ("shear", sensor.shear_m),
+                ("torsion", sensor.torsion_rad),
+                ("brightness", sensor.brightness),
             ):
                 if value is not None:
                     yield role, sensor.seq, what, value
@@ -72,11 +89,12 @@ class Finite:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Workspace:
-    """A point of an arm's tool stays inside a box along the axes of the arm's base.
+    """A point of an arm's tool stays inside a box along the axes of the arm's base; motion back into it is allowed.
 
     Attributes:
         arm: role of the arm.
-        T_tcp_point: pose (4, 4) of the guarded point in the tool frame: the sensor's, or the identity.
+        T_tcp_point: pose (4, 4) of the guarded point in the tool frame: the sensor's, so that its length counts, or the
+            identity.
         min_m: lower corner (3,).
         max_m: upper corner (3,).
     """
@@ -89,16 +107,52 @@ class Workspace:
     max_m: Array
 
     def check(self, view: CellView) -> Violation | None:
-        T_base_tcp = view.arms[self.arm].state.value.T_base_tcp
-        p = (T_base_tcp @ self.T_tcp_point)[:3, 3]
+        arm = view.arms[self.arm]
+        p = (arm.state.value.T_base_tcp @ self.T_tcp_point)[:3, 3]
         excess = np.maximum(self.min_m - p, p - self.max_m)
         axis = int(np.argmax(excess))
         if excess[axis] <= 0.0:
+            return None
+        v = arm.commanded_velocity(self.T_tcp_point)
+        if v is not None and np.all(np.where(p > self.max_m, v < 0.0, np.where(p < self.min_m, v > 0.0, True))):
             return None
         limit = self.max_m[axis] if p[axis] > self.max_m[axis] else self.min_m[axis]
         reason = f"{'xyz'[axis]} = {1e3 * p[axis]:.1f} mm is outside the box, limit {1e3 * limit:g} mm"
         return Violation(
             self.name, self.severity, self.arm, reason, view.now_ns, value=float(p[axis]), limit=float(limit), unit="m"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tilt:
+    """The z axis of an arm's tool, or of the sensor on it, stays in a cone; motion back into it is allowed.
+
+    Attributes:
+        arm: role of the arm.
+        axis_tcp: (3,) unit vector of the guarded axis in the tool frame.
+        direction: (3,) unit vector of the cone's axis along base axes.
+        limit_rad: half of the cone's opening.
+    """
+
+    name: str
+    severity: Severity
+    arm: str
+    axis_tcp: Array
+    direction: Array
+    limit_rad: float
+
+    def check(self, view: CellView) -> Violation | None:
+        arm = view.arms[self.arm]
+        axis = arm.state.value.T_base_tcp[:3, :3] @ self.axis_tcp
+        tilt_rad = math.acos(max(-1.0, min(1.0, float(axis @ self.direction))))
+        if tilt_rad <= self.limit_rad:
+            return None
+        twist = arm.commanded_twist()
+        if twist is not None and float(np.cross(twist[3:], axis) @ self.direction) > 0.0:
+            return None
+        reason = f"tilted by {math.degrees(tilt_rad):.1f} deg, limit {math.degrees(self.limit_rad):g} deg"
+        return Violation(
+            self.name, self.severity, self.arm, reason, view.now_ns, value=tilt_rad, limit=self.limit_rad, unit="rad"
         )
 
 
@@ -204,26 +258,18 @@ def _check_ages(
     return None
 
 
-class _Settings(BaseModel):
-    """Base of the settings: unknown keys refused, no limit has a default."""
+class WorkspaceConfig(GradedSettings):
+    """Box for a sensor, or for the tool centre point of an arm without one, along the axes of the arm's base.
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    severity: Literal["trip", "fault"] = "trip"
-
-    @property
-    def _severity(self) -> Severity:
-        return Severity[self.severity.upper()]
-
-
-class WorkspaceConfig(_Settings):
-    """Box for a sensor, or for the tool centre point of an arm without one, along the axes of the arm's base."""
+    ``margin_mm`` is how far outside the box nothing stands: a cell whose arm may overshoot by more is refused.
+    """
 
     kind: Literal["workspace"]
     arm: str
     sensor: str | None = None
     min_mm: tuple[float, float, float]
     max_mm: tuple[float, float, float]
+    margin_mm: PositiveFloat | None = None
 
     @model_validator(mode="after")
     def _corners_in_order(self) -> WorkspaceConfig:
@@ -233,19 +279,48 @@ class WorkspaceConfig(_Settings):
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
         """The rule. Raises ConfigError for a sensor that the cell does not have."""
-        if self.sensor is not None and self.sensor not in T_tcp_sensor:
-            raise ConfigError(
-                f"the task has no sensor {self.sensor!r}",
-                key=f"interlocks.{name}.sensor",
-                value=self.sensor,
-                hint=f"sensors: {', '.join(sorted(T_tcp_sensor)) or 'none'}",
-            )
-        T_tcp_point = np.eye(4) if self.sensor is None else T_tcp_sensor[self.sensor]
+        T_tcp_point = _guarded(name, self.sensor, T_tcp_sensor)
         min_m, max_m = 1e-3 * np.array(self.min_mm), 1e-3 * np.array(self.max_mm)
-        return Workspace(name, self._severity, self.arm, T_tcp_point, min_m, max_m)
+        return Workspace(name, self.level, self.arm, T_tcp_point, min_m, max_m)
 
 
-class TcpSpeedConfig(_Settings):
+def _guarded(name: str, sensor: str | None, T_tcp_sensor: Mapping[str, Array]) -> Array:
+    """Pose (4, 4) of the sensor in the tool frame, or the identity. Raises ConfigError for one that is not there."""
+    if sensor is None:
+        return np.eye(4)
+    if sensor not in T_tcp_sensor:
+        raise ConfigError(
+            f"the task has no sensor {sensor!r}",
+            key=f"interlocks.{name}.sensor",
+            value=sensor,
+            hint=f"sensors: {', '.join(sorted(T_tcp_sensor)) or 'none'}",
+        )
+    return T_tcp_sensor[sensor]
+
+
+class TiltConfig(GradedSettings):
+    """Cone for the z axis of a sensor, or of the tool of an arm without one; ``direction`` is along base axes."""
+
+    kind: Literal["tilt"]
+    arm: str
+    sensor: str | None = None
+    direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    limit_deg: Annotated[float, Field(gt=0.0, le=180.0)]
+
+    @model_validator(mode="after")
+    def _has_direction(self) -> TiltConfig:
+        if not any(self.direction):
+            raise ValueError("direction is zero")
+        return self
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
+        """The rule. Raises ConfigError for a sensor that the cell does not have."""
+        axis = _guarded(name, self.sensor, T_tcp_sensor)[:3, 2]
+        direction = np.array(self.direction) / np.linalg.norm(self.direction)
+        return Tilt(name, self.level, self.arm, axis, direction, math.radians(self.limit_deg))
+
+
+class TcpSpeedConfig(InterlockSettings):
     """Largest speeds of any tool centre point."""
 
     kind: Literal["tcp_speed"]
@@ -254,10 +329,10 @@ class TcpSpeedConfig(_Settings):
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
         """The rule."""
-        return TcpSpeed(name, self._severity, self.limit_m_s, self.limit_rad_s)
+        return TcpSpeed(name, self.level, self.limit_m_s, self.limit_rad_s)
 
 
-class DepthConfig(_Settings):
+class DepthConfig(GradedSettings):
     """Deepest indentation of any sensor."""
 
     kind: Literal["depth"]
@@ -265,10 +340,10 @@ class DepthConfig(_Settings):
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
         """The rule."""
-        return Depth(name, self._severity, 1e-3 * self.limit_mm)
+        return Depth(name, self.level, 1e-3 * self.limit_mm)
 
 
-class FrameAgeConfig(_Settings):
+class FrameAgeConfig(InterlockSettings):
     """Oldest tactile frame."""
 
     kind: Literal["frame_age"]
@@ -276,10 +351,10 @@ class FrameAgeConfig(_Settings):
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
         """The rule."""
-        return FrameAge(name, self._severity, 1e-3 * self.limit_ms)
+        return FrameAge(name, self.level, 1e-3 * self.limit_ms)
 
 
-class ArmStateAgeConfig(_Settings):
+class ArmStateAgeConfig(InterlockSettings):
     """Oldest arm state."""
 
     kind: Literal["arm_state_age"]
@@ -287,11 +362,28 @@ class ArmStateAgeConfig(_Settings):
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
         """The rule."""
-        return ArmStateAge(name, self._severity, 1e-3 * self.limit_ms)
+        return ArmStateAge(name, self.level, 1e-3 * self.limit_ms)
 
 
 InterlockConfig = Annotated[
-    WorkspaceConfig | TcpSpeedConfig | DepthConfig | FrameAgeConfig | ArmStateAgeConfig, Field(discriminator="kind")
+    WorkspaceConfig
+    | TiltConfig
+    | TcpSpeedConfig
+    | DepthConfig
+    | FrameAgeConfig
+    | ArmStateAgeConfig
+    | FrameFrozenConfig
+    | ExposureConfig
+    | UncertainConfig
+    | OutOfRangeConfig
+    | InconsistentConfig
+    | ContactLostConfig
+    | ShearConfig
+    | TorsionConfig
+    | TrackingConfig
+    | StandstillConfig
+    | LimitedConfig,
+    Field(discriminator="kind"),
 ]
 """One entry of the ``interlocks:`` section; ``kind`` says which."""
 
@@ -324,6 +416,18 @@ INTERLOCKS: Final[Mapping[str, InterlockSpec]] = MappingProxyType(
             InterlockSpec("depth", "no sensor is pressed in too deep", DepthConfig),
             InterlockSpec("frame_age", "tactile frames are fresh", FrameAgeConfig),
             InterlockSpec("arm_state_age", "arm states are fresh", ArmStateAgeConfig),
+            InterlockSpec("tilt", "sensor or tool points along a direction within a cone", TiltConfig),
+            InterlockSpec("frame_frozen", "tactile pictures change, noise and all", FrameFrozenConfig),
+            InterlockSpec("exposure", "brightness stays near that of the first frames", ExposureConfig),
+            InterlockSpec("uncertain", "the depth is known well enough", UncertainConfig),
+            InterlockSpec("out_of_range", "the network stays in the range that it was trained on", OutOfRangeConfig),
+            InterlockSpec("inconsistent", "the filter's innovations fit its covariance", InconsistentConfig),
+            InterlockSpec("contact_lost", "a contact that was made is not missing for long", ContactLostConfig),
+            InterlockSpec("shear", "no contact is sheared until it saturates or slips", ShearConfig),
+            InterlockSpec("torsion", "no contact is twisted too far", TorsionConfig),
+            InterlockSpec("tracking", "an arm moves as it was sent", TrackingConfig),
+            InterlockSpec("standstill", "an arm that is told to stand does", StandstillConfig),
+            InterlockSpec("limited", "no gate holds an arm back for long", LimitedConfig),
         )
     }
 )
@@ -351,6 +455,6 @@ def parse_interlocks(section: Mapping[str, Any]) -> dict[str, InterlockConfig]:
 
 def build_interlocks(
     settings: Mapping[str, InterlockConfig], T_tcp_sensor: Mapping[str, Array]
-) -> tuple[Interlock, ...]:
+) -> tuple[Interlock | TimedInterlock, ...]:
     """The rules of a cell whose sensors sit at ``T_tcp_sensor``, (4, 4) by role. Raises ConfigError."""
     return tuple(config.build(name, T_tcp_sensor) for name, config in settings.items())

@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from drivers.commands import TwistCommand
+import numpy as np
+
+from drivers.commands import Sent, TwistCommand, in_base_axes
 from drivers.samples import Stamped, TcpState
+from geometry.types import Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,10 +19,24 @@ class ArmView:
     Attributes:
         state: newest measured state.
         command: what is about to be sent; None when it is told to stop.
+        sent: what its gate let through in the cycle before, and why it differs; None when it was told to stop.
     """
 
     state: Stamped[TcpState]
     command: TwistCommand | None = None
+    sent: Sent[TwistCommand] | None = None
+
+    def commanded_twist(self) -> Array | None:
+        """(6,) the command's twist of the tool centre point along base axes; None without a command."""
+        return None if self.command is None else in_base_axes(self.command, self.state.value.T_base_tcp)
+
+    def commanded_velocity(self, T_tcp_point: Array) -> Array | None:
+        """(3,) velocity along base axes that the command asks of a point of the tool; None without a command."""
+        twist = self.commanded_twist()
+        if twist is None:
+            return None
+        velocity: Array = twist[:3] + np.cross(twist[3:], self.state.value.T_base_tcp[:3, :3] @ T_tcp_point[:3, 3])
+        return velocity
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +51,10 @@ class SensorView:
         in_range: False when the network left the range that it was trained on.
         nis: normalised innovation squared of the last filter correction, where there was one.
         sigma_depth_m: standard deviation of the depth, where there is one.
+        shear_m: size of the estimated tangential shear; None without contact.
+        torsion_rad: estimated rotation about the surface normal; None without contact.
+        content: number that changes with the frame's picture, noise included; None where nobody looks at it.
+        brightness: the frame's mean grey level; None likewise.
     """
 
     t_frame_ns: int
@@ -43,12 +64,17 @@ class SensorView:
     in_range: bool = True
     nis: float | None = None
     sigma_depth_m: float | None = None
+    shear_m: float | None = None
+    torsion_rad: float | None = None
+    content: int | None = None
+    brightness: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class CellView:
-    """The cell at ``now_ns``, arms and sensors by their role in the task."""
+    """The cell at ``now_ns``, arms and sensors by their role in the task, and the state that the task is in."""
 
     now_ns: int
     arms: Mapping[str, ArmView] = field(default_factory=dict)
     sensors: Mapping[str, SensorView] = field(default_factory=dict)
+    task_state: str = ""

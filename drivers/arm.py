@@ -71,7 +71,7 @@ class Arm(Device):
     ) -> None:
         super().__init__(name, clock)
         self._limits = limits
-        self._stop_categories = frozenset(stop_categories)
+        self._stop_categories = frozenset(StopCategory(category) for category in stop_categories)
         self._max_state_age_s = max_state_age_s
         self._desk = LeaseDesk(name)
         self._gate = TwistGate(name, limits, self._desk, clock, max_ttl_s=max_ttl_s)
@@ -80,6 +80,11 @@ class Arm(Device):
     def limits(self) -> TwistLimits:
         """What the gate allows."""
         return self._limits
+
+    @property
+    def stop_categories(self) -> frozenset[StopCategory]:
+        """Stop categories that it offers in software."""
+        return self._stop_categories
 
     @property
     def owner(self) -> str | None:

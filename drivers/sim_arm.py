@@ -69,16 +69,21 @@ class SimArm(Arm):
         self.T_world_base = se3.from_euler_mm_deg(config.base_pose_mm_deg)
         self._timeline = timeline or Timeline(clock)
         self._body = TwistFollower(se3.from_euler_mm_deg(config.start_pose_mm_deg), self.limits, self._timeline.step_ns)
-        self._timeline.add(Phase.MOTION, self._body.step)
+        self._powered = False
+        self._told: Stamped[TcpState] | None = None
+        self._timeline.add(Phase.MOTION, self._step)
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
         """State at the last step of the simulation. Raises StaleData if it is older than ``max_age_s``."""
         self._require("tell its pose", *_READABLE)
         t_ns = self._timeline.advance()
-        state = TcpState(self._body.T_base_tcp.copy(), self._body.velocity.copy())
+        state = TcpState(self._body.T_base_tcp.copy(), self._velocity())
         if self.faults.nan_state:
             state = TcpState(np.full((4, 4), np.nan), np.full(6, np.nan))
         sample = Stamped(state, t_ns, t_ns // self._timeline.step_ns)
+        if self.faults.stale and self._told is not None:
+            sample = self._told
+        self._told = sample
         age_s = sample.age_s(self._clock.now_ns())
         if max_age_s is not None and age_s > max_age_s:
             raise StaleData(self.name, age_s, max_age_s, sample.seq)
@@ -87,7 +92,7 @@ class SimArm(Arm):
     def at_rest(self) -> bool:
         """Whether it stands still and is not about to move."""
         self._timeline.advance()
-        return self._body.at_rest()
+        return self._body.at_rest() and not self._velocity().any()
 
     def health(self) -> dict[str, float | int | str | bool]:
         """Speeds of the tool centre point and who commands it."""
@@ -109,8 +114,32 @@ class SimArm(Arm):
 
     def _begin_stop(self, category: StopCategory) -> None:
         self._timeline.advance()
-        if not self.faults.deaf:
+        if self.faults.deaf:
+            return
+        self._powered = category is StopCategory.STOP_AND_HOLD
+        if not (self.faults.runs_on and self._powered):
             self._body.halt()
+
+    def _step(self, t_ns: int) -> None:
+        if self.faults.runs_on and self._powered:
+            self._body.prolong(t_ns)
+        self._body.step(t_ns)
+        drift_m_s = self._drift_m_s()
+        if drift_m_s:
+            T = self._body.T_base_tcp.copy()
+            T[2, 3] -= drift_m_s * self._timeline.step_ns * 1e-9
+            self._body.T_base_tcp = T
+
+    def _velocity(self) -> Array:
+        velocity = self._body.velocity.copy()
+        velocity[2] -= self._drift_m_s()
+        return velocity
+
+    def _drift_m_s(self) -> float:
+        return self.faults.drift_m_s if self._powered else 0.0
+
+    def _activate(self) -> None:
+        self._powered = True
 
     def _open(self) -> None:
         self._timeline.advance()

@@ -6,6 +6,7 @@ import math
 import zlib
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field
 
 from drivers.clock import Clock
@@ -133,6 +134,8 @@ class SimTactip(Device):
     def _expose(self, seq: int, t_ns: int) -> Frame:
         pixels = self._tip.pixels(self._scene.contact(self.name, t_ns).value.T_f_s)
         image = self._renderer.processed(pixels) if self._processed else self._renderer.raw(pixels, seq)
+        if self.faults.gain != 1.0:
+            image = np.clip(image * self.faults.gain, 0.0, 255.0).astype(np.uint8)
         image.flags.writeable = False
         self._drawn += 1
         return Frame(image)

@@ -121,7 +121,8 @@ class ContactPipeline:
             self._ended = True
             return self._newest
         read_ns = self._timer() - start
-        if self._newest is None or frame.seq != self._newest.seq:
+        # A frame that is older than the newest tells nothing, and there is no way back in a filter.
+        if self._newest is None or frame.t_ns > self._newest.t_frame_ns:
             self.frame = frame
             self._newest = self._process(frame, read_ns)
         return self._replayed(self._newest, now_ns)

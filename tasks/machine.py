@@ -172,6 +172,11 @@ class TaskMachine:
         return self._engine_model.state
 
     @property
+    def active_states(self) -> tuple[Enum, ...]:
+        """The states that are not terminal, as the table names them."""
+        return tuple(state for state, definition in self._definitions.items() if not definition.terminal)
+
+    @property
     def finished(self) -> bool:
         """Whether the present state is terminal."""
         return self._definitions[self.state].terminal

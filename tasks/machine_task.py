@@ -22,6 +22,11 @@ class MachineTask(ABC):
         return state_name(self._machine.state)
 
     @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states that it may be in before it has finished, the first one first."""
+        return tuple(state_name(state) for state in self._machine.active_states)
+
+    @property
     def finished(self) -> bool:
         """Whether a terminal state has been reached."""
         return self._machine.finished

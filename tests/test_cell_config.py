@@ -105,6 +105,56 @@ def test_missing_limit(tmp_path: Path) -> None:
     assert error.reason == "is missing"
 
 
+def test_a_workspace_whose_arm_cannot_stop_within_its_margin(tmp_path: Path) -> None:
+    path = written(tmp_path, ("margin_mm: 15", "margin_mm: 11"))
+    error = refused(path)
+    assert error.key == "interlocks.workspace.margin_mm"
+    assert error.line == line_of(path, "margin_mm: 11")
+    # 100 mm/s at 100 Hz, seen 2 ms late, braked with 0.5 m/s^2.
+    for number in (
+        "100 mm/s",
+        "1.0 mm in a cycle",
+        "0.2 mm in the arm's latency",
+        "10.0 mm to brake",
+        "11.2 mm in all",
+    ):
+        assert number in error.reason
+    assert "tcp_speed_m_s" in error.hint
+    plan_cell(written(tmp_path, ("margin_mm: 15", "margin_mm: 11.3")))
+
+
+def test_an_interlock_on_an_arm_that_is_not_there(tmp_path: Path) -> None:
+    error = refused(written(tmp_path, ("kind: tilt, arm: arm", "kind: tilt, arm: amr")))
+    assert error.key == "interlocks.tilt.arm"
+    assert "'arm'" in error.hint
+
+
+def test_a_slower_arm_needs_less_margin(tmp_path: Path) -> None:
+    plan_cell(written(tmp_path, ("margin_mm: 15", "margin_mm: 4"), ("tcp_speed_m_s: 0.10", "tcp_speed_m_s: 0.05")))
+
+
+def test_the_length_of_the_sensor_swings_further(tmp_path: Path) -> None:
+    long = ("mounted_on: arm", "mounted_on: arm\n    tcp_to_sensor_mm_deg: [0, 0, 100, 0, 0, 0]")
+    plan = plan_cell(written(tmp_path, long, ("margin_mm: 15", "margin_mm: 30")))
+    way = plan.overshoots["workspace"]
+    assert way.speed_m_s == pytest.approx(0.1 + 0.5 * 0.1)
+    assert way.braking_m == pytest.approx(0.01 + 0.5 * 0.05 * 0.5 / 2.5)
+
+
+def test_a_limit_alone_does_not_bound_a_moving_task(tmp_path: Path) -> None:
+    change = ("{kind: depth, limit_mm: 6}", "{kind: depth, limit_mm: 6, severity: limit}")
+    error = refused(written(tmp_path, change))
+    assert error.key == "interlocks"
+    assert "'depth' that stops" in error.reason
+
+
+def test_a_stop_category_that_the_driver_does_not_offer(tmp_path: Path) -> None:
+    plan = plan_cell(written(tmp_path, ("deactivate: hold", "deactivate: hold\n    stop_category: 1")))
+    assert plan.cell.arms["arm"].stop_category == 1
+    error = refused(written(tmp_path, ("deactivate: hold", "deactivate: hold\n    stop_category: 0")))
+    assert error.key == "arms.arm.stop_category"
+
+
 def test_a_moving_task_must_be_bounded(tmp_path: Path) -> None:
     error = refused(written(tmp_path, ("  indentation: {kind: depth, limit_mm: 6}\n", "")))
     assert error.key == "interlocks"

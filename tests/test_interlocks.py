@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from control.interlocks import INTERLOCKS, Finite, build_interlocks, parse_interlocks
+from control.timed import TimedInterlock
 from control.view import ArmView, CellView, SensorView
 from control.violation import Severity
 from drivers.commands import TwistCommand, TwistFrame
@@ -32,6 +33,18 @@ GOOD = {
     "depth": {"kind": "depth", "limit_mm": 6.0},
     "frames": {"kind": "frame_age", "limit_ms": 100},
     "states": {"kind": "arm_state_age", "limit_ms": 50, "severity": "fault"},
+    "tilt": {"kind": "tilt", "arm": "arm", "sensor": "sensor", "direction": [0, 0, 2], "limit_deg": 20},
+    "frozen": {"kind": "frame_frozen", "limit_ms": 200},
+    "exposure": {"kind": "exposure", "limit_percent": 20},
+    "uncertain": {"kind": "uncertain", "limit_mm": 1},
+    "range": {"kind": "out_of_range", "limit_ms": 200},
+    "nis": {"kind": "inconsistent", "limit_nis": 22.5, "frames": 5},
+    "lost": {"kind": "contact_lost", "limit_ms": 500},
+    "shear": {"kind": "shear", "limit_mm": 5},
+    "torsion": {"kind": "torsion", "limit_deg": 8},
+    "tracking": {"kind": "tracking", "limit_mm_s": 20, "hold_ms": 100},
+    "stand": {"kind": "standstill", "limit_mm": 1, "settle_ms": 500},
+    "limited": {"kind": "limited", "limit_ms": 300},
 }
 
 
@@ -52,7 +65,8 @@ def rule(name):
 
 @pytest.mark.parametrize("name", GOOD)
 def test_a_quiet_cell_breaks_no_rule(name):
-    assert rule(name).check(view()) is None
+    quiet = rule(name)
+    assert (quiet.judge(view(), {})[0] if isinstance(quiet, TimedInterlock) else quiet.check(view())) is None
 
 
 @pytest.mark.parametrize(
@@ -68,6 +82,15 @@ def test_a_quiet_cell_breaks_no_rule(name):
         ("depth", {"depth_m": 0.006}, {"depth_m": 0.0061}, 0.0061, 0.006, "m"),
         ("frames", {"t_frame_ns": NOW - 100_000_000}, {"t_frame_ns": NOW - 101_000_000}, 0.101, 0.1, "s"),
         ("frames", {"t_frame_ns": NOW}, {"t_frame_ns": NOW + 1_000_000}, -0.001, 0.1, "s"),
+        # The sensor's z axis is the tool's.
+        (
+            "tilt",
+            {"pose_mm_deg": (0, 0, 100, 19, 0, 70)},
+            {"pose_mm_deg": (0, 0, 100, 0, 21, 0)},
+            math.radians(21),
+            math.radians(20),
+            "rad",
+        ),
         ("states", {"state_ns": NOW - 50_000_000}, {"state_ns": NOW - 51_000_000}, 0.051, 0.05, "s"),
     ],
 )
@@ -80,6 +103,34 @@ def test_limits(name, inside, outside, value, limit, unit):
     assert found.value == pytest.approx(math.hypot(0.06, 0.09) if value is None else value, abs=1e-12)
     assert found.limit == pytest.approx(limit)
     assert found.frame_seq == (17 if name in ("depth", "frames") else None)
+
+
+@pytest.mark.parametrize(
+    ("pose_mm_deg", "back", "away"),
+    [
+        ((0, 0, 201, 0, 0, 0), (0, 0, -0.01, 0, 0, 0), (0.01, 0, 0, 0, 0, 0)),
+        ((0, 0, 201, 0, 0, 0), (0.02, 0, -0.01, 0, 0, 0), (0, 0, 0.01, 0, 0, 0)),
+        # Below and beside the box: it has to come back along both axes.
+        ((105, 0, -110, 0, 0, 0), (-0.01, 0, 0.01, 0, 0, 0), (-0.01, 0, 0, 0, 0, 0)),
+        # The tool turns about itself, and the sensor at its end swings back or away.
+        ((105, 0, 100, 0, 0, 0), (0, 0, 0, 0, -0.1, 0), (0, 0, 0, 0, 0.1, 0)),
+        # Along its own axis, and turned over: the command is along tool axes.
+        ((0, 0, 99, 180, 0, 0), (0, 0, -0.01, 0, 0, 0), (0, 0, 0.01, 0, 0, 0)),
+    ],
+)
+def test_motion_back_into_the_workspace_is_allowed(pose_mm_deg, back, away):
+    box = rule("box")
+    assert box.check(view(pose_mm_deg=pose_mm_deg, command=back)) is None
+    assert box.check(view(pose_mm_deg=pose_mm_deg, command=away)) is not None
+    assert box.check(view(pose_mm_deg=pose_mm_deg)) is not None
+
+
+def test_turning_back_into_the_cone_is_allowed():
+    tilt = rule("tilt")
+    tilted = (0, 0, 100, 25, 0, 30)
+    assert tilt.check(view(pose_mm_deg=tilted, command=(0, 0, 0, -0.1, 0, 0))) is None
+    assert tilt.check(view(pose_mm_deg=tilted, command=(0, 0, 0, 0.1, 0, 0))) is not None
+    assert tilt.check(view(pose_mm_deg=tilted, command=(0, 0, 0.1, 0, 0, 0))) is not None
 
 
 def test_the_worst_of_two_speeds_is_reported():
@@ -118,6 +169,9 @@ def test_anything_not_finite_is_found(bad, place):
         view(depth_m=bad),
         view(nis=bad),
         view(sigma_depth_m=bad),
+        view(shear_m=bad),
+        view(torsion_rad=bad),
+        view(brightness=bad),
         CellView(NOW, {"arm": ArmView(Stamped(TcpState(pose, np.zeros(6)), NOW, 1))}),
         CellView(
             NOW,
@@ -149,6 +203,10 @@ def test_anything_not_finite_is_found(bad, place):
         ({"kind": "depth", "limit_mm": 6, "limit_deg": 1}, "interlocks.x.limit_deg"),
         ({"kind": "tcp_speed", "limit_m_s": 0.1}, "interlocks.x.limit_rad_s"),
         ({"kind": "frame_age", "limit_ms": 10, "severity": "limit"}, "interlocks.x.severity"),
+        ({"kind": "limited", "limit_ms": 300, "severity": "limit"}, "interlocks.x.severity"),
+        ({"kind": "inconsistent", "limit_nis": 20}, "interlocks.x.frames"),
+        ({"kind": "contact_lost", "limit_ms": 20, "states": []}, "interlocks.x.states"),
+        ({**GOOD["tilt"], "direction": [0, 0, 0]}, "interlocks.x"),
         ({"kind": "finite"}, "interlocks.x"),
         ({"limit_mm": 6}, "interlocks.x"),
         ({**GOOD["box"], "min_mm": [200, -100, 0]}, "interlocks.x"),

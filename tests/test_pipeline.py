@@ -159,3 +159,17 @@ def test_a_foreign_image_is_refused(tmp_path: object) -> None:
     source = ContactPipeline(StubCamera(clock, [PRESSED]), Picky())  # type: ignore[arg-type]
     with pytest.raises(ImageError):
         source.update(0)
+
+
+def test_a_frame_older_than_the_newest_is_left_alone() -> None:
+    made, model, clock = pipeline([PRESSED] * 10, pose_filter=PoseFilter(isotropic_noise(1e-3, 0.01)))
+    made.record_pose(0, pose(0))
+    clock.advance_s(0.1)
+    newest = made.update(clock.now_ns())
+    assert newest is not None
+    late = StubCamera(VirtualClock(start_ns=40_000_000), [PRESSED] * 10)
+    made._camera = late
+    again = made.update(clock.now_ns())
+    assert again is not None
+    assert (again.seq, again.t_frame_ns) == (newest.seq, newest.t_frame_ns)
+    assert model.inferences == 1

@@ -35,6 +35,10 @@ class TwistFollower:
         self._target = twist.copy()
         self._expires_ns = expires_ns
 
+    def prolong(self, t_ns: int) -> None:
+        """Let what it follows hold at least until ``t_ns``."""
+        self._expires_ns = max(self._expires_ns, t_ns)
+
     def halt(self) -> None:
         """Slow down to rest."""
         self._target = np.zeros(6)

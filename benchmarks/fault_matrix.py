@@ -1,0 +1,256 @@
+"""Every fault of the simulated devices in every state of every task: what trips, and how the arm comes to rest.
+
+The matrix is generated: faults are listed once, states come from the tasks' own tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import yaml
+
+from cell.cli import find_cell
+from cell.compose import Cell, compose
+from cell.config import plan_cell
+from cell.loop import RunLoop, RunResult, StopRequest
+from drivers.sim_arm import SimArm
+from drivers.sim_tactip import SimTactip
+from tasks.machine_task import MachineTask
+
+_WATCHED_S = 3.0
+_SETTLED_CYCLES = 3
+# By then the camera has shown enough for its brightness to be known.
+_NOT_BEFORE_S = 0.4
+
+Inject = Callable[[Cell, StopRequest], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Something that goes wrong, and what has to come of it.
+
+    Attributes:
+        name: in tables.
+        device: what it belongs to; a task without an arm has no faults of one.
+        inject: makes it happen.
+        expected: kinds of interlock, or of error, of which one has to end the run; empty: it ends without.
+        unseen: states in which it has no effect that could be seen, and why.
+        obeys: whether the arm still does what its stop category asks for; if not, it takes twice as long ...
+        extra_m_s: ... and moves at this speed besides.
+    """
+
+    name: str
+    device: Literal["arm", "camera"]
+    inject: Inject
+    expected: frozenset[str]
+    unseen: Mapping[str, str]
+    obeys: bool = True
+    extra_m_s: float = 0.0
+
+
+def _arm(**changes: Any) -> Inject:
+    def inject(cell: Cell, stop: StopRequest) -> None:
+        for arm in cell.arms.values():
+            assert isinstance(arm, SimArm)
+            arm.faults = replace(arm.faults, **changes)
+
+    return inject
+
+
+def _camera(**changes: Any) -> Inject:
+    def inject(cell: Cell, stop: StopRequest) -> None:
+        for camera in cell.cameras.values():
+            assert isinstance(camera, SimTactip)
+            if "last_seq" in changes:
+                camera.faults = replace(camera.faults, last_seq=camera.latest().seq)
+            else:
+                camera.faults = replace(camera.faults, **changes)
+
+    return inject
+
+
+def _and_stop(inject: Inject) -> Inject:
+    """The fault, and a stop by the operator at the same time, without which it would not show."""
+
+    def both(cell: Cell, stop: StopRequest) -> None:
+        inject(cell, stop)
+        stop.ask_at_once()
+
+    return both
+
+
+_STANDS = {"prepare": "nothing moves yet"}
+_NO_BASELINE = {"prepare": "the first frames are the measure", "wait": "the first frames are the measure"}
+
+FAULTS: Final = (
+    Fault("operator's stop", "arm", _and_stop(lambda cell, stop: None), frozenset(), {}),
+    Fault("arm: nan_state", "arm", _arm(nan_state=True), frozenset({"finite"}), {}),
+    Fault("arm: stale", "arm", _arm(stale=True), frozenset({"arm_state_age"}), {}),
+    Fault(
+        "arm: drift_m_s",
+        "arm",
+        _arm(drift_m_s=0.03),
+        frozenset({"tracking", "standstill", "depth", "workspace"}),
+        {},
+        obeys=False,
+        extra_m_s=0.03,
+    ),
+    Fault("arm: deaf", "arm", _and_stop(_arm(deaf=True)), frozenset(), {}),
+    Fault("arm: runs_on", "arm", _and_stop(_arm(runs_on=True)), frozenset({"stop"}), _STANDS, obeys=False),
+    Fault("camera: frozen", "camera", _camera(frozen=True), frozenset({"frame_frozen"}), {}),
+    Fault("camera: last_seq", "camera", _camera(last_seq=0), frozenset({"frame_age"}), {}),
+    # Where the loop waits for the first frame, its command has expired when it is sent; a task without commands sees
+    # the same picture for too long.
+    Fault(
+        "camera: extra_latency_s",
+        "camera",
+        _camera(extra_latency_s=0.3),
+        frozenset({"frame_age", "CommandRejected", "frame_frozen"}),
+        {},
+    ),
+    Fault("camera: gain", "camera", _camera(gain=0.6), frozenset({"exposure"}), _NO_BASELINE),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One place in the matrix and what was found there.
+
+    Attributes:
+        task, fault, state: which place.
+        ended_by: kind of the interlock that came first, "stop" for an arm that had to be stopped by stronger means, the
+            kind of the error that was raised, or empty if none.
+        detection_s: from the fault to the trip.
+        stop_s, distance_m: until the arm stood; None where there is no arm, or nothing to be read.
+        declared_s, declared_m: what that may take.
+        problem: what was not as it has to be; empty if all was.
+    """
+
+    task: str
+    fault: str
+    state: str
+    ended_by: str = ""
+    detection_s: float | None = None
+    stop_s: float | None = None
+    distance_m: float | None = None
+    declared_s: float | None = None
+    declared_m: float | None = None
+    problem: str = ""
+
+
+def cells() -> dict[str, dict[str, Any]]:
+    """A short cell file for every task, by the task's name."""
+    following, tracking = _shipped("surface_follow_sim.yaml"), _shipped("object_track_sim.yaml")
+    following["task"] |= {"distance_mm": 10, "retract_mm": 10}
+    tracking["task"] |= {"duration_s": 0.6, "retract_mm": 12}
+    observing = _shipped("surface_follow_sim.yaml")
+    observing["task"] = {"name": "observe"}
+    of_sensors = ("frame_age", "frame_frozen", "exposure")
+    observing["interlocks"] = {n: e for n, e in observing["interlocks"].items() if e["kind"] in of_sensors}
+    return {"surface_following": following, "object_tracking": tracking, "observe": observing}
+
+
+def matrix(folder: Path, devices: Sequence[str] = ("arm", "camera")) -> Iterator[Case]:
+    """Run every place of the matrix and yield what was found.
+
+    Args:
+        folder: for cell files.
+        devices: whose faults; those of cameras need a model, those of arms run on the true contact.
+    """
+    for task, data in cells().items():
+        for kind in devices:
+            path = folder / f"{task}_{kind}.yaml"
+            sensor = data["sensors"]["sensor"]
+            if kind == "arm":
+                sensor = {**sensor, "estimator": {"kind": "true_contact"}}
+            path.write_text(yaml.safe_dump({**data, "sensors": {"sensor": sensor}}))
+            probe = compose(plan_cell(path))
+            assert isinstance(probe.task, MachineTask)
+            if kind == "arm" and not probe.plan.arm_roles:
+                continue
+            for fault in (fault for fault in FAULTS if fault.device == kind):
+                for state in probe.task.states:
+                    yield run_case(path, fault, state)
+
+
+def run_case(path: Path, fault: Fault, state: str) -> Case:
+    """Run the cell, let the fault happen in ``state``, and judge what comes of it."""
+    cell, stop, trace = compose(plan_cell(path)), StopRequest(), _Trace()
+    case = Case(cell.plan.task.name, fault.name, state)
+    injected_ns: int | None = None
+    with cell:
+        assert isinstance(cell.task, MachineTask)
+        initial = state == cell.task.states[0]
+        wait = 1 if initial else _SETTLED_CYCLES
+        loop = RunLoop(cell, None, box=trace, stop=stop)
+        loop.begin()
+        going = True
+        while going:
+            if injected_ns is None and cell.task.state == state:
+                wait -= 1
+                now_ns = cell.clock.now_ns()
+                if wait <= 0 and (initial or now_ns >= cell.start_ns + _NOT_BEFORE_S * 1e9):
+                    injected_ns = now_ns
+                    fault.inject(cell, stop)
+            if injected_ns is not None and cell.clock.now_ns() > injected_ns + _WATCHED_S * 1e9:
+                break
+            going = loop.step()
+        result = loop.end()
+        at_rest = all(arm.at_rest() for arm in cell.arms.values())
+    if injected_ns is None:
+        return replace(case, problem="the state was not reached")
+    return _judged(case, fault, cell, result, trace, injected_ns, at_rest=at_rest)
+
+
+class _Trace:
+    """Remembers when commands were sent."""
+
+    def __init__(self) -> None:
+        self.sent_ns: list[int] = []
+
+    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
+        if topic.endswith("/command"):
+            self.sent_ns.append(t_ns)
+
+
+def _judged(
+    case: Case, fault: Fault, cell: Cell, result: RunResult, trace: _Trace, injected_ns: int, *, at_rest: bool
+) -> Case:
+    problems = []
+    first = result.causes[0] if result.causes else None
+    kinds = {name: entry.kind for name, entry in cell.plan.cell.interlocks.items()}
+    by = "" if result.error is None else type(result.error).__name__
+    if first is not None:
+        by = kinds.get(first.interlock, first.interlock)
+    expected: frozenset[str] = frozenset() if case.state in fault.unseen else fault.expected
+    if by not in (expected or {""}):
+        problems.append(f"ended by {by or 'nothing'}, expected {' or '.join(sorted(expected)) or 'nothing'}")
+    if first is not None and any(t_ns >= first.t_ns for t_ns in trace.sent_ns):
+        problems.append("a command was sent after the trip")
+    if not at_rest:
+        problems.append("the arm does not stand")
+    case = replace(case, ended_by=by, detection_s=None if first is None else (first.t_ns - injected_ns) * 1e-9)
+    for report in result.stops.values():
+        times = 1 if fault.obeys else 2
+        longest_s = times * report.declared_s + 1.0 / cell.rate_hz
+        farthest_m = times * report.declared_m + fault.extra_m_s * longest_s
+        if report.time_s is None or report.time_s > longest_s:
+            problems.append(f"at rest after {report.time_s} s, declared {report.declared_s:.3f} s")
+        if report.distance_m is not None and report.distance_m > farthest_m:
+            problems.append(f"stood after {1e3 * report.distance_m:.2f} mm, declared {1e3 * report.declared_m:.2f} mm")
+        case = replace(
+            case,
+            stop_s=report.time_s,
+            distance_m=report.distance_m,
+            declared_s=report.declared_s,
+            declared_m=report.declared_m,
+        )
+    return replace(case, problem="; ".join(problems))
+
+
+def _shipped(name: str) -> dict[str, Any]:
+    data: dict[str, Any] = yaml.safe_load(find_cell(Path("configs") / name).read_text())
+    return data
