@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, Protocol
@@ -25,6 +26,7 @@ from control.view import ArmView, CellView, SensorView
 from control.violation import Severity, Violation
 from drivers.arm import Arm
 from drivers.commands import Sent, TwistCommand
+from drivers.errors import DeviceError
 from drivers.lease import Lease
 from drivers.samples import Stamped, TcpState
 from geometry import se3
@@ -202,7 +204,9 @@ class RunLoop:
             if report.problem:
                 self._event("stop failed", f"{role}: {report.problem}")
         for role, lease in self._leases.items():
-            cell.arms[role].release(lease)
+            # What an arm that is gone says to it has been told already.
+            with suppress(DeviceError):
+                self._arms[role].release(lease)
         reason = self._reason or ("" if self._error is None else str(self._error))
         if (trip := cell.supervisor.latch.first_cause) is not None:
             outcome, reason = Outcome.TRIPPED, f"{trip.interlock}: {trip.subject}: {trip.reason}"

@@ -39,6 +39,18 @@ class NoSuchRun(TouchcellError):
         self.folder = folder
 
 
+class FolderInUse(TouchcellError):
+    """Another run goes on in the run folder.
+
+    Attributes:
+        folder: the run folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(f"{folder}: another run goes on here", hint="choose another folder with --out")
+        self.folder = folder
+
+
 @contextlib.contextmanager
 def stop_on_signals(stop: StopRequest) -> Iterator[None]:
     """The first Ctrl-C, SIGTERM or lost terminal ends the task in an orderly way, the second stops at once."""
@@ -98,9 +110,17 @@ def _look(fd: int, stop: StopRequest) -> None:
 
 @contextlib.contextmanager
 def reachable(folder: Path) -> Iterator[None]:
-    """While inside, ``touchcell stop FOLDER`` finds this process: by a file with its number, locked while it lives."""
-    with (folder / PID_FILE).open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    """While inside, ``touchcell stop FOLDER`` finds this process: by a file with its number, locked while it lives.
+
+    Raises:
+        FolderInUse: another run goes on there.
+    """
+    with (folder / PID_FILE).open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise FolderInUse(folder) from None
+        file.truncate(0)
         file.write(str(os.getpid()))
         file.flush()
         try:

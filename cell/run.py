@@ -77,21 +77,24 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
                 show(progress)
 
         result = RunLoop(cell, recorder, box=box, stop=stop, on_cycle=after_cycle).run()
-        start_ns = cell.start_ns
-    if result.outcome in (Outcome.TRIPPED, Outcome.ERROR):
-        file = folder / "cell.yaml"
-        about = {
-            "cell": cell.plan.cell.name,
-            "cell_file": file.name,
-            "cell_sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-            "start_ns": start_ns,
-        }
-        try:
-            box.dump(folder, result, about)
-        except RecordingError as error:
-            # What happened is told all the same.
-            print(f"touchcell: no black box: {error}", file=sys.stderr)
+        # Before the devices are given back, which an arm that obeys nothing may not survive.
+        if result.outcome in (Outcome.TRIPPED, Outcome.ERROR):
+            _dump(box, folder, cell, result)
     return result
+
+
+def _dump(box: BlackBox, folder: Path, cell: Cell, result: RunResult) -> None:
+    about = {
+        "cell": cell.plan.cell.name,
+        "cell_file": "cell.yaml",
+        "cell_sha256": hashlib.sha256((folder / "cell.yaml").read_bytes()).hexdigest(),
+        "start_ns": cell.start_ns,
+    }
+    try:
+        box.dump(folder, result, about)
+    except RecordingError as error:
+        # What happened is told all the same.
+        print(f"touchcell: no black box: {error}", file=sys.stderr)
 
 
 @contextlib.contextmanager

@@ -19,6 +19,7 @@ def plot_trip(run: Run, trip_s: float, cause: dict[str, Any] | None, path: Path)
     """Speed sent and measured, depth, and the age of the frames, from a second before the trip until after the stop."""
     figure, axes = plt.subplots(3, 1, figsize=(11, 8), sharex=True, layout="constrained")
     speed, depth, age = axes
+    axes[-1].set_xlim(-_BEFORE_S, _AFTER_S)
     for role in run.roles("arms", "tcp"):
         tcp, sent = run.series(f"/arms/{role}/tcp"), run.series(f"/arms/{role}/command")
         assert tcp is not None
@@ -49,7 +50,6 @@ def plot_trip(run: Run, trip_s: float, cause: dict[str, Any] | None, path: Path)
         axis.grid(alpha=0.3)
         if axis.get_legend_handles_labels()[0]:
             axis.legend(fontsize=9, loc="upper left")
-    axes[-1].set_xlim(-_BEFORE_S, _AFTER_S)
     axes[-1].set_xlabel("time from the trip (s)")
     if cause is not None:
         figure.suptitle(f"{cause['interlock']}: {cause['subject']}: {cause['reason']}")

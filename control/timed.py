@@ -109,14 +109,15 @@ class Sustained:
         return found, marks
 
     def _violation(self, view: CellView, reading: Reading, lasted_s: float) -> Violation:
-        reason = f"{self.what} {reading.value:.4g} {self.unit}, limit {self.limit:g} {self.unit}".replace(" ,", ",")
+        unit = f" {self.unit}" if self.unit else ""
+        reason = f"{self.what} {reading.value:.4g}{unit}, limit {self.limit:g}{unit}"
         if lasted_s > 0.0:
             reason += f", for {1e3 * lasted_s:.0f} ms"
         return Violation(
             self.name,
             self.severity,
             reading.subject,
-            reason.strip(),
+            reason,
             view.now_ns,
             value=reading.value,
             limit=self.limit,

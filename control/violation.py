@@ -12,7 +12,7 @@ class Severity(IntEnum):
     """How much a violation asks for, in rising order."""
 
     LIMIT = 1
-    """Motion goes on, reduced by the arm's own gate; the violation is reported."""
+    """Motion goes on, slower; a violation that lasts becomes a trip. It is reported."""
     TRIP = 2
     """Controlled stop, latched; a person resets it once the cause has gone."""
     FAULT = 3

@@ -130,6 +130,27 @@ def test_workspace_trip_latches_and_stops_the_arm(tmp_path: Path) -> None:
     assert max(x_mm) < -72 + 1.0
 
 
+def test_a_limit_slows_the_arm_down_and_trips_when_it_lasts(tmp_path: Path) -> None:
+    def touchy(data: dict[str, Any]) -> None:
+        data["interlocks"]["shear"] = {"kind": "shear", "limit_mm": 2, "severity": "limit"}
+
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        _, result = run(true_contact_cell(tmp_path, touchy), recorder=recorder)
+    assert result.outcome is Outcome.TRIPPED
+    assert "limiting for over 300 ms" in result.reason
+    messages = list(read(tmp_path / "run.mcap"))
+    limited_ns = [m.t_ns for m in messages if m.topic == "/safety"]
+    assert result.causes[0].t_ns - limited_ns[0] == 310_000_000
+    commands = [m for m in messages if m.topic == "/arms/arm/command"]
+    before = [m.data["speed_mm_s"] for m in commands if m.t_ns < limited_ns[0]][-5:]
+    after = [m.data["speed_mm_s"] for m in commands if m.t_ns > limited_ns[0] + 100_000_000]
+    # A quarter of the 20 mm/s, and the servo's corrections.
+    assert min(before) > 19
+    assert len(after) == 20
+    assert max(after) < 6
+    assert result.stops["arm"].kept
+
+
 class _FullDisk(io.BytesIO):
     def write(self, data: object) -> int:
         if self.tell() > 60_000:

@@ -17,7 +17,16 @@ import pytest
 import yaml
 
 from cell.cli import EXIT_BAD_INPUT, main
-from cell.operator import NoSuchRun, ask_to_stop, await_end, reachable, running, stop_on_keys, stop_on_signals
+from cell.operator import (
+    FolderInUse,
+    NoSuchRun,
+    ask_to_stop,
+    await_end,
+    reachable,
+    running,
+    stop_on_keys,
+    stop_on_signals,
+)
 
 SHIPPED = Path(__file__).parent.parent / "configs" / "surface_follow_sim.yaml"
 DEADLINE_S = 60.0
@@ -119,6 +128,9 @@ def test_a_run_is_found_as_long_as_it_lives(tmp_path: Path) -> None:
     folder.mkdir()
     with reachable(folder):
         assert running(tmp_path) == [folder]
+        with pytest.raises(FolderInUse), reachable(folder):
+            pass
+        assert (folder / "pid").read_text() == str(os.getpid())
         assert not await_end(folder, wait_s=0.0)
     assert running(tmp_path) == []
     assert await_end(folder)

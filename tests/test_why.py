@@ -13,6 +13,8 @@ import yaml
 from cell.blackbox import BlackBox
 from cell.cli import EXIT_BAD_INPUT, EXIT_OK, EXIT_TRIPPED, main
 from cell.recording import read
+from drivers.sim_arm import SimArm
+from drivers.simulation.faults import ArmFaults
 
 SHIPPED = Path(__file__).parent.parent / "configs" / "surface_follow_sim.yaml"
 
@@ -86,3 +88,27 @@ def test_the_stop_category_of_the_cell_file_is_used(tmp_path: Path) -> None:
 def test_a_run_without_a_black_box(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["why", str(tmp_path)]) == EXIT_BAD_INPUT
     assert "holds no black box" in capsys.readouterr().err
+
+
+def test_an_arm_that_obeys_nothing_still_leaves_a_black_box(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    honest = SimArm.__init__
+
+    def broken(arm: SimArm, *arguments: Any, **more: Any) -> None:
+        honest(arm, *arguments, **more)
+        arm.faults = ArmFaults(deaf=True, drift_m_s=0.004)
+
+    monkeypatch.setattr(SimArm, "__init__", broken)
+    data = yaml.safe_load(SHIPPED.read_text())
+    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    data["interlocks"]["workspace"]["max_mm"] = [-72, 50, 150]
+    cell, folder = tmp_path / "cell.yaml", tmp_path / "run"
+    cell.write_text(yaml.safe_dump(data))
+    assert main(["run", str(cell), "--out", str(folder), "--quiet"]) == EXIT_TRIPPED
+    capsys.readouterr()
+    assert main(["why", str(folder)]) == EXIT_OK
+    told = capsys.readouterr().out
+    assert "never seen at rest: does not come to rest by any means that its driver has: use the emergency stop" in told
+    assert "then " in told
+    assert "stop (fault): arm: not seen at rest" in told
