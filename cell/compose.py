@@ -225,10 +225,10 @@ def _sensor(
 
 def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Device) -> ContactPipeline:
     from perception.contact_gate import ContactGate
+    from perception.estimators import load_estimator
     from perception.filter import PoseFilter, isotropic_noise
-    from perception.inference import ContactModel
 
-    model = ContactModel.load(model_path(estimator.model))
+    model = load_estimator(model_path(estimator.model))
     settings = estimator.filter
     pose_filter = (
         PoseFilter(isotropic_noise(1e-3 * settings.drift_mm_per_sqrt_s, np.deg2rad(settings.drift_deg_per_sqrt_s)))

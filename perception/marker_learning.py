@@ -22,6 +22,7 @@ from perception.marker_matching import (
     MarkerMatcher,
     disc_density,
     pair,
+    quality,
 )
 from perception.markers import Discs, lattice, ring_numbers
 
@@ -31,6 +32,9 @@ _GUESS_BATCH = 128
 _CANDIDATES = 120
 _BANK = 2000
 _LAST_STEPS = 100
+_SURE = 0.96
+_SPREADS = 2
+_ALIKE = 8
 _SWEEP = 2000
 
 Told = Callable[[int, int], None]
@@ -46,6 +50,7 @@ class Learned:
         guess: its first guess.
         bank: (b, k) its coefficients to try.
         least_score, most_rms_px: its limits.
+        fields: of all frames that it was taught with.
     """
 
     matcher: MarkerMatcher
@@ -53,6 +58,7 @@ class Learned:
     bank: Array
     least_score: float
     most_rms_px: float
+    fields: list[MarkerField]
 
 
 def fit_lattice(discs: Discs, rings: int) -> tuple[Array, float]:
@@ -141,8 +147,8 @@ def learn_markers(
     rings: int = 10,
     modes: int = 24,
     reference: Array | None = None,
-    rounds: int = 3,
-    guess_steps: int = 2500,
+    rounds: int = 2,
+    guess_steps: int = 1200,
     seed: int = 0,
     told: Told | None = None,
 ) -> Learned:
@@ -155,7 +161,7 @@ def learn_markers(
         modes: ways of moving that are kept.
         reference: (m, 2) px lattice out of contact; None finds the least deformed frame.
         rounds: of matching and learning anew.
-        guess_steps: of the training of the first guess, each round.
+        guess_steps: of the training of the first guess, each round; threefold in the last.
         seed: of everything random.
         told: of the frames that have been matched.
 
@@ -174,13 +180,16 @@ def learn_markers(
         model, guess, image_size, bank=_bank(coefficients), least_score=least_score, most_rms_px=most_rms_px
     )
     bank = _bank(coefficients)
+    density = np.stack([guess.density(discs.centres) for discs in frames])
     for number in range(rounds):
         fields = []
         for i, discs in enumerate(frames):
             fields.append(matcher.match(discs))
-            if told is not None and (i % 50 == 49 or i + 1 == len(frames)):
-                told(number * len(frames) + i + 1, rounds * len(frames))
-        good = [field for field in fields if field.valid and field.score > 0.96]
+            if told is not None:
+                told(number * len(frames) + i + 1, (rounds + 1) * len(frames))
+        for _ in range(_SPREADS):
+            _spread(matcher, frames, fields, density)
+        good = [field for field in fields if _surely(field)]
         if len(good) < max(2 * modes, len(frames) // 4):
             raise TrainingError(
                 f"only {len(good)} of {len(frames)} images could be matched",
@@ -198,12 +207,13 @@ def learn_markers(
         )
         coefficients = np.stack([model.basis @ (field.displacements.ravel() - model.mean) for field in good])
         noise_px = float(np.median([field.rms_px for field in good]))
-        guess = train_guess(model, coefficients, noise_px=noise_px, scatter=0.05, steps=guess_steps, seed=seed)
+        steps = guess_steps if number + 1 < rounds else 3 * guess_steps
+        guess = train_guess(model, coefficients, noise_px=noise_px, scatter=0.05, steps=steps, seed=seed)
         bank = _bank(coefficients)
-        matcher = MarkerMatcher(
-            model, guess, image_size, bank=bank, least_score=least_score, most_rms_px=0.2 * model.spacing_px
-        )
-    return Learned(matcher, guess, bank, least_score, 0.2 * model.spacing_px)
+        matcher = MarkerMatcher(model, guess, image_size, bank=bank, least_score=least_score, most_rms_px=most_rms_px)
+    fields = match_all(matcher, frames, None if told is None else lambda i, n: told(rounds * n + i, (rounds + 1) * n))
+    _spread(matcher, frames, fields, density)
+    return Learned(matcher, guess, bank, least_score, most_rms_px, fields)
 
 
 def train_guess(
@@ -243,10 +253,16 @@ def train_guess(
         # The wide ways of moving decide which marker a disc is; the narrow ones are found once that is known.
         weights = torch.from_numpy(np.sqrt(model.sd / model.sd[0]).astype(np.float32))
         squares: list[NDArray[np.float32]] = []
+        # Far contacts are few and hard, so they come more often.
+        far = 0.5 + ((coefficients / model.sd) ** 2).mean(axis=1)
+        often = far / far.sum()
         for _ in range(steps):
-            one, other = rng.integers(0, len(coefficients), (2, _GUESS_BATCH))
-            share = rng.uniform(0.0, 0.5, (_GUESS_BATCH, 1)) * (rng.random((_GUESS_BATCH, 1)) < 0.5)
+            one = rng.choice(len(coefficients), _GUESS_BATCH, p=often)
+            other = rng.integers(0, len(coefficients), _GUESS_BATCH)
+            share = rng.uniform(-0.2, 0.5, (_GUESS_BATCH, 1)) * (rng.random((_GUESS_BATCH, 1)) < 0.5)
             chosen = coefficients[one] + share * (coefficients[other] - coefficients[one])
+            # What could not be matched so far lies beyond what could.
+            chosen = rng.uniform(0.8, 1.2, (_GUESS_BATCH, 1)) * chosen
             chosen = chosen + rng.normal(0.0, scatter, chosen.shape) * model.sd
             positions = model.positions(chosen) + rng.normal(0.0, noise_px, (_GUESS_BATCH, m, 2))
             present = (rng.random((_GUESS_BATCH, m)) < 0.98).astype(np.float64)
@@ -259,8 +275,9 @@ def train_guess(
             loss.backward()
             optimizer.step()
             schedule.step()
-    arrays = [parameter.detach().numpy().copy() for parameter in network.parameters()]
-    return FirstGuess(low, float(cell_px), *arrays, sd=np.sqrt(np.mean(squares[-_LAST_STEPS:], axis=0)) * model.sd)
+    hidden_weight, hidden_bias, weight, bias = (parameter.detach().numpy().copy() for parameter in network.parameters())
+    sd = np.sqrt(np.mean(squares[-_LAST_STEPS:], axis=0)) * model.sd
+    return FirstGuess(low, float(cell_px), hidden_weight, hidden_bias, weight, bias, sd)
 
 
 def match_all(matcher: MarkerMatcher, frames: Sequence[Discs], told: Told | None = None) -> list[MarkerField]:
@@ -276,6 +293,25 @@ def match_all(matcher: MarkerMatcher, frames: Sequence[Discs], told: Told | None
 def stacked(fields: Sequence[MarkerField]) -> tuple[Array, NDArray[np.bool_]]:
     """Displacements (n, m, 2) px and seen markers (n, m)."""
     return np.stack([field.displacements for field in fields]), np.stack([field.seen for field in fields])
+
+
+def _surely(field: MarkerField) -> bool:
+    return field.valid and field.score > _SURE
+
+
+def _spread(
+    matcher: MarkerMatcher, frames: Sequence[Discs], fields: list[MarkerField], density: NDArray[np.float32]
+) -> None:
+    """Match the frames that failed from those that succeeded and look most alike, in place."""
+    sure = np.flatnonzero([_surely(field) for field in fields])
+    if not len(sure):
+        return
+    for i, field in enumerate(fields):
+        if not _surely(field) and len(frames[i]):
+            apart = ((density[sure] - density[i]) ** 2).sum(axis=1)
+            alike = sure[np.argsort(apart)[:_ALIKE]]
+            again = matcher.match_from(frames[i], [fields[j].coefficients for j in alike])
+            fields[i] = max(field, again, key=quality)
 
 
 def _bank(coefficients: Array) -> Array:

@@ -2,14 +2,15 @@
 
 A marker's displacement says little by itself, as markers move further than half their spacing. All together move in few
 ways: a linear model with some two dozen coefficients leaves less than a pixel. So the coefficients are found, and the
-markers with them, by turns: predict the markers, pair each with its nearest disc where both agree, fit anew. From a near
-start (the frame before) this converges in two or three turns. Without one a small network looks at where the discs
-are dense, and guesses the coefficients.
+markers with them, by turns: predict the markers, pair each with its nearest disc, fit anew. From a near start (the
+frame before) this converges in two or three turns. Without one a small network looks at where the discs are dense, and
+guesses the coefficients; when the guess leads nowhere, learned contacts whose discs lie alike are tried.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,10 @@ _FIT_SD_PX = 0.7
 _TURNS = 12
 _SETTLED_PX = 0.05
 _CONVINCING = 0.965
-_MOST_STARTS = 8
+_COMPLETE = 0.985
+_MOST_STARTS = 6
+_RINGS_GROWN = 6
+_ONWARD = 1.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,10 +130,15 @@ class FirstGuess:
     bias: NDArray[np.float32]
     sd: Array
 
-    def __call__(self, centres: Array) -> Array:
-        """(k,) coefficients over their standard deviations, of discs (n, 2)."""
-        grid = int(round(np.sqrt(self.hidden_weight.shape[1])))
-        density = disc_density(centres[None], np.ones((1, len(centres))), self.low, self.cell_px, grid)[0]
+    def density(self, centres: Array) -> NDArray[np.float32]:
+        """(..., grid * grid) what it looks at, of discs (..., n, 2)."""
+        grid = math.isqrt(self.hidden_weight.shape[1])
+        batch = centres.reshape(-1, *centres.shape[-2:])
+        density = disc_density(batch, np.ones(batch.shape[:2]), self.low, self.cell_px, grid)
+        return density.reshape(*centres.shape[:-2], -1)
+
+    def __call__(self, density: NDArray[np.float32]) -> Array:
+        """(k,) coefficients over their standard deviations, of a density (grid * grid,)."""
         hidden = np.maximum(self.hidden_weight @ density + self.hidden_bias, 0.0)
         guess: Array = (self.weight @ hidden + self.bias).astype(np.float64)
         return guess
@@ -195,7 +204,13 @@ class MarkerMatcher:
         self._base = model.base
         self._middle = model.base.reshape(-1, 2).mean(axis=0)
         self._spacing_px = model.spacing_px
-        self._guess_sd = guess.sd
+        self._reach = 0.3 * self._spacing_px
+        apart = np.linalg.norm(model.reference[:, None] - model.reference[None], axis=2)
+        self._neighbours = ((apart > 0.0) & (apart < 1.5 * self._spacing_px)).astype(np.float64)
+        # Where a contact is far from those that taught it, a guess is off by more than its own standard deviation.
+        self._guess_sd = np.hypot(3.0 * guess.sd, 0.1 * model.sd)
+        self._bank_density = guess.density(model.positions(self._bank))
+        self._bank_squares = (self._bank_density**2).sum(axis=1)
 
     def match(self, discs: Discs, previous: MarkerField | None = None) -> MarkerField:
         """Markers of the image in which ``discs`` were found.
@@ -209,60 +224,99 @@ class MarkerMatcher:
         centres = discs.centres
         search = _Nearest(centres, self._middle)
         if previous is not None and previous.valid:
-            field = self._refine(previous.coefficients, centres, search, near=True)
-            if field.valid and field.score >= _CONVINCING:
+            field = self._refine(previous.coefficients, centres, search, self.model.sd, near=True)
+            if _convincing(field):
                 return field
-        guessed = self._guess(centres) * self.model.sd
-        tried = [self._refine(guessed, centres, search)]
-        for start in self._alike(guessed):
-            if tried[-1].valid and tried[-1].score >= _CONVINCING:
-                break
-            tried.append(self._refine(start, centres, search))
-        return max(tried, key=_quality)
+        density = self._guess.density(centres)
+        wide_sd = 0.4 * self.model.sd
+        tried = [self._refine(self._guess(density) * self.model.sd, centres, search, self._guess_sd)]
+        if not _convincing(tried[0]):
+            for start in self._alike(density):
+                tried.append(self._refine(start, centres, search, wide_sd))
+                if _convincing(tried[-1]):
+                    break
+        return max(tried, key=quality)
 
-    def _alike(self, guessed: Array) -> Iterator[Array]:
-        """Learned contacts that are like a guess, the likest first, each unlike those before it."""
-        left = self._bank
-        for _ in range(_MOST_STARTS):
-            if not len(left):
-                return
-            off = (((left - guessed) / self._guess_sd) ** 2).sum(axis=1)
-            chosen = left[int(np.argmin(off))]
-            yield chosen
-            left = left[(((left - chosen) / self._guess_sd) ** 2).sum(axis=1) > 0.3 * left.shape[1]]
+    def match_from(self, discs: Discs, starts: Iterable[Array]) -> MarkerField:
+        """Best of the matches that begin at other contacts' coefficients (k,), far from the right ones maybe."""
+        search = _Nearest(discs.centres, self._middle)
+        prior_sd = 0.4 * self.model.sd
+        return max((self._refine(start, discs.centres, search, prior_sd) for start in starts), key=quality)
 
-    def _refine(self, start: Array, centres: Array, search: _Nearest, *, near: bool = False) -> MarkerField:
-        final_reach = 0.3 * self._spacing_px
-        reach = final_reach if near else 0.6 * self._spacing_px
-        modes = len(start)
-        ridge = (_FIT_SD_PX / (self.model.sd if near else 3.0 * self._guess_sd)) ** 2
-        coefficients = start
-        predicted = (self._base + start @ self.model.basis).reshape(-1, 2)
+    def _alike(self, density: NDArray[np.float32]) -> Array:
+        """(s, k) coefficients of the learned contacts whose discs are dense where this image's are."""
+        if not len(self._bank):
+            return self._bank
+        # The distance less what is the same for all.
+        apart = self._bank_squares - 2.0 * (self._bank_density @ density)
+        return self._bank[np.argsort(apart)[:_MOST_STARTS]]
+
+    def _refine(
+        self, start: Array, centres: Array, search: _Nearest, prior_sd: Array, *, near: bool = False
+    ) -> MarkerField:
+        ridge = (_FIT_SD_PX / prior_sd) ** 2
+        first_reach = self._reach if near else 2.0 * self._reach
+        coefficients = self._settle(start, start, ridge, centres, search, first_reach)
+        field = self._field(coefficients, centres, search)
+        if near or field.score >= _COMPLETE or field.seen.mean() < 0.5:
+            return field
+        # Where a part of the rim is off by half a spacing, the part that is right leads on to it.
+        grown = self._grow(coefficients, start, ridge, centres, search)
+        again = self._field(self._settle(grown, start, ridge, centres, search, self._reach), centres, search)
+        return max(field, again, key=quality)
+
+    def _settle(
+        self, coefficients: Array, start: Array, ridge: Array, centres: Array, search: _Nearest, reach: float
+    ) -> Array:
+        """Pair and fit by turns until nothing moves."""
+        predicted = self.model.positions(coefficients)
         for _ in range(_TURNS):
             partner, square = search(predicted)
             paired = _own(partner, square, len(centres)) & (square < reach * reach)
-            if paired.sum() < modes:
+            if paired.sum() < len(start):
                 break
-            off = centres[partner] - predicted
             # A disc far from where its marker should be may be a neighbour's, and counts less.
             weight = paired / (1.0 + square / (0.35 * reach) ** 2)
-            weighted = self.model.basis * np.repeat(weight, 2)
-            moments = weighted @ self.model.basis.T
-            moments[np.diag_indices(modes)] += ridge
-            change = np.linalg.solve(moments, weighted @ off.ravel() + ridge * (start - coefficients))
+            change = self._change(weight, centres[partner] - predicted, start - coefficients, ridge)
             coefficients = coefficients + change
             shift = (change @ self.model.basis).reshape(-1, 2)
             predicted = predicted + shift
-            if reach <= final_reach and float(np.abs(shift).max()) < _SETTLED_PX:
+            if reach <= self._reach and float(np.abs(shift).max()) < _SETTLED_PX:
                 break
-            reach = max(final_reach, 0.8 * reach)
-        return self._field(coefficients, predicted, centres, search, final_reach)
+            reach = max(self._reach, 0.8 * reach)
+        return coefficients
 
-    def _field(
-        self, coefficients: Array, predicted: Array, centres: Array, search: _Nearest, reach: float
-    ) -> MarkerField:
+    def _change(self, weight: Array, off: Array, from_start: Array, ridge: Array) -> Array:
+        """(k,) change of coefficients that brings markers nearest to discs ``off`` (m, 2) away, and not far from
+        the start."""
+        weighted = self.model.basis * np.repeat(weight, 2)
+        moments = weighted @ self.model.basis.T
+        moments[np.diag_indices(len(moments))] += ridge
+        return np.linalg.solve(moments, weighted @ off.ravel() + ridge * from_start).astype(np.float64)
+
+    def _grow(self, coefficients: Array, start: Array, ridge: Array, centres: Array, search: _Nearest) -> Array:
+        """Coefficients after markers without a disc were looked for where their neighbours' discs point."""
+        predicted = self.model.positions(coefficients)
         partner, square = search(predicted)
-        paired = _own(partner, square, len(centres)) & (square < reach * reach)
+        paired = _own(partner, square, len(centres)) & (square < self._reach**2)
+        off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
+        for _ in range(_RINGS_GROWN):
+            near_by = self._neighbours @ paired
+            expected: Array = (self._neighbours @ off) / np.maximum(near_by, 1.0)[:, None]
+            corrected = predicted + np.where(paired[:, None], off, _ONWARD * expected)
+            partner, square = search(corrected)
+            before = int(paired.sum())
+            paired = _own(partner, square, len(centres)) & (square < (1.3 * self._reach) ** 2)
+            paired &= near_by >= 2.0
+            off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
+            if int(paired.sum()) <= before:
+                break
+        return coefficients + self._change(paired.astype(np.float64), off, start - coefficients, ridge)
+
+    def _field(self, coefficients: Array, centres: Array, search: _Nearest) -> MarkerField:
+        predicted = self.model.positions(coefficients)
+        partner, square = search(predicted)
+        paired = _own(partner, square, len(centres)) & (square < self._reach**2)
         positions = predicted.copy()
         positions[paired] = centres[partner[paired]]
         left_over = np.ones(len(centres), bool)
@@ -294,7 +348,12 @@ class MarkerMatcher:
         return MarkerField(positions.copy(), shift, np.zeros(len(shift), bool), coefficients, 0.0, np.inf, False)
 
 
-def _quality(field: MarkerField) -> tuple[bool, float]:
+def _convincing(field: MarkerField) -> bool:
+    return field.valid and field.score >= _CONVINCING
+
+
+def quality(field: MarkerField) -> tuple[bool, float]:
+    """Orders matches of one image, the better the greater."""
     return field.valid, field.score - 0.05 * min(field.rms_px, 20.0)
 
 
