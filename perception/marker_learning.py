@@ -29,7 +29,7 @@ from perception.markers import Discs, lattice, ring_numbers
 GRID = 32
 GUESS_HIDDEN = 256
 _GUESS_BATCH = 128
-_CANDIDATES = 120
+_CANDIDATES = 60
 _BANK = 2000
 _LAST_STEPS = 100
 _SURE = 0.96

@@ -50,6 +50,7 @@ class MarkerSettings:
         seed: of everything random.
         rings: of the sensor's lattice.
         modes: in which its markers move together.
+        guess_steps: of the first guess's training (``marker_learning.learn_markers``).
         hidden: units of each layer of a displacement network.
         networks: trained side by side; their mixture is the estimate.
         batch_size: contacts per step and network.
@@ -65,6 +66,7 @@ class MarkerSettings:
     seed: int = 0
     rings: int = 10
     modes: int = 24
+    guess_steps: int = 1200
     hidden: tuple[int, ...] = (384, 384, 192)
     networks: int = 4
     batch_size: int = 64
@@ -308,7 +310,8 @@ def _matched(
     cache: Path | None,
     observer: Observer | None,
 ) -> _Matched:
-    recipe = [training_data, validation.digest(), settings.rings, settings.modes, settings.seed]
+    recipe = [training_data, validation.digest(), settings.rings, settings.modes, settings.guess_steps]
+    recipe += [settings.seed]
     name = f"{hashlib.sha256(json.dumps(recipe).encode()).hexdigest()[:32]}.markers.npz"
     stored = _load(cache / name) if cache is not None else None
     if stored is not None:
@@ -323,6 +326,7 @@ def _matched(
         image_size,
         rings=settings.rings,
         modes=settings.modes,
+        guess_steps=settings.guess_steps,
         seed=settings.seed,
         told=told("matched"),
     )

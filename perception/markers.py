@@ -66,7 +66,7 @@ class Discs:
 def detect_markers(image: ImageArray, size: MarkerSize) -> Discs:
     """Centroids of the connected white components that have the size of a marker.
 
-    On discs that were drawn at known places a centroid is off by 0.03 px on average.
+    In black and white images of discs drawn at known places, a centroid is off by 0.07 px at the median.
 
     Args:
         image: uint8 (height, width); what is not zero is white.
