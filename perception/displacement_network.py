@@ -70,7 +70,7 @@ class DisplacementNetwork(nn.Module):
         """Tensors of a model file: the first layer takes pixels, the last gives means and standard deviations."""
         weights = [weight.detach().double() for weight in self.weights]
         biases = [bias.detach().double() for bias in self.biases]
-        biases[0] = biases[0] - self.offset.double() @ weights[0]
+        biases[0] = biases[0] - (self.offset.double() @ weights[0])[:, None]
         weights[0] = self.features.double() @ weights[0]
         kept = [*range(6), *range(12, 18)]
         weights[-1], biases[-1] = weights[-1][:, :, kept], biases[-1][:, :, kept]

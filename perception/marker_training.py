@@ -310,9 +310,9 @@ def _matched(
     cache: Path | None,
     observer: Observer | None,
 ) -> _Matched:
-    recipe = [training_data, validation.digest(), settings.rings, settings.modes, settings.guess_steps]
-    recipe += [settings.seed]
-    name = f"{hashlib.sha256(json.dumps(recipe).encode()).hexdigest()[:32]}.markers.npz"
+    matching = [settings.rings, settings.modes, settings.guess_steps, settings.seed]
+    key = json.dumps([training_data, validation.digest(), *matching])
+    name = f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.markers.npz"
     stored = _load(cache / name) if cache is not None else None
     if stored is not None:
         arrays = {key: stored.pop(key) for key in ("frame", "training", "validation", "taught")}

@@ -7,10 +7,10 @@ from test_markers import MARKERS, inside
 
 pytest.importorskip("torch")
 
-from perception.errors import TrainingError  # noqa: E402
-from perception.marker_learning import Learned, fit_lattice, learn_markers  # noqa: E402
-from perception.marker_matching import DisplacementModel, MarkerField  # noqa: E402
-from perception.markers import Discs, detect_markers  # noqa: E402
+from perception.errors import TrainingError
+from perception.marker_learning import Learned, fit_lattice, learn_markers
+from perception.marker_matching import DisplacementModel, MarkerField
+from perception.markers import Discs, detect_markers
 
 
 @pytest.fixture(scope="module")
