@@ -21,10 +21,11 @@ from perception.markers import Discs
 
 _FIT_SD_PX = 0.7
 _TURNS = 12
-_SETTLED_PX = 0.05
+_SETTLED_PX = 0.1
 _CONVINCING = 0.965
 _COMPLETE = 0.985
 _MOST_STARTS = 6
+_MOST_STARTS_DOUBTFUL = 2
 _RINGS_GROWN = 6
 _ONWARD = 1.2
 
@@ -202,6 +203,7 @@ class MarkerMatcher:
         self._least_score = least_score
         self._most_rms_px = most_rms_px
         self._base = model.base
+        self._basis = model.basis.astype(np.float32)
         self._middle = model.base.reshape(-1, 2).mean(axis=0)
         self._spacing_px = model.spacing_px
         self._reach = 0.3 * self._spacing_px
@@ -228,13 +230,15 @@ class MarkerMatcher:
             if _convincing(field):
                 return field
         density = self._guess.density(centres)
-        wide_sd = 0.4 * self.model.sd
-        tried = [self._refine(self._guess(density) * self.model.sd, centres, search, self._guess_sd)]
-        if not _convincing(tried[0]):
-            for start in self._alike(density):
-                tried.append(self._refine(start, centres, search, wide_sd))
-                if _convincing(tried[-1]):
-                    break
+        field = self._refine(self._guess(density) * self.model.sd, centres, search, self._guess_sd)
+        if _convincing(field):
+            return field
+        tried = [field]
+        starts = self._alike(density)[: _MOST_STARTS_DOUBTFUL if field.valid else _MOST_STARTS]
+        for start in starts:
+            tried.append(self._refine(start, centres, search, 0.4 * self.model.sd))
+            if _convincing(tried[-1]):
+                break
         return max(tried, key=quality)
 
     def match_from(self, discs: Discs, starts: Iterable[Array]) -> MarkerField:
@@ -283,16 +287,19 @@ class MarkerMatcher:
             predicted = predicted + shift
             if reach <= self._reach and float(np.abs(shift).max()) < _SETTLED_PX:
                 break
-            reach = max(self._reach, 0.8 * reach)
+            typical_px = math.sqrt(float(np.median(square[paired])))
+            reach = max(self._reach, min(0.8 * reach, 4.0 * typical_px))
         return coefficients
 
     def _change(self, weight: Array, off: Array, from_start: Array, ridge: Array) -> Array:
         """(k,) change of coefficients that brings markers nearest to discs ``off`` (m, 2) away, and not far from
         the start."""
-        weighted = self.model.basis * np.repeat(weight, 2)
-        moments = weighted @ self.model.basis.T
+        weighted = self._basis * np.repeat(weight, 2).astype(np.float32)
+        moments = (weighted @ self._basis.T).astype(np.float64)
         moments[np.diag_indices(len(moments))] += ridge
-        return np.linalg.solve(moments, weighted @ off.ravel() + ridge * from_start).astype(np.float64)
+        return np.linalg.solve(moments, weighted @ off.ravel().astype(np.float32) + ridge * from_start).astype(
+            np.float64
+        )
 
     def _grow(self, coefficients: Array, start: Array, ridge: Array, centres: Array, search: _Nearest) -> Array:
         """Coefficients after markers without a disc were looked for where their neighbours' discs point."""

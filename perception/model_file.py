@@ -184,7 +184,17 @@ def _parse_header(text: str | None, path: Path) -> Header:
         return Header.model_validate_json(text)
     except ValidationError as error:
         first = error.errors()[0]
-        raise ModelError(path, first["msg"], key=".".join(map(str, first["loc"])), hint="train it again") from error
+        raise ModelError(path, first["msg"], key=_key(first["type"], first["loc"]), hint="train it again") from error
+
+
+def _key(error: str, location: tuple[int | str, ...]) -> str:
+    """The header's field that an error of pydantic speaks of; it names the architecture's kind among the fields."""
+    parts = [str(part) for part in location]
+    if error.startswith("union_tag"):
+        parts.append("kind")
+    elif parts[:1] == ["architecture"]:
+        parts[1:2] = []
+    return ".".join(parts)
 
 
 def _check_tensors(model: Model, path: Path) -> None:
