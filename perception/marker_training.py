@@ -30,6 +30,7 @@ from perception.figures import write_curves, write_predictions
 from perception.labels import CONTACT_NAMES, contact_from_xi, xi_from_contact
 from perception.marker_architecture import MarkerArchitecture
 from perception.marker_estimator import mixed
+from perception.marker_figures import write_markers
 from perception.marker_learning import GRID, GUESS_HIDDEN, Learned, learn_markers, match_all, stacked
 from perception.marker_matching import DisplacementModel
 from perception.markers import Discs, MarkerSize, detect_markers, typical_size
@@ -129,7 +130,8 @@ def train_markers(
 ) -> Model:
     """Learn to match the markers of ``data/train`` without its labels, then contact pose and shear with them.
 
-    Arguments, files written and resuming as ``training.train``; matching is done once for the same images.
+    Arguments, files written and resuming as ``training.train``; ``NAME_markers.png`` shows displacements and density.
+    Matching is done once for the same images.
 
     Raises:
         DataError: the data set is damaged.
@@ -176,7 +178,7 @@ def train_on_discs(
     cache: Path | None = None,
     observer: Observer | None = None,
 ) -> Model:
-    """Train on discs in memory and write the model file ``out`` with two figures beside it.
+    """Train on discs in memory and write the model file ``out`` with three figures beside it.
 
     Args:
         training: to learn from.
@@ -255,6 +257,7 @@ def train_on_discs(
         sigma=scale * sigma**power * labels.half_range,
     )
     write_curves(out.with_name(f"{out.stem}_curves.png"), run.progress.history)
+    _write_examples(out.with_name(f"{out.stem}_markers.png"), run.model, matched.validation, preprocessing.output_size)
     delete_checkpoint(out)
     return model
 
@@ -353,6 +356,18 @@ def _matched(
     return matched
 
 
+def _write_examples(
+    path: Path, model: DisplacementModel, displacements: NDArray[np.float32], size: tuple[int, int]
+) -> None:
+    """A slight, a middling and a strong contact, so that a person sees whether the markers were matched."""
+    order = np.argsort(np.abs(displacements).mean(axis=1))
+    shares = (0.1, 0.5, 0.95)
+    chosen = [order[int(share * (len(order) - 1))] for share in shares]
+    positions = [model.reference + displacements[i].reshape(-1, 2).astype(np.float64) for i in chosen]
+    titles = [f"validation image {i + 1}" for i in chosen]
+    write_markers(path, model.reference, positions, titles, size, model.spacing_px)
+
+
 def _tensors(learned: Learned) -> dict[str, NDArray[np.float32]]:
     model, guess = learned.matcher.model, learned.guess
     tensors = {
@@ -384,7 +399,7 @@ class _Run:
 
     def __post_init__(self) -> None:
         tensors = {name: tensor.astype(np.float64) for name, tensor in self.matched.tensors.items()}
-        model = DisplacementModel(
+        self.model = model = DisplacementModel(
             tensors["lattice"],
             tensors["displacement.mean"],
             tensors["displacement.basis"],

@@ -70,7 +70,7 @@ def trained(data: Path) -> Path:
 
 
 def test_a_minute_of_images_teaches_contacts(data: Path, trained: Path) -> None:
-    for name in ("markers_predictions.png", "markers_curves.png"):
+    for name in ("markers_predictions.png", "markers_curves.png", "markers_markers.png"):
         assert (data / name).stat().st_size > 10_000
     result = evaluate(data, "val", trained)
     assert result.n == 40

@@ -7,6 +7,7 @@ from marker_samples import CORNER, REST, SIZE, TIP, simulated
 
 from drivers.simulation.render import FrameRenderer
 from perception.errors import ImageError
+from perception.marker_figures import density_change
 from perception.marker_learning import fit_lattice
 from perception.markers import Discs, MarkerSize, detect_markers, lattice, ring_numbers, typical_size
 from perception.preprocessing import AdaptiveThreshold, Crop, Preprocessing
@@ -117,3 +118,19 @@ def test_lattice_is_fitted_to_an_undeformed_tip(turn_deg: float, zoom: float, sh
     assert distances.min(axis=1).max() < 2.0
     assert len(set(distances.argmin(axis=1))) == 331
     assert TIP.parameters.rings == 10
+
+
+def test_density_tells_where_markers_crowd() -> None:
+    middle = REST.mean(axis=0)
+    assert np.abs(density_change(REST, REST, SIZE, 18.0)).max() == 0.0
+    # Those right of the middle move away from it: fewer there, and more at the rim.
+    from_middle = REST - middle
+    near = np.exp(-((np.linalg.norm(from_middle - [60.0, 0.0], axis=1) / 50.0) ** 2))
+    change = density_change(REST + 0.5 * near[:, None] * (from_middle - [60.0, 0.0]), REST, SIZE, 18.0)
+    v, u = (int(c) for c in (middle[1] / 4, (middle[0] + 60.0) / 4))
+    assert change[v, u] < -0.3
+    assert change.max() > 0.1
+    assert abs(change[v, int((middle[0] - 120.0) / 4)]) < 0.05
+    nothing = density_change(REST + 1000.0, REST, SIZE, 18.0)
+    assert nothing.min() == -1.0
+    assert nothing.max() == 0.0
