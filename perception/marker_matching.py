@@ -24,6 +24,7 @@ _TURNS = 12
 _SETTLED_PX = 0.1
 _CONVINCING = 0.965
 _COMPLETE = 0.985
+_STILL_THERE = 0.6
 _MOST_STARTS = 6
 _MOST_STARTS_DOUBTFUL = 2
 _RINGS_GROWN = 6
@@ -225,7 +226,7 @@ class MarkerMatcher:
             return self._nothing()
         centres = discs.centres
         search = _Nearest(centres, self._middle)
-        if previous is not None and previous.valid:
+        if previous is not None and previous.valid and self._is_near(previous, search):
             field = self._refine(previous.coefficients, centres, search, self.model.sd, near=True)
             if _convincing(field):
                 return field
@@ -240,6 +241,11 @@ class MarkerMatcher:
             if _convincing(tried[-1]):
                 break
         return max(tried, key=quality)
+
+    def _is_near(self, previous: MarkerField, search: _Nearest) -> bool:
+        """Whether most markers of the frame before still have a disc close by."""
+        _, square = search(self.model.positions(previous.coefficients))
+        return float(np.mean(square < self._reach**2)) > _STILL_THERE
 
     def match_from(self, discs: Discs, starts: Iterable[Array]) -> MarkerField:
         """Best of the matches that begin at other contacts' coefficients (k,), far from the right ones maybe."""
