@@ -42,10 +42,16 @@ class MarkerEstimator:
         self._size = architecture.size
         self._matcher = matcher_of(model, architecture)
         layers = range(len(architecture.hidden) + 1)
-        self._layers = [(model.tensors[f"layer{i}.weight"], model.tensors[f"layer{i}.bias"]) for i in layers]
+        self._layers = [
+            (
+                np.ascontiguousarray(model.tensors[f"layer{i}.weight"].transpose(0, 2, 1)),
+                model.tensors[f"layer{i}.bias"][:, 0],
+            )
+            for i in layers
+        ]
         # One long product is faster than several short ones that read the same input.
         first, bias = self._layers.pop(0)
-        self._first = np.ascontiguousarray(first.transpose(0, 2, 1).reshape(-1, first.shape[1]))
+        self._first = first.reshape(-1, first.shape[2])
         self._first_bias = bias.reshape(-1)
         self._networks = architecture.networks
         self._centre = model.header.labels.centre
@@ -101,13 +107,13 @@ class MarkerEstimator:
 
     def _infer(self, displacements: Array) -> tuple[Array, Array]:
         """Mean and standard deviation (6,), in label half-ranges, of the mixture of all networks' Gaussians."""
-        x = self._first @ displacements.ravel().astype(np.float32) + self._first_bias
-        x = x.reshape(self._networks, 1, -1)
+        x = np.einsum("ij,j->i", self._first, displacements.ravel().astype(np.float32)) + self._first_bias
+        x = x.reshape(self._networks, -1)
         for weight, bias in self._layers:
             # Below -80 the exponential overflows, and the product is zero to float32 anyway.
             x = x / (1.0 + np.exp(-np.maximum(x, -80.0)))
-            x = np.matmul(x, weight) + bias
-        outputs = x[:, 0].astype(np.float64)
+            x = np.einsum("noi,ni->no", weight, x) + bias
+        outputs = x.astype(np.float64)
         log_precision = np.clip(outputs[:, 6:], *LOG_PRECISION_BOUNDS)
         return mixed(outputs[:, :6], log_precision)
 

@@ -5,6 +5,9 @@ ways: a linear model with some two dozen coefficients leaves less than a pixel. 
 markers with them, by turns: predict the markers, pair each with its nearest disc, fit anew. From a near start (the
 frame before) this converges in two or three turns. Without one a small network looks at where the discs are dense, and
 guesses the coefficients; when the guess leads nowhere, learned contacts whose discs lie alike are tried.
+
+Products are written as ``einsum``, which never leaves its thread: a linear algebra library would spread products of this
+size over all cores, and wait for a core that is busy far longer than the product takes.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ _MOST_STARTS = 6
 _MOST_STARTS_DOUBTFUL = 2
 _RINGS_GROWN = 6
 _ONWARD = 1.2
+_ROWS = 64  # Too few for a linear algebra library to spread over cores.
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +66,7 @@ class DisplacementModel:
 
     def positions(self, coefficients: Array) -> Array:
         """(..., m, 2) px of coefficients (..., k)."""
-        flat = self.base + coefficients @ self.basis
+        flat: Array = self.base + np.einsum("...k,kj->...j", coefficients, self.basis)
         return flat.reshape(*flat.shape[:-1], -1, 2)
 
     @classmethod
@@ -141,8 +145,8 @@ class FirstGuess:
 
     def __call__(self, density: NDArray[np.float32]) -> Array:
         """(k,) coefficients over their standard deviations, of a density (grid * grid,)."""
-        hidden = np.maximum(self.hidden_weight @ density + self.hidden_bias, 0.0)
-        guess: Array = (self.weight @ hidden + self.bias).astype(np.float64)
+        hidden = np.maximum(np.einsum("ij,j->i", self.hidden_weight, density) + self.hidden_bias, 0.0)
+        guess: Array = (np.einsum("ij,j->i", self.weight, hidden) + self.bias).astype(np.float64)
         return guess
 
 
@@ -258,7 +262,7 @@ class MarkerMatcher:
         if not len(self._bank):
             return self._bank
         # The distance less what is the same for all.
-        apart = self._bank_squares - 2.0 * (self._bank_density @ density)
+        apart = self._bank_squares - 2.0 * np.einsum("ij,j->i", self._bank_density, density)
         return self._bank[np.argsort(apart)[:_MOST_STARTS]]
 
     def _refine(
@@ -289,7 +293,7 @@ class MarkerMatcher:
             weight = paired / (1.0 + square / (0.35 * reach) ** 2)
             change = self._change(weight, centres[partner] - predicted, start - coefficients, ridge)
             coefficients = coefficients + change
-            shift = (change @ self.model.basis).reshape(-1, 2)
+            shift = np.einsum("k,kj->j", change, self.model.basis).reshape(-1, 2)
             predicted = predicted + shift
             if reach <= self._reach and float(np.abs(shift).max()) < _SETTLED_PX:
                 break
@@ -301,11 +305,10 @@ class MarkerMatcher:
         """(k,) change of coefficients that brings markers nearest to discs ``off`` (m, 2) away, and not far from
         the start."""
         weighted = self._basis * np.repeat(weight, 2).astype(np.float32)
-        moments = (weighted @ self._basis.T).astype(np.float64)
+        moments = np.einsum("kj,lj->kl", weighted, self._basis).astype(np.float64)
         moments[np.diag_indices(len(moments))] += ridge
-        return np.linalg.solve(moments, weighted @ off.ravel().astype(np.float32) + ridge * from_start).astype(
-            np.float64
-        )
+        toward = np.einsum("kj,j->k", weighted, off.ravel().astype(np.float32))
+        return np.linalg.solve(moments, toward + ridge * from_start).astype(np.float64)
 
     def _grow(self, coefficients: Array, start: Array, ridge: Array, centres: Array, search: _Nearest) -> Array:
         """Coefficients after markers without a disc were looked for where their neighbours' discs point."""
@@ -314,8 +317,8 @@ class MarkerMatcher:
         paired = _own(partner, square, len(centres)) & (square < self._reach**2)
         off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
         for _ in range(_RINGS_GROWN):
-            near_by = self._neighbours @ paired
-            expected: Array = (self._neighbours @ off) / np.maximum(near_by, 1.0)[:, None]
+            near_by = np.einsum("ij,j->i", self._neighbours, paired.astype(np.float64))
+            expected: Array = np.einsum("ij,jc->ic", self._neighbours, off) / np.maximum(near_by, 1.0)[:, None]
             corrected = predicted + np.where(paired[:, None], off, _ONWARD * expected)
             partner, square = search(corrected)
             before = int(paired.sum())
@@ -385,7 +388,9 @@ class _Nearest:
         if self._work is None:
             self._work = np.empty((len(places), self._points.shape[1]), np.float32)
         from_middle = (places - self._middle).astype(np.float32)
-        np.matmul(np.column_stack([from_middle, np.ones(len(places), np.float32)]), self._points, out=self._work)
+        rows = np.column_stack([from_middle, np.ones(len(places), np.float32)])
+        for i in range(0, len(rows), _ROWS):
+            np.matmul(rows[i : i + _ROWS], self._points, out=self._work[i : i + _ROWS])
         nearest = self._work.argmin(axis=1)
         square = self._work[np.arange(len(places)), nearest] + (from_middle**2).sum(axis=1)
         return nearest, np.maximum(square, 0.0).astype(np.float64)
