@@ -75,7 +75,12 @@ def _parser() -> argparse.ArgumentParser:
     train = commands.add_parser("train", help="train an estimator on labelled images")
     train.add_argument("--data", type=Path, required=True, help="data set folder with train/ and val/")
     train.add_argument("--out", type=Path, required=True, help="model file to write (.safetensors)")
-    train.add_argument("--kind", choices=("gdn", "cnn"), default="gdn", help="Gaussian-density network or regression")
+    train.add_argument(
+        "--kind",
+        choices=("gdn", "cnn", "markers"),
+        default="gdn",
+        help="Gaussian-density network, regression or marker estimator",
+    )
     train.add_argument("--epochs", type=int)
     train.add_argument("--seed", type=int, default=0)
     train.add_argument("--fresh", action="store_true", help="start again instead of resuming")

@@ -277,9 +277,9 @@ def _truth(name: str, mount: Device | None, scene: Scene | None, T_tcp_sensor: A
 
 def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Device) -> ContactPipeline:
     from perception.contact_gate import ContactGate
-    from perception.inference import ContactModel
+    from perception.estimators import load_estimator
 
-    model = ContactModel.load(model_path(estimator.model))
+    model = load_estimator(model_path(estimator.model))
     pose_filter = None if estimator.filter is None else build_filter(estimator.filter)
     contact_gate = None
     if (gate := estimator.gate) is not None:

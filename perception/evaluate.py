@@ -17,7 +17,7 @@ import numpy as np
 from drivers.clock import Clock, MonotonicClock
 from drivers.tactile_data import read_split
 from perception.dataset import Progress
-from perception.inference import ContactModel
+from perception.estimators import load_estimator
 from perception.labels import CONTACT_NAMES, XI_UNITS, contact_from_xi, xi_from_contact
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def evaluate(
     """
     clock = clock or MonotonicClock()
     labelled = read_split(data, split)
-    contact_model = ContactModel.load(model)
+    contact_model = load_estimator(model)
     n = len(labelled.images)
     means, sigmas, latencies_ns = np.empty((n, 6)), np.empty((n, 6)), np.empty(n)
     with _one_opencv_thread():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.architecture import Architecture
 from perception.model_file import Model
 
 IMAGES = "images"
@@ -18,10 +19,15 @@ def onnx_model(model: Model) -> bytes:
     """A serialised ONNX model: float32 (n, 1, height, width) in [0, 1] to float32 (n, outputs).
 
     The same function as ``networks.ContactNetwork`` in evaluation, softbound included.
+
+    Raises:
+        TypeError: the model is no image network.
     """
     from onnx import NodeProto, TensorProto, helper, numpy_helper
 
     architecture = model.header.architecture
+    if not isinstance(architecture, Architecture):
+        raise TypeError(f"a model of kind {architecture.kind} has no graph")
     constants: dict[str, NDArray[np.generic]] = dict(model.tensors)
     nodes: list[NodeProto] = []
     last = IMAGES

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from geometry.types import Array, ImageArray
 from perception.architecture import Architecture
 from perception.errors import ModelError
+from perception.marker_architecture import MarkerArchitecture
 from perception.preprocessing import Preprocessing
 
 FORMAT_VERSION = 1
@@ -75,7 +76,8 @@ class Header(BaseModel):
         preprocessing: from camera image to network input.
         labels: what the outputs mean.
         sigma_scale: (6,) gdn: what the network's standard deviations are multiplied by to be calibrated; cnn: the
-            standard deviations themselves, in label half-ranges. Found on the validation split.
+            standard deviations themselves, in label half-ranges; markers: the factor for the networks' standard
+            deviations after these are raised to the tensor ``sigma_power``. Found on the validation split.
         training_data: digest of the training set (``LabelledImages.digest``).
         training: settings and outcome of the training, for people.
     """
@@ -84,7 +86,7 @@ class Header(BaseModel):
 
     format_version: Literal[1] = 1
     touchcell_version: str
-    architecture: Architecture
+    architecture: Annotated[Architecture | MarkerArchitecture, Field(discriminator="kind")]
     preprocessing: Preprocessing
     labels: Labels
     sigma_scale: SixPositive
@@ -182,7 +184,17 @@ def _parse_header(text: str | None, path: Path) -> Header:
         return Header.model_validate_json(text)
     except ValidationError as error:
         first = error.errors()[0]
-        raise ModelError(path, first["msg"], key=".".join(map(str, first["loc"])), hint="train it again") from error
+        raise ModelError(path, first["msg"], key=_key(first["type"], first["loc"]), hint="train it again") from error
+
+
+def _key(error: str, location: tuple[int | str, ...]) -> str:
+    """The header's field that an error of pydantic speaks of; it names the architecture's kind among the fields."""
+    parts = [str(part) for part in location]
+    if error.startswith("union_tag"):
+        parts.append("kind")
+    elif parts[:1] == ["architecture"]:
+        parts[1:2] = []
+    return ".".join(parts)
 
 
 def _check_tensors(model: Model, path: Path) -> None:

@@ -21,8 +21,8 @@ from geometry.gaussian import PoseGaussian
 from geometry.types import Array
 from perception.contact_gate import ContactGate
 from perception.estimate import ContactEstimate
+from perception.estimators import ContactEstimator
 from perception.filter import ContactFilter
-from perception.inference import ContactModel
 from perception.motion import PoseHistory
 
 Timer = Callable[[], int]
@@ -69,7 +69,7 @@ class ContactPipeline:
 
     Args:
         camera: an opened frame source.
-        model: the network with its preprocessing.
+        model: any estimator, with its preprocessing.
         contact_gate: decides about contact without the network; None puts every frame through the network.
         pose_filter: None takes each frame by itself.
         timer: nanosecond counter for stage durations; it never influences an estimate.
@@ -78,7 +78,7 @@ class ContactPipeline:
     def __init__(
         self,
         camera: FrameSource,
-        model: ContactModel,
+        model: ContactEstimator,
         *,
         contact_gate: ContactGate | None = None,
         pose_filter: ContactFilter | None = None,

@@ -89,7 +89,7 @@ def train(
     data: Path,
     out: Path,
     *,
-    kind: Literal["gdn", "cnn"] = "gdn",
+    kind: Literal["gdn", "cnn", "markers"] = "gdn",
     epochs: int | None = None,
     seed: int = 0,
     resume: bool = True,
@@ -104,7 +104,7 @@ def train(
     Args:
         data: data set, see ``dataset``.
         out: ``NAME.safetensors``; figures become ``NAME_predictions.png`` and ``NAME_curves.png``.
-        kind: gdn predicts a Gaussian, cnn means alone.
+        kind: gdn predicts a Gaussian, cnn means alone; markers as ``marker_training``.
         epochs: None for the default of ``Settings``.
         seed: of everything random; the same seed on the same machine gives the same file.
         resume: go on with an interrupted training; False begins anew.
@@ -119,6 +119,12 @@ def train(
     if observer is None:
         with Display() as display:
             train(data, out, kind=kind, epochs=epochs, seed=seed, resume=resume, cache=cache, observer=display)
+        return
+    if kind == "markers":
+        from perception.marker_training import MarkerSettings, train_markers
+
+        marker_settings = MarkerSettings(seed=seed) if epochs is None else MarkerSettings(seed=seed, epochs=epochs)
+        train_markers(data, out, settings=marker_settings, resume=resume, cache=cache, observer=observer)
         return
     splits = {name: read_split(data, name) for name in ("train", "val")}
     first = next(splits["train"].read())

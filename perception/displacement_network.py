@@ -1,0 +1,100 @@
+"""The displacement networks in PyTorch, for training. A running cell never imports this module."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from perception.marker_architecture import LOG_PRECISION_BOUNDS
+from perception.marker_matching import DisplacementModel
+
+_DISPLACEMENT_PX = 8.0
+_NARROWEST = 0.02
+
+
+class DisplacementNetwork(nn.Module):
+    """Marker displacements (networks, n, 2 m) px to outputs (networks, n, 18), in label half-ranges.
+
+    Outputs are six means, the logarithms of their inverse Laplace scales, which only the training uses, and the
+    logarithms of their inverse standard deviations. Each network sees the displacements and, on an equal footing, the
+    displacement model's coefficients: the narrow ways of moving tell tilt and depth.
+
+    Args:
+        model: of the displacements.
+        hidden: units of each layer.
+        networks: how many, trained side by side and independently.
+        dropout: after every hidden layer.
+    """
+
+    features: Tensor
+    offset: Tensor
+
+    def __init__(self, model: DisplacementModel, hidden: tuple[int, ...], networks: int, dropout: float) -> None:
+        super().__init__()
+        scaled = model.basis.T / np.maximum(model.sd, _NARROWEST * model.sd[0])
+        features = np.concatenate([np.eye(len(model.mean)) / _DISPLACEMENT_PX, scaled], axis=1)
+        self.register_buffer("features", torch.from_numpy(features.astype(np.float32)), persistent=False)
+        self.register_buffer("offset", torch.from_numpy((model.mean @ features).astype(np.float32)), persistent=False)
+        self.dropout = dropout
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        before = features.shape[1]
+        for units in (*hidden, 18):
+            bound = 1.0 / math.sqrt(before)
+            self.weights.append(nn.Parameter(torch.empty(networks, before, units).uniform_(-bound, bound)))
+            self.biases.append(nn.Parameter(torch.empty(networks, 1, units).uniform_(-bound, bound)))
+            before = units
+        with torch.no_grad():
+            self.weights[-1][:, :, 6:] *= 0.1
+
+    def forward(self, displacements: Tensor, noise: float = 0.0) -> Tensor:
+        x = displacements @ self.features - self.offset
+        if noise:
+            x = x + noise * torch.randn_like(x)
+        for weight, bias in zip(list(self.weights)[:-1], list(self.biases)[:-1], strict=True):
+            x = functional.silu(torch.baddbmm(bias, x, weight))
+            x = functional.dropout(x, self.dropout, self.training)
+        # The standard deviations are read off what the means have taught, and change nothing about it.
+        weight, bias = self.weights[-1], self.biases[-1]
+        outputs = torch.baddbmm(bias[:, :, :12], x, weight[:, :, :12])
+        spread = torch.baddbmm(bias[:, :, 12:], x.detach(), weight[:, :, 12:])
+        low, high = LOG_PRECISION_BOUNDS
+        return torch.cat([outputs[..., :6], outputs[..., 6:].clamp(low, high), spread.clamp(low, high)], dim=-1)
+
+    def folded(self) -> dict[str, NDArray[np.float32]]:
+        """Tensors of a model file: the first layer takes pixels, the last gives means and standard deviations."""
+        weights = [weight.detach().double() for weight in self.weights]
+        biases = [bias.detach().double() for bias in self.biases]
+        biases[0] = biases[0] - (self.offset.double() @ weights[0])[:, None]
+        weights[0] = self.features.double() @ weights[0]
+        kept = [*range(6), *range(12, 18)]
+        weights[-1], biases[-1] = weights[-1][:, :, kept], biases[-1][:, :, kept]
+        tensors: dict[str, NDArray[np.float32]] = {}
+        for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+            tensors[f"layer{i}.weight"] = np.ascontiguousarray(weight.float().numpy())
+            tensors[f"layer{i}.bias"] = np.ascontiguousarray(bias.float().numpy().reshape(len(bias), 1, -1))
+        return tensors
+
+
+def displacement_loss(outputs: Tensor, labels: Tensor) -> Tensor:
+    """Laplace likelihood of the means, each term weighted by the root of its own scale, and Gaussian likelihood of the
+    standard deviations about those means.
+
+    Slip makes heavy tails, for which a Laplace density is closer than a Gaussian. The weight (Seitzer et al. 2022,
+    beta-NLL with beta 0.5) keeps the likelihood from giving up on what is hard, gamma above all.
+
+    Args:
+        outputs: (networks, n, 18).
+        labels: (networks, n, 6).
+    """
+    mean, log_inverse_scale, log_precision = outputs[..., :6], outputs[..., 6:12], outputs[..., 12:]
+    off = (labels - mean).abs()
+    laplace = (off * log_inverse_scale.exp() - log_inverse_scale) * (-0.5 * log_inverse_scale.detach()).exp()
+    gaussian = 0.5 * (off.detach() * log_precision.exp()).square() - log_precision
+    loss: Tensor = (laplace.sum(-1) + 0.2 * gaussian.sum(-1)).mean()
+    return loss

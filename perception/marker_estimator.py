@@ -1,0 +1,159 @@
+"""Contact pose and shear from the markers of one image, in a running cell: OpenCV and NumPy, nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from drivers.samples import Frame, Stamped
+from geometry.types import Array, ImageArray
+from perception.errors import ModelError
+from perception.inference import RANGE_TOLERANCE, Prediction
+from perception.marker_architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture
+from perception.marker_matching import DisplacementModel, FirstGuess, MarkerField, MarkerMatcher
+from perception.markers import detect_markers
+from perception.model_file import Header, Model, load_model
+
+
+class MarkerEstimator:
+    """A trained marker model, ready to predict.
+
+    Images that follow each other are matched faster, as each starts from the one before; the result is the same. Not
+    safe for use from two threads at once.
+
+    Attributes:
+        header: of the model file.
+        reference: preprocessed image out of contact, or None.
+        field: the markers of the last image, None before the first.
+    """
+
+    def __init__(self, model: Model) -> None:
+        """
+        Raises:
+            TypeError: the model is of another kind.
+        """
+        architecture = model.header.architecture
+        if not isinstance(architecture, MarkerArchitecture):
+            raise TypeError(f"a model of kind {architecture.kind}, not markers")
+        self.header: Header = model.header
+        self.reference: ImageArray | None = model.reference
+        self.field: MarkerField | None = None
+        self._size = architecture.size
+        self._matcher = matcher_of(model, architecture)
+        layers = range(len(architecture.hidden) + 1)
+        self._layers = [
+            (
+                np.ascontiguousarray(model.tensors[f"layer{i}.weight"].transpose(0, 2, 1)),
+                model.tensors[f"layer{i}.bias"][:, 0],
+            )
+            for i in layers
+        ]
+        # One long product is faster than several short ones that read the same input.
+        first, bias = self._layers.pop(0)
+        self._first = first.reshape(-1, first.shape[2])
+        self._first_bias = bias.reshape(-1)
+        self._networks = architecture.networks
+        self._centre = model.header.labels.centre
+        self._half_range = model.header.labels.half_range
+        self._power = model.tensors["sigma_power"].astype(np.float64)
+        self._sigma_scale = np.array(model.header.sigma_scale) * self._half_range
+
+    @classmethod
+    def load(cls, path: Path) -> MarkerEstimator:
+        """Open a model file.
+
+        Raises:
+            ModelError: as ``model_file.load_model``, or the model is of another kind.
+        """
+        model = load_model(path)
+        if model.header.architecture.kind != "markers":
+            raise ModelError(path, f"is {model.header.architecture.kind}, expected markers", key="architecture.kind")
+        return cls(model)
+
+    def reduce(self, image: ImageArray) -> ImageArray:
+        """The model's preprocessing, uint8 (height, width): black and white, in the camera's resolution.
+
+        Raises:
+            ImageError: the image is not what the model's preprocessing was made for.
+        """
+        return self.header.preprocessing.reduce(image)
+
+    def predict(self, image: ImageArray) -> Prediction:
+        """Contact in one camera image. Raises as ``reduce``."""
+        return self.predict_reduced(self.reduce(image))
+
+    def predict_reduced(self, reduced: ImageArray) -> Prediction:
+        """Contact in an image that ``reduce`` made.
+
+        Where the markers cannot be matched with certainty, ``in_range`` is False. Where next to nothing can be, the
+        prediction is the middle of the taught range, with sigmas as wide as the range.
+        """
+        field = self._matcher.match(detect_markers(reduced, self._size), self.field)
+        self.field = field
+        if not field.seen.any():
+            return Prediction(self._centre.copy(), self._half_range.copy(), in_range=False)
+        mean, sigma = self._infer(field.displacements)
+        in_range = field.valid and bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
+        return Prediction(
+            xi=self._centre + self._half_range * mean, sigma=self._sigma_scale * sigma**self._power, in_range=in_range
+        )
+
+    def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:
+        """``predict`` of a camera's sample; the prediction keeps the stamp, number and quality of the frame."""
+        return Stamped(
+            self.predict(sample.value.image), sample.t_ns, sample.seq, sample.t_device_ns, quality=sample.quality
+        )
+
+    def _infer(self, displacements: Array) -> tuple[Array, Array]:
+        """Mean and standard deviation (6,), in label half-ranges, of the mixture of all networks' Gaussians."""
+        x = np.einsum("ij,j->i", self._first, displacements.ravel().astype(np.float32)) + self._first_bias
+        x = x.reshape(self._networks, -1)
+        for weight, bias in self._layers:
+            # Below -80 the exponential overflows, and the product is zero to float32 anyway.
+            x = x / (1.0 + np.exp(-np.maximum(x, -80.0)))
+            x = np.einsum("noi,ni->no", weight, x) + bias
+        outputs = x.astype(np.float64)
+        log_precision = np.clip(outputs[:, 6:], *LOG_PRECISION_BOUNDS)
+        return mixed(outputs[:, :6], log_precision)
+
+
+def mixed(means: Array, log_precisions: Array) -> tuple[Array, Array]:
+    """Mean and standard deviation of an even mixture of Gaussians.
+
+    Args:
+        means: (networks, ..., 6).
+        log_precisions: (networks, ..., 6) logarithms of inverse standard deviations.
+
+    Returns:
+        (..., 6) and (..., 6).
+    """
+    mean = means.mean(axis=0)
+    variance = np.exp(-2.0 * log_precisions).mean(axis=0) + means.var(axis=0)
+    return mean, np.sqrt(variance)
+
+
+def matcher_of(model: Model, architecture: MarkerArchitecture) -> MarkerMatcher:
+    """The matcher that a marker model describes."""
+    tensors = {name: tensor.astype(np.float64) for name, tensor in model.tensors.items() if "layer" not in name}
+    return MarkerMatcher(
+        DisplacementModel(
+            reference=tensors["lattice"],
+            mean=tensors["displacement.mean"],
+            basis=tensors["displacement.basis"],
+            sd=tensors["displacement.sd"],
+        ),
+        FirstGuess(
+            low=np.array(architecture.guess_low_px),
+            cell_px=architecture.guess_cell_px,
+            hidden_weight=model.tensors["guess.hidden.weight"],
+            hidden_bias=model.tensors["guess.hidden.bias"],
+            weight=model.tensors["guess.output.weight"],
+            bias=model.tensors["guess.output.bias"],
+            sd=tensors["guess.sd"],
+        ),
+        architecture.input_size,
+        bank=tensors["bank"],
+        least_score=architecture.least_score,
+        most_rms_px=architecture.most_rms_px,
+    )

@@ -1,0 +1,417 @@
+"""Which disc of an image is which marker of the lattice.
+
+A marker's displacement says little by itself, as markers move further than half their spacing. All together move in few
+ways: a linear model with some two dozen coefficients leaves less than a pixel. So the coefficients are found, and the
+markers with them, by turns: predict the markers, pair each with its nearest disc, fit anew. From a near start (the
+frame before) this converges in two or three turns. Without one a small network looks at where the discs are dense, and
+guesses the coefficients; when the guess leads nowhere, learned contacts whose discs lie alike are tried.
+
+Products are written as ``einsum``, which never leaves its thread: a linear algebra library would spread products of this
+size over all cores, and wait for a core that is busy far longer than the product takes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.types import Array
+from perception.markers import Discs
+
+_FIT_SD_PX = 0.7
+_TURNS = 12
+_SETTLED_PX = 0.1
+_CONVINCING = 0.965
+_COMPLETE = 0.985
+_STILL_THERE = 0.6
+_MOST_STARTS = 6
+_MOST_STARTS_DOUBTFUL = 2
+_RINGS_GROWN = 6
+_ONWARD = 1.2
+_ROWS = 64  # Too few for a linear algebra library to spread over cores.
+
+
+@dataclass(frozen=True, slots=True)
+class DisplacementModel:
+    """The ways in which the markers of a sensor move together.
+
+    Attributes:
+        reference: (m, 2) px, markers of the undeformed tip.
+        mean: (2 m,) px, mean displacement (u, v, u, v, ...).
+        basis: (k, 2 m) orthonormal rows, the widest way first.
+        sd: (k,) px, standard deviations of the coefficients.
+    """
+
+    reference: Array
+    mean: Array
+    basis: Array
+    sd: Array
+
+    @property
+    def base(self) -> Array:
+        """(2 m,) px, marker positions with all coefficients zero."""
+        base: Array = self.reference.ravel() + self.mean
+        return base
+
+    @property
+    def spacing_px(self) -> float:
+        """Median distance of a reference marker from its nearest neighbour."""
+        distances = np.linalg.norm(self.reference[:, None] - self.reference[None], axis=2)
+        np.fill_diagonal(distances, np.inf)
+        return float(np.median(distances.min(axis=1)))
+
+    def positions(self, coefficients: Array) -> Array:
+        """(..., m, 2) px of coefficients (..., k)."""
+        flat: Array = self.base + np.einsum("...k,kj->...j", coefficients, self.basis)
+        return flat.reshape(*flat.shape[:-1], -1, 2)
+
+    @classmethod
+    def fit(cls, reference: Array, displacements: Array, seen: NDArray[np.bool_], modes: int) -> DisplacementModel:
+        """Principal components of displacements of which some are missing.
+
+        Args:
+            reference: (m, 2) px.
+            displacements: (n, m, 2) px; those of unseen markers are taken for a first guess.
+            seen: (n, m).
+            modes: how many components are kept, at most n - 1.
+        """
+        flat = displacements.reshape(len(displacements), -1).astype(np.float64)
+        known = np.repeat(seen, 2, axis=1)
+        filled = flat.copy()
+        for _ in range(3):
+            mean = filled.mean(axis=0)
+            centred = filled - mean
+            # The matrix of 2m x 2m moments is smaller than thousands of frames.
+            values, vectors = np.linalg.eigh(centred.T @ centred / len(flat))
+            basis = vectors[:, ::-1][:, : min(modes, len(flat) - 1)].T
+            filled = np.where(known, flat, mean + (centred @ basis.T) @ basis)
+        sd = np.sqrt(np.maximum(values[::-1][: len(basis)], 1e-12))
+        return cls(reference, mean, np.ascontiguousarray(basis), sd)
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerField:
+    """Where all markers of a lattice are in one image.
+
+    Attributes:
+        positions: (m, 2) px; of unseen markers as the displacement model fills them in.
+        displacements: (m, 2) px from the reference.
+        seen: (m,) markers that have a disc of their own.
+        coefficients: (k,) px, of the displacement model.
+        score: markers seen over those expected in view, or over the discs among them where these are more; 1 is best.
+        rms_px: of the seen markers from the displacement model.
+        valid: the match can be believed.
+    """
+
+    positions: Array
+    displacements: Array
+    seen: NDArray[np.bool_]
+    coefficients: Array
+    score: float
+    rms_px: float
+    valid: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FirstGuess:
+    """A network with one hidden layer from the density of discs to the coefficients of a displacement model.
+
+    Attributes:
+        low: (2,) px, corner of the square that is looked at.
+        cell_px: side of a cell of its grid.
+        hidden_weight, hidden_bias: (hidden, grid * grid), (hidden,).
+        weight, bias: (k, hidden), (k,); outputs are in standard deviations of the coefficients.
+        sd: (k,) px, how far its guesses are off.
+    """
+
+    low: Array
+    cell_px: float
+    hidden_weight: NDArray[np.float32]
+    hidden_bias: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    bias: NDArray[np.float32]
+    sd: Array
+
+    def density(self, centres: Array) -> NDArray[np.float32]:
+        """(..., grid * grid) what it looks at, of discs (..., n, 2)."""
+        grid = math.isqrt(self.hidden_weight.shape[1])
+        batch = centres.reshape(-1, *centres.shape[-2:])
+        density = disc_density(batch, np.ones(batch.shape[:2]), self.low, self.cell_px, grid)
+        return density.reshape(*centres.shape[:-2], -1)
+
+    def __call__(self, density: NDArray[np.float32]) -> Array:
+        """(k,) coefficients over their standard deviations, of a density (grid * grid,)."""
+        hidden = np.maximum(np.einsum("ij,j->i", self.hidden_weight, density) + self.hidden_bias, 0.0)
+        guess: Array = (np.einsum("ij,j->i", self.weight, hidden) + self.bias).astype(np.float64)
+        return guess
+
+
+def disc_density(centres: Array, weights: Array, low: Array, cell_px: float, grid: int) -> NDArray[np.float32]:
+    """How many discs lie in each cell of a grid, each shared bilinearly among the four cells around it.
+
+    Args:
+        centres: (b, n, 2) px.
+        weights: (b, n), zero for a disc that is not there.
+        low: (2,) px, where the grid begins.
+        cell_px: side of a cell.
+        grid: cells along each side.
+
+    Returns:
+        (b, grid * grid).
+    """
+    place = (centres - low) / cell_px - 0.5
+    whole = np.floor(place)
+    part = place - whole
+    cell = whole.astype(np.intp)
+    density = np.zeros(len(centres) * grid * grid)
+    first = (np.arange(len(centres)) * grid * grid)[:, None]
+    for right in (0, 1):
+        for down in (0, 1):
+            u, v = cell[..., 0] + right, cell[..., 1] + down
+            inside = (u >= 0) & (u < grid) & (v >= 0) & (v < grid)
+            share = np.abs(1 - right - part[..., 0]) * np.abs(1 - down - part[..., 1]) * weights * inside
+            index = np.where(inside, first + v * grid + u, 0)
+            density += np.bincount(index.ravel(), share.ravel(), len(density))
+    return density.reshape(len(centres), -1).astype(np.float32)
+
+
+class MarkerMatcher:
+    """Matches the discs of one frame after the other.
+
+    Args:
+        model: how the markers move.
+        guess: a start for frames without a near frame before them.
+        image_size: (height, width) px.
+        bank: (b, k) learned coefficients, of which those like the guess are tried when the guess leads nowhere.
+        least_score: below this a match is not believed.
+        most_rms_px: above this a match is not believed.
+    """
+
+    def __init__(
+        self,
+        model: DisplacementModel,
+        guess: FirstGuess,
+        image_size: tuple[int, int],
+        *,
+        bank: Array | None = None,
+        least_score: float = 0.9,
+        most_rms_px: float = 2.0,
+    ) -> None:
+        self.model = model
+        self._guess = guess
+        self._size = np.array(image_size[::-1], dtype=np.float64)
+        self._bank = np.empty((0, len(model.sd))) if bank is None else bank
+        self._least_score = least_score
+        self._most_rms_px = most_rms_px
+        self._base = model.base
+        self._basis = model.basis.astype(np.float32)
+        self._middle = model.base.reshape(-1, 2).mean(axis=0)
+        self._spacing_px = model.spacing_px
+        self._reach = 0.3 * self._spacing_px
+        apart = np.linalg.norm(model.reference[:, None] - model.reference[None], axis=2)
+        self._neighbours = ((apart > 0.0) & (apart < 1.5 * self._spacing_px)).astype(np.float64)
+        # Where a contact is far from those that taught it, a guess is off by more than its own standard deviation.
+        self._guess_sd = np.hypot(3.0 * guess.sd, 0.1 * model.sd)
+        self._bank_density = guess.density(model.positions(self._bank))
+        self._bank_squares = (self._bank_density**2).sum(axis=1)
+
+    def match(self, discs: Discs, previous: MarkerField | None = None) -> MarkerField:
+        """Markers of the image in which ``discs`` were found.
+
+        Args:
+            discs: what was found in the image.
+            previous: of the frame before, when there was one; an invalid one is not used.
+        """
+        if not len(self.model.reference) // 4 <= len(discs) <= 4 * len(self.model.reference):
+            return self._nothing()
+        centres = discs.centres
+        search = _Nearest(centres, self._middle)
+        if previous is not None and previous.valid and self._is_near(previous, search):
+            field = self._refine(previous.coefficients, centres, search, self.model.sd, near=True)
+            if _convincing(field):
+                return field
+        density = self._guess.density(centres)
+        field = self._refine(self._guess(density) * self.model.sd, centres, search, self._guess_sd)
+        if _convincing(field):
+            return field
+        tried = [field]
+        starts = self._alike(density)[: _MOST_STARTS_DOUBTFUL if field.valid else _MOST_STARTS]
+        for start in starts:
+            tried.append(self._refine(start, centres, search, 0.4 * self.model.sd))
+            if _convincing(tried[-1]):
+                break
+        return max(tried, key=quality)
+
+    def _is_near(self, previous: MarkerField, search: _Nearest) -> bool:
+        """Whether most markers of the frame before still have a disc close by."""
+        _, square = search(self.model.positions(previous.coefficients))
+        return float(np.mean(square < self._reach**2)) > _STILL_THERE
+
+    def match_from(self, discs: Discs, starts: Iterable[Array]) -> MarkerField:
+        """Best of the matches that begin at other contacts' coefficients (k,), far from the right ones maybe."""
+        search = _Nearest(discs.centres, self._middle)
+        prior_sd = 0.4 * self.model.sd
+        return max((self._refine(start, discs.centres, search, prior_sd) for start in starts), key=quality)
+
+    def _alike(self, density: NDArray[np.float32]) -> Array:
+        """(s, k) coefficients of the learned contacts whose discs are dense where this image's are."""
+        if not len(self._bank):
+            return self._bank
+        # The distance less what is the same for all.
+        apart = self._bank_squares - 2.0 * np.einsum("ij,j->i", self._bank_density, density)
+        return self._bank[np.argsort(apart)[:_MOST_STARTS]]
+
+    def _refine(
+        self, start: Array, centres: Array, search: _Nearest, prior_sd: Array, *, near: bool = False
+    ) -> MarkerField:
+        ridge = (_FIT_SD_PX / prior_sd) ** 2
+        first_reach = self._reach if near else 2.0 * self._reach
+        coefficients = self._settle(start, start, ridge, centres, search, first_reach)
+        field = self._field(coefficients, centres, search)
+        if near or field.score >= _COMPLETE or field.seen.mean() < 0.5:
+            return field
+        # Where a part of the rim is off by half a spacing, the part that is right leads on to it.
+        grown = self._grow(coefficients, start, ridge, centres, search)
+        again = self._field(self._settle(grown, start, ridge, centres, search, self._reach), centres, search)
+        return max(field, again, key=quality)
+
+    def _settle(
+        self, coefficients: Array, start: Array, ridge: Array, centres: Array, search: _Nearest, reach: float
+    ) -> Array:
+        """Pair and fit by turns until nothing moves."""
+        predicted = self.model.positions(coefficients)
+        for _ in range(_TURNS):
+            partner, square = search(predicted)
+            paired = _own(partner, square, len(centres)) & (square < reach * reach)
+            if paired.sum() < len(start):
+                break
+            # A disc far from where its marker should be may be a neighbour's, and counts less.
+            weight = paired / (1.0 + square / (0.35 * reach) ** 2)
+            change = self._change(weight, centres[partner] - predicted, start - coefficients, ridge)
+            coefficients = coefficients + change
+            shift = np.einsum("k,kj->j", change, self.model.basis).reshape(-1, 2)
+            predicted = predicted + shift
+            if reach <= self._reach and float(np.abs(shift).max()) < _SETTLED_PX:
+                break
+            typical_px = math.sqrt(float(np.median(square[paired])))
+            reach = max(self._reach, min(0.8 * reach, 4.0 * typical_px))
+        return coefficients
+
+    def _change(self, weight: Array, off: Array, from_start: Array, ridge: Array) -> Array:
+        """(k,) change of coefficients that brings markers nearest to discs ``off`` (m, 2) away, and not far from
+        the start."""
+        weighted = self._basis * np.repeat(weight, 2).astype(np.float32)
+        moments = np.einsum("kj,lj->kl", weighted, self._basis).astype(np.float64)
+        moments[np.diag_indices(len(moments))] += ridge
+        toward = np.einsum("kj,j->k", weighted, off.ravel().astype(np.float32))
+        return np.linalg.solve(moments, toward + ridge * from_start).astype(np.float64)
+
+    def _grow(self, coefficients: Array, start: Array, ridge: Array, centres: Array, search: _Nearest) -> Array:
+        """Coefficients after markers without a disc were looked for where their neighbours' discs point."""
+        predicted = self.model.positions(coefficients)
+        partner, square = search(predicted)
+        paired = _own(partner, square, len(centres)) & (square < self._reach**2)
+        off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
+        for _ in range(_RINGS_GROWN):
+            near_by = np.einsum("ij,j->i", self._neighbours, paired.astype(np.float64))
+            expected: Array = np.einsum("ij,jc->ic", self._neighbours, off) / np.maximum(near_by, 1.0)[:, None]
+            corrected = predicted + np.where(paired[:, None], off, _ONWARD * expected)
+            partner, square = search(corrected)
+            before = int(paired.sum())
+            paired = _own(partner, square, len(centres)) & (square < (1.3 * self._reach) ** 2)
+            paired &= near_by >= 2.0
+            off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
+            if int(paired.sum()) <= before:
+                break
+        return coefficients + self._change(paired.astype(np.float64), off, start - coefficients, ridge)
+
+    def _field(self, coefficients: Array, centres: Array, search: _Nearest) -> MarkerField:
+        predicted = self.model.positions(coefficients)
+        partner, square = search(predicted)
+        paired = _own(partner, square, len(centres)) & (square < self._reach**2)
+        positions = predicted.copy()
+        positions[paired] = centres[partner[paired]]
+        left_over = np.ones(len(centres), bool)
+        left_over[partner[paired]] = False
+        among = 0
+        if left_over.any():
+            apart = centres[left_over][:, None] - predicted[None]
+            among = int(((apart**2).sum(axis=2).min(axis=1) < self._spacing_px**2).sum())
+        margin = 0.5 * self._spacing_px
+        in_view = ((predicted >= margin) & (predicted <= self._size - 1.0 - margin)).all(axis=1)
+        found = int(paired.sum())
+        expected = max(int((in_view | paired).sum()), found + among, 1)
+        rms = float(np.sqrt(square[paired].mean())) if found else np.inf
+        score = found / expected
+        return MarkerField(
+            positions=positions,
+            displacements=positions - self.model.reference,
+            seen=paired,
+            coefficients=coefficients,
+            score=score,
+            rms_px=rms,
+            valid=score >= self._least_score and rms <= self._most_rms_px and found >= len(positions) // 2,
+        )
+
+    def _nothing(self) -> MarkerField:
+        positions = self._base.reshape(-1, 2)
+        coefficients = np.zeros(len(self.model.sd))
+        shift = positions - self.model.reference
+        return MarkerField(positions.copy(), shift, np.zeros(len(shift), bool), coefficients, 0.0, np.inf, False)
+
+
+def _convincing(field: MarkerField) -> bool:
+    return field.valid and field.score >= _CONVINCING
+
+
+def quality(field: MarkerField) -> tuple[bool, float]:
+    """Orders matches of one image, the better the greater."""
+    return field.valid, field.score - 0.05 * min(field.rms_px, 20.0)
+
+
+class _Nearest:
+    """Nearest of some points, by one small matrix product: a tree takes longer to build."""
+
+    def __init__(self, points: Array, middle: Array) -> None:
+        # Near the origin, float32 keeps distances to a hundredth of a pixel.
+        self._middle = middle
+        from_middle = (points - middle).astype(np.float32)
+        self._points = np.column_stack([-2.0 * from_middle, (from_middle**2).sum(axis=1)]).T.astype(np.float32)
+        self._work: NDArray[np.float32] | None = None
+
+    def __call__(self, places: Array) -> tuple[NDArray[np.intp], Array]:
+        """(m,) index of the point nearest to each place (m, 2), and the squared distance."""
+        if self._work is None:
+            self._work = np.empty((len(places), self._points.shape[1]), np.float32)
+        from_middle = (places - self._middle).astype(np.float32)
+        rows = np.column_stack([from_middle, np.ones(len(places), np.float32)])
+        for i in range(0, len(rows), _ROWS):
+            np.matmul(rows[i : i + _ROWS], self._points, out=self._work[i : i + _ROWS])
+        nearest = self._work.argmin(axis=1)
+        square = self._work[np.arange(len(places)), nearest] + (from_middle**2).sum(axis=1)
+        return nearest, np.maximum(square, 0.0).astype(np.float64)
+
+
+def _own(partner: NDArray[np.intp], square: Array, points: int) -> NDArray[np.bool_]:
+    """(m,) whether each place is, of all that have the same nearest point, the nearest to it."""
+    order = np.argsort(-square)
+    owner = np.full(points, -1)
+    owner[partner[order]] = order
+    own: NDArray[np.bool_] = owner[partner] == np.arange(len(partner))
+    return own
+
+
+def pair(places: Array, points: Array, reach: float) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """(m,) point nearest to each place, and whether it is within reach and nearest to no other place.
+
+    Args:
+        places: (m, 2) px.
+        points: (n, 2) px.
+        reach: px.
+    """
+    nearest, square = _Nearest(points, points.mean(axis=0))(places)
+    return nearest, _own(nearest, square, len(points)) & (square < reach * reach)
