@@ -6,8 +6,8 @@ markers with them, by turns: predict the markers, pair each with its nearest dis
 frame before) this converges in two or three turns. Without one a small network looks at where the discs are dense, and
 guesses the coefficients; when the guess leads nowhere, learned contacts whose discs lie alike are tried.
 
-Products are written as ``einsum``, which never leaves its thread: a linear algebra library would spread products of this
-size over all cores, and wait for a core that is busy far longer than the product takes.
+Products are written as ``einsum``, which never leaves its thread: a linear algebra library would spread products of
+this size over all cores, and wait for a busy core far longer than the product takes.
 """
 
 from __future__ import annotations
