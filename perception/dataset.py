@@ -60,7 +60,7 @@ def load_reduced(
         DataError: as ``Split.read``.
         ImageError: the images are not what the preprocessing was made for.
     """
-    kept = cache / f"{_cache_key(split, preprocessing)}.npz" if cache is not None else None
+    kept = cache / f"{cache_key(split, preprocessing)}.npz" if cache is not None else None
     if kept is not None and kept.is_file():
         try:
             with np.load(kept, allow_pickle=False) as archive:
@@ -87,7 +87,8 @@ def default_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "touchcell" / "images"
 
 
-def _cache_key(split: Split, preprocessing: Preprocessing) -> str:
+def cache_key(split: Split, preprocessing: Preprocessing) -> str:
+    """Names what the preprocessing makes of these very image files."""
     key = hashlib.sha256(f"{split.folder.resolve()}\0{preprocessing.model_dump_json()}\0".encode())
     for path in split.images:
         status = path.stat()

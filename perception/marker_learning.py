@@ -176,10 +176,8 @@ def learn_markers(
     # The simulated tip is 2.5 px off the real one on average, and its coefficients scatter too little.
     guess = train_guess(model, coefficients, noise_px=2.0, scatter=0.15, steps=guess_steps, seed=seed)
     least_score, most_rms_px = 0.9, 0.2 * model.spacing_px
-    matcher = MarkerMatcher(
-        model, guess, image_size, bank=_bank(coefficients), least_score=least_score, most_rms_px=most_rms_px
-    )
     bank = _bank(coefficients)
+    matcher = MarkerMatcher(model, guess, image_size, bank=bank, least_score=least_score, most_rms_px=most_rms_px)
     density = np.stack([guess.density(discs.centres) for discs in frames])
     for number in range(rounds):
         fields = []

@@ -7,7 +7,7 @@ frame before) this converges in two or three turns. Without one a small network 
 guesses the coefficients; when the guess leads nowhere, learned contacts whose discs lie alike are tried.
 
 Products are written as ``einsum``, which never leaves its thread: a linear algebra library would spread products of
-this size over all cores, and wait for a core that is busy far longer than the product takes.
+this size over all cores, and wait for a busy core far longer than the product takes.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ _STILL_THERE = 0.6
 _MOST_STARTS = 6
 _MOST_STARTS_DOUBTFUL = 2
 _RINGS_GROWN = 6
+_NEIGHBOURS = 7
 _ONWARD = 1.2
 _ROWS = 64  # Too few for a linear algebra library to spread over cores.
 
@@ -213,7 +214,10 @@ class MarkerMatcher:
         self._spacing_px = model.spacing_px
         self._reach = 0.3 * self._spacing_px
         apart = np.linalg.norm(model.reference[:, None] - model.reference[None], axis=2)
-        self._neighbours = ((apart > 0.0) & (apart < 1.5 * self._spacing_px)).astype(np.float64)
+        nearest = np.argsort(apart, axis=1)[:, 1 : _NEIGHBOURS + 1]
+        # Markers of the rim have fewer neighbours: the number of markers stands for nobody.
+        is_near = np.take_along_axis(apart, nearest, axis=1) < 1.5 * self._spacing_px
+        self._neighbours = np.where(is_near, nearest, len(apart))
         # Where a contact is far from those that taught it, a guess is off by more than its own standard deviation.
         self._guess_sd = np.hypot(3.0 * guess.sd, 0.1 * model.sd)
         self._bank_density = guess.density(model.positions(self._bank))
@@ -316,14 +320,17 @@ class MarkerMatcher:
         partner, square = search(predicted)
         paired = _own(partner, square, len(centres)) & (square < self._reach**2)
         off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
+        nobody = np.zeros((1, 2))
         for _ in range(_RINGS_GROWN):
-            near_by = np.einsum("ij,j->i", self._neighbours, paired.astype(np.float64))
-            expected: Array = np.einsum("ij,jc->ic", self._neighbours, off) / np.maximum(near_by, 1.0)[:, None]
+            near_by = np.append(paired, False)[self._neighbours].sum(axis=1)
+            expected: Array = (
+                np.concatenate([off, nobody])[self._neighbours].sum(axis=1) / np.maximum(near_by, 1.0)[:, None]
+            )
             corrected = predicted + np.where(paired[:, None], off, _ONWARD * expected)
             partner, square = search(corrected)
             before = int(paired.sum())
             paired = _own(partner, square, len(centres)) & (square < (1.3 * self._reach) ** 2)
-            paired &= near_by >= 2.0
+            paired &= near_by >= 2
             off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
             if int(paired.sum()) <= before:
                 break

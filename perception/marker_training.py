@@ -23,7 +23,7 @@ from torch import Tensor
 from drivers.tactile_data import Split, read_split
 from geometry.types import Array, ImageArray
 from perception.checkpoint import EpochRecord, Progress, delete_checkpoint, load_checkpoint, save_checkpoint
-from perception.dataset import _cache_key, default_cache
+from perception.dataset import cache_key, default_cache
 from perception.displacement_network import DisplacementNetwork, displacement_loss
 from perception.errors import TrainingError
 from perception.figures import write_curves, write_predictions
@@ -522,7 +522,7 @@ def _discs(
     split: Split, preprocessing: Preprocessing, size: MarkerSize, cache: Path, told: Callable[[int, int], None]
 ) -> list[Discs]:
     """Discs of every image of a split; found once."""
-    key = hashlib.sha256((_cache_key(split, preprocessing) + size.model_dump_json()).encode()).hexdigest()[:32]
+    key = hashlib.sha256((cache_key(split, preprocessing) + size.model_dump_json()).encode()).hexdigest()[:32]
     kept = cache / f"{key}.discs.npz"
     stored = _load(kept)
     if stored is None:

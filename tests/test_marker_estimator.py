@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from marker_samples import REST, SIZE, simulated, write_split
+from marker_samples import SIZE, simulated, write_split
 from test_model_file import make_model
 from test_pipeline import StubCamera
 
@@ -21,7 +21,6 @@ from perception.errors import ImageError, ModelError, TrainingError  # noqa: E40
 from perception.estimators import load_estimator  # noqa: E402
 from perception.evaluate import evaluate  # noqa: E402
 from perception.inference import ContactModel  # noqa: E402
-from perception.labels import contact_from_xi  # noqa: E402
 from perception.marker_estimator import MarkerEstimator, mixed  # noqa: E402
 from perception.marker_matching import DisplacementModel  # noqa: E402
 from perception.marker_training import MarkerSettings, calibrate, preprocessing_for, train_markers  # noqa: E402
@@ -69,12 +68,12 @@ def trained(data: Path) -> Path:
     return out
 
 
-def test_a_minute_of_images_teaches_contacts(data: Path, trained: Path) -> None:
+def test_few_images_teach_contacts(data: Path, trained: Path) -> None:
     for name in ("markers_predictions.png", "markers_curves.png", "markers_markers.png"):
         assert (data / name).stat().st_size > 10_000
     result = evaluate(data, "val", trained)
     assert result.n == 40
-    # What the middle of the range errs by, at this few images and epochs halved.
+    # Well below what the middle of the range errs by: 1.4 mm, 2 mm, 10 deg.
     assert result.mae["z_mm"] < 0.5 * 1.4
     assert result.mae["x_mm"] < 0.5 * 2.0
     assert result.mae["alpha_deg"] < 0.8 * 10.0
@@ -244,5 +243,3 @@ def test_a_running_cell_carries_no_torch(trained: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", program, str(trained)], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
-    assert REST.shape == (331, 2)
-    assert contact_from_xi(np.zeros(6)).shape == (6,)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from marker_samples import CORNER, REST, SIZE, TIP, simulated
+from marker_samples import CORNER, REST, SIZE, simulated
 
 from drivers.simulation.render import FrameRenderer
 from perception.errors import ImageError
@@ -117,7 +117,6 @@ def test_lattice_is_fitted_to_an_undeformed_tip(turn_deg: float, zoom: float, sh
     distances = np.linalg.norm(points[:, None] - truth[None], axis=2)
     assert distances.min(axis=1).max() < 2.0
     assert len(set(distances.argmin(axis=1))) == 331
-    assert TIP.parameters.rings == 10
 
 
 def test_density_tells_where_markers_crowd() -> None:
