@@ -97,6 +97,9 @@ class GaussianContact:
         return ContactEstimate(True, belief, t_ns, self._seq, t_ns, nis=nis)
 
 
+_REQUIRED = ("workspace", "tcp_speed", "depth", "frame_age", "arm_state_age")
+
+
 def track(name: str, *, moving: bool, duration_s: float, seed: int, network: Path | None = None) -> dict[str, Any]:
     """Run the shipped tracking cell with one of ``FILTERS``; the plate stands still unless ``moving``.
 
@@ -112,6 +115,8 @@ def track(name: str, *, moving: bool, duration_s: float, seed: int, network: Pat
     """
     cell_file = yaml.safe_load(find_cell(Path("configs/object_track_sim.yaml")).read_text())
     cell_file["task"]["duration_s"] = duration_s
+    # Interlocks that judge estimates and motion would end the runs of the worse filters, which are to be measured.
+    cell_file["interlocks"] = {k: v for k, v in cell_file["interlocks"].items() if v["kind"] in _REQUIRED}
     if not moving:
         del cell_file["scene"]["surfaces"]["plate"]["motion"]
     settings = FILTERS[name]
