@@ -214,6 +214,33 @@ class Arm(Device):
                 )
             self._clock.sleep_until_ns(now_ns + _REST_POLL_NS)
 
+    def _admitted_joint_goal(
+        self, q: Array, lease: Lease, speed_fraction: float, lower: Array | float, upper: Array | float, joints: int
+    ) -> Array:
+        """A joint goal (joints,) rad that may be sent: finite, of that shape, owned, in ACTIVE and within the limits.
+
+        The order is the twist gate's. Raises CommandRejected with the first reason that applies.
+        """
+        target = np.asarray(q, dtype=np.float64)
+        if not (np.isfinite(target).all() and np.isfinite(speed_fraction)):
+            raise CommandRejected(self.name, Rejection.NON_FINITE, "joint goal is not finite", value=q)
+        if target.shape != (joints,):
+            raise CommandRejected(
+                self.name, Rejection.SHAPE, f"joint goal has shape {target.shape}, not ({joints},)", value=target.shape
+            )
+        self._desk.check(lease)
+        if self.state is not Lifecycle.ACTIVE:
+            raise CommandRejected(self.name, Rejection.MODE, f"device is {self.state.value}, not active")
+        if not (0.0 < speed_fraction <= 1.0 and (target >= lower).all() and (target <= upper).all()):
+            raise CommandRejected(
+                self.name,
+                Rejection.LIMIT,
+                "joint goal or speed fraction is outside the limits",
+                value=q,
+                limit=(lower, upper),
+            )
+        return target
+
     def _tool_pose(self, command: TwistCommand) -> Array:
         # Elsewhere the gate refuses the command, or does not turn it.
         if self.state is not Lifecycle.ACTIVE or command.frame is not TwistFrame.TCP:

@@ -21,8 +21,8 @@ from typing import Any
 from drivers import can_errors
 from drivers import damiao_codec as codec
 from drivers.clock import Clock
-from drivers.damiao_codec import CodecError, Feedback, Ranges, Register
-from drivers.errors import ConnectError, DeviceFault, DeviceGone, FaultClass, Remedy, TransportTimeout
+from drivers.damiao_codec import Feedback, Ranges, Register
+from drivers.errors import CodecError, ConnectError, DeviceFault, DeviceGone, FaultClass, Remedy, TransportTimeout
 
 _ANSWER_S = 0.1
 _TRIES = 3

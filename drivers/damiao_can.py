@@ -226,16 +226,11 @@ class DamiaoCanArm(Arm):
         Raises:
             CommandRejected: not finite, wrong shape, no lease, not active, outside the joint limits.
         """
-        q = np.asarray(q, dtype=np.float64)
-        if not (np.isfinite(q).all() and np.isfinite(speed_fraction)):
-            raise CommandRejected(self.name, Rejection.NON_FINITE, "joint goal is not finite", value=q)
-        if q.shape != (self._chain.joint_count,):
-            raise CommandRejected(self.name, Rejection.SHAPE, f"joint goal has shape {q.shape}", value=q.shape)
-        self._desk.check(lease)
-        if self.state is not Lifecycle.ACTIVE or self._trouble is not None:
-            raise CommandRejected(self.name, Rejection.MODE, f"device is {self.state.value}, not active")
-        if not (0.0 < speed_fraction <= 1.0 and (q >= self._chain.lower).all() and (q <= self._chain.upper).all()):
-            raise CommandRejected(self.name, Rejection.LIMIT, "joint goal or speed is outside the limits", value=q)
+        q = self._admitted_joint_goal(
+            q, lease, speed_fraction, self._chain.lower, self._chain.upper, self._chain.joint_count
+        )
+        if self._trouble is not None:
+            raise CommandRejected(self.name, Rejection.MODE, f"in trouble: {self._trouble}")
         self._setpoint.go_to(q, speed_fraction)
 
     def health(self) -> dict[str, float | int | str | bool]:

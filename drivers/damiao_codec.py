@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from types import MappingProxyType
 
-from drivers.errors import FaultClass, Remedy
-from geometry.errors import TouchcellError
+from drivers.errors import CodecError, FaultClass, Remedy
 
 PARAMETER_ID = 0x7FF
 KP_MAX = 500.0
@@ -28,20 +27,6 @@ SET_ZERO = b"\xff\xff\xff\xff\xff\xff\xff\xfe"
 CLEAR_ERROR = b"\xff\xff\xff\xff\xff\xff\xff\xfb"
 
 _READ, _WRITE, _REQUEST_FEEDBACK = 0x33, 0x55, 0xCC
-
-
-class CodecError(TouchcellError, ValueError):
-    """A value cannot be put on the wire, or bytes are no message of the expected kind.
-
-    Attributes:
-        field: the offending field.
-        value: what it was.
-    """
-
-    def __init__(self, field: str, value: object, reason: str) -> None:
-        super().__init__(f"{field} {value!r} {reason}")
-        self.field = field
-        self.value = value
 
 
 class Register(IntEnum):

@@ -49,6 +49,20 @@ class DataError(TouchcellError, ValueError):
         self.column = column
 
 
+class CodecError(TouchcellError, ValueError):
+    """A value cannot be put on the wire, or bytes are no message of the expected kind.
+
+    Attributes:
+        field: the offending field.
+        value: what it was.
+    """
+
+    def __init__(self, field: str, value: object, reason: str) -> None:
+        super().__init__(f"{field} {value!r} {reason}")
+        self.field = field
+        self.value = value
+
+
 class DeviceError(TouchcellError):
     """Something about one device; ``device`` is its name in the cell."""
 

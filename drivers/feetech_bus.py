@@ -16,8 +16,8 @@ from typing import Any
 
 from drivers import feetech_codec as codec
 from drivers.clock import Clock
-from drivers.errors import ConnectError, CorruptMessage, DeviceGone, TransportTimeout
-from drivers.feetech_codec import CodecError, Identity, Packet, Register, ServoState
+from drivers.errors import CodecError, ConnectError, CorruptMessage, DeviceGone, TransportTimeout
+from drivers.feetech_codec import Identity, Packet, Register, ServoState
 
 _TRIES = 3
 _ANSWER_TIMEOUT_S = 0.1

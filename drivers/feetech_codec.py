@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from types import MappingProxyType
 
-from drivers.errors import FaultClass, Remedy
-from geometry.errors import TouchcellError
+from drivers.errors import CodecError, FaultClass, Remedy
 
 TICKS_PER_TURN = 4096
 RAD_PER_TICK = 2.0 * math.pi / TICKS_PER_TURN
@@ -26,20 +25,6 @@ STS3215 = 777
 _HEADER = b"\xff\xff"
 _LONGEST_DATA = 253
 _OVERHEAD = 6
-
-
-class CodecError(TouchcellError, ValueError):
-    """A value cannot be put on the wire, or bytes are no message of the expected kind.
-
-    Attributes:
-        field: the offending field.
-        value: what it was.
-    """
-
-    def __init__(self, field: str, value: object, reason: str) -> None:
-        super().__init__(f"{field} {value!r} {reason}")
-        self.field = field
-        self.value = value
 
 
 class Instruction(IntEnum):

@@ -176,21 +176,12 @@ class UrArm(Arm):
         Raises:
             CommandRejected: nothing was sent.
         """
-        target = np.asarray(q, dtype=np.float64)
-        if not (np.isfinite(target).all() and math.isfinite(speed_fraction)):
-            raise CommandRejected(self.name, Rejection.NON_FINITE, "joint goal is not finite", value=q)
-        if target.shape != (JOINTS,):
-            raise CommandRejected(self.name, Rejection.SHAPE, f"{target.shape} is not (6,)", value=target.shape)
-        self._desk.check(lease)
+        target = self._admitted_joint_goal(q, lease, speed_fraction, -_MAX_JOINT_GOAL_RAD, _MAX_JOINT_GOAL_RAD, JOINTS)
         link = self._link
-        if self.state is not Lifecycle.ACTIVE or link is None:
-            raise CommandRejected(self.name, Rejection.MODE, f"device is {self.state.value}, not active")
+        if link is None:
+            raise CommandRejected(self.name, Rejection.MODE, "the control program is gone")
         if not self.at_rest():
             raise CommandRejected(self.name, Rejection.MODE, "the arm is moving", hint="stop it first")
-        if float(np.abs(target).max()) > _MAX_JOINT_GOAL_RAD or not 0.0 < speed_fraction <= 1.0:
-            raise CommandRejected(
-                self.name, Rejection.LIMIT, "goal beyond a full turn, or speed fraction not in (0, 1]", value=q
-            )
         speed = math.radians(self._config.joint_speed_deg_s) * speed_fraction
         accel = math.radians(self._config.joint_accel_deg_s2)
         self._attempt(lambda: link.move_joints(target, speed, accel, self._config.stop_accel_m_s2))

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers import damiao_codec as codec
-from drivers.damiao_codec import CodecError, Feedback, MitCommand, Ranges, Register
-from drivers.errors import FaultClass
+from drivers.damiao_codec import Feedback, MitCommand, Ranges, Register
+from drivers.errors import CodecError, FaultClass
 
 R4310 = Ranges(12.5, 30.0, 10.0)
 

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers import feetech_codec as codec
-from drivers.errors import FaultClass, Remedy
-from drivers.feetech_codec import CodecError, Packet, Register
+from drivers.errors import CodecError, FaultClass, Remedy
+from drivers.feetech_codec import Packet, Register
 
 packets = st.builds(Packet, st.integers(0, 254), st.integers(0, 255), st.binary(max_size=40))
 
