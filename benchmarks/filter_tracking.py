@@ -18,6 +18,7 @@ from cell.config import FilterSection, plan_cell
 from cell.loop import RunLoop
 from cell.recording import Recorder
 from cell.report import load_run, summarise
+from control.interlocks import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH
 from geometry import gaussian, se3
 from geometry.types import Array
 from perception.estimate import ContactEstimate
@@ -97,9 +98,6 @@ class GaussianContact:
         return ContactEstimate(True, belief, t_ns, self._seq, t_ns, nis=nis)
 
 
-_REQUIRED = ("workspace", "tcp_speed", "depth", "frame_age", "arm_state_age")
-
-
 def track(name: str, *, moving: bool, duration_s: float, seed: int, network: Path | None = None) -> dict[str, Any]:
     """Run the shipped tracking cell with one of ``FILTERS``; the plate stands still unless ``moving``.
 
@@ -116,7 +114,9 @@ def track(name: str, *, moving: bool, duration_s: float, seed: int, network: Pat
     cell_file = yaml.safe_load(find_cell(Path("configs/object_track_sim.yaml")).read_text())
     cell_file["task"]["duration_s"] = duration_s
     # Interlocks that judge estimates and motion would end the runs of the worse filters, which are to be measured.
-    cell_file["interlocks"] = {k: v for k, v in cell_file["interlocks"].items() if v["kind"] in _REQUIRED}
+    cell_file["interlocks"] = {
+        k: v for k, v in cell_file["interlocks"].items() if v["kind"] in REQUIRED_TO_MOVE | REQUIRED_TO_TOUCH
+    }
     if not moving:
         del cell_file["scene"]["surfaces"]["plate"]["motion"]
     settings = FILTERS[name]

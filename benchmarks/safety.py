@@ -20,7 +20,7 @@ import yaml
 from benchmarks.fault_matrix import FAULTS, Case, matrix
 from benchmarks.provenance import provenance
 from cell.cli import find_cell
-from control.interlocks import build_interlocks, parse_interlocks
+from control.interlocks import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, build_interlocks, parse_interlocks
 from control.latch import Latch
 from control.supervisor import Supervisor
 from control.view import ArmView, CellView, SensorView
@@ -98,7 +98,7 @@ def _costs() -> dict[str, float]:
         assert supervisor.latch.first_cause is None
         return median_us
 
-    required = [n for n in names if shipped[n]["kind"] in _REQUIRED]
+    required = [n for n in names if shipped[n]["kind"] in REQUIRED_TO_MOVE | REQUIRED_TO_TOUCH]
     for chosen in ([], required, names):
         costs[f"review, {len(chosen)} interlocks and finite"] = cost_us(chosen)
     bare = costs["review, 0 interlocks and finite"]
@@ -106,9 +106,6 @@ def _costs() -> dict[str, float]:
         costs[f"  of it {shipped[name]['kind']}"] = round(max(0.0, cost_us([name]) - bare), 2)
     costs["gate"] = _median_us(_Gate())
     return costs
-
-
-_REQUIRED = ("workspace", "tcp_speed", "depth", "frame_age", "arm_state_age")
 
 
 def _median_us(call: Callable[[int], object]) -> float:

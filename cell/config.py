@@ -16,12 +16,18 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag
 
 from cell.margins import Overshoot, overshoot
-from cell.yaml_file import InvalidCell, KeyPath, YamlFile, load, suggest
-from control.interlocks import INTERLOCKS, InterlocksConfig, WorkspaceConfig
+from cell.yaml_file import InvalidCell, KeyPath, YamlFile, load
+from control.interlocks import (
+    INTERLOCKS,
+    REQUIRED_TO_MOVE,
+    REQUIRED_TO_TOUCH,
+    InterlocksConfig,
+    WorkspaceConfig,
+)
 from drivers import registry as driver_registry
 from drivers.arm import LimitsConfig
 from drivers.device import DeactivatePolicy
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, suggest
 from drivers.registry import DriverConfig, DriverSpec
 from tasks import registry as task_registry
 from tasks.interface import TaskConfig, TaskSpec
@@ -356,9 +362,9 @@ class _Planner:
     def _require_interlocks(self, cell: CellFile, task: TaskSpec) -> None:
         """What moves must be bounded; limits have no defaults, so the file has to name them."""
         moves = any("TwistSink" in abilities for abilities in task.arms.values())
-        required = {"workspace", "tcp_speed", "arm_state_age"} if moves else set()
+        required = REQUIRED_TO_MOVE if moves else frozenset()
         if moves and task.sensors:
-            required |= {"depth", "frame_age"}
+            required |= REQUIRED_TO_TOUCH
         stopping = {entry.kind for entry in cell.interlocks.values() if entry.severity != "limit"}
         for kind in sorted(required - stopping):
             self._add(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any, TypeVar, get_args
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, suggest
 
 KeyPath = tuple[str | int, ...]
 M = TypeVar("M", bound=BaseModel)
@@ -78,12 +77,6 @@ class YamlFile:
             if (*path, part) in self.lines:
                 path = (*path, part)
         return path + location[-1:]
-
-
-def suggest(word: str, known: Sequence[str]) -> str:
-    """A "did you mean" for ``word``, or the list of what is known."""
-    near = difflib.get_close_matches(word, known, n=1)
-    return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(sorted(known))}"
 
 
 def _fields_at(model: type[BaseModel], location: KeyPath) -> list[str]:

@@ -406,6 +406,11 @@ class InterlockSpec:
     config: type[BaseModel] | None
 
 
+REQUIRED_TO_MOVE: Final = frozenset({"workspace", "tcp_speed", "arm_state_age"})
+"""Kinds that a cell must have for a task that moves an arm."""
+REQUIRED_TO_TOUCH: Final = frozenset({"depth", "frame_age"})
+"""Kinds that it must have besides when the task feels."""
+
 INTERLOCKS: Final[Mapping[str, InterlockSpec]] = MappingProxyType(
     {
         spec.kind: spec

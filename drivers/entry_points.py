@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from importlib.metadata import EntryPoint, entry_points
 from typing import TypeVar
 
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, suggest
 
 S = TypeVar("S")
 
@@ -30,9 +29,9 @@ def load(group: str, word: str, name: str, kind: type[S]) -> S:
     """
     points = installed(group)
     if name not in points:
-        near = difflib.get_close_matches(name, points, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"known {word}s: {', '.join(sorted(points))}"
-        raise ConfigError(f"unknown {word} {name!r}", key=word, value=name, hint=hint)
+        raise ConfigError(
+            f"unknown {word} {name!r}", key=word, value=name, hint=suggest(name, points, otherwise=f"known {word}s")
+        )
     found = points[name].load()
     if not isinstance(found, kind):
         raise ConfigError(

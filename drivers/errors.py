@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Iterable, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 from geometry.errors import TouchcellError
+
+
+def suggest(word: str, known: Iterable[str], *, otherwise: str = "known") -> str:
+    """A hint for an unknown ``word``: "did you mean" one of ``known``, or all of them after ``otherwise``."""
+    names = sorted(known)
+    near = difflib.get_close_matches(word, names, n=1)
+    return f"did you mean {near[0]!r}?" if near else f"{otherwise}: {', '.join(names)}"
 
 
 class ConfigError(TouchcellError, ValueError):
