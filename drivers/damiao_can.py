@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers import damiao_codec as codec
 from drivers.abilities import StopCategory
-from drivers.arm import Arm, LimitsConfig
+from drivers.arm import LimitsConfig
 from drivers.clock import Clock
 from drivers.damiao_bus import Address, Answer, MotorBus
 from drivers.damiao_codec import MitCommand, Register
@@ -37,14 +37,13 @@ from drivers.errors import (
     LifecycleError,
     Rejection,
     Remedy,
-    StaleData,
     TransportTimeout,
 )
+from drivers.joint_arm import JointArm
 from drivers.joint_setpoint import JointSetpoint
 from drivers.kinematics import GRAVITY_M_S2, ChainDescription, DifferentialIk, SerialChain, Tool, Vector3
-from drivers.lease import Lease
 from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
-from drivers.samples import JointState, Stamped, TcpState
+from drivers.samples import JointState, Stamped
 from geometry.types import Array
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -145,7 +144,7 @@ class DamiaoCanConfig(DriverConfig):
         return found
 
 
-class DamiaoCanArm(Arm):
+class DamiaoCanArm(JointArm):
     """One arm; see the module for what stops it and what then happens.
 
     Args:
@@ -189,22 +188,6 @@ class DamiaoCanArm(Arm):
         self._latest_s = 0.0
         self._missed: deque[bool] = deque(maxlen=_MISS_WINDOW)
 
-    def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
-        """Newest joint angles, velocities and motor torques, stamped when they were asked for. Raises StaleData."""
-        sample = self._joints
-        if sample is None:
-            raise StaleData(self.name, float("inf"), max_age_s or 0.0, 0, hint="no motor has answered yet")
-        age_s = sample.age_s(self._clock.now_ns())
-        if max_age_s is not None and not age_s <= max_age_s:
-            raise StaleData(self.name, age_s, max_age_s, sample.seq)
-        return sample
-
-    def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """Newest tool pose and twist, from measured joint angles. Raises StaleData."""
-        sample = self.joints(max_age_s)
-        T_base_tcp, J = self._chain.forward_and_jacobian(sample.value.q)
-        return Stamped(TcpState(T_base_tcp, J @ sample.value.dq), sample.t_ns, sample.seq)
-
     def at_rest(self) -> bool:
         """Whether setpoint and joints stand still; a joint's velocity is told in steps of up to 0.015 rad/s."""
         sample = self._joints
@@ -219,19 +202,6 @@ class DamiaoCanArm(Arm):
         if len(known) < len(self._enabled):
             raise LifecycleError(self.name, "tell the watchdog", self.state.value, [Lifecycle.READY.value])
         return max(known) * codec.TIMEOUT_TICK_S
-
-    def go_to_joints(self, q: Array, lease: Lease, *, speed_fraction: float = 0.1) -> None:
-        """Start moving to ``q`` (n,) rad in a straight line in joint space, within the limits of the tool centre point.
-
-        Raises:
-            CommandRejected: not finite, wrong shape, no lease, not active, outside the joint limits.
-        """
-        q = self._admitted_joint_goal(
-            q, lease, speed_fraction, self._chain.lower, self._chain.upper, self._chain.joint_count
-        )
-        if self._trouble is not None:
-            raise CommandRejected(self.name, Rejection.MODE, f"in trouble: {self._trouble}")
-        self._setpoint.go_to(q, speed_fraction)
 
     def health(self) -> dict[str, float | int | str | bool]:
         """Counters of the bus and the loop, temperatures, status, what limits the motion."""
@@ -448,10 +418,7 @@ class DamiaoCanArm(Arm):
             self._clock.sleep_until_ns(self._clock.now_ns() + 5_000_000)
 
     def _parked(self) -> bool:
-        if self._config.park_deg is None:
-            return False
-        away = np.abs(self.joints().value.q - np.deg2rad(self._config.park_deg))
-        return bool((away <= np.deg2rad(self._config.park_tolerance_deg)).all())
+        return self._is_at(self._config.park_deg, self._config.park_tolerance_deg)
 
     def _run(self) -> None:
         period_ns = round(1e9 / self._config.rate_hz)
@@ -578,14 +545,6 @@ class DamiaoCanArm(Arm):
                     hint="look for a collision, a wrong tool mass or a wrong offset",
                 )
             )
-
-    def _latch(self, error: DeviceError) -> None:
-        if self._trouble is None:
-            self._trouble = error
-            self._setpoint.stop()
-        # A transition that was under way in another thread may have overwritten the state: every cycle asserts it.
-        if self.state not in (Lifecycle.DISCONNECTED, Lifecycle.FAULTED):
-            self._to_faulted(self._trouble)
 
 
 def _open_bus(device: str, config: DamiaoCanConfig) -> Any:

@@ -28,10 +28,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers import feetech_codec as codec
 from drivers.abilities import StopCategory
-from drivers.arm import Arm, LimitsConfig
+from drivers.arm import LimitsConfig
 from drivers.clock import Clock
 from drivers.commands import Adjustment
-from drivers.device import DeactivatePolicy, Lifecycle, OperatorToken
+from drivers.device import DeactivatePolicy, OperatorToken
 from drivers.errors import (
     CommandRejected,
     ConfigError,
@@ -44,16 +44,15 @@ from drivers.errors import (
     LifecycleError,
     Rejection,
     Remedy,
-    StaleData,
     TransportTimeout,
 )
 from drivers.feetech_bus import Answer, ServoBus
 from drivers.feetech_codec import FaultBit, Register, ServoState
+from drivers.joint_arm import JointArm
 from drivers.joint_setpoint import JointSetpoint
 from drivers.kinematics import ChainDescription, DifferentialIk, SerialChain, Tool
-from drivers.lease import Lease
 from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
-from drivers.samples import JointState, Quality, Stamped, TcpState
+from drivers.samples import JointState, Quality, Stamped
 from drivers.twist_projection import followable
 from geometry.types import Array
 
@@ -190,7 +189,7 @@ class FeetechSerialConfig(DriverConfig):
         return found.model_copy(update={"joints": tuple(joints)})
 
 
-class FeetechSerialArm(Arm):
+class FeetechSerialArm(JointArm):
     """One arm; see the module for what stops it and what then happens.
 
     Args:
@@ -229,26 +228,6 @@ class FeetechSerialArm(Arm):
         self._lost: tuple[Adjustment, ...] = ()
         self._follows_until_ns = 0
 
-    def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
-        """Newest joint angles and velocities, stamped when they were asked for. Servos measure no torque.
-
-        SUSPECT when a joint is outside its calibrated range. Raises StaleData.
-        """
-        sample = self._joints
-        if sample is None:
-            raise StaleData(self.name, float("inf"), max_age_s or 0.0, 0, hint="not all servos have answered yet")
-        age_s = sample.age_s(self._clock.now_ns())
-        if max_age_s is not None and not age_s <= max_age_s:
-            raise StaleData(self.name, age_s, max_age_s, sample.seq)
-        return sample
-
-    def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """Newest tool pose and twist, from measured joint angles. Raises StaleData."""
-        sample = self.joints(max_age_s)
-        T_base_tcp, J = self._chain.forward_and_jacobian(sample.value.q)
-        state = TcpState(T_base_tcp, J @ sample.value.dq)
-        return Stamped(state, sample.t_ns, sample.seq, quality=sample.quality)
-
     def at_rest(self) -> bool:
         """Whether setpoint and joints stand still."""
         sample = self._joints
@@ -258,19 +237,6 @@ class FeetechSerialArm(Arm):
         if sample is None or not fresh or due or self._setpoint.moving:
             return False
         return bool((np.abs(sample.value.dq) <= _REST_SPEED_RAD_S).all())
-
-    def go_to_joints(self, q: Array, lease: Lease, *, speed_fraction: float = 0.1) -> None:
-        """Start moving to ``q`` (n,) rad in a straight line in joint space, within the limits of the tool centre point.
-
-        Raises:
-            CommandRejected: not finite, wrong shape, no lease, not active, outside the joint limits.
-        """
-        q = self._admitted_joint_goal(
-            q, lease, speed_fraction, self._chain.lower, self._chain.upper, self._chain.joint_count
-        )
-        if self._trouble is not None:
-            raise CommandRejected(self.name, Rejection.MODE, f"in trouble: {self._trouble}")
-        self._setpoint.go_to(q, speed_fraction)
 
     def health(self) -> dict[str, float | int | str | bool]:
         """Counters of the line and the loop, the calibration's hash, and what each servo tells of itself."""
@@ -512,10 +478,7 @@ class FeetechSerialArm(Arm):
             self._clock.sleep_until_ns(self._clock.now_ns() + 5_000_000)
 
     def _parked(self) -> bool:
-        if self._config.park_deg is None:
-            return False
-        away = np.abs(self.joints().value.q - np.deg2rad(self._config.park_deg))
-        return bool((away <= np.deg2rad(self._config.park_tolerance_deg)).all())
+        return self._is_at(self._config.park_deg, self._config.park_tolerance_deg)
 
     def _run(self) -> None:
         period_ns = round(1e9 / self._config.rate_hz)
@@ -640,14 +603,6 @@ class FeetechSerialArm(Arm):
                     hint="look for a collision or a load that is too heavy",
                 )
             )
-
-    def _latch(self, error: DeviceError) -> None:
-        if self._trouble is None:
-            self._trouble = error
-            self._setpoint.stop()
-        # A transition that was under way in another thread may have overwritten the state: every cycle asserts it.
-        if self.state not in (Lifecycle.DISCONNECTED, Lifecycle.FAULTED):
-            self._to_faulted(self._trouble)
 
 
 def _open_port(device: str, config: FeetechSerialConfig) -> Any:
