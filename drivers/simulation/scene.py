@@ -15,6 +15,7 @@ from drivers.samples import Stamped
 from drivers.simulation.contact import ContactLaw, ContactState
 from drivers.simulation.motions import Glide, Motion, Periodic, Still
 from drivers.simulation.objects import ObjectConfig, PoseMmDeg, TableConfig
+from drivers.simulation.quasi_static import QuasiStaticWorld
 from drivers.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
 from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Timeline
 from drivers.simulation.world import KinematicWorld, World
@@ -213,18 +214,20 @@ class TipLawConfig(_Part):
 
     radius_mm: float = Field(default=20.0, gt=0.0)
     stiffness_n_mm: float = Field(default=1.5, gt=0.0)
+    friction: float = Field(default=0.8, gt=0.0)
 
     def build(self) -> ContactLaw:
-        return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3)
+        return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3, self.friction)
 
 
 class SceneConfig(_Part):
     """The ``scene:`` section of a cell file. Poses are in the world frame.
 
     ``physics`` says how true it is. ``kinematic``: surfaces move as they were told, whatever touches them.
+    ``quasi_static``: besides, objects slide on the table where tips push them, without inertia and always upright.
     """
 
-    physics: Literal["kinematic"] = "kinematic"
+    physics: Literal["kinematic", "quasi_static"] = "kinematic"
     surfaces: dict[
         str,
         Annotated[PlaneConfig | RampConfig | DomeConfig | SphereConfig, Field(discriminator="kind")],
@@ -244,5 +247,12 @@ class SceneConfig(_Part):
 
     def build(self, clock: Clock) -> Scene:
         """The scene, with its motions starting now."""
+        return Scene(self._world(), clock, self.step_ms * 1e-3)
+
+    def _world(self) -> World:
         surfaces = {name: config.build() for name, config in self.surfaces.items()}
-        return Scene(KinematicWorld(surfaces, self.tip.build()), clock, self.step_ms * 1e-3)
+        law = self.tip.build()
+        if self.physics == "kinematic":
+            return KinematicWorld(surfaces, law)
+        objects = {name: config.build(self.table) for name, config in self.objects.items()}
+        return QuasiStaticWorld(surfaces, objects, law)

@@ -110,6 +110,99 @@ class Ramp:
 
 
 @dataclass(frozen=True, slots=True)
+class Extruded:
+    """A convex outline drawn up along z, from z = 0 to ``height_m``.
+
+    Attributes:
+        outline_m: (n, 2) corners, anticlockwise.
+        height_m: along z.
+    """
+
+    outline_m: Array
+    height_m: float
+    _sides: tuple[tuple[float, float, float, float, float], ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        corners = self.outline_m.tolist()
+        sides = []
+        for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
+            length = math.hypot(bx - ax, by - ay)
+            sides.append((ax, ay, (bx - ax) / length, (by - ay) / length, length))
+        object.__setattr__(self, "_sides", tuple(sides))
+
+    def nearest(self, p: Array) -> SurfacePoint:
+        """Nearest surface point to ``p`` (3,) m; from inside, on the nearest side or the top."""
+        x, y, z = (float(value) for value in p)
+        inside, outside = -math.inf, math.inf
+        point, normal = (0.0, 0.0), (1.0, 0.0)
+        for ax, ay, tx, ty, length in self._sides:
+            beyond = (x - ax) * ty - (y - ay) * tx
+            if beyond > 0.0:
+                along = (x - ax) * tx + (y - ay) * ty
+                if 0.0 <= along <= length:
+                    outside, point, normal = beyond, (ax + along * tx, ay + along * ty), (ty, -tx)
+                    break
+                corner = (ax, ay) if along < 0.0 else (ax + length * tx, ay + length * ty)
+                distance = math.hypot(x - corner[0], y - corner[1])
+                if distance < outside:
+                    outside, point = distance, corner
+                    normal = ((x - corner[0]) / distance, (y - corner[1]) / distance)
+            elif outside == math.inf and beyond > inside:
+                inside, point, normal = beyond, (x - beyond * ty, y + beyond * tx), (ty, -tx)
+        beside = inside if outside == math.inf else outside
+        return _under_a_lid(x, y, z, beside, point, normal, 0.0, self.height_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Revolved:
+    """Upright cylinders upon each other about the z axis, the lowest one on z = 0.
+
+    Attributes:
+        sections_m: (height, radius) of each, from the bottom up.
+    """
+
+    sections_m: tuple[tuple[float, float], ...]
+
+    def nearest(self, p: Array) -> SurfacePoint:
+        """Nearest surface point to ``p`` (3,) m; exact outside the body, which is where a tip's centre is."""
+        x, y, z = (float(value) for value in p)
+        from_axis = math.hypot(x, y)
+        normal = (x / from_axis, y / from_axis) if from_axis > 0.0 else (1.0, 0.0)
+        found, bottom = None, 0.0
+        for height, radius in self.sections_m:
+            side = (radius * normal[0], radius * normal[1])
+            each = _under_a_lid(x, y, z, from_axis - radius, side, normal, bottom, bottom + height)
+            found = each if found is None or each.distance_m < found.distance_m else found
+            bottom += height
+        assert found is not None
+        return found
+
+
+def _under_a_lid(
+    x: float,
+    y: float,
+    z: float,
+    beside: float,
+    side: tuple[float, float],
+    normal: tuple[float, float],
+    bottom: float,
+    top: float,
+) -> SurfacePoint:
+    """The nearest point of an upright body between ``bottom`` and ``top`` to (x, y, z), of which the nearest point of
+    its side, were it endless, is ``side`` at the signed distance ``beside``."""
+    above = max(z - top, bottom - z)
+    lid = top if z - top >= bottom - z else bottom
+    up = 1.0 if lid == top else -1.0
+    if above <= 0.0 or beside <= 0.0:
+        if beside >= above:
+            return SurfacePoint(beside, np.array([*normal, 0.0]), np.array([*side, z]))
+        return SurfacePoint(above, np.array([0.0, 0.0, up]), np.array([x, y, lid]))
+    distance = math.hypot(beside, above)
+    to_rim = np.array([normal[0] * beside, normal[1] * beside, up * above]) / distance
+    return SurfacePoint(distance, to_rim, np.array([*side, lid]))
+
+
+@dataclass(frozen=True, slots=True)
 class Surface:
     """A shape on its way through the world.
 
