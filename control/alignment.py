@@ -3,90 +3,118 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from control.path import Path, Point
 from control.pid import Pid, PidGains
 from geometry.types import Array
 
 
 @dataclass(frozen=True, slots=True)
-class Bearing:
-    """Where the target lies, seen along the contact normal in the plane of pushing.
+class AlignmentGains:
+    """How a pushed object is steered.
 
     Attributes:
-        ahead_m: from the middle of the tip, along the normal.
-        aside_m: along the sensor's y axis, turned with the normal: the distance of the target from the normal, signed.
+        kp: sideways speed per bearing of the point aimed at, m/s per rad.
+        ki: sideways acceleration per distance from the path, 1/s^2.
+        kd: sideways speed per rate of the bearing, m per rad.
+        limit_m_s: largest sideways speed.
+        look_ahead_m: how far ahead on the path it aims.
+        lead_m: where the object turns, ahead of the middle of the tip.
     """
 
-    ahead_m: float
+    kp: float
+    ki: float
+    kd: float
+    limit_m_s: float
+    look_ahead_m: float
+    lead_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Aim:
+    """How the object stands to its target.
+
+    Attributes:
+        theta_rad: bearing of the point aimed at, from the contact normal, positive to its left.
+        rest_m: way that is left.
+        aside_m: distance of the object from its path, positive to its left.
+        target_aside_m: distance of the target from the contact normal, positive to its left.
+        heading_rad: of the contact normal in the base frame.
+    """
+
+    theta_rad: float
+    rest_m: float
     aside_m: float
-
-    @property
-    def theta_rad(self) -> float:
-        """From the normal to the target, positive towards the y axis."""
-        return math.atan2(self.aside_m, self.ahead_m)
-
-    @property
-    def rho_m(self) -> float:
-        """Distance of the target."""
-        return math.hypot(self.ahead_m, self.aside_m)
-
-
-def bearing(T_base_sensor: Array, T_s_f: Array, target: Array) -> Bearing:
-    """Bearing of ``target`` (2,) m, x and y in the arm's base frame whose z axis is upright.
-
-    Args:
-        T_base_sensor: (4, 4) pose of the sensor, its x axis upright.
-        T_s_f: (4, 4) contact: z of the surface frame is the inward normal.
-        target: (2,) m.
-    """
-    normal = T_base_sensor[:2, :3] @ T_s_f[:3, 2]
-    length = math.hypot(normal[0], normal[1])
-    nx, ny = normal[0] / length, normal[1] / length
-    # The sensor's y axis lies to the left of the normal if its x axis points down.
-    left = -math.copysign(1.0, T_base_sensor[2, 0])
-    dx, dy = float(target[0] - T_base_sensor[0, 3]), float(target[1] - T_base_sensor[1, 3])
-    return Bearing(nx * dx + ny * dy, left * (nx * dy - ny * dx))
+    target_aside_m: float
+    heading_rad: float
 
 
 class TargetAlignment:
-    """A PID on the bearing that moves the contact away from the target's side, which turns the object towards it.
+    """A PID on a bearing that moves the contact to the other side, which turns the object towards where it shall go.
 
-    Pushed at its near side, an object turns about a point ahead of the contact: to head left, the contact has to go
-    right. Within ``off_m`` of the target the bearing says nothing of use any more and the motion is zero (Lloyd &
-    Lepora 2021).
+    Pushed at its near side, an object turns about a point ahead of the contact, near its middle: to head left, the
+    contact has to go right. Seen from that point, ``lead_m`` ahead, the object is steered like a unicycle.
+
+    The paper takes the bearing of the target from the sensor. From there the sideways motion itself turns the bearing
+    the wrong way, as much as the object's turn rights it when the target is at ``lead_m``; so it has to be switched off
+    before the end, and an object that is not pushed through its middle then goes astray. Here the bearing is taken from
+    where the object turns, of a point ``look_ahead_m`` further on the straight path to the target (pure pursuit), and
+    it is the distance from that path that is integrated: the object may head a little aside to go straight. That works
+    until the end, and along bent paths.
 
     Args:
-        kp: m/s per rad.
-        ki: m/s^2 per rad.
-        kd: m per rad.
-        limit_m_s: largest motion, and largest integral part of it.
-        off_m: distance of the target, from the middle of the tip, within which it is switched off.
+        path: points (x, y) of the way, m, in the base frame, without the object's own place at the start; the last one
+            is the target.
+        gains: see there.
 
     Raises:
-        ControlError: a number is not finite or a limit negative.
+        ControlError: a number is not finite, a limit negative, or the path is none.
     """
 
-    def __init__(self, kp: float, ki: float, kd: float, limit_m_s: float, off_m: float) -> None:
-        limit = _along_y(limit_m_s)
-        self._pid = Pid(PidGains(_along_y(kp), _along_y(ki), _along_y(kd), limit, np.full(6, np.pi), limit))
-        self._off_m = off_m
+    def __init__(self, path: Sequence[Point], gains: AlignmentGains) -> None:
+        kp, ki, kd = np.zeros((3, 6, 6))
+        kp[1, 1], ki[1, 0], kd[1, 1] = gains.kp, gains.ki, gains.kd
+        limit = np.array([0.0, gains.limit_m_s, 0.0, 0.0, 0.0, 0.0])
+        zone = np.array([0.5 * gains.look_ahead_m, 0.0, 0.0, 0.0, 0.0, 0.0])
+        self._pid = Pid(PidGains(kp, ki, kd, 0.5 * limit, zone, limit))
+        self._points = list(path)
+        self._gains = gains
+        self._path: Path | None = None
+        self._along_m = 0.0
 
-    def reset(self) -> None:
-        """Forget the past."""
+    def pause(self) -> None:
+        """The motion was interrupted: forget the past, but not the path."""
         self._pid.reset()
 
-    def step(self, seen: Bearing, dt_s: float) -> float:
-        """Speed of the contact along the sensor's y axis, m/s."""
-        if seen.rho_m < self._off_m:
-            self._pid.reset()
-            return 0.0
-        return -float(self._pid.step(_along_y(seen.theta_rad), np.zeros(6), dt_s)[1])
+    def aim(self, T_base_sensor: Array, T_s_f: Array) -> Aim:
+        """How the object stands now. The first time it also lays the path from there.
 
+        Args:
+            T_base_sensor: (4, 4) pose of the sensor, its x axis upright.
+            T_s_f: (4, 4) contact: z of the surface frame is the inward normal.
+        """
+        normal = T_base_sensor[:2, :3] @ T_s_f[:3, 2]
+        length = math.hypot(normal[0], normal[1])
+        nx, ny = float(normal[0]) / length, float(normal[1]) / length
+        tip = float(T_base_sensor[0, 3]), float(T_base_sensor[1, 3])
+        middle = tip[0] + self._gains.lead_m * nx, tip[1] + self._gains.lead_m * ny
+        if self._path is None:
+            self._path = Path([middle, *self._points])
+        place = self._path.place(middle, self._along_m, self._gains.look_ahead_m)
+        self._along_m = max(self._along_m, place.along_m)
+        ahead = self._path.point(place.along_m + self._gains.look_ahead_m)
+        dx, dy = ahead[0] - middle[0], ahead[1] - middle[1]
+        theta = math.atan2(nx * dy - ny * dx, nx * dx + ny * dy)
+        target = self._points[-1]
+        target_aside = nx * (target[1] - tip[1]) - ny * (target[0] - tip[0])
+        rest_m = self._path.length_m - place.along_m
+        return Aim(theta, rest_m, place.aside_m, target_aside, math.atan2(ny, nx))
 
-def _along_y(value: float) -> Array:
-    six = np.zeros(6)
-    six[1] = value
-    return six
+    def step(self, aim: Aim, dt_s: float) -> float:
+        """Speed of the contact to the left of the contact normal, m/s."""
+        e = np.array([-aim.aside_m, aim.theta_rad, 0.0, 0.0, 0.0, 0.0])
+        return -float(self._pid.step(e, np.zeros(6), dt_s)[1])

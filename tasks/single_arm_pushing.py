@@ -7,11 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from control.alignment import Bearing, TargetAlignment, bearing
+from control.alignment import Aim, AlignmentGains, TargetAlignment
 from geometry.types import Array
 from tasks.hand import Hand, HandConfig, Six, SixGains
 from tasks.interface import TaskContext, TaskSpec
 from tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
+
+Mm = tuple[float, float]
 
 
 class PushConfig(HandConfig):
@@ -21,29 +23,44 @@ class PushConfig(HandConfig):
     Attributes:
         reference_mm_deg: contact to hold; only the components with gains count.
         target_mm: x and y of the target in the arm's base frame, whose z axis is upright.
+        path_mm: points to push it past on the way there.
         push_speed_mm_s: speed along the sensor's axis.
-        arrive_mm: done when the target is no further ahead of the middle of the tip: the tip's radius and half of the
-            object bring the object's middle to the target.
-        align_kp_mm_s_per_deg: sideways speed per degree of the target's bearing.
-        align_ki_mm_s2_per_deg: its integral gain.
-        align_kd_mm_per_deg: its derivative gain.
+        middle_mm: the object's middle, ahead of the middle of the tip: the tip's radius and half of the object. It is
+            what is brought to the target, and about which the object turns.
+        look_ahead_mm: how far ahead on the way the middle is aimed.
+        align_kp_mm_s_per_deg: sideways speed per degree of the bearing of the point that is aimed at.
+        align_ki_per_s2: sideways acceleration per distance from the way.
+        align_kd_mm_per_deg: derivative gain on the bearing.
         align_max_mm_s: largest sideways speed.
-        align_off_mm: no alignment when the target is nearer to the middle of the tip.
         push_timeout_s: give up when it has not arrived by then.
     """
 
     reference_mm_deg: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     kp_per_s: SixGains = (0.0, 0.0, 0.0, 4.0, 0.0, 0.0)
     ki_per_s2: SixGains = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    target_mm: tuple[float, float]
+    target_mm: Mm
+    path_mm: tuple[Mm, ...] = ()
     push_speed_mm_s: PositiveFloat = 20.0
-    arrive_mm: NonNegativeFloat = 60.0
-    align_kp_mm_s_per_deg: NonNegativeFloat = 1.0
-    align_ki_mm_s2_per_deg: NonNegativeFloat = 0.2
+    middle_mm: PositiveFloat = 60.0
+    look_ahead_mm: PositiveFloat = 60.0
+    align_kp_mm_s_per_deg: PositiveFloat = 3.0
+    align_ki_per_s2: NonNegativeFloat = 1.0
     align_kd_mm_per_deg: NonNegativeFloat = 0.0
     align_max_mm_s: PositiveFloat = 20.0
-    align_off_mm: NonNegativeFloat = 65.0
     push_timeout_s: PositiveFloat = 120.0
+
+    def alignment(self) -> TargetAlignment:
+        """The controller that steers, in SI units."""
+        per_rad = 1e-3 * np.degrees(1.0)
+        gains = AlignmentGains(
+            kp=self.align_kp_mm_s_per_deg * per_rad,
+            ki=self.align_ki_per_s2,
+            kd=self.align_kd_mm_per_deg * per_rad,
+            limit_m_s=1e-3 * self.align_max_mm_s,
+            look_ahead_m=1e-3 * self.look_ahead_mm,
+            lead_m=1e-3 * self.middle_mm,
+        )
+        return TargetAlignment([(1e-3 * x, 1e-3 * y) for x, y in (*self.path_mm, self.target_mm)], gains)
 
 
 class SingleArmPushingConfig(PushConfig, ServoConfig):
@@ -54,25 +71,17 @@ class Push:
     """The run of pushing: forward along the contact normal, sideways by target alignment, until the target is near."""
 
     def __init__(self, config: PushConfig) -> None:
-        self._target = 1e-3 * np.array(config.target_mm)
         self._speed_m_s = 1e-3 * config.push_speed_mm_s
-        self._arrive_m = 1e-3 * config.arrive_mm
         self._timeout_s = config.push_timeout_s
-        per_rad = 1e-3 * np.degrees(1.0)
-        self._alignment = TargetAlignment(
-            config.align_kp_mm_s_per_deg * per_rad,
-            config.align_ki_mm_s2_per_deg * per_rad,
-            config.align_kd_mm_per_deg * per_rad,
-            1e-3 * config.align_max_mm_s,
-            1e-3 * config.align_off_mm,
-        )
-        self._seen: Bearing | None = None
-        self._sideways_m_s = 0.0
+        self._alignment = config.alignment()
+        self._aim: Aim | None = None
+        self._left_m_s = 0.0
+        self._y_is_left = 1.0
 
     @property
     def feedforward(self) -> Array:
         """Twist (6,) in the desired sensor frame."""
-        return np.array([0.0, self._sideways_m_s, self._speed_m_s, 0.0, 0.0, 0.0])
+        return np.array([0.0, self._y_is_left * self._left_m_s, self._speed_m_s, 0.0, 0.0, 0.0])
 
     @property
     def timeout_s(self) -> float:
@@ -80,24 +89,27 @@ class Push:
         return self._timeout_s
 
     def advance(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
-        """Look where the target is."""
+        """Look where the object stands to its target."""
         if T_s_f is None:
-            self._alignment.reset()
-            self._sideways_m_s = 0.0
+            self._alignment.pause()
+            self._left_m_s = 0.0
             return False
-        self._seen = bearing(now, T_s_f, self._target)
-        self._sideways_m_s = self._alignment.step(self._seen, dt_s)
-        return self._seen.ahead_m <= self._arrive_m
+        self._y_is_left = -float(np.sign(now[2, 0]))
+        self._aim = self._alignment.aim(now, T_s_f)
+        self._left_m_s = self._alignment.step(self._aim, dt_s)
+        return self._aim.rest_m <= 0.0
 
     def telemetry(self) -> Mapping[str, float]:
-        """The target's bearing, its distances along the contact normal and from it, and what alignment asks for."""
-        if self._seen is None:
+        """Way that is left, distance of the target from the contact normal, and how the object is steered."""
+        if self._aim is None:
             return {}
         return {
-            "target_bearing_deg": float(np.degrees(self._seen.theta_rad)),
-            "target_ahead_mm": 1e3 * self._seen.ahead_m,
-            "target_aside_mm": 1e3 * self._seen.aside_m,
-            "align_mm_s": 1e3 * self._sideways_m_s,
+            "rest_mm": 1e3 * self._aim.rest_m,
+            "target_aside_mm": 1e3 * self._aim.target_aside_m,
+            "aside_mm": 1e3 * self._aim.aside_m,
+            "bearing_deg": float(np.degrees(self._aim.theta_rad)),
+            "heading_deg": float(np.degrees(self._aim.heading_rad)),
+            "align_mm_s": 1e3 * self._left_m_s,
         }
 
 
