@@ -213,6 +213,7 @@ class TipLawConfig(_Part):
 
     radius_mm: float = Field(default=20.0, gt=0.0)
     stiffness_n_mm: float = Field(default=1.5, gt=0.0)
+    friction: float = Field(default=0.9, gt=0.0, le=3.0, description="of the skin, where the physics is dynamic")
 
     def build(self) -> ContactLaw:
         return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3)
@@ -221,10 +222,12 @@ class TipLawConfig(_Part):
 class SceneConfig(_Part):
     """The ``scene:`` section of a cell file. Poses are in the world frame.
 
-    ``physics`` says how true it is. ``kinematic``: surfaces move as they were told, whatever touches them.
+    ``physics`` says how true it is (docs/simulation.md). ``kinematic``: surfaces move as they were told, whatever
+    touches them. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms`` within
+    ``step_ms``, the grid on which arms move and contacts are kept.
     """
 
-    physics: Literal["kinematic"] = "kinematic"
+    physics: Literal["kinematic", "dynamic"] = "kinematic"
     surfaces: dict[
         str,
         Annotated[PlaneConfig | RampConfig | DomeConfig | SphereConfig, Field(discriminator="kind")],
@@ -233,6 +236,7 @@ class SceneConfig(_Part):
     table: TableConfig = TableConfig()
     tip: TipLawConfig = TipLawConfig()
     step_ms: float = Field(default=2.0, ge=0.1, le=10.0)
+    physics_step_ms: float = Field(default=1.0, ge=0.05, le=5.0)
 
     @model_validator(mode="after")
     def _something_to_touch(self) -> SceneConfig:
@@ -240,9 +244,36 @@ class SceneConfig(_Part):
             raise ValueError("the scene has neither surfaces nor objects to touch")
         if self.physics == "kinematic" and self.objects:
             raise ValueError("free objects need another physics than kinematic")
+        steps = self.step_ms / self.physics_step_ms
+        if self.physics == "dynamic" and abs(steps - max(round(steps), 1)) > 1e-6:
+            raise ValueError(f"step_ms {self.step_ms:g} is no multiple of physics_step_ms {self.physics_step_ms:g}")
         return self
 
     def build(self, clock: Clock) -> Scene:
         """The scene, with its motions starting now."""
+        return Scene(self._world(), clock, self.step_ms * 1e-3)
+
+    def _world(self) -> World:
         surfaces = {name: config.build() for name, config in self.surfaces.items()}
-        return Scene(KinematicWorld(surfaces, self.tip.build()), clock, self.step_ms * 1e-3)
+        if self.physics == "kinematic":
+            return KinematicWorld(surfaces, self.tip.build())
+        return self._dynamic_world(surfaces)
+
+    def _dynamic_world(self, surfaces: Mapping[str, Surface]) -> World:
+        try:
+            from drivers.simulation.dynamics import DynamicWorld
+            from drivers.simulation.dynamics_model import TipMechanics
+        except ModuleNotFoundError as error:
+            raise ConfigError(
+                f"physics: dynamic needs {error.name}, which is not installed",
+                key="scene.physics",
+                value="dynamic",
+                hint="pip install 'touchcell[physics]'",
+            ) from None
+        tip = TipMechanics(
+            radius_m=1e-3 * self.tip.radius_mm,
+            stiffness_n_m=1e3 * self.tip.stiffness_n_mm,
+            friction=self.tip.friction,
+        )
+        objects = {name: config.build(self.table) for name, config in self.objects.items()}
+        return DynamicWorld(surfaces, objects, 1e-3 * self.table.height_mm, tip, 1e-3 * self.physics_step_ms)
