@@ -83,6 +83,7 @@ class SimTactip(Device):
         self._drawn = 0
         T_tcp_s = se3.from_euler_mm_deg(config.tcp_to_sensor_mm_deg)
         scene.mount(name, lambda: mount.T_world_tcp() @ T_tcp_s)
+        scene.timeline.keep(lambda: self._forget)
 
     def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
         """Newest frame; waits for the very first. Raises StaleData if it is older than ``max_age_s``."""
@@ -139,6 +140,10 @@ class SimTactip(Device):
         image.flags.writeable = False
         self._drawn += 1
         return Frame(image)
+
+    def _forget(self, later_ns: int) -> None:
+        """The newest picture may show what a restored scene has taken back."""
+        self._newest = None
 
     def _open(self) -> None:
         self._scene.timeline.advance()

@@ -7,11 +7,12 @@ inward normal and its origin one tip radius outside the surface, so that {f} = {
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from drivers.simulation.surfaces import Surface
+from drivers.simulation.timeline import Restore
 from geometry import se3
 from geometry.types import Array
 
@@ -152,6 +153,15 @@ class ContactModel:
             torsion = held_torsion
         R_f_s = about_z(torsion) @ R_tilt
         return self._state(T_world_s, R_world_b @ R_b_f, R_f_s, (shear[0], shear[1], depth), slipping=slipping)
+
+    def snapshot(self) -> Restore:
+        """What brings the contact back as it is now."""
+        held = self._anchor and replace(self._anchor)
+
+        def restore() -> None:
+            self._anchor = held and replace(held)
+
+        return restore
 
     def _state(
         self, T_world_s: Array, R_world_f: Array, R_f_s: Array, position: tuple[float, float, float], *, slipping: bool

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -24,12 +24,14 @@ from drivers.simulation.motions import Still
 from drivers.simulation.objects import FreeObject
 from drivers.simulation.solids import shape_of
 from drivers.simulation.surfaces import Plane, Surface, SurfacePoint
+from drivers.simulation.timeline import Restore
 from geometry.types import Array
 
 # A carriage that would turn faster than this in one step has come to another face: it is set there, not swung.
 _SWING_RAD = 0.1
 # Friction is regularised: what slides carries a little less than the cone allows.
 _SLIDING_SHARE = 0.97
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 @dataclass(slots=True)
@@ -101,6 +103,19 @@ class DynamicWorld:
     def objects(self) -> Mapping[str, Array]:
         """T_world_object (4, 4) of every free object now."""
         return {name: self._pose(name) for name in self._things}
+
+    def snapshot(self) -> Restore:
+        """What puts objects, tips and carriages back."""
+        model, data = self._at.model, self._data
+        state = np.empty(mujoco.mj_stateSize(model, _STATE))
+        mujoco.mj_getState(model, data, state, _STATE)
+        t_s, mounted = self._t_s, {sensor: replace(each) for sensor, each in self._mounted.items()}
+
+        def restore() -> None:
+            mujoco.mj_setState(model, data, state, _STATE)
+            self._t_s, self._mounted = t_s, {sensor: replace(each) for sensor, each in mounted.items()}
+
+        return restore
 
     def _build(self, T_world_object: Mapping[str, Array]) -> None:
         """Compile the model anew, with objects at ``T_world_object`` (4, 4) or else where they stand at first."""

@@ -16,7 +16,7 @@ from drivers.simulation.contact import ContactLaw, ContactState
 from drivers.simulation.motions import Glide, Motion, Periodic, Still
 from drivers.simulation.objects import ObjectConfig, PoseMmDeg, TableConfig
 from drivers.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
-from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Timeline
+from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeline
 from drivers.simulation.world import KinematicWorld, World
 from geometry import se3
 from geometry.errors import TouchcellError
@@ -66,9 +66,11 @@ class Scene:
         self.timeline = Timeline(clock, step_s)
         self._start_ns = self.timeline.t_ns
         self._poses: dict[str, Callable[[], Array]] = {}
-        self._felt: dict[str, deque[Stamped[ContactState]]] = {}
+        # The last one is of the timeline's present step, the one before it of the step before.
+        self._felt: dict[str, deque[ContactState]] = {}
         self._kept = round(HISTORY_S * 1e9 / self.timeline.step_ns)
         self.timeline.add(Phase.CONTACT, self._step)
+        self.timeline.keep(self._snapshot)
 
     def mount(self, sensor: str, pose: Callable[[], Array]) -> None:
         """Let ``sensor`` feel. ``pose`` gives T_world_s (4, 4) at the present step and must not advance time."""
@@ -77,7 +79,7 @@ class Scene:
         t_ns = self.timeline.t_ns
         state = self.world.mount(sensor, pose(), self.seconds(t_ns))
         self._poses[sensor] = pose
-        self._felt[sensor] = deque([Stamped(state, t_ns, t_ns // self.timeline.step_ns)], maxlen=self._kept)
+        self._felt[sensor] = deque([state], maxlen=self._kept)
 
     def contact(self, sensor: str, t_ns: int | None = None) -> Stamped[ContactState]:
         """What ``sensor`` feels now, or felt at ``t_ns`` (the step before it), at most HISTORY_S ago.
@@ -89,17 +91,28 @@ class Scene:
         if sensor not in self._felt:
             raise ConfigError(f"no sensor {sensor!r} is mounted", key="scene", value=sensor)
         now_ns = self.timeline.advance()
-        felt = self._felt[sensor]
-        t_ns = now_ns if t_ns is None else t_ns
-        back = felt[-1].seq - t_ns // self.timeline.step_ns
-        if not 0 <= back < len(felt):
-            raise ContactNotKept(t_ns, felt[0].t_ns, felt[-1].t_ns)
-        return felt[-1 - back]
+        felt, step_ns = self._felt[sensor], self.timeline.step_ns
+        newest = now_ns // step_ns
+        seq = newest if t_ns is None else t_ns // step_ns
+        if not 0 <= newest - seq < len(felt):
+            raise ContactNotKept(seq * step_ns, (newest - len(felt) + 1) * step_ns, now_ns)
+        return Stamped(felt[seq - newest - 1], seq * step_ns, seq)
 
     def objects(self) -> Stamped[Mapping[str, Array]]:
         """T_world_object (4, 4) of every free object now."""
         t_ns = self.timeline.advance()
         return Stamped(self.world.objects(), t_ns, t_ns // self.timeline.step_ns)
+
+    def snapshot(self) -> Restore:
+        """What puts the world, its contacts and the arms in it back as they are now, at whatever time it is called.
+
+        The clock goes on: a surface that moves as it was told goes on from where it was. Lifecycles and leases of
+        devices are not touched.
+
+        Raises (when called):
+            ConfigError: a sensor was mounted since.
+        """
+        return self.timeline.snapshot()
 
     def seconds(self, t_ns: int) -> float:
         """Time of the world at ``t_ns``."""
@@ -108,7 +121,20 @@ class Scene:
     def _step(self, t_ns: int) -> None:
         poses = {sensor: pose() for sensor, pose in self._poses.items()}
         for sensor, state in self.world.step(poses, self.seconds(t_ns)).items():
-            self._felt[sensor].append(Stamped(state, t_ns, t_ns // self.timeline.step_ns))
+            self._felt[sensor].append(state)
+
+    def _snapshot(self) -> Callable[[int], None]:
+        start_ns, world = self._start_ns, self.world.snapshot()
+        felt = {sensor: states.copy() for sensor, states in self._felt.items()}
+
+        def restore(later_ns: int) -> None:
+            if felt.keys() != self._felt.keys():
+                raise ConfigError("a sensor was mounted after the snapshot was taken", key="scene")
+            self._start_ns = start_ns + later_ns
+            self._felt = {sensor: states.copy() for sensor, states in felt.items()}
+            world()
+
+        return restore
 
 
 _HERE: PoseMmDeg = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
