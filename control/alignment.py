@@ -5,12 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from control.path import Path, Point
 from control.pid import Pid, PidGains
 from geometry.types import Array
+
+MAX_CRAB_RAD: Final = math.radians(15.0)
+"""Furthest that an object is headed aside to go straight: it is pushed this far beside its middle."""
+MAX_INTEGRATED_M: Final = 0.006
+"""Larger distances from the path are not integrated: on the way back to it the integral would only gather overshoot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +25,7 @@ class AlignmentGains:
 
     Attributes:
         kp: sideways speed per bearing of the point aimed at, m/s per rad.
-        ki: sideways acceleration per distance from the path, 1/s^2.
+        ki: how fast the object is headed aside per distance from the path, rad per m and s.
         kd: sideways speed per rate of the bearing, m per rad.
         limit_m_s: largest sideways speed.
         look_ahead_m: how far ahead on the path it aims.
@@ -77,10 +83,11 @@ class TargetAlignment:
 
     def __init__(self, path: Sequence[Point], gains: AlignmentGains) -> None:
         kp, ki, kd = np.zeros((3, 6, 6))
-        kp[1, 1], ki[1, 0], kd[1, 1] = gains.kp, gains.ki, gains.kd
+        kp[1, 1], ki[1, 0], kd[1, 1] = gains.kp, gains.kp * gains.ki, gains.kd
+        most_aside = np.array([0.0, gains.kp * MAX_CRAB_RAD, 0.0, 0.0, 0.0, 0.0])
+        zone = np.array([MAX_INTEGRATED_M, 0.0, 0.0, 0.0, 0.0, 0.0])
         limit = np.array([0.0, gains.limit_m_s, 0.0, 0.0, 0.0, 0.0])
-        zone = np.array([0.5 * gains.look_ahead_m, 0.0, 0.0, 0.0, 0.0, 0.0])
-        self._pid = Pid(PidGains(kp, ki, kd, 0.5 * limit, zone, limit))
+        self._pid = Pid(PidGains(kp, ki, kd, most_aside, zone, limit))
         self._points = list(path)
         self._gains = gains
         self._path: Path | None = None

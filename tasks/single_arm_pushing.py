@@ -29,24 +29,24 @@ class PushConfig(HandConfig):
             what is brought to the target, and about which the object turns.
         look_ahead_mm: how far ahead on the way the middle is aimed.
         align_kp_mm_s_per_deg: sideways speed per degree of the bearing of the point that is aimed at.
-        align_ki_per_s2: sideways acceleration per distance from the way.
+        align_ki_deg_per_mm_s: how fast it is headed aside per distance from the way.
         align_kd_mm_per_deg: derivative gain on the bearing.
         align_max_mm_s: largest sideways speed.
         push_timeout_s: give up when it has not arrived by then.
     """
 
     reference_mm_deg: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    kp_per_s: SixGains = (0.0, 0.0, 0.0, 4.0, 0.0, 0.0)
+    kp_per_s: SixGains = (0.0, 0.0, 0.0, 8.0, 0.0, 0.0)
     ki_per_s2: SixGains = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     target_mm: Mm
     path_mm: tuple[Mm, ...] = ()
     push_speed_mm_s: PositiveFloat = 20.0
     middle_mm: PositiveFloat = 60.0
-    look_ahead_mm: PositiveFloat = 60.0
+    look_ahead_mm: PositiveFloat = 40.0
     align_kp_mm_s_per_deg: PositiveFloat = 3.0
-    align_ki_per_s2: NonNegativeFloat = 1.0
+    align_ki_deg_per_mm_s: NonNegativeFloat = 0.15
     align_kd_mm_per_deg: NonNegativeFloat = 0.0
-    align_max_mm_s: PositiveFloat = 20.0
+    align_max_mm_s: PositiveFloat = 10.0
     push_timeout_s: PositiveFloat = 120.0
 
     def alignment(self) -> TargetAlignment:
@@ -54,7 +54,7 @@ class PushConfig(HandConfig):
         per_rad = 1e-3 * np.degrees(1.0)
         gains = AlignmentGains(
             kp=self.align_kp_mm_s_per_deg * per_rad,
-            ki=self.align_ki_per_s2,
+            ki=1e3 * np.radians(self.align_ki_deg_per_mm_s),
             kd=self.align_kd_mm_per_deg * per_rad,
             limit_m_s=1e-3 * self.align_max_mm_s,
             look_ahead_m=1e-3 * self.look_ahead_mm,

@@ -20,8 +20,10 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.simulation.contact import ContactLaw, ContactModel, ContactState
-from drivers.simulation.objects import Ball, FreeObject, Prism, Solid, Turned
-from drivers.simulation.surfaces import Extruded, Revolved, Shape, Surface
+from drivers.simulation.objects import Ball, FreeObject
+from drivers.simulation.solids import friction_radius_m, shape_of
+from drivers.simulation.surfaces import Surface
+from drivers.simulation.timeline import Restore
 from geometry.types import Array
 
 GRAVITY_M_S2: Final = 9.81
@@ -29,40 +31,6 @@ GRAVITY_M_S2: Final = 9.81
 _MAX_ITERATIONS: Final = 30
 _TOLERANCE_M: Final = 1e-10
 _TOLERANCE: Final = 1e-7
-
-
-def friction_radius_m(solid: Solid) -> float:
-    """Moment per friction force when ``solid`` turns in place: the mean distance of its bottom from its axis.
-
-    2R/3 for a disc, 0.3826 w for a square of side w.
-    """
-    if isinstance(solid, Ball):
-        return 0.0
-    if isinstance(solid, Turned):
-        return 2.0 / 3.0 * solid.sections_m[0][1]
-    area = moment = 0.0
-    for (ax, ay), (bx, by) in zip(solid.outline_m, np.roll(solid.outline_m, -1, axis=0), strict=True):
-        length = math.hypot(bx - ax, by - ay)
-        height = (ax * by - ay * bx) / length
-        start = ((bx - ax) * ax + (by - ay) * ay) / length
-        area += 0.5 * height * length
-        # In polar coordinates about the axis the triangle below a side at ``height`` gives h^3/3 times int sec^3.
-        for sign, along in ((1.0, start + length), (-1.0, start)):
-            tan = along / height
-            moment += sign * height**3 / 6.0 * (tan * math.hypot(1.0, tan) + math.asinh(tan))
-    return moment / area
-
-
-def _shape(name: str, solid: Solid) -> Shape:
-    if isinstance(solid, Prism):
-        return Extruded(solid.outline_m, solid.height_m)
-    if isinstance(solid, Turned):
-        return Revolved(solid.sections_m)
-    raise ConfigError(
-        "a ball rolls, which quasi-static physics does not know",
-        key=f"scene.objects.{name}",
-        hint="use physics: dynamic",
-    )
 
 
 class _Slider:
@@ -74,15 +42,21 @@ class _Slider:
     """
 
     def __init__(self, name: str, body: FreeObject) -> None:
-        T = body.T_world_object
+        T, solid = body.T_world_object, body.solid
+        if isinstance(solid, Ball):
+            raise ConfigError(
+                "a ball rolls, which quasi-static physics does not know",
+                key=f"scene.objects.{name}",
+                hint="use physics: dynamic",
+            )
         if T[2, 2] < 1.0 - 1e-9:
             raise ConfigError(
                 "quasi-static physics holds objects upright",
                 key=f"scene.objects.{name}.pose_mm_deg",
                 hint="turn it about z only",
             )
-        self.surface = Surface(_shape(name, body.solid), self)
-        self.radius_m = friction_radius_m(body.solid)
+        self.surface = Surface(shape_of(solid), self)
+        self.radius_m = friction_radius_m(solid)
         self.friction = body.friction
         self.own_weight_n = body.mass_kg * GRAVITY_M_S2
         self.weight_n = self.own_weight_n
@@ -103,6 +77,15 @@ class _Slider:
     def twist(self, t_s: float) -> Array:
         """(6,) [v, w] in the last step, along world axes."""
         return self._velocity
+
+    def snapshot(self) -> Restore:
+        """What brings it back where it is now."""
+        kept = self.x, self.y, self.yaw, self.weight_n, self._velocity, self._T
+
+        def restore() -> None:
+            self.x, self.y, self.yaw, self.weight_n, self._velocity, self._T = kept
+
+        return restore
 
     def move(self, shift: Array, dt_s: float) -> None:
         """Move by ``shift`` (3,): x, y and friction radius times yaw, m, within ``dt_s``."""
@@ -160,6 +143,17 @@ class QuasiStaticWorld:
     def objects(self) -> Mapping[str, Array]:
         """T_world_object (4, 4) of every free object at the last step."""
         return {name: slider.pose(self._t_s) for name, slider in self._sliders.items()}
+
+    def snapshot(self) -> Restore:
+        """What brings every object and contact back."""
+        parts = [slider.snapshot() for slider in self._sliders.values()]
+        parts += [model.snapshot() for model in self._models.values()]
+
+        def restore() -> None:
+            for part in parts:
+                part()
+
+        return restore
 
     def _nearest(self, T_world_s: Array, t_s: float) -> Surface:
         if len(self._bodies) == 1:
