@@ -28,6 +28,7 @@ class ContactState:
         in_contact: whether the tip touches.
         slipping: whether the contact slid in the last step.
         normal_force_n: force on the tip along the surface normal.
+        shear_force_n: force on the tip along the x and y axes of {f}; zero where the physics does not tell it.
     """
 
     T_f_s: Array
@@ -35,6 +36,7 @@ class ContactState:
     in_contact: bool
     slipping: bool
     normal_force_n: float
+    shear_force_n: tuple[float, float] = (0.0, 0.0)
 
     @property
     def T_s_f(self) -> Array:  # noqa: N802  the field's own name
@@ -45,6 +47,12 @@ class ContactState:
     def depth_m(self) -> float:
         """Indentation, negative out of contact."""
         return float(self.T_f_s[2, 3])
+
+    @property
+    def force_world_n(self) -> Array:
+        """(3,) force on the tip along the world's axes."""
+        force: Array = self.T_world_f[:3, :3] @ np.array([*self.shear_force_n, -self.normal_force_n])
+        return force
 
 
 @dataclass(frozen=True, slots=True)

@@ -176,9 +176,9 @@ class DynamicWorld:
             tip.torsion_stiffness_n_m_rad * turned / tip.torsion_friction_m,
         )
         force = max(pressing - tip.damping_n_s_m * float(self._qvel[at.qvel + 2]), 0.0)
-        return _state(
-            T_world_s, R_tilt, -turned, (*shear, depth), slipping=held >= _SLIDING_SHARE * pressing, force_n=force
-        )
+        slipping = held >= _SLIDING_SHARE * pressing
+        pull = (-tip.shear_stiffness_n_m * shear[0], -tip.shear_stiffness_n_m * shear[1])
+        return _state(T_world_s, R_tilt, -turned, (*shear, depth), slipping=slipping, force_n=force, pull_n=pull)
 
     def _nearest(self, point: Array, t_s: float) -> SurfacePoint:
         """What is nearest to ``point`` (3,): a surface, the table, or an object where it is now."""
@@ -226,6 +226,7 @@ def _state(
     *,
     slipping: bool = False,
     force_n: float = 0.0,
+    pull_n: tuple[float, float] = (0.0, 0.0),
 ) -> ContactState:
     T_f_s = np.eye(4)
     T_f_s[:3, :3] = about_z(torsion) @ R_tilt
@@ -233,7 +234,7 @@ def _state(
     T_world_f = np.eye(4)
     T_world_f[:3, :3] = T_world_s[:3, :3] @ T_f_s[:3, :3].T
     T_world_f[:3, 3] = T_world_s[:3, 3] - T_world_f[:3, :3] @ T_f_s[:3, 3]
-    return ContactState(T_f_s, T_world_f, position[2] > 0.0, slipping, force_n)
+    return ContactState(T_f_s, T_world_f, position[2] > 0.0, slipping, force_n, pull_n)
 
 
 def _nearer(a: SurfacePoint | None, b: SurfacePoint) -> SurfacePoint:
