@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from drivers.kinematics import ChainDescription, Tool
-from drivers.simulation.dynamics_model import quaternion
+from drivers.simulation.dynamics_model import cross, quaternion
 from geometry.types import Array
 
 _ROD_RADIUS_M = 0.05
@@ -73,7 +73,7 @@ class ArmDynamics:
     def bear(self, force: Array, point: Array) -> None:
         """From now on feel ``force`` (3,) N at ``point`` (3,) m on the last link, both in the base frame."""
         self._data.xfrc_applied[self._last, :3] = force
-        self._data.xfrc_applied[self._last, 3:] = np.cross(point - self._data.xipos[self._last], force)
+        self._data.xfrc_applied[self._last, 3:] = cross(point - self._data.xipos[self._last], force)
 
     def step(self, steps: int) -> None:
         """Move on by that many time steps."""

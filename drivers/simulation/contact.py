@@ -17,6 +17,9 @@ from geometry import se3
 from geometry.types import Array
 
 
+_IDENTITY = np.eye(4)
+
+
 @dataclass(frozen=True, slots=True)
 class ContactState:
     """What the tip feels: the only thing that the simulated image depends on, and the ground truth for it.
@@ -174,10 +177,10 @@ class ContactModel:
     def _state(
         self, T_world_s: Array, R_world_f: Array, R_f_s: Array, position: tuple[float, float, float], *, slipping: bool
     ) -> ContactState:
-        T_f_s = np.eye(4)
+        T_f_s = _IDENTITY.copy()
         T_f_s[:3, :3] = R_f_s
         T_f_s[:3, 3] = position
-        T_world_f = np.eye(4)
+        T_world_f = _IDENTITY.copy()
         T_world_f[:3, :3] = R_world_f
         T_world_f[:3, 3] = T_world_s[:3, 3] - R_world_f @ T_f_s[:3, 3]
         depth = position[2]
