@@ -70,6 +70,11 @@ class Sensor:
     _picture: tuple[int | None, float | None] = field(default=(None, None), init=False)
     _picture_seq: int = field(default=-1, init=False)
 
+    def await_frame(self) -> None:
+        """Wait for the first frame, so that no control cycle has to. Raises DeviceError."""
+        if isinstance(self.source, ContactPipeline):
+            self.source.await_frame()
+
     def picture(self) -> tuple[int | None, float | None]:
         """A checksum and the mean grey level of every third pixel of the newest frame; (None, None) if not watched."""
         frame = self.source.frame if self.watched and isinstance(self.source, ContactPipeline) else None

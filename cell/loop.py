@@ -165,13 +165,15 @@ class RunLoop:
         return result
 
     def begin(self) -> None:
-        """Take the arms' leases."""
-        self._start_ns = self._cell.clock.now_ns()
+        """Wait for each camera's first frame, and take the arms' leases."""
         try:
+            for sensor in self._cell.sensors.values():
+                sensor.await_frame()
             for role, arm in self._arms.items():
                 self._leases[role] = arm.acquire(self._cell.task_name)
         except TouchcellError as error:
             self._error = error
+        self._start_ns = self._cell.clock.now_ns()
 
     def step(self) -> bool:
         """One cycle, and the wait for the next; returns whether there is to be one."""
