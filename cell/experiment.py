@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from cell.provenance import provenance
+from cell.run_folder import RunFolder
 from cell.trial_table import Column, Row, table, to_json
-from cell.trials import Finished, Perform, Trial, TrialFolder, perform_all
+from cell.trials import Finished, Perform, Trial, perform_all
 from drivers import entry_points
 
 GROUP = "touchcell.experiments"
@@ -57,7 +58,7 @@ class ExperimentSpec:
     name: str
     summary: str
     trials: Callable[[Scale], Sequence[Trial]]
-    measure: Callable[[TrialFolder], Mapping[str, float]]
+    measure: Callable[[RunFolder], Mapping[str, float]]
     columns: tuple[Column, ...]
     draw: Callable[[Sequence[Finished], Path], Sequence[Path]]
     paper: Mapping[str, str] = field(default_factory=dict)

@@ -13,18 +13,17 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from cell.compose import compose
-from cell.config import CellPlan, plan_cell
+from cell.config import plan_cell
 from cell.errors import RecordingError
 from cell.loop import Outcome, RunLoop
 from cell.recording import Recorder
-from cell.report import Run, load_run
+from cell.run_folder import RunFolder
 from drivers.errors import ConfigError, suggest
 
 CONFIGS = Path(__file__).parent.parent / "configs"
@@ -62,23 +61,6 @@ class Trial:
         return data
 
 
-@dataclass(frozen=True)
-class TrialFolder:
-    """What a trial has left behind."""
-
-    path: Path
-
-    @cached_property
-    def plan(self) -> CellPlan:
-        """Its cell."""
-        return plan_cell(self.path / "cell.yaml")
-
-    @cached_property
-    def run(self) -> Run:
-        """Its recording."""
-        return load_run(self.path / "run.mcap")
-
-
 @dataclass(frozen=True, slots=True)
 class Finished:
     """A trial that has run.
@@ -92,7 +74,7 @@ class Finished:
     """
 
     trial: Trial
-    folder: TrialFolder
+    folder: RunFolder
     outcome: str
     reason: str
     measures: Mapping[str, float]
@@ -112,7 +94,7 @@ class Perform:
         root: holds one folder for each trial.
     """
 
-    measure: Callable[[TrialFolder], Mapping[str, float]]
+    measure: Callable[[RunFolder], Mapping[str, float]]
     root: Path
 
     def __call__(self, trial: Trial) -> Finished:
@@ -127,7 +109,7 @@ class Perform:
         cell = compose(plan_cell(folder / "cell.yaml"))
         with Recorder(folder / "run.mcap") as recorder, cell:
             result = RunLoop(cell, recorder).run()
-        left = TrialFolder(folder)
+        left = RunFolder(folder)
         measures = self.measure(left) if result.cycles else {}
         record = {
             "settings": _digest(data),
@@ -148,9 +130,7 @@ class Perform:
             record = json.loads((folder / "trial.json").read_text())
         except (OSError, ValueError):
             return None
-        return (
-            _finished(trial, TrialFolder(folder), record) if record["settings"] == _digest(trial.cell_data()) else None
-        )
+        return _finished(trial, RunFolder(folder), record) if record["settings"] == _digest(trial.cell_data()) else None
 
 
 def perform_all(
@@ -205,7 +185,7 @@ def _leave_interrupts_to_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _finished(trial: Trial, folder: TrialFolder, record: Mapping[str, Any]) -> Finished:
+def _finished(trial: Trial, folder: RunFolder, record: Mapping[str, Any]) -> Finished:
     return Finished(trial, folder, record["outcome"], record["reason"], record["measures"])
 
 

@@ -11,8 +11,9 @@ import pytest
 
 from cell.cli import main
 from cell.experiment import ExperimentSpec, Scale, installed, run_experiment, spec
+from cell.run_folder import RunFolder
 from cell.trial_table import Column, Row, table, to_json
-from cell.trials import CONFIGS, Finished, Perform, Trial, TrialFolder, perform_all
+from cell.trials import CONFIGS, Finished, Perform, Trial, perform_all
 from drivers.errors import ConfigError
 
 SHORT = {
@@ -30,13 +31,13 @@ def trial(name: str, **changes: object) -> Trial:
 TWO = [trial("slow"), trial("fast", **{"task.speed_mm_s": 30})]
 
 
-def duration(folder: TrialFolder) -> Mapping[str, float]:
-    task = folder.run.series("/task")
+def duration(folder: RunFolder) -> Mapping[str, float]:
+    task = folder.recording.series("/task")
     assert task is not None
-    return {"run_s": float(folder.run.during(task.t_s, "run").sum() / folder.plan.cell.rate_hz), "never": np.nan}
+    return {"run_s": float(folder.recording.during(task.t_s, "run").sum() / folder.plan.cell.rate_hz), "never": np.nan}
 
 
-def broken(folder: TrialFolder) -> Mapping[str, float]:
+def broken(folder: RunFolder) -> Mapping[str, float]:
     if folder.path.name == "fast":
         raise KeyboardInterrupt
     return duration(folder)

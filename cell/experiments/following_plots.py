@@ -9,14 +9,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from cell.experiments.frames import BLUE, GREY, ORANGE, frames_2d, label_2d, path_2d, save
-from cell.experiments.truth import Poses, sensor_poses, surface, tilt_deg, true_contacts
-from cell.trials import TrialFolder
+from cell.run_folder import Poses, RunFolder, sensor_poses, surface, tilt_deg, true_contacts
 from geometry.types import Array
 
 _SIDE, _ABOVE = (0, 2), (0, 1)
 
 
-def plot_ramp(trial: TrialFolder, path: Path) -> Path:
+def plot_ramp(trial: RunFolder, path: Path) -> Path:
     """From the side with the ramp's profile, from above, and the errors along the way."""
     figure, axes = plt.subplots(2, 2, figsize=(13, 7.5), layout="constrained")
     poses = _while_running(trial)
@@ -30,7 +29,7 @@ def plot_ramp(trial: TrialFolder, path: Path) -> Path:
     return save(figure, path)
 
 
-def plot_dome(trials: Sequence[TrialFolder], path: Path) -> Path:
+def plot_dome(trials: Sequence[RunFolder], path: Path) -> Path:
     """All paths from above, each from the side along its own direction, and the errors along the way."""
     figure, axes = plt.subplots(2, 2, figsize=(13, 9), layout="constrained")
     names = []
@@ -53,10 +52,10 @@ def plot_dome(trials: Sequence[TrialFolder], path: Path) -> Path:
     return save(figure, path)
 
 
-def _errors(axes: Array, trials: Sequence[TrialFolder], names: Sequence[str]) -> None:
+def _errors(axes: Array, trials: Sequence[RunFolder], names: Sequence[str]) -> None:
     for trial, name in zip(trials, names, strict=True):
         series, contacts = true_contacts(trial, "sensor")
-        running = trial.run.during(series.t_s, "run")
+        running = trial.recording.during(series.t_s, "run")
         t_s = series.t_s[running] - series.t_s[running][0]
         colour = BLUE if len(trials) == 1 else None
         axes[0].plot(t_s, contacts[running, 2], lw=1.0, color=colour, label=name)
@@ -72,13 +71,13 @@ def _errors(axes: Array, trials: Sequence[TrialFolder], names: Sequence[str]) ->
         axes[1].legend(ncols=2, fontsize=9, title="path")
 
 
-def _while_running(trial: TrialFolder) -> Poses:
+def _while_running(trial: RunFolder) -> Poses:
     poses = sensor_poses(trial, "sensor")
-    inside = trial.run.during(poses.t_s - 1e-9 * trial.run.start_ns, "run")
+    inside = trial.recording.during(poses.t_s - 1e-9 * trial.recording.start_ns, "run")
     return Poses(poses.t_s[inside], poses.T_world[inside])
 
 
-def _profile(axis: plt.Axes, trial: TrialFolder, along_mm: Array, direction: Array) -> None:
+def _profile(axis: plt.Axes, trial: RunFolder, along_mm: Array, direction: Array) -> None:
     """The surface's height over a line through the origin, from its own closed form."""
     shape = surface(trial)
     heights = []

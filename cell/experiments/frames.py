@@ -10,7 +10,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from cell.experiments.truth import Poses
+from cell.run_folder import Poses
 from geometry.types import Array
 
 AXIS_COLOURS = ("#d62728", "#2ca02c", "#1f77b4")

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from cell.experiment import ExperimentSpec, Scale
-from cell.experiments.truth import Poses, rms, scene_time, sensor_poses, surface, true_contacts
 from cell.messages import COMPONENTS
+from cell.run_folder import Poses, RunFolder, rms, scene_time, sensor_poses, surface, true_contacts
 from cell.trial_table import Column
-from cell.trials import Finished, Trial, TrialFolder
+from cell.trials import Finished, Trial
 from geometry import se3
 from geometry.types import Array
 
@@ -74,13 +74,13 @@ def _repeated(row: str, name: str, changes: Mapping[str, Any], scale: Scale) -> 
     return [Trial(f"{name}_{seed}", row, CELL, {**changes, "seed": seed}) for seed in seeds]
 
 
-def measure(trial: TrialFolder) -> Mapping[str, float]:
+def measure(trial: RunFolder) -> Mapping[str, float]:
     """RMS of each component of the sensor's pose against a sensor that sticks where it first touched."""
     _, _, error = tracking(trial)
     return {f"{name}_rms": rms(error[:, i]) for i, name in enumerate(COMPONENTS)}
 
 
-def tracking(trial: TrialFolder) -> tuple[Poses, Array, Array]:
+def tracking(trial: RunFolder) -> tuple[Poses, Array, Array]:
     """The sensor's poses, the plate's at the same times, and the errors (n, 6) in mm and degrees.
 
     The surface frame is that of the first touch, carried along by the plate; the error is the sensor's pose in it
@@ -93,14 +93,14 @@ def tracking(trial: TrialFolder) -> tuple[Poses, Array, Array]:
     series, contacts = true_contacts(trial, SENSOR)
     touched = np.flatnonzero([bool(row.get("in_contact")) for row in series.rows])
     error = np.full((len(poses.t_s), 6), np.nan)
-    task = trial.run.series("/task")
+    task = trial.recording.series("/task")
     if len(touched) and task is not None:
         t_touch = scene_time(trial, series)[touched[0]]
         at_touch = Poses(poses.t_s, T_plate_s).at(np.array([t_touch]))[0]
         T_f_plate = se3.from_euler_mm_deg(contacts[touched[0]]) @ se3.inverse(at_touch)
         error = np.asarray(se3.to_euler_mm_deg(T_f_plate @ T_plate_s))
         error[:, 2] -= np.nanmedian(task.column("reference_z_mm"))
-        error[~trial.run.during(poses.t_s - 1e-9 * trial.run.start_ns, "run")] = np.nan
+        error[~trial.recording.during(poses.t_s - 1e-9 * trial.recording.start_ns, "run")] = np.nan
     return poses, T_world_plate, error
 
 

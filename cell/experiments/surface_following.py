@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from cell.experiment import ExperimentSpec, Scale
-from cell.experiments.truth import during, rms, tilt_deg, true_contacts
+from cell.run_folder import RunFolder, during, rms, tilt_deg, true_contacts
 from cell.trial_table import Column
-from cell.trials import Finished, Trial, TrialFolder
+from cell.trials import Finished, Trial
 
 DIRECTIONS_DEG = (0, 45, 90, 135, 180, 225, 270, 315)
 SENSOR = "sensor"
@@ -44,14 +44,14 @@ def trials(scale: Scale) -> list[Trial]:
     return found
 
 
-def measure(trial: TrialFolder) -> Mapping[str, float]:
+def measure(trial: RunFolder) -> Mapping[str, float]:
     """RMS while the task ran: true contact against the reference, and estimate against true contact."""
     series, contacts = true_contacts(trial, SENSOR)
-    task = trial.run.series("/task")
+    task = trial.recording.series("/task")
     assert task is not None
     contacts = contacts[during(trial, series)]
     reference_mm = np.nanmedian(task.column("reference_z_mm"))
-    estimated = trial.run.series(f"/sensors/{SENSOR}/contact")
+    estimated = trial.recording.series(f"/sensors/{SENSOR}/contact")
     assert estimated is not None
     error = (estimated.poses() - series.poses()[: len(estimated.t_s)])[during(trial, estimated)]
     return {

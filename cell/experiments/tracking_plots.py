@@ -10,15 +10,15 @@ import numpy as np
 
 from cell.experiments.frames import BLUE, ORANGE, frames_2d, label_2d, path_2d, save
 from cell.experiments.object_tracking import tracking
-from cell.experiments.truth import Poses
 from cell.messages import COMPONENTS
-from cell.trials import Finished, TrialFolder
+from cell.run_folder import Poses, RunFolder
+from cell.trials import Finished
 from geometry import se3
 
 _UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 
 
-def plot_components(trials: Mapping[str, TrialFolder], path: Path) -> Path:
+def plot_components(trials: Mapping[str, RunFolder], path: Path) -> Path:
     """The moved component of plate and sensor over time, each trial in its panel, with the error below."""
     figure, axes = plt.subplots(
         2, 6, figsize=(18, 6), sharex=True, height_ratios=(3, 2), layout="constrained", squeeze=False
@@ -40,7 +40,7 @@ def plot_components(trials: Mapping[str, TrialFolder], path: Path) -> Path:
     return save(figure, path)
 
 
-def plot_all_six(trial: TrialFolder, path: Path) -> Path:
+def plot_all_six(trial: RunFolder, path: Path) -> Path:
     """Ways of plate and sensor with their frames, from above and from the side, and all errors over time."""
     figure, axes = plt.subplots(1, 3, figsize=(18, 6), layout="constrained")
     poses, T_world_plate, error = tracking(trial)

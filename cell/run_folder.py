@@ -1,19 +1,38 @@
-"""What was true in a trial, read from its recording: where sensors and surfaces were, what was touched."""
+"""What a run has left behind, and what was true in it: where sensors and surfaces were, what was touched."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.report import Series, tip_points
-from cell.trials import TrialFolder
+from cell.config import CellPlan, plan_cell
+from cell.report import Run, Series, load_run, tip_points
 from drivers.simulation.scene import SceneConfig
 from drivers.simulation.surfaces import Surface
 from geometry import se3
 from geometry.types import Array
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run's folder: ``cell.yaml`` and ``run.mcap``, read when they are asked for."""
+
+    path: Path
+
+    @cached_property
+    def plan(self) -> CellPlan:
+        """Its cell. Raises ConfigError."""
+        return plan_cell(self.path / "cell.yaml")
+
+    @cached_property
+    def recording(self) -> Run:
+        """What was recorded, without images. Raises RecordingError."""
+        return load_run(self.path / "run.mcap")
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,23 +49,23 @@ class Poses:
         return poses
 
 
-def scene_time(trial: TrialFolder, series: Series) -> Array:
+def scene_time(run: RunFolder, series: Series) -> Array:
     """(n,) times of a series since the start of the scene, which is when simulated time was zero."""
-    return series.t_s + 1e-9 * trial.run.start_ns
+    return series.t_s + 1e-9 * run.recording.start_ns
 
 
-def sensor_poses(trial: TrialFolder, role: str) -> Poses:
+def sensor_poses(run: RunFolder, role: str) -> Poses:
     """Where the sensor of a role was."""
-    plan = trial.plan
+    plan = run.plan
     section = plan.cell.sensors[plan.sensor_roles[role]]
     assert section.mounted_on is not None
     arm = section.mounted_on
     arm_role = next((each for each, name in plan.arm_roles.items() if name == arm), arm)
-    series = trial.run.series(f"/arms/{arm_role}/tcp")
+    series = run.recording.series(f"/arms/{arm_role}/tcp")
     assert series is not None
     T_world_base = se3.from_euler_mm_deg(np.array(base_pose_mm_deg(plan.cell.arms[arm])))
     T_tcp_sensor = se3.from_euler_mm_deg(np.array(section.tcp_to_sensor_mm_deg))
-    return Poses(scene_time(trial, series), T_world_base @ tip_points(series) @ T_tcp_sensor)
+    return Poses(scene_time(run, series), T_world_base @ tip_points(series) @ T_tcp_sensor)
 
 
 def base_pose_mm_deg(arm: Any) -> Any:
@@ -54,14 +73,14 @@ def base_pose_mm_deg(arm: Any) -> Any:
     return (arm.model_extra or {}).get("base_pose_mm_deg", (0.0,) * 6)
 
 
-def during(trial: TrialFolder, series: Series, state: str = "run") -> NDArray[np.bool_]:
+def during(run: RunFolder, series: Series, state: str = "run") -> NDArray[np.bool_]:
     """(n,) which samples lie in cycles in which the task was in ``state``."""
-    return trial.run.during(series.t_s, state)
+    return run.recording.during(series.t_s, state)
 
 
-def true_contacts(trial: TrialFolder, role: str) -> tuple[Series, Array]:
+def true_contacts(run: RunFolder, role: str) -> tuple[Series, Array]:
     """The series of true contacts of a sensor, and them as (n, 6) in mm and degrees; NaN out of contact."""
-    series = trial.run.series(f"/sensors/{role}/truth")
+    series = run.recording.series(f"/sensors/{role}/truth")
     assert series is not None
     return series, series.poses()
 
@@ -79,7 +98,7 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(finite**2))) if len(finite) else float("nan")
 
 
-def surface(trial: TrialFolder) -> Surface:
-    """The first surface of the trial's scene, with its motion."""
-    scene = SceneConfig.model_validate(trial.plan.cell.scene)
+def surface(run: RunFolder) -> Surface:
+    """The first surface of the run's scene, with its motion."""
+    scene = SceneConfig.model_validate(run.plan.cell.scene)
     return next(iter(scene.surfaces.values())).build()
