@@ -102,6 +102,7 @@ def _parser() -> argparse.ArgumentParser:
 
     report = commands.add_parser("report", help="make a run's summary and plots again from its recording")
     report.add_argument("folder", type=Path)
+    report.add_argument("--animate", action="store_true", help="also write animation.gif")
     report.set_defaults(run=_report)
 
     why = commands.add_parser("why", help="explain why a run tripped, from its black box")
@@ -228,6 +229,10 @@ def _report(options: argparse.Namespace) -> int:
     from cell.report import write_report
 
     print(write_report(options.folder))
+    if options.animate:
+        from cell.animation import animate
+
+        print(animate(options.folder))
     return EXIT_OK
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -100,5 +101,18 @@ def rms(values: Array) -> float:
 
 def surface(run: RunFolder) -> Surface:
     """The first surface of the run's scene, with its motion."""
-    scene = SceneConfig.model_validate(run.plan.cell.scene)
-    return next(iter(scene.surfaces.values())).build()
+    return next(iter(scene(run).surfaces.values())).build()
+
+
+def object_poses(run: RunFolder) -> Mapping[str, Poses]:
+    """Where every free object was, by its name."""
+    return {
+        topic.rpartition("/")[2]: Poses(scene_time(run, series), tip_points(series))
+        for topic, series in run.recording.topics.items()
+        if topic.startswith("/objects/")
+    }
+
+
+def scene(run: RunFolder) -> SceneConfig:
+    """The scene of a simulated run."""
+    return SceneConfig.model_validate(run.plan.cell.scene)

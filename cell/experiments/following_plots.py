@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from cell.experiments.frames import BLUE, GREY, ORANGE, frames_2d, label_2d, path_2d, save
+from cell.outlines import height_mm
 from cell.run_folder import Poses, RunFolder, sensor_poses, surface, tilt_deg, true_contacts
 from geometry.types import Array
 
@@ -79,14 +80,7 @@ def _while_running(trial: RunFolder) -> Poses:
 
 def _profile(axis: plt.Axes, trial: RunFolder, along_mm: Array, direction: Array) -> None:
     """The surface's height over a line through the origin, from its own closed form."""
-    shape = surface(trial)
-    heights = []
-    for s in 1e-3 * along_mm:
-        point = np.array([*(s * direction), 0.2])
-        # The point above or below on the surface: nearest points, until the way there is vertical.
-        for _ in range(60):
-            found = shape.nearest(point, 0.0)
-            point[2] -= found.distance_m * found.normal[2]
-        heights.append(1e3 * point[2])
-    axis.fill_between(along_mm, heights, min(heights) - 8, color=GREY, alpha=0.35, lw=0)
+    x, y = 1e-3 * along_mm * direction[0], 1e-3 * along_mm * direction[1]
+    heights = height_mm(surface(trial), x, y, 0.0)
+    axis.fill_between(along_mm, heights, heights.min() - 8, color=GREY, alpha=0.35, lw=0)
     axis.plot(along_mm, heights, color=ORANGE, lw=1.2)
