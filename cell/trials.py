@@ -27,6 +27,8 @@ from cell.run_folder import RunFolder
 from drivers.errors import ConfigError, suggest
 
 CONFIGS = Path(__file__).parent.parent / "configs"
+COLLECTED = "data"
+"""Folder, in a trial's own, of the frames that a trial collects."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +107,9 @@ class Perform:
         marker = folder / "trial.json"
         marker.unlink(missing_ok=True)
         data = trial.cell_data()
+        settings = _digest(data)
+        if "collect" in data:
+            data["collect"]["data"] = str(folder / COLLECTED)
         (folder / "cell.yaml").write_text(yaml.safe_dump(data, sort_keys=False))
         cell = compose(plan_cell(folder / "cell.yaml"))
         with Recorder(folder / "run.mcap") as recorder, cell:
@@ -112,7 +117,7 @@ class Perform:
         left = RunFolder(folder)
         measures = self.measure(left) if result.cycles else {}
         record = {
-            "settings": _digest(data),
+            "settings": settings,
             "outcome": result.outcome.value,
             "reason": result.reason,
             "duration_s": result.duration_s,
