@@ -69,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     probe.add_argument("cell", type=Path)
     probe.set_defaults(run=_probe)
 
-    listing = commands.add_parser("list", help="known drivers, tasks, interlocks, emulators, benchmarks and cells")
+    listing = commands.add_parser("list", help="known drivers, tasks, interlocks, experiments, cells")
     listing.set_defaults(run=_list)
 
     train = commands.add_parser("train", help="train an estimator on labelled images")
@@ -102,6 +102,7 @@ def _parser() -> argparse.ArgumentParser:
 
     report = commands.add_parser("report", help="make a run's summary and plots again from its recording")
     report.add_argument("folder", type=Path)
+    report.add_argument("--animate", action="store_true", help="also write animation.gif")
     report.set_defaults(run=_report)
 
     why = commands.add_parser("why", help="explain why a run tripped, from its black box")
@@ -118,6 +119,14 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for tables and plots")
     bench.add_argument("rest", nargs="*", help="arguments of the benchmark; its options follow after --")
     bench.set_defaults(run=_bench)
+
+    experiment = commands.add_parser("experiment", help="the paper's experiments: trials, table and plots")
+    experiment.add_argument("name", help="which, or `all`; `touchcell list` names them")
+    experiment.add_argument("--out", type=Path, default=Path("runs/experiments"), help="folder with one for each")
+    experiment.add_argument("--jobs", type=int, help="trials at a time (default: one for each core)")
+    experiment.add_argument("--trials", type=int, help="repetitions of each row (default: the experiment's own number)")
+    experiment.add_argument("--quick", action="store_true", help="the least that still shows every kind of row")
+    experiment.set_defaults(run=_experiment)
 
     commands.add_parser("emulate", help="emulate a device on the wire", add_help=False)
     return parser
@@ -220,6 +229,10 @@ def _report(options: argparse.Namespace) -> int:
     from cell.report import write_report
 
     print(write_report(options.folder))
+    if options.animate:
+        from cell.animation import animate
+
+        print(animate(options.folder))
     return EXIT_OK
 
 
@@ -253,6 +266,28 @@ def _bench(options: argparse.Namespace) -> int:
         return EXIT_BAD_INPUT
     options.out.mkdir(parents=True, exist_ok=True)
     known[options.name].load()([*options.rest, *options.passed_on], options.out)
+    return EXIT_OK
+
+
+def _experiment(options: argparse.Namespace) -> int:
+    # Each trial has a core; libraries that start a thread for every core would only be in each other's way.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from cell.experiment import Scale, installed, run_experiment, spec
+
+    experiments = [spec(name) for name in (installed() if options.name == "all" else [options.name])]
+    scale = Scale(options.trials, options.quick)
+    jobs = options.jobs or os.cpu_count() or 1
+    tables = []
+    for experiment in experiments:
+        folder = options.out / experiment.name
+        try:
+            tables.append(run_experiment(experiment, folder, scale, jobs=jobs, live=sys.stdout.isatty()))
+        except KeyboardInterrupt:
+            print(f"touchcell: what has finished is kept in {folder}; the same command goes on", file=sys.stderr)
+            raise
+        print(tables[-1], flush=True)
+    if len(tables) > 1:
+        (options.out / "summary.txt").write_text("\n\n".join(tables) + "\n")
     return EXIT_OK
 
 

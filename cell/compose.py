@@ -12,14 +12,17 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
 import numpy as np
 
+from cell.collection import Collection
 from cell.config import (
     CellPlan,
     DevicePlan,
+    KnownSurface,
     MovingSurfaceSection,
     NetworkEstimator,
     SensorSection,
     StillSurfaceSection,
 )
+from cell.known_surface import KnownSurfaceSource
 from cell.messages import belief_message, pose_message
 from control.interlocks import build_interlocks
 from control.latch import Latch
@@ -30,6 +33,7 @@ from drivers.clock import Clock, MonotonicClock, VirtualClock
 from drivers.device import Device
 from drivers.errors import ConfigError
 from drivers.registry import DriverContext
+from drivers.samples import Frame, Stamped
 from geometry import se3
 from geometry.types import Array
 from perception.pipeline import ContactPipeline, ContactSource
@@ -70,9 +74,19 @@ class Sensor:
     _picture: tuple[int | None, float | None] = field(default=(None, None), init=False)
     _picture_seq: int = field(default=-1, init=False)
 
+    @property
+    def frame(self) -> Stamped[Frame] | None:
+        """The newest frame that was looked at; None from a source that looks at none."""
+        return self.source.frame if isinstance(self.source, ContactPipeline | KnownSurfaceSource) else None
+
+    def await_frame(self) -> None:
+        """Wait for the first frame, so that no control cycle has to. Raises DeviceError."""
+        if isinstance(self.source, ContactPipeline | KnownSurfaceSource):
+            self.source.await_frame()
+
     def picture(self) -> tuple[int | None, float | None]:
         """A checksum and the mean grey level of every third pixel of the newest frame; (None, None) if not watched."""
-        frame = self.source.frame if self.watched and isinstance(self.source, ContactPipeline) else None
+        frame = self.frame if self.watched else None
         if frame is not None and frame.seq != self._picture_seq:
             sample = np.ascontiguousarray(frame.value.image[::3, ::3])
             self._picture = zlib.crc32(sample.data), float(sample.mean())
@@ -97,10 +111,10 @@ class Sensor:
             measured = self.source.measurement
             if measured is not None and measured.belief is not None:
                 yield "measurement", measured.t_ns, {"seq": measured.seq, **belief_message(measured.belief)}
-            frame = self.source.frame
-            if self.frames != "none" and frame is not None and frame.seq != self._recorded_seq:
-                self._recorded_seq = frame.seq
-                yield "image", frame.t_ns, _image_message(frame.value.image, self.frames, frame.seq, frame.t_ns)
+        frame = self.frame
+        if self.frames != "none" and frame is not None and frame.seq != self._recorded_seq:
+            self._recorded_seq = frame.seq
+            yield "image", frame.t_ns, _image_message(frame.value.image, self.frames, frame.seq, frame.t_ns)
         if self.truth is not None:
             true = self.truth.update(now_ns)
             if true is not None:
@@ -121,6 +135,7 @@ class Cell:
         sensors: by role.
         stop_categories: by which each arm stops when something is wrong, by role.
         scene: what is simulated around the arms, None in a cell of real devices.
+        collection: where labelled frames go, None where the task labels none.
     """
 
     plan: CellPlan
@@ -132,6 +147,7 @@ class Cell:
     task: Task
     stop_categories: Mapping[str, StopCategory] = field(default_factory=dict)
     scene: Scene | None = None
+    collection: Collection | None = None
     start_ns: int = 0
     _exit: ExitStack = field(default_factory=ExitStack, init=False)
 
@@ -188,6 +204,7 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
     Raises:
         ConfigError: an interlock names what is not there.
         ModelError: a model file cannot be used.
+        RecordingError: the folder for labelled frames cannot be written.
     """
     cell_clock = clock or _clock(plan)
     scene = _scene(plan, cell_clock)
@@ -197,7 +214,9 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
     sensors = {role: _sensor(plan, name, devices, scene, arm_of) for role, name in plan.sensor_roles.items()}
     poses = {role: sensor.T_tcp_sensor for role, sensor in sensors.items()}
     supervisor = Supervisor(build_interlocks(plan.cell.interlocks, poses), Latch())
-    task = plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses))
+    collection = _collection(plan)
+    kept = 0 if collection is None else collection.kept
+    task = plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses, kept))
     return Cell(
         plan=plan,
         clock=cell_clock,
@@ -208,6 +227,7 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
         task=task,
         stop_categories={role: StopCategory(plan.cell.arms[name].stop_category) for name, role in arm_of.items()},
         scene=scene,
+        collection=collection,
     )
 
 
@@ -247,6 +267,15 @@ def _scene(plan: CellPlan, clock: Clock) -> Scene | None:
     return SceneConfig.model_validate(plan.cell.scene).build(clock)
 
 
+def _collection(plan: CellPlan) -> Collection | None:
+    section = plan.cell.collect
+    if section is None:
+        return None
+    # More samples of the same kind may be asked for later.
+    about = {"cell": plan.cell.name, **plan.task_config.model_dump(exclude={"samples"})}
+    return Collection(section.data, dict(section.shares.items()), about)
+
+
 def _sensor(
     plan: CellPlan, name: str, devices: Mapping[str, Device], scene: Scene | None, arm_of: Mapping[str, str]
 ) -> Sensor:
@@ -256,6 +285,9 @@ def _sensor(
     source: ContactSource
     if isinstance(section.estimator, NetworkEstimator):
         source = _pipeline(section, section.estimator, devices[name])
+    elif isinstance(section.estimator, KnownSurface):
+        T_base_f = se3.from_euler_mm_deg(np.array(section.estimator.surface_mm_deg))
+        source = KnownSurfaceSource(cast(FrameSource, devices[name]), T_base_f)
     else:
         assert truth is not None
         source = truth

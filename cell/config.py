@@ -109,7 +109,17 @@ class TrueContact(_Section):
     kind: Literal["true_contact"]
 
 
-EstimatorSection = Annotated[NetworkEstimator | TrueContact, Field(discriminator="kind")]
+class KnownSurface(_Section):
+    """The contact from the arm's pose over a surface that stands where the file says, for collecting labels.
+
+    ``surface_mm_deg`` is where the sensor frame is, in the arm's base, when it just touches the surface, upright.
+    """
+
+    kind: Literal["known_surface"]
+    surface_mm_deg: Six
+
+
+EstimatorSection = Annotated[NetworkEstimator | TrueContact | KnownSurface, Field(discriminator="kind")]
 
 
 class ArmSection(_OpenSection):
@@ -146,6 +156,15 @@ class RecordingSection(_Section):
     frames: Literal["none", "jpeg", "png"] = "none"
 
 
+class CollectSection(_Section):
+    """Where labelled frames go, and in which proportion to which split."""
+
+    data: Path
+    shares: dict[Literal["train", "val", "test"], Annotated[int, Field(ge=1)]] = Field(
+        default={"train": 3, "val": 1}, min_length=1
+    )
+
+
 class CellFile(_Section):
     """A whole cell file."""
 
@@ -161,6 +180,7 @@ class CellFile(_Section):
     interlocks: InterlocksConfig = {}
     task: TaskSection
     recording: RecordingSection = RecordingSection()
+    collect: CollectSection | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,6 +248,8 @@ class _Planner:
 
     def plan(self) -> CellPlan:
         file = self._file
+        if "data" in self._overrides and isinstance(collect := file.data.get("collect"), dict):
+            collect["data"] = self._overrides["data"]
         cell = file.validate(CellFile, file.data)
         self._require_scene_fits(cell)
         task, task_config = self._task(cell)
@@ -241,6 +263,7 @@ class _Planner:
         arms = {name: plan for name, plan in devices.items() if name in needed_arms}
         sensors = {name: plan for name, plan in devices.items() if name in needed_sensors}
         if task:
+            self._require_collection(cell, task)
             self._require_abilities(task, arm_roles, arms)
             self._require_interlocks(cell, task)
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
@@ -413,6 +436,12 @@ class _Planner:
                     hint=f"lower arms.{arm.name}.limits.tcp_speed_m_s, or make the box smaller and the margin larger",
                 )
         return found
+
+    def _require_collection(self, cell: CellFile, task: TaskSpec) -> None:
+        if task.labels_frames and cell.collect is None:
+            self._add(("collect",), f"{task.name} labels frames, and nothing says where they go", hint="add `collect:`")
+        if cell.collect is not None and not task.labels_frames:
+            self._add(("collect",), f"{task.name} labels no frames", hint="leave out `collect:`")
 
     def _require_abilities(self, task: TaskSpec, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]) -> None:
         for role, abilities in task.arms.items():

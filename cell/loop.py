@@ -31,6 +31,7 @@ from drivers.lease import Lease
 from drivers.samples import Stamped, TcpState
 from geometry import se3
 from geometry.errors import TouchcellError
+from geometry.types import Array
 from perception.estimate import ContactEstimate
 from tasks.interface import Action, Observation, TransitionRecord
 
@@ -165,13 +166,15 @@ class RunLoop:
         return result
 
     def begin(self) -> None:
-        """Take the arms' leases."""
-        self._start_ns = self._cell.clock.now_ns()
+        """Wait for each camera's first frame, and take the arms' leases."""
         try:
+            for sensor in self._cell.sensors.values():
+                sensor.await_frame()
             for role, arm in self._arms.items():
                 self._leases[role] = arm.acquire(self._cell.task_name)
         except TouchcellError as error:
             self._error = error
+        self._start_ns = self._cell.clock.now_ns()
 
     def step(self) -> bool:
         """One cycle, and the wait for the next; returns whether there is to be one."""
@@ -267,6 +270,7 @@ class RunLoop:
             if verdict.trip is not None:
                 cell.task.trip(now_ns, str(verdict.trip))
         self._sent = sent
+        self._keep(action.labels)
         done = time.perf_counter_ns()
         self._count("sense", perceived - started)
         self._count("task and control", thought - perceived)
@@ -279,6 +283,12 @@ class RunLoop:
         self._count("record", time.perf_counter_ns() - done)
         if self._on_cycle is not None:
             self._on_cycle(Progress((now_ns - cell.start_ns) * 1e-9, cell.task.state, contacts, action.telemetry))
+
+    def _keep(self, labels: Mapping[str, Array]) -> None:
+        for role, T_f_s in labels.items():
+            frame = self._cell.sensors[role].frame
+            if self._cell.collection is not None and frame is not None:
+                self._cell.collection.keep(frame.value.image, T_f_s)
 
     def _stop_arms(self, *, tripped: bool) -> None:
         """Tell all arms to stop: as the cell file says when something is wrong, else holding where they are."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -100,6 +101,11 @@ class ContactPipeline:
     def ended(self) -> bool:
         """Whether the camera has come to its end."""
         return self._ended
+
+    def await_frame(self) -> None:
+        """Wait for the camera's first frame, which is processed by the next update. Raises DeviceError."""
+        with suppress(EndOfStream):
+            self._camera.latest()
 
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
         """Tell where the sensor was at ``t_ns``."""
