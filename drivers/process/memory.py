@@ -149,9 +149,6 @@ class BlockReader(_Mapped):
                 continue
             start = _WORD * (slot + _SLOT_WORDS)
             record = bytes(self._bytes[start : start + length])
-            if (
-                self._words[slot + _NUMBER] == number
-                and zlib.crc32(record, number & 0xFFFFFFFF) == check & 0xFFFFFFFF
-            ):
+            if self._words[slot + _NUMBER] == number and zlib.crc32(record, number & 0xFFFFFFFF) == check & 0xFFFFFFFF:
                 return number, record
         raise CorruptMessage("shared memory", f"no complete record in {_ATTEMPTS} attempts")
