@@ -9,8 +9,9 @@ from typing import Annotated, Literal, Protocol, runtime_checkable
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from drivers.abilities import TcpSource
 from drivers.clock import Clock
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, DeviceError
 from drivers.samples import Stamped
 from drivers.simulation.contact import ContactLaw, ContactState
 from drivers.simulation.motions import Glide, Motion, Periodic, Still
@@ -49,6 +50,36 @@ class Carrier(Protocol):
         ...
 
 
+class MeasuredCarrier:
+    """Any other arm, as what it tells: so that a simulated sensor sits on a real or an emulated arm.
+
+    Where the arm tells nothing, because it is gone or has not begun, it is where it was last.
+
+    Args:
+        arm: tells its pose.
+        T_world_base: (4, 4) where its base stands.
+    """
+
+    def __init__(self, arm: TcpSource, T_world_base: Array) -> None:
+        self._arm = arm
+        self._T_world_base = T_world_base
+        self._T_base_tcp: Array | None = None
+
+    def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
+        """(4, 4) newest measured pose. Raises DeviceError if there has never been one."""
+        try:
+            T_base_tcp = self._arm.tcp().value.T_base_tcp
+        except DeviceError:
+            if self._T_base_tcp is None:
+                raise
+        else:
+            # What is not finite is for the supervisor to see, not for the physics.
+            if self._T_base_tcp is None or np.isfinite(T_base_tcp).all():
+                self._T_base_tcp = T_base_tcp
+        assert self._T_base_tcp is not None
+        return self._T_world_base @ self._T_base_tcp
+
+
 class Scene:
     """A world and the sensors that touch it. One thread only.
 
@@ -78,6 +109,10 @@ class Scene:
         state = self.world.mount(sensor, pose(), self.seconds(t_ns))
         self._poses[sensor] = pose
         self._felt[sensor] = deque([Stamped(state, t_ns, t_ns // self.timeline.step_ns)], maxlen=self._kept)
+
+    def has(self, sensor: str) -> bool:
+        """Whether ``sensor`` is mounted."""
+        return sensor in self._poses
 
     def contact(self, sensor: str, t_ns: int | None = None) -> Stamped[ContactState]:
         """What ``sensor`` feels now, or felt at ``t_ns`` (the step before it), at most HISTORY_S ago.
