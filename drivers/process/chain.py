@@ -7,7 +7,6 @@ import signal
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -15,6 +14,7 @@ from typing import Any, Final, Self
 from drivers.clock import Clock
 from drivers.device import Device
 from drivers.errors import DeviceFault, FaultClass, Remedy
+from drivers.process.groups import Group, HostedDevice
 from drivers.process.layouts import (
     ANSWER,
     ARM,
@@ -34,57 +34,8 @@ from drivers.process.layouts import (
 from drivers.process.link import Child, HostLink
 from drivers.process.proxies import RemoteArm, RemoteCamera, RemoteDevice
 from drivers.process.watchdog import silence_s
-from drivers.registry import DriverConfig, DriverSpec
-
-FASTEST_HZ: Final = 500.0
-"""Device cycles per second of a host at most: a process in Python holds no more beside others."""
 
 _GUARD_S: Final = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class HostedDevice:
-    """A device that lives in a host.
-
-    Attributes:
-        name: in the cell.
-        spec, config: of its driver.
-        category: by which an arm stops when something is wrong; 0 for a camera.
-        policy: what an arm does when it is given back; empty for a camera.
-    """
-
-    name: str
-    spec: DriverSpec
-    config: DriverConfig
-    category: int = 0
-    policy: str = ""
-
-    @property
-    def is_arm(self) -> bool:
-        """Whether it is an arm."""
-        return self.spec.capabilities.kind == "arm"
-
-
-@dataclass(frozen=True, slots=True)
-class Group:
-    """Devices that share a host, and why.
-
-    Attributes:
-        name: of the host.
-        devices: arms before the sensors that they carry.
-        why: in words.
-        scene: the simulated scene's section, if they share one.
-    """
-
-    name: str
-    devices: tuple[HostedDevice, ...]
-    why: str
-    scene: Mapping[str, Any] | None = None
-
-    def rate_hz(self, control_hz: float) -> float:
-        """Device cycles per second: as often as its arms tell something new, and twice in a control period at least."""
-        told = max((each.spec.capabilities.state_rate_hz for each in self.devices if each.is_arm), default=0.0)
-        return max(2.0 * control_hz, min(told, FASTEST_HZ))
 
 
 class Chain:
@@ -98,6 +49,7 @@ class Chain:
 
     Attributes:
         devices: proxies of all hosted devices, by name, there from the beginning.
+        state_fds: descriptors of the arms' state blocks, by name, while it runs.
     """
 
     def __init__(self, groups: Sequence[Group], control_hz: float, seed: int, clock: Clock) -> None:
@@ -110,6 +62,7 @@ class Chain:
             for group in groups
             for each in group.devices
         }
+        self.state_fds: dict[str, int] = {}
         self._links: list[HostLink] = []
         self._watchdog: Child | None = None
         self._exit = ExitStack()
@@ -152,7 +105,7 @@ class Chain:
         self._task.value["guard"] = True
         self.beat()
         deadline_ns = time.monotonic_ns() + round(1e9 * _GUARD_S)
-        while not self._watch.read()["guarding"]:
+        while not self.guarding:
             if self.watchdog.end_words() or time.monotonic_ns() > deadline_ns:
                 words = self.watchdog.end_words() or f"does not answer within {_GUARD_S:g} s"
                 raise DeviceFault("watchdog", words, fault_class=FaultClass.COMMUNICATION, needs=Remedy.OPERATOR)
@@ -178,15 +131,21 @@ class Chain:
     def alarm(self) -> Cause | None:
         """Why all arms have been stopped, or None."""
         watch = self._watch.read()
+        cause: Cause | None
         if watch["stop"] and (cause := cause_of(watch)).reason is not Reason.HOST_LATCHED:
             return cause
         for link in self._links:
-            if (host := link.beats.read())["latched"]:
-                return cause_of(host)
+            if (cause := link.latched()) is not None:
+                return cause
         silent_s = (time.monotonic_ns() - int(watch["t_ns"])) * 1e-9
         if self._task.value["guard"] and silent_s > self.silence_s:
             return Cause(Reason.WATCHDOG_SILENT, time.monotonic_ns(), silent_s, self.silence_s)
         return None
+
+    @property
+    def guarding(self) -> bool:
+        """Whether the watchdog guards; hosts obey no motion otherwise."""
+        return bool(self._watch.read()["guarding"])
 
     def clear(self) -> None:
         """Clear a stop after ``end``, with all arms at rest and nobody's. Moves nothing. Raises LifecycleError."""
@@ -218,7 +177,7 @@ class Chain:
         self._watch = self._exit.enter_context(RecordReader(watch_fd, WATCH))
         for group, fds in zip(self.groups, blocks, strict=True):
             self._links.append(self._start_host(group, fds))
-        arms = {
+        self.state_fds = {
             each.name: fds["devices"][each.name]["state"]
             for group, fds in zip(self.groups, blocks, strict=True)
             for each in group.devices
@@ -229,7 +188,7 @@ class Chain:
             "watch": watch_fd,
             "hosts": [fds["host"] for fds in blocks],
             "wakes": [fds["wake"] for fds in blocks],
-            "arms": arms,
+            "arms": self.state_fds,
         }
         spec = {"period_s": self.period_s, "fds": watched}
         self._watchdog = Child("watchdog", "drivers.process.watchdog", spec, _numbers(watched))

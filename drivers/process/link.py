@@ -14,7 +14,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
-from drivers.errors import ConnectError, DeviceFault, DeviceGone, FaultClass, Remedy, TransportTimeout
+from drivers.errors import DeviceFault, DeviceGone, FaultClass, LifecycleError, Remedy, TransportTimeout
+from drivers.process.layouts import Cause, RecordReader, cause_of
 from drivers.process.wire import decode_error, receive, send
 
 _START_S: Final = 30.0
@@ -56,7 +57,7 @@ class Child:
         return self.process.pid
 
     def await_ready(self) -> None:
-        """Wait until it has built what it owns. Raises ConnectError, or the error that it met."""
+        """Wait until it has built what it owns. Raises the error that it met, or DeviceGone."""
         self.realtime = self._answer(_START_S)["realtime"]
 
     def call(self, call: str, **arguments: Any) -> dict[str, Any]:
@@ -82,9 +83,9 @@ class Child:
         if message is None:
             raise self._gone()
         if not message["ok"]:
-            raise (
-                decode_error(message["error"], self.name) if "error" in message else ConnectError(self.name, "refused")
-            )
+            if "error" in message:
+                raise decode_error(message["error"], self.name)
+            raise LifecycleError(self.name, "do what was asked", "guarding", ["nobody is guarded"])
         return message
 
     def _gone(self) -> DeviceGone:
@@ -127,7 +128,7 @@ class HostLink(Child):
         spec: Mapping[str, Any],
         fds: Sequence[int],
         *,
-        beats: Any,
+        beats: RecordReader,
         silence_s: float,
     ) -> None:
         super().__init__(name, "drivers.process.host", spec, fds)
@@ -149,6 +150,11 @@ class HostLink(Child):
                 needs=Remedy.OPERATOR,
                 hint="see that the arm stands, then start the run again",
             )
+
+    def latched(self) -> Cause | None:
+        """Why it has stopped its arms, or None."""
+        beat = self.beats.read()
+        return cause_of(beat) if beat["latched"] else None
 
     def wake(self) -> None:
         """Let the host look for a command now."""

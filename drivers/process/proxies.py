@@ -34,12 +34,6 @@ from drivers.samples import Frame, Quality, Stamped, TcpState
 _FRAME_POLL_NS: Final = 1_000_000
 _FIRST_FRAME_S: Final = 5.0
 
-REMOTE_ABILITIES: Final = {
-    "arm": frozenset({"TcpSource", "TwistSink", "Stoppable", "HealthSource"}),
-    "camera": frozenset({"FrameSource", "HealthSource"}),
-}
-"""What proxies can do; a task that needs more of an arm runs in one process."""
-
 
 class RemoteDevice(Device):
     """The lifecycle of a device in another process.
@@ -188,6 +182,11 @@ class RemoteArm(RemoteDevice):
         """Whether it stood when the host looked, if that was after the last command or stop."""
         record, _ = self._look()
         return bool(record["at_rest"]) and int(record["told_ns"]) > self._written_ns
+
+    def rested_ns(self) -> int | None:
+        """When its host saw it at rest after the latest stop by the chain; None as long as it has not."""
+        record, _ = self._look()
+        return int(record["rest_ns"]) or None
 
     def send_twist(self, command: TwistCommand, lease: Lease) -> Sent[TwistCommand]:
         """Have the host follow ``command`` until it expires; returns what its gate let pass.
