@@ -100,6 +100,8 @@ class ArmSeat:
         stop, number = int(command["stop"]), int(command["number"])
         if stop > self._stop_seen:
             self._stop_seen = stop
+            if not self._state.value["at_rest"]:
+                self._state.value["asked_ns"] = time.monotonic_ns()
             # A driver that cannot stop its arm has latched its fault, which the state tells.
             with suppress(DeviceError):
                 self.arm.stop(StopCategory(int(command["category"])))
@@ -174,6 +176,8 @@ class ArmSeat:
                 value["at_rest"], value["failed"] = False, True
                 note = error_note(error, MAX_NOTE_BYTES)
             value["lifecycle"] = LIFECYCLES.index(self.arm.state)
+            if not value["at_rest"]:
+                value["moved_ns"] = now_ns
         if self._deadline_ns:
             self._follow_stop(now_ns)
         self._state.publish(note)

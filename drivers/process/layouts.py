@@ -104,8 +104,10 @@ ARM: Final = np.dtype(
         ("at_rest", "u8"),
         ("told_ns", "i8"),  # when the host looked
         # The host's own record, for whoever asks afterwards what happened.
+        ("moved_ns", "i8"),  # when it was last seen moving
         ("obeyed", "u8"),
         ("obeyed_ns", "i8"),
+        ("asked_ns", "i8"),  # when the task last asked it to stop while it moved
         ("stop_ns", "i8"),
         ("rest_ns", "i8"),
         ("stop_speed_m_s", "f8"),
