@@ -154,7 +154,7 @@ def run_fault(folder: Path, fault: ProcessFault, rate_hz: float) -> ProcessCase:
                 continue
             if not record["at_rest"]:
                 problems.append(f"{name} moved afterwards")
-            if record["obeyed_ns"] > record["stop_ns"] > 0 or (
+            if record["obeyed_ns"] > record["stop_ns"] > hurt_ns or (
                 name in at_rest and record["obeyed"] != at_rest[name]["obeyed"]
             ):
                 problems.append(f"{name} obeyed a command after the stop")

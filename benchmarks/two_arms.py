@@ -134,7 +134,7 @@ class _InnerFault:
         match (self._folder / "fault").read_text():
             case "gil":
                 # One instruction of the interpreter that takes seconds, in another thread.
-                threading.Thread(target=pow, args=(7, 8_000_000), daemon=True).start()
+                threading.Thread(target=pow, args=(7, 2_500_000), daemon=True).start()
             case "memory":
                 used = 4096 * int(Path("/proc/self/statm").read_text().split()[0])
                 resource.setrlimit(resource.RLIMIT_AS, (used + (64 << 20), used + (64 << 20)))

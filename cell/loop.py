@@ -200,6 +200,9 @@ class RunLoop:
         """Bring the arms to rest, give them back, and say how it went."""
         cell = self._cell
         self._ending = True
+        if self._error is not None:
+            # Whoever looked on from outside may know better why a device does not answer.
+            cell.supervisor.latch.update(cell.watch.alarms(cell.clock.now_ns()))
         self._stop_arms(tripped=self._error is not None or cell.supervisor.latch.first_cause is not None)
         stops = self._stopper.watch(self._record_state, self._escalated)
         for role, report in stops.items():

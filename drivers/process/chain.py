@@ -134,9 +134,13 @@ class Chain:
         cause: Cause | None
         if watch["stop"] and (cause := cause_of(watch)).reason is not Reason.HOST_LATCHED:
             return cause
-        for link in self._links:
+        for number, link in enumerate(self._links):
             if (cause := link.latched()) is not None:
                 return cause
+            if link.judged and link.end_words():
+                return Cause(Reason.HOST_GONE, time.monotonic_ns(), host=number)
+            if too_long_s := link.silent_too_long():
+                return Cause(Reason.HOST_SILENT, time.monotonic_ns(), too_long_s, self.silence_s, number)
         silent_s = (time.monotonic_ns() - int(watch["t_ns"])) * 1e-9
         if self._task.value["guard"] and silent_s > self.silence_s:
             return Cause(Reason.WATCHDOG_SILENT, time.monotonic_ns(), silent_s, self.silence_s)

@@ -32,6 +32,7 @@ class Reason(IntEnum):
     HOST_LATCHED = 4
     WATCHDOG_SILENT = 5
     TASK_GONE = 6
+    HOST_GONE = 7
 
     @property
     def words(self) -> str:
@@ -47,6 +48,7 @@ _WORDS: Final = {
     Reason.HOST_LATCHED: "a device host has stopped its arms by itself",
     Reason.WATCHDOG_SILENT: "the watchdog has missed two beats",
     Reason.TASK_GONE: "the task's process has gone",
+    Reason.HOST_GONE: "the process of a device host has gone",
 }
 
 

@@ -140,16 +140,20 @@ class HostLink(Child):
 
     def check(self, device: str) -> None:
         """Raise DeviceFault if the host has died, or is silent while it should beat."""
-        ended = self.end_words()
-        silent_s = (time.monotonic_ns() - int(self.beats.read()["t_ns"])) * 1e-9
-        if ended or (self.judged and silent_s > self._silence_s):
+        ended, too_long_s = self.end_words(), self.silent_too_long()
+        if ended or too_long_s:
             raise DeviceFault(
                 device,
-                f"its process {ended}" if ended else f"its process has been silent for {silent_s:.3f} s",
+                f"its process {ended}" if ended else f"its process has been silent for {too_long_s:.3f} s",
                 fault_class=FaultClass.COMMUNICATION,
                 needs=Remedy.OPERATOR,
                 hint="see that the arm stands, then start the run again",
             )
+
+    def silent_too_long(self) -> float:
+        """How long (s) it has been silent, if that is too long; 0 while its arms are not guarded."""
+        silent_s = (time.monotonic_ns() - int(self.beats.read()["t_ns"])) * 1e-9
+        return silent_s if self.judged and silent_s > self._silence_s else 0.0
 
     def latched(self) -> Cause | None:
         """Why it has stopped its arms, or None."""
