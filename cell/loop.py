@@ -188,7 +188,7 @@ class RunLoop:
             return False
         try:
             cell.watch.beat()
-            self._cycle(now_ns)
+            self._cycle()
         except TouchcellError as error:
             self._error = error
             return False
@@ -200,9 +200,9 @@ class RunLoop:
         """Bring the arms to rest, give them back, and say how it went."""
         cell = self._cell
         self._ending = True
-        if self._error is not None:
-            # Whoever looked on from outside may know better why a device does not answer.
-            cell.supervisor.latch.update(cell.watch.alarms(cell.clock.now_ns()))
+        # Whoever looks on from outside may know better why a device does not answer.
+        if self._error is not None and (alarms := cell.watch.alarms(cell.clock.now_ns())):
+            cell.supervisor.latch.update(alarms)
         self._stop_arms(tripped=self._error is not None or cell.supervisor.latch.first_cause is not None)
         stops = self._stopper.watch(self._record_state, self._escalated)
         for role, report in stops.items():
@@ -237,7 +237,7 @@ class RunLoop:
             stops,
         )
 
-    def _cycle(self, now_ns: int) -> None:
+    def _cycle(self) -> None:
         cell = self._cell
         started = time.perf_counter_ns()
         states = {role: arm.tcp() for role, arm in cell.arms.items()}
@@ -249,17 +249,16 @@ class RunLoop:
                 if np.isfinite(state.value.T_base_tcp).all():
                     T_base_sensor = se3.compose(state.value.T_base_tcp, sensor.T_tcp_sensor)
                     sensor.source.record_pose(state.t_ns, T_base_sensor)
-            if (estimate := sensor.source.update(now_ns)) is not None:
+            if (estimate := sensor.source.update(cell.clock.now_ns())) is not None:
                 contacts[role] = estimate
+        # Only now: what a device's own thread brought in the meantime would seem to come from the future.
+        now_ns = cell.clock.now_ns()
         perceived = time.perf_counter_ns()
         ended = bool(cell.sensors) and all(sensor.source.ended for sensor in cell.sensors.values())
         observation = Observation(now_ns, states, contacts, operator_stop=self._stop.count > 0, ended=ended)
         action = cell.task.tick(observation)
         thought = time.perf_counter_ns()
-        # In real time a sample may be younger than the cycle's beginning; it does not come from the future for that.
-        judged_ns = cell.clock.now_ns()
-        view = self._view(judged_ns, states, contacts, action)
-        verdict = cell.supervisor.review(view, cell.watch.alarms(judged_ns))
+        verdict = cell.supervisor.review(self._view(now_ns, states, contacts, action), cell.watch.alarms(now_ns))
         judged = time.perf_counter_ns()
         sent: dict[str, Sent[TwistCommand]] = {}
         if verdict.allow:
