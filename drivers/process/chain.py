@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -33,7 +32,7 @@ from drivers.process.layouts import (
 )
 from drivers.process.link import Child, HostLink
 from drivers.process.proxies import RemoteArm, RemoteCamera, RemoteDevice
-from drivers.process.watchdog import silence_s
+from drivers.process.watchdog import SLOW_PERIODS, silence_s
 
 _GUARD_S: Final = 1.0
 
@@ -102,14 +101,16 @@ class Chain:
 
     def begin(self) -> None:
         """Beat, have the watchdog guard, and wait until it does. Raises DeviceFault if it does not."""
+        # What went before was no period of the loop.
+        self.beat()
         self._task.value["guard"] = True
         self.beat()
-        deadline_ns = time.monotonic_ns() + round(1e9 * _GUARD_S)
+        deadline_ns = self._clock.now_ns() + round(1e9 * _GUARD_S)
         while not self.guarding:
-            if self.watchdog.end_words() or time.monotonic_ns() > deadline_ns:
+            if self.watchdog.end_words() or self._clock.now_ns() > deadline_ns:
                 words = self.watchdog.end_words() or f"does not answer within {_GUARD_S:g} s"
                 raise DeviceFault("watchdog", words, fault_class=FaultClass.COMMUNICATION, needs=Remedy.OPERATOR)
-            time.sleep(self.period_s / 10)
+            self.sleep(self.period_s / 10)
             self.beat()
         for link in self._links:
             link.judged = True
@@ -117,8 +118,13 @@ class Chain:
     def beat(self) -> None:
         """Say that the loop goes on; once in each of its cycles."""
         value = self._task.value
+        now_ns = self._clock.now_ns()
+        period_ns = now_ns - int(value["t_ns"])
+        if value["guard"] and period_ns > SLOW_PERIODS * self.period_s * 1e9:
+            value["late"] += 1
+            value["late_ns"] = period_ns
         value["count"] += 1
-        value["t_ns"] = time.monotonic_ns()
+        value["t_ns"] = now_ns
         self._task.publish()
 
     def end(self) -> None:
@@ -127,6 +133,14 @@ class Chain:
             link.judged = False
         self._task.value["guard"] = False
         self.beat()
+
+    def now_ns(self) -> int:
+        """Time on the clock that all processes share."""
+        return self._clock.now_ns()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait on that clock."""
+        self._clock.sleep_until_ns(self._clock.now_ns() + round(1e9 * seconds))
 
     def alarm(self) -> Cause | None:
         """Why all arms have been stopped, or None."""
@@ -138,12 +152,12 @@ class Chain:
             if (cause := link.latched()) is not None:
                 return cause
             if link.judged and link.end_words():
-                return Cause(Reason.HOST_GONE, time.monotonic_ns(), host=number)
+                return Cause(Reason.HOST_GONE, self._clock.now_ns(), host=number)
             if too_long_s := link.silent_too_long():
-                return Cause(Reason.HOST_SILENT, time.monotonic_ns(), too_long_s, self.silence_s, number)
-        silent_s = (time.monotonic_ns() - int(watch["t_ns"])) * 1e-9
+                return Cause(Reason.HOST_SILENT, self._clock.now_ns(), too_long_s, self.silence_s, number)
+        silent_s = (self._clock.now_ns() - int(watch["t_ns"])) * 1e-9
         if self._task.value["guard"] and silent_s > self.silence_s:
-            return Cause(Reason.WATCHDOG_SILENT, time.monotonic_ns(), silent_s, self.silence_s)
+            return Cause(Reason.WATCHDOG_SILENT, self._clock.now_ns(), silent_s, self.silence_s)
         return None
 
     @property
@@ -227,7 +241,7 @@ class Chain:
             "fds": fds,
         }
         beats = self._exit.enter_context(RecordReader(fds["host"], HOST))
-        link = HostLink(group.name, spec, _numbers(fds), beats=beats, silence_s=self.silence_s)
+        link = HostLink(group.name, spec, _numbers(fds), beats=beats, silence_s=self.silence_s, clock=self._clock)
         self._exit.callback(link.close)
         return link
 

@@ -12,7 +12,6 @@ import select
 import signal
 import socket
 import sys
-import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
@@ -23,7 +22,7 @@ import numpy as np
 from drivers import registry
 from drivers.abilities import FrameSource, HealthSource, StopCategory
 from drivers.arm import Arm
-from drivers.clock import MonotonicClock
+from drivers.clock import Clock, MonotonicClock
 from drivers.commands import TwistCommand, TwistFrame
 from drivers.device import DeactivatePolicy, Device, Lifecycle, OperatorToken
 from drivers.errors import CommandRejected, DeviceError, LifecycleError, Rejection
@@ -90,28 +89,29 @@ class ArmSeat:
             self.arm.release(lease)
         return {}
 
-    def obey(self, refuse: str) -> bool:
+    def obey(self, refuse: str, now_ns: int) -> bool:
         """Do what the newest command says; returns whether there is an answer for the task to read.
 
         Args:
             refuse: why no motion is allowed; empty if it is. Stops are always obeyed.
+            now_ns: for the record.
         """
         command = self._commands.read()
         stop, number = int(command["stop"]), int(command["number"])
         if stop > self._stop_seen:
             self._stop_seen = stop
             if not self._state.value["at_rest"]:
-                self._state.value["asked_ns"] = time.monotonic_ns()
+                self._state.value["asked_ns"] = now_ns
             # A driver that cannot stop its arm has latched its fault, which the state tells.
             with suppress(DeviceError):
                 self.arm.stop(StopCategory(int(command["category"])))
         if number <= max(self._twist_seen, stop):
             return False
         self._twist_seen = number
-        self._answer(command, number, refuse)
+        self._answer(command, number, refuse, now_ns)
         return True
 
-    def _answer(self, command: Any, number: int, refuse: str) -> None:
+    def _answer(self, command: Any, number: int, refuse: str, now_ns: int) -> None:
         answer = self._answers.value
         answer["number"], answer["written_ns"] = number, command["written_ns"]
         try:
@@ -119,7 +119,7 @@ class ArmSeat:
                 raise CommandRejected(self.arm.name, Rejection.MODE, refuse)
             sent = self.arm.send_twist(_twist_command(command), self._lease(int(command["lease"])))
         except TouchcellError as error:
-            answer["refused"], answer["t_ns"] = True, time.monotonic_ns()
+            answer["refused"], answer["t_ns"] = True, now_ns
             self._answers.publish(error_note(error, MAX_NOTE_BYTES))
             return
         answer["refused"], answer["t_ns"], answer["twist"] = False, sent.t_ns, sent.command.twist
@@ -236,10 +236,12 @@ class Host:
     Args:
         spec: what ``link.HostLink`` writes.
         control: socket to the task's process.
+        clock: CLOCK_MONOTONIC, which all processes share.
     """
 
-    def __init__(self, spec: Mapping[str, Any], control: socket.socket) -> None:
+    def __init__(self, spec: Mapping[str, Any], control: socket.socket, clock: Clock) -> None:
         self._control = control
+        self._clock = clock
         self._period_ns = round(1e9 / spec["rate_hz"])
         self._silence_s = silence_s(spec["period_s"])
         fds = spec["fds"]
@@ -247,7 +249,7 @@ class Host:
         self._answered: int = fds["answered"]
         self._watch = RecordReader(fds["watch"], WATCH)
         self._beat = RecordWriter(fds["host"], HOST)
-        self.devices = _build(spec)
+        self.devices = _build(spec, clock)
         self._policies = {each["name"]: DeactivatePolicy(each["policy"]) for each in spec["devices"] if each["policy"]}
         self._arms = {
             each["name"]: ArmSeat(arm, StopCategory(each["category"]), fds["devices"][each["name"]])
@@ -262,25 +264,29 @@ class Host:
         self._cause: Cause | None = None
         self._guarded = False
         self._turn = 0
+        self._due_ns = clock.now_ns()
         self.ending = False
 
     def run(self) -> None:
         """Until the task's process has gone or says so; the arms stand then."""
-        due_ns = time.monotonic_ns()
         while not self.ending:
-            wait_s = max(0.0, (due_ns - time.monotonic_ns()) * 1e-9)
+            wait_s = max(0.0, (self._due_ns - self._clock.now_ns()) * 1e-9)
             ready = select.select([self._wake, self._control.fileno()], [], [], wait_s)[0]
             if self._wake in ready:
                 os.eventfd_read(self._wake)
-            now_ns = time.monotonic_ns()
-            self._heed_watchdog(now_ns)
-            self._obey()
-            if now_ns >= due_ns:
-                self._tell(now_ns)
-                due_ns = max(due_ns + self._period_ns, now_ns)
+            self.cycle()
             if self._control.fileno() in ready:
                 self._serve()
         self._come_to_rest()
+
+    def cycle(self) -> None:
+        """Heed the watchdog and the task now, and tell the state of all devices when it is time to."""
+        now_ns = self._clock.now_ns()
+        self._heed_watchdog(now_ns)
+        self._obey(now_ns)
+        if now_ns >= self._due_ns:
+            self._tell(now_ns)
+            self._due_ns = max(self._due_ns + self._period_ns, now_ns)
 
     def _heed_watchdog(self, now_ns: int) -> None:
         watch = self._watch.read()
@@ -304,11 +310,11 @@ class Host:
         put_cause(self._beat.value, cause)
         self._tell(now_ns)
 
-    def _obey(self) -> None:
+    def _obey(self, now_ns: int) -> None:
         refuse = "" if self._guarded else "no watchdog guards it"
         if self._cause is not None:
             refuse = f"stopped, {self._cause.reason.words}"
-        answers = [seat.obey(refuse) for seat in self._arms.values()]
+        answers = [seat.obey(refuse, now_ns) for seat in self._arms.values()]
         if any(answers):
             os.eventfd_write(self._answered, 1)
 
@@ -321,7 +327,7 @@ class Host:
             self._cameras[self._turn].look()
         beat = self._beat.value
         beat["count"] += 1
-        beat["t_ns"] = time.monotonic_ns()
+        beat["t_ns"] = self._clock.now_ns()
         self._beat.publish()
 
     def _serve(self) -> None:
@@ -329,14 +335,14 @@ class Host:
         if message is None or message["call"] == "end":
             self.ending = True
             if message is None and self._cause is None and any(not seat.free() for seat in self._arms.values()):
-                self._latch(Cause(Reason.TASK_GONE, time.monotonic_ns()), time.monotonic_ns())
+                self._latch(Cause(Reason.TASK_GONE, self._clock.now_ns()), self._clock.now_ns())
             return
         try:
             answer = {"ok": True, **self._call(message)}
         except TouchcellError as error:
             answer = {"ok": False, "error": encode_error(error)}
         # So that who asked finds what has become of it.
-        self._tell(time.monotonic_ns())
+        self._tell(self._clock.now_ns())
         with suppress(OSError):
             send(self._control, answer)
 
@@ -379,20 +385,19 @@ class Host:
         """Stop the arms, watch them until they stand or have had their time, then deactivate what is active."""
         for seat in self._arms.values():
             seat.stop()
-        self._tell(time.monotonic_ns())
-        deadline_ns = time.monotonic_ns() + _LAST_REST_NS
-        while any(not seat.stands() for seat in self._arms.values()) and time.monotonic_ns() < deadline_ns:
-            time.sleep(self._period_ns * 1e-9)
-            self._tell(time.monotonic_ns())
+        self._tell(self._clock.now_ns())
+        deadline_ns = self._clock.now_ns() + _LAST_REST_NS
+        while any(not seat.stands() for seat in self._arms.values()) and self._clock.now_ns() < deadline_ns:
+            self._clock.sleep_until_ns(self._clock.now_ns() + self._period_ns)
+            self._tell(self._clock.now_ns())
         for name, device in self.devices.items():
             if device.state is Lifecycle.ACTIVE:
                 with suppress(DeviceError):
                     device.deactivate(self._policies.get(name, DeactivatePolicy.HOLD))
-        self._tell(time.monotonic_ns())
+        self._tell(self._clock.now_ns())
 
 
-def _build(spec: Mapping[str, Any]) -> dict[str, Device]:
-    clock = MonotonicClock()
+def _build(spec: Mapping[str, Any], clock: Clock) -> dict[str, Device]:
     scene = None
     if spec["scene"] is not None:
         from drivers.simulation.scene import SceneConfig
@@ -421,7 +426,7 @@ def main() -> None:
     spec = json.loads(sys.argv[1])
     control = socket.socket(fileno=spec["fds"]["socket"])
     try:
-        host = Host(spec, control)
+        host = Host(spec, control, MonotonicClock())
     except TouchcellError as error:
         send(control, {"ok": False, "error": encode_error(error)})
         return

@@ -73,7 +73,14 @@ class Cause:
 _CAUSE = [("reason", "u4"), ("host", "i4"), ("t_ns", "i8"), ("value_s", "f8"), ("limit_s", "f8")]
 _BEAT = [("count", "u8"), ("t_ns", "i8")]
 
-TASK: Final = np.dtype([*_BEAT, ("guard", "u8")])
+TASK: Final = np.dtype(
+    [
+        *_BEAT,
+        ("guard", "u8"),
+        ("late", "u8"),  # how many periods were late, and how long the newest of these was
+        ("late_ns", "i8"),
+    ]
+)
 WATCH: Final = np.dtype([*_BEAT, ("guarding", "u8"), ("stop", "u8"), ("cause", _CAUSE)])
 HOST: Final = np.dtype([*_BEAT, ("latched", "u8"), ("cause", _CAUSE)])
 COMMAND: Final = np.dtype(

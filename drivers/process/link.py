@@ -9,11 +9,11 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
+from drivers.clock import Clock
 from drivers.errors import DeviceFault, DeviceGone, FaultClass, LifecycleError, Remedy, TransportTimeout
 from drivers.process.layouts import Cause, RecordReader, cause_of
 from drivers.process.wire import decode_error, receive, send
@@ -120,6 +120,10 @@ class HostLink(Child):
         fds: what it inherits.
         beats: reader of its beat.
         silence_s: silence after which it is taken for dead.
+        clock: CLOCK_MONOTONIC.
+
+    Attributes:
+        judged: whether silence counts: not while it is busy with what it was called for.
     """
 
     def __init__(
@@ -130,12 +134,14 @@ class HostLink(Child):
         *,
         beats: RecordReader,
         silence_s: float,
+        clock: Clock,
     ) -> None:
         super().__init__(name, "drivers.process.host", spec, fds)
         self._wake: int = spec["fds"]["wake"]
         self._answered: int = spec["fds"]["answered"]
         self.beats = beats
         self._silence_s = silence_s
+        self._clock = clock
         self.judged = False
 
     def check(self, device: str) -> None:
@@ -152,7 +158,7 @@ class HostLink(Child):
 
     def silent_too_long(self) -> float:
         """How long (s) it has been silent, if that is too long; 0 while its arms are not guarded."""
-        silent_s = (time.monotonic_ns() - int(self.beats.read()["t_ns"])) * 1e-9
+        silent_s = (self._clock.now_ns() - int(self.beats.read()["t_ns"])) * 1e-9
         return silent_s if self.judged and silent_s > self._silence_s else 0.0
 
     def latched(self) -> Cause | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import replace
 from typing import Any, Final
 
@@ -239,19 +238,19 @@ class RemoteArm(RemoteDevice):
         return self._number
 
     def _write(self, link: HostLink) -> None:
-        self._written_ns = time.monotonic_ns()
+        self._written_ns = self._clock.now_ns()
         self._commands.value["written_ns"] = self._written_ns
         self._commands.publish()
         link.wake()
 
     def _await_answer(self, link: HostLink, ttl_s: float) -> tuple[Any, bytes]:
         seconds = ttl_s if math.isfinite(ttl_s) and ttl_s > 0.0 else 1e-3
-        deadline_ns = time.monotonic_ns() + round(1e9 * seconds)
+        deadline_ns = self._clock.now_ns() + round(1e9 * seconds)
         while True:
             _, answer, note = self._answers.read_all()
             if int(answer["number"]) == self._number:
                 return answer, note
-            left_s = (deadline_ns - time.monotonic_ns()) * 1e-9
+            left_s = (deadline_ns - self._clock.now_ns()) * 1e-9
             if left_s <= 0.0:
                 self._check_host()
                 raise TransportTimeout(self.name, "answer of its host", seconds)

@@ -6,7 +6,6 @@ Commands go on through both parts, so that it is the chain that stops the arms a
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from drivers.commands import TwistCommand, TwistFrame
+from drivers.device import Lifecycle
 from drivers.errors import CommandRejected, DeviceError
 from drivers.lease import Lease
 from drivers.process.chain import Chain
@@ -106,7 +106,7 @@ def _part(chain: Chain, link: str, reason: Reason, withhold: Callable[[], None] 
         _until_all_move(chain, leases, link, within_s)
         # The last beat: what is withheld is silent from here on.
         chain.beat()
-        last_ns = time.monotonic_ns()
+        last_ns = chain.now_ns()
         if withhold is not None:
             withhold()
         cause = _until_stopped(chain, leases, within_s, beats=withhold is not None)
@@ -126,15 +126,19 @@ def _part(chain: Chain, link: str, reason: Reason, withhold: Callable[[], None] 
         found = "nothing" if cause is None else cause.reason.words
         raise SelfTestFailed("chain", link, f"it stopped for {found}, not {reason.words}", within_s, time_s)
     _clear(chain)
+    for arm in arms.values():
+        # A stop of a category that removes power ends there.
+        if arm.state is Lifecycle.READY:
+            arm.activate()
     return Proof(link, time_s, within_s)
 
 
 def _until_all_move(chain: Chain, leases: Mapping[str, Lease], link: str, within_s: float) -> None:
     arms = chain.arms
     started = {name: _position(arm) for name, arm in arms.items()}
-    unseen, deadline_ns = set(arms), time.monotonic_ns() + round(1e9 * _SEEN_WITHIN_S)
+    unseen, deadline_ns = set(arms), chain.now_ns() + round(1e9 * _SEEN_WITHIN_S)
     while unseen:
-        if time.monotonic_ns() > deadline_ns:
+        if chain.now_ns() > deadline_ns:
             raise SelfTestFailed(min(unseen), link, "it was not seen to move at 1 mm/s", within_s, None)
         _cycle(chain, leases, beats=True)
         unseen = {
@@ -144,8 +148,8 @@ def _until_all_move(chain: Chain, leases: Mapping[str, Lease], link: str, within
 
 def _until_stopped(chain: Chain, leases: Mapping[str, Lease], within_s: float, *, beats: bool) -> Cause | None:
     """Go on commanding until somebody has stopped the arms; returns who, or None after the time."""
-    deadline_ns = time.monotonic_ns() + round(1e9 * within_s)
-    while time.monotonic_ns() < deadline_ns:
+    deadline_ns = chain.now_ns() + round(1e9 * within_s)
+    while chain.now_ns() < deadline_ns:
         if (cause := _host_cause(chain)) is not None:
             return cause
         # Once the hosts have latched they refuse, which is what is wanted.
@@ -161,14 +165,14 @@ def _host_cause(chain: Chain) -> Cause | None:
 
 
 def _cycle(chain: Chain, leases: Mapping[str, Lease], *, beats: bool) -> None:
-    due_ns = time.monotonic_ns() + round(1e9 * chain.period_s)
+    due_ns = chain.now_ns() + round(1e9 * chain.period_s)
     if beats:
         chain.beat()
     for name, lease in leases.items():
         arm = chain.arms[name]
         ttl_s = _TTL_PERIODS * chain.period_s
-        arm.send_twist(TwistCommand(_retreat(chain, name), TwistFrame.TCP, time.monotonic_ns(), ttl_s), lease)
-    time.sleep(max(0.0, (due_ns - time.monotonic_ns()) * 1e-9))
+        arm.send_twist(TwistCommand(_retreat(chain, name), TwistFrame.TCP, chain.now_ns(), ttl_s), lease)
+    chain.sleep(max(0.0, (due_ns - chain.now_ns()) * 1e-9))
 
 
 def _retreat(chain: Chain, name: str) -> Array:
@@ -190,14 +194,14 @@ def _rested_ns(chain: Chain, arm: RemoteArm, deadline_ns: int) -> int | None:
         rested_ns = arm.rested_ns()
         if rested_ns is not None:
             return rested_ns if rested_ns <= deadline_ns else None
-        if time.monotonic_ns() > deadline_ns:
+        if chain.now_ns() > deadline_ns:
             return None
-        time.sleep(chain.period_s / 4)
+        chain.sleep(chain.period_s / 4)
 
 
 def _clear(chain: Chain) -> None:
     """Clear the stop, as soon as the watchdog has seen that nobody is guarded any more."""
-    deadline_ns = time.monotonic_ns() + round(1e9 * _SEEN_WITHIN_S)
-    while chain.guarding and time.monotonic_ns() < deadline_ns:
-        time.sleep(chain.period_s / 4)
+    deadline_ns = chain.now_ns() + round(1e9 * _SEEN_WITHIN_S)
+    while chain.guarding and chain.now_ns() < deadline_ns:
+        chain.sleep(chain.period_s / 4)
     chain.clear()

@@ -42,11 +42,21 @@ def silence_s(period_s: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Beat:
-    """The newest sign of life of a process: how many it gave, and when this one."""
+    """The newest sign of life of a process.
+
+    Attributes:
+        count: how many it gave.
+        t_ns: when it gave this one.
+        latched: whether it has stopped its arms, for a host.
+        late: how many periods were late, for the task; two beats may come between two looks of the watchdog.
+        late_ns: how long the newest of these was.
+    """
 
     count: int
     t_ns: int
     latched: bool = False
+    late: int = 0
+    late_ns: int = 0
 
 
 class Judge:
@@ -64,8 +74,7 @@ class Judge:
     def begin(self, now_ns: int) -> None:
         """Everybody starts afresh: only what happens from now on counts."""
         self._begun_ns = now_ns
-        self._task: Beat | None = None
-        self._periods: deque[tuple[int, int]] = deque()
+        self._beats: deque[Beat] = deque()
 
     def update(self, now_ns: int, task: Beat, hosts: Sequence[Beat]) -> Cause | None:
         """The first cause to stop, or None; to be asked several times in a control period."""
@@ -79,18 +88,17 @@ class Judge:
         return self._too_slow(now_ns, task)
 
     def _too_slow(self, now_ns: int, task: Beat) -> Cause | None:
-        before, self._task = self._task, task
-        if before is not None and task.count > before.count:
-            self._periods.append((task.t_ns, (task.t_ns - before.t_ns) // (task.count - before.count)))
-        while self._periods and self._periods[0][0] < now_ns - _WINDOW_NS:
-            self._periods.popleft()
-        if now_ns - self._begun_ns < _WINDOW_NS or not self._periods:
+        beats = self._beats
+        if not beats or task.count > beats[-1].count:
+            beats.append(task)
+        while len(beats) > 1 and beats[1].t_ns < now_ns - _WINDOW_NS:
+            beats.popleft()
+        if now_ns - self._begun_ns < _WINDOW_NS:
             return None
-        periods = sorted(period for _, period in self._periods)
-        late = [period for period in periods if period > SLOW_PERIODS * self._period_ns]
-        if len(late) < _LATE_COUNT or len(late) <= _LATE_SHARE * len(periods):
+        late, periods = task.late - beats[0].late, task.count - beats[0].count
+        if late < _LATE_COUNT or late <= _LATE_SHARE * periods:
             return None
-        return Cause(Reason.TASK_SLOW, now_ns, late[0] * 1e-9, SLOW_PERIODS * self._period_ns * 1e-9)
+        return Cause(Reason.TASK_SLOW, now_ns, task.late_ns * 1e-9, SLOW_PERIODS * self._period_ns * 1e-9)
 
 
 class _Watchdog:
@@ -127,7 +135,9 @@ class _Watchdog:
             if self._task_gone_ns is not None:
                 self._cause = Cause(Reason.TASK_GONE, now_ns)
             elif wanted:
-                self._cause = self._judge.update(now_ns, _beat(task), [_beat(host.read()) for host in self._hosts])
+                self._cause = self._judge.update(
+                    now_ns, _task_beat(task), [_host_beat(host.read()) for host in self._hosts]
+                )
         self._guarding = wanted
         self._publish(now_ns)
         if self._notes is not None and self._cause is not None and self._settled(now_ns):
@@ -203,9 +213,12 @@ def stop_record(arm: Any) -> dict[str, Any]:
     }
 
 
-def _beat(record: Any) -> Beat:
-    latched = bool(record["latched"]) if "latched" in record.dtype.names else False
-    return Beat(int(record["count"]), int(record["t_ns"]), latched)
+def _task_beat(record: Any) -> Beat:
+    return Beat(int(record["count"]), int(record["t_ns"]), late=int(record["late"]), late_ns=int(record["late_ns"]))
+
+
+def _host_beat(record: Any) -> Beat:
+    return Beat(int(record["count"]), int(record["t_ns"]), bool(record["latched"]))
 
 
 def main() -> None:
