@@ -155,6 +155,11 @@ def _check(options: argparse.Namespace) -> int:
     for name, interlock in plan.cell.interlocks.items():
         way = plan.overshoots.get(name)
         print(f"  interlock {name}: {interlock.kind}" + (f"; beyond the box, {way}" if way else ""))
+    if plan.cell.processes == "separate":
+        from cell.processes import process_lines
+
+        for line in process_lines(plan):
+            print(f"  process  {line}")
     if plan.skipped:
         print(f"  not needed by this task and not built: {', '.join(plan.skipped)}")
     return EXIT_OK

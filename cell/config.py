@@ -172,6 +172,7 @@ class CellFile(_Section):
     name: str
     time: Literal["simulated", "real"]
     rate_hz: Annotated[float, Field(gt=0, le=1000)]
+    processes: Literal["one", "separate"] = "one"
     seed: int = 0
     max_duration_s: PositiveFloat = 3600.0
     scene: dict[str, Any] | None = None
@@ -266,6 +267,7 @@ class _Planner:
             self._require_collection(cell, task)
             self._require_abilities(task, arm_roles, arms)
             self._require_interlocks(cell, task)
+            self._require_processes(cell, task, arm_roles)
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
         overshoots = self._require_margins(cell, arm_roles, sensor_roles, arms)
         if self._problems:
@@ -395,6 +397,31 @@ class _Planner:
                 f"no interlock of kind {kind!r} that stops, which a task that moves an arm must have",
                 hint=f"add one: {INTERLOCKS[kind].summary}",
             )
+
+    def _require_processes(self, cell: CellFile, task: TaskSpec, arm_roles: Mapping[str, str]) -> None:
+        """What devices in other processes cannot do is not asked of them."""
+        if cell.processes == "one":
+            return
+        from drivers.process.groups import REMOTE_ABILITIES
+
+        if cell.time == "simulated":
+            self._add(
+                ("processes",), "several processes share real time only", value=cell.processes, hint="`time: real`"
+            )
+        for name, section in cell.sensors.items():
+            if section.estimator.kind == "true_contact":
+                self._add(
+                    ("sensors", name, "estimator"),
+                    "true_contact needs the scene in the task's own process",
+                    hint="use kind: network, or leave out `processes:`",
+                )
+        for role, abilities in task.arms.items():
+            if missing := abilities - REMOTE_ABILITIES:
+                self._add(
+                    ("processes",),
+                    f"{task.name} needs {', '.join(sorted(missing))} of {role!r}, which no other process passes on",
+                    hint="leave out `processes:`",
+                )
 
     def _require_guarded_arms(self, cell: CellFile, roles: set[str]) -> None:
         for name, entry in cell.interlocks.items():

@@ -88,9 +88,14 @@ class Supervisor:
         """The latch, to be read."""
         return self._latch
 
-    def review(self, view: CellView) -> Verdict:
-        """Check ``view``, latch what it shows, and say whether its commands may be sent. Never raises."""
-        violations = self._violations(view)
+    def review(self, view: CellView, alarms: Sequence[Violation] = ()) -> Verdict:
+        """Check ``view``, latch what it shows, and say whether its commands may be sent. Never raises.
+
+        Args:
+            view: what is known in this cycle.
+            alarms: what others have found, the watchdog for one; taken as it is.
+        """
+        violations = (*alarms, *self._violations(view))
         self._latch.update(violations)
         first = self._latch.first_cause
         return Verdict(
