@@ -16,6 +16,7 @@ from typing import Annotated, Any, Final, Literal, Protocol
 import numpy as np
 from pydantic import BaseModel, Field, PositiveFloat, TypeAdapter, ValidationError, model_validator
 
+from control.clearance import ClearanceConfig, Surroundings
 from control.motion_interlocks import LimitedConfig, StandstillConfig, TrackingConfig
 from control.settings import GradedSettings, InterlockSettings
 from control.tactile_interlocks import (
@@ -74,6 +75,8 @@ class Finite:
                 yield role, None, "commanded time-to-live", arm.command.ttl_s
             yield role, None, "measured pose", arm.state.value.T_base_tcp
             yield role, None, "measured twist", arm.state.value.twist
+            if arm.joints is not None:
+                yield role, None, "measured joint angles", arm.joints.value.q
         for role, sensor in view.sensors.items():
             for what, value in (
                 ("depth", sensor.depth_m),
@@ -382,7 +385,8 @@ InterlockConfig = Annotated[
     | TorsionConfig
     | TrackingConfig
     | StandstillConfig
-    | LimitedConfig,
+    | LimitedConfig
+    | ClearanceConfig,
     Field(discriminator="kind"),
 ]
 """One entry of the ``interlocks:`` section; ``kind`` says which."""
@@ -432,6 +436,7 @@ INTERLOCKS: Final[Mapping[str, InterlockSpec]] = MappingProxyType(
             InterlockSpec("torsion", "no contact is twisted too far", TorsionConfig),
             InterlockSpec("tracking", "an arm moves as it was sent", TrackingConfig),
             InterlockSpec("standstill", "an arm that is told to stand does", StandstillConfig),
+            InterlockSpec("clearance", "arms keep away from each other, obstacles and themselves", ClearanceConfig),
             InterlockSpec("limited", "no gate holds an arm back for long", LimitedConfig),
         )
     }
@@ -459,7 +464,23 @@ def parse_interlocks(section: Mapping[str, Any]) -> dict[str, InterlockConfig]:
 
 
 def build_interlocks(
-    settings: Mapping[str, InterlockConfig], T_tcp_sensor: Mapping[str, Array]
+    settings: Mapping[str, InterlockConfig],
+    T_tcp_sensor: Mapping[str, Array],
+    surroundings: Surroundings | None = None,
 ) -> tuple[Interlock | TimedInterlock, ...]:
-    """The rules of a cell whose sensors sit at ``T_tcp_sensor``, (4, 4) by role. Raises ConfigError."""
-    return tuple(config.build(name, T_tcp_sensor) for name, config in settings.items())
+    """The rules of a cell.
+
+    Args:
+        settings: by name.
+        T_tcp_sensor: (4, 4) where each sensor sits, by role.
+        surroundings: what a ``clearance`` is about.
+
+    Raises:
+        ConfigError: a rule is about something that is not there.
+    """
+    return tuple(
+        config.build(name, surroundings or Surroundings())
+        if isinstance(config, ClearanceConfig)
+        else config.build(name, T_tcp_sensor)
+        for name, config in settings.items()
+    )

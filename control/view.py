@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivers.commands import Sent, TwistCommand, in_base_axes
-from drivers.samples import Stamped, TcpState
+from drivers.samples import JointState, Stamped, TcpState
 from geometry.types import Array
 
 
@@ -20,11 +20,13 @@ class ArmView:
         state: newest measured state.
         command: what is about to be sent; None when it is told to stop.
         sent: what its gate let through in the cycle before, and why it differs; None when it was told to stop.
+        joints: newest joint angles, where an interlock looks at them.
     """
 
     state: Stamped[TcpState]
     command: TwistCommand | None = None
     sent: Sent[TwistCommand] | None = None
+    joints: Stamped[JointState] | None = None
 
     def commanded_twist(self) -> Array | None:
         """(6,) the command's twist of the tool centre point along base axes; None without a command."""

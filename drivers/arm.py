@@ -21,7 +21,7 @@ from drivers.commands import Adjustment, Sent, TwistCommand, TwistFrame
 from drivers.device import DeactivatePolicy, Device, Lifecycle
 from drivers.errors import CommandRejected, DeviceError, DeviceFault, FaultClass, LifecycleError, Rejection
 from drivers.gate import TwistGate, TwistLimits
-from drivers.kinematics import LocalIk
+from drivers.kinematics import DifferentialIk, LocalIk
 from drivers.lease import Lease, LeaseDesk
 from drivers.registry import DriverConfig
 from drivers.samples import Stamped, TcpState
@@ -178,11 +178,12 @@ class Arm(Device):
         """What the arm can follow of a twist, and why it differs: all of it, unless a driver knows better."""
         return twist_base, ()
 
-    def _local_ik(self) -> LocalIk | None:
-        """Where its joints are, for the gate to keep them within limits; None for an arm that has none to tell.
+    def kinematics(self) -> DifferentialIk | None:
+        """Of its joints, for an arm that tells them and whose chain is known; None for others."""
+        return None
 
-        Raises StaleData, and GeometryError for what is not finite.
-        """
+    def _local_ik(self) -> LocalIk | None:
+        """The same where the joints are now, for the gate to keep them within limits. Raises StaleData."""
         return None
 
     def _after_rest(self, policy: DeactivatePolicy) -> None:

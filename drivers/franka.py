@@ -148,7 +148,7 @@ class FrankaArm(Arm):
         self._contact = threading.Event()
         self._moved_ns = clock.now_ns()
         self._joint_limits = np.zeros((7, 2))
-        self._ik: DifferentialIk | None = None
+        self._ik = self._kinematics_of(SerialChain(ChainDescription.shipped("fr3")))
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
         """Newest state. Raises StaleData if it is older than ``max_age_s``, and the fault that makes it FAULTED."""
@@ -229,6 +229,10 @@ class FrankaArm(Arm):
             "in_motion": reader.in_motion,
             "external_force_n": float(np.linalg.norm(reading.wrench[:3])),
         }
+
+    def kinematics(self) -> DifferentialIk:
+        """Of its joints, with the tool that the controller has since ``configure``."""
+        return self._ik
 
     def watchdog_s(self) -> float:
         """Silence after which the controller stops the arm: 20 command packets at 1 kHz, fixed by Franka."""
@@ -311,6 +315,9 @@ class FrankaArm(Arm):
             Tool(origin_mm=tuple(tool[:3]), rotation_deg=tuple(tool[3:])),
         )
         require_same_arm(self.name, chain, np.asarray(state.q), np.asarray(state.O_T_EE.matrix))
+        return self._kinematics_of(chain)
+
+    def _kinematics_of(self, chain: SerialChain) -> DifferentialIk:
         return DifferentialIk(chain, self._config.joint_limits.settings(own_controller=True))
 
     def _verify_frame(self, name: str, wanted: Array) -> None:
@@ -381,8 +388,8 @@ class FrankaArm(Arm):
         )
         self._start(motion, franky.CartesianVelocityStopMotion, franky.ControlSignalType.CartesianVelocities)
 
-    def _local_ik(self) -> LocalIk | None:
-        return None if self._ik is None else self._ik.at(self.joints(self._max_state_age_s).value.q)
+    def _local_ik(self) -> LocalIk:
+        return self._ik.at(self.joints(self._max_state_age_s).value.q)
 
     def _begin_stop(self, category: StopCategory) -> None:
         # While a silent arm rests, franky would wait for it.

@@ -56,6 +56,10 @@ class JointArm(Arm):
             raise CommandRejected(self.name, Rejection.MODE, f"in trouble: {self._trouble}")
         self._setpoint.go_to(q, speed_fraction)
 
+    def kinematics(self) -> DifferentialIk:
+        """Of its joints."""
+        return self._ik
+
     def _local_ik(self) -> LocalIk:
         return self._ik.at(self.joints(self._max_state_age_s).value.q)
 

@@ -49,11 +49,19 @@ class Placement(_Description):
         return T
 
 
+class CapsuleShape(_Description):
+    """A part of a link as a capsule: all that lies within a radius of a segment, in the frame that it is fixed to."""
+
+    from_mm: Vector3
+    to_mm: Vector3
+    radius_mm: Positive
+
+
 class Joint(Placement):
     """A revolute joint and the link that it moves.
 
     The joint frame sits at ``origin_mm`` and ``rotation_deg`` in the link before it when the joint is at zero;
-    ``axis`` and ``com_mm`` are given in the joint frame.
+    ``axis``, ``com_mm`` and ``capsules`` are given in the joint frame.
     """
 
     name: str
@@ -65,6 +73,7 @@ class Joint(Placement):
     torque_n_m: Positive
     mass_kg: NotNegative = 0.0
     com_mm: Vector3 = (0.0, 0.0, 0.0)
+    capsules: tuple[CapsuleShape, ...] = ()
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -83,9 +92,10 @@ class Tool(Placement):
 
 
 class ChainDescription(_Description):
-    """A serial arm, base to flange."""
+    """A serial arm, base to flange; ``base_capsules`` are in the base frame."""
 
     name: str
+    base_capsules: tuple[CapsuleShape, ...] = ()
     joints: tuple[Joint, ...] = Field(min_length=1)
     flange: Placement = Placement()
 
@@ -134,12 +144,14 @@ class SerialChain:
         gravity_m_s2: (3,) along base axes, for arms that hang or stand on a wall.
 
     Attributes:
+        description: the arm.
         joint_names, lower, upper, speed, accel, torque: (n,) per joint, rad, rad, rad/s, rad/s2, N m.
     """
 
     def __init__(
         self, description: ChainDescription, tool: Tool | None = None, gravity_m_s2: Vector3 = GRAVITY_M_S2
     ) -> None:
+        self.description = description
         joints = description.joints
         tool = tool or Tool()
         self.joint_names = tuple(joint.name for joint in joints)
@@ -168,6 +180,10 @@ class SerialChain:
     def forward(self, q: Array) -> Array:
         """Pose ``T_base_tcp`` (4, 4) at joint angles ``q`` (n,) rad. Raises GeometryError for a wrong shape or NaN."""
         return self._place(q)[1]
+
+    def link_poses(self, q: Array) -> Array:
+        """Poses (n, 4, 4) of the joint frames along base axes, each turned by its joint. Raises GeometryError."""
+        return self._place(q)[0]
 
     def jacobian(self, q: Array) -> Array:
         """Geometric Jacobian (6, n): [v, w] of the tool centre point along base axes per joint velocity."""

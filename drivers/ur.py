@@ -198,6 +198,10 @@ class UrArm(Arm):
         accel = math.radians(self._config.joint_accel_deg_s2)
         self._attempt(lambda: link.move_joints(target, speed, accel, self._config.stop_accel_m_s2))
 
+    def kinematics(self) -> DifferentialIk:
+        """Of its joints."""
+        return self._ik
+
     def watchdog_s(self) -> float:
         """Silence after which the controller stops the arm, proven at activation. Raises LifecycleError before it."""
         if self._proven_watchdog_s is None:
