@@ -122,6 +122,7 @@ class Cell:
         sensors: by role.
         stop_categories: by which each arm stops when something is wrong, by role.
         watched_joints: roles of arms whose joint angles an interlock looks at.
+        scene: what is simulated around the arms, None in a cell of real devices.
     """
 
     plan: CellPlan
@@ -133,6 +134,7 @@ class Cell:
     task: Task
     stop_categories: Mapping[str, StopCategory] = field(default_factory=dict)
     watched_joints: frozenset[str] = frozenset()
+    scene: Scene | None = None
     start_ns: int = 0
     _exit: ExitStack = field(default_factory=ExitStack, init=False)
 
@@ -211,6 +213,7 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
         task=task,
         stop_categories={role: StopCategory(plan.cell.arms[name].stop_category) for name, role in arm_of.items()},
         watched_joints=frozenset(role for role, body in surroundings.bodies.items() if body.link_count),
+        scene=scene,
     )
 
 
