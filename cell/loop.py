@@ -408,6 +408,9 @@ def _sensor_view(estimate: ContactEstimate, sensor: Sensor) -> SensorView:
         torsion_rad,
         content,
         brightness,
+        None if estimate.belief is None else estimate.belief.mean,
+        estimate.markers,
+        sensor.arm_role,
     )
 
 

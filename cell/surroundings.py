@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from cell.config import ArmSection, BoxSection, CapsuleSection, CellPlan
-from control.clearance import Body, ClearanceConfig, Surroundings
+from control.clearance import ClearanceConfig
 from control.collision import BASE, TOOL, Box, Capsule
+from control.surroundings import Body, Surroundings
 from drivers.arm import Arm
 from drivers.errors import ConfigError
 from drivers.kinematics import CapsuleShape, ChainDescription
@@ -18,7 +19,7 @@ from geometry.types import Array
 
 
 def build_surroundings(plan: CellPlan, arms: Mapping[str, Any], names: Mapping[str, str]) -> Surroundings:
-    """What the cell's ``clearance`` is about; nothing where it has none.
+    """Where the arms of a cell stand, and what they look like if it has a ``clearance``.
 
     Args:
         plan: a checked cell file.
@@ -28,17 +29,15 @@ def build_surroundings(plan: CellPlan, arms: Mapping[str, Any], names: Mapping[s
     Raises:
         ConfigError: an arm has no capsule at all.
     """
+    sections = {role: plan.cell.arms[names[role]] for role in arms}
+    placed = {role: se3.from_euler_mm_deg(np.array(each.base_pose_mm_deg)) for role, each in sections.items()}
     if not any(isinstance(entry, ClearanceConfig) for entry in plan.cell.interlocks.values()):
-        return Surroundings()
-    bodies = {}
-    for role, arm in arms.items():
-        if isinstance(arm, Arm):
-            bodies[role] = _body(plan.cell.arms[names[role]], arm)
-    return Surroundings(bodies, [_box(name, section) for name, section in plan.cell.obstacles.items()])
+        return Surroundings(placed)
+    bodies = {role: _body(sections[role], placed[role], arm) for role, arm in arms.items() if isinstance(arm, Arm)}
+    return Surroundings(placed, bodies, [_box(name, section) for name, section in plan.cell.obstacles.items()])
 
 
-def _body(section: ArmSection, arm: Arm) -> Body:
-    T_world_base = se3.from_euler_mm_deg(np.array(section.base_pose_mm_deg))
+def _body(section: ArmSection, T_world_base: Array, arm: Arm) -> Body:
     parts = [_part(k, part) for k, part in enumerate(section.body)]
     ik = arm.kinematics()
     links = [] if ik is None else _links(ik.chain.description)

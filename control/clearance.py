@@ -2,61 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Literal, Self
 
 import numpy as np
 from pydantic import PositiveFloat, model_validator
 
-from control.collision import Box, Capsule, Clearances, Pair
-from control.settings import InterlockSettings
-from control.view import ArmView, CellView
+from control.collision import Clearances, Pair
+from control.surroundings import Body, PlacedSettings, Surroundings
+from control.view import CellView
 from control.violation import Severity, Violation
 from drivers.errors import ConfigError
-from drivers.kinematics import DifferentialIk
-from geometry import se3
 from geometry.types import Array
 
 _AHEAD_S = 0.01
 _NEGLIGIBLE_M = 1e-7
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Body:
-    """What an arm looks like, and where it stands.
-
-    Attributes:
-        T_world_base: pose (4, 4) of its base.
-        capsules: its parts; frame 0 is the base, frames from 1 on are the links, the last is the tool.
-        kinematics: of an arm whose links have capsules; None where only base and tool are frames.
-        link_count: how many links that are.
-    """
-
-    T_world_base: Array
-    capsules: Sequence[Capsule]
-    kinematics: Callable[[], DifferentialIk | None] = lambda: None
-    link_count: int = 0
-
-    def frames(self, arm: ArmView, ahead_s: float = 0.0) -> Array:
-        """(link_count + 2, 4, 4) in the world as measured, or as its command would move them within ``ahead_s``."""
-        T_base_tcp, twist = arm.state.value.T_base_tcp, arm.commanded_twist() if ahead_s else None
-        ik = self.kinematics()
-        T = np.empty((self.link_count + 2, 4, 4))
-        T[0] = np.eye(4)
-        if ik is not None:
-            if arm.joints is None:
-                raise ValueError("nobody has read the joints")
-            q = arm.joints.value.q
-            if twist is not None:
-                q = q + ahead_s * ik.solve(q, twist).dq
-            T[1:-1] = ik.chain.link_poses(q)
-        T[-1] = T_base_tcp
-        if twist is not None:
-            T[-1, :3, :3] = se3.exp(np.concatenate([np.zeros(3), ahead_s * twist[3:]]))[:3, :3] @ T_base_tcp[:3, :3]
-            T[-1, :3, 3] += ahead_s * twist[:3]
-        placed: Array = self.T_world_base @ T
-        return placed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,15 +69,7 @@ class Clearance:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Surroundings:
-    """What a clearance is about: the arms' bodies by role, and what stands around them."""
-
-    bodies: Mapping[str, Body] = field(default_factory=dict)
-    boxes: Sequence[Box] = ()
-
-
-class ClearanceConfig(InterlockSettings):
+class ClearanceConfig(PlacedSettings):
     """Least distance of every arm from the others, from the cell's ``obstacles:`` and from itself.
 
     Nearer than ``slow_mm`` motion towards each other is slowed to a quarter, for as long as it lasts.
@@ -132,7 +85,7 @@ class ClearanceConfig(InterlockSettings):
             raise ValueError(f"slow_mm {self.slow_mm:g} is below limit_mm {self.limit_mm:g}")
         return self
 
-    def build(self, name: str, surroundings: Surroundings) -> Clearance:
+    def build_placed(self, name: str, T_tcp_sensor: Mapping[str, Array], surroundings: Surroundings) -> Clearance:
         """The rule. Raises ConfigError where there is nothing that could come near anything."""
         bodies = surroundings.bodies
         counts = {role: body.link_count + 2 for role, body in bodies.items()}

@@ -57,6 +57,9 @@ class SensorView:
         torsion_rad: estimated rotation about the surface normal; None without contact.
         content: number that changes with the frame's picture, noise included; None where nobody looks at it.
         brightness: the frame's mean grey level; None likewise.
+        T_s_f: (4, 4) estimated pose of the surface in the sensor's frame; None without contact.
+        markers: share of the markers expected in view that are seen; None where the estimator looks at none.
+        arm: role of the arm that carries it; None where nothing moves it.
     """
 
     t_frame_ns: int
@@ -70,6 +73,9 @@ class SensorView:
     torsion_rad: float | None = None
     content: int | None = None
     brightness: float | None = None
+    T_s_f: Array | None = None
+    markers: float | None = None
+    arm: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

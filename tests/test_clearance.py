@@ -16,11 +16,12 @@ from cell.config import plan_cell
 from cell.loop import Outcome, RunLoop
 from cell.surroundings import _links
 from cell.yaml_file import InvalidCell
-from control.clearance import Body, Clearance, ClearanceConfig, Surroundings
+from control.clearance import Clearance, ClearanceConfig
 from control.collision import BASE, TOOL, Box, Capsule, Clearances
 from control.interlocks import build_interlocks, parse_interlocks
 from control.latch import Latch
 from control.supervisor import LIMIT_FOR_NS, REDUCED, Supervisor
+from control.surroundings import Body, Surroundings
 from control.view import ArmView, CellView
 from control.violation import Severity
 from drivers.commands import TwistCommand, TwistFrame
@@ -52,7 +53,7 @@ def apart(gap_mm: float, left: Any = None, right: Any = None) -> CellView:
 
 
 def rule(boxes: tuple[Box, ...] = (), **changes: Any) -> Clearance:
-    (built,) = build_interlocks(parse_interlocks({"clear": {**ENTRY, **changes}}), {}, Surroundings(BODIES, boxes))
+    (built,) = build_interlocks(parse_interlocks({"clear": {**ENTRY, **changes}}), {}, Surroundings({}, BODIES, boxes))
     assert isinstance(built, Clearance)
     return built
 
@@ -114,7 +115,7 @@ def test_a_table_counts_too_and_names_itself():
 
 
 def test_slow_may_last_and_near_does_not():
-    supervisor = Supervisor(build_interlocks(parse_interlocks({"clear": ENTRY}), {}, Surroundings(BODIES)), Latch())
+    supervisor = Supervisor(build_interlocks(parse_interlocks({"clear": ENTRY}), {}, Surroundings({}, BODIES)), Latch())
     for k in range(100):
         verdict = supervisor.review(replace(apart(40, FORTH), now_ns=NOW + k * LIMIT_FOR_NS // 10))
         assert (verdict.allow, verdict.speed) == (True, REDUCED)
@@ -157,7 +158,7 @@ def test_links_are_where_kinematics_put_them_and_move_as_the_command_asks():
 def test_an_arm_that_folds_onto_itself_is_slowed():
     parts = [*_links(CHAIN.description), Capsule("gripper", (TOOL, TOOL), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.15)), 0.03)]
     bodies = {"arm": Body(np.eye(4), parts, lambda: IK, 6)}
-    (clear,) = build_interlocks(parse_interlocks({"clear": {**ENTRY, "slow_mm": 80}}), {}, Surroundings(bodies))
+    (clear,) = build_interlocks(parse_interlocks({"clear": {**ENTRY, "slow_mm": 80}}), {}, Surroundings({}, bodies))
     q = np.deg2rad([0.0, 20.0, 140.0, 0.0, 85.0, 0.0])
     bend = np.array([0.0, 0.0, 0.0, 0.0, 0.3, 0.0])
     found = clear.check(CellView(NOW, {"arm": jointed(q, bend)}))
