@@ -84,6 +84,7 @@ class SimTactip(Device):
         self._drawn = 0
         self._mount = mount
         self._T_tcp_s = se3.from_euler_mm_deg(config.tcp_to_sensor_mm_deg)
+        scene.timeline.keep(lambda: self._forget)
         if not isinstance(mount, MeasuredCarrier):
             self._touch()
 
@@ -142,6 +143,10 @@ class SimTactip(Device):
         image.flags.writeable = False
         self._drawn += 1
         return Frame(image)
+
+    def _forget(self, later_ns: int) -> None:
+        """The newest picture may show what a restored scene has taken back."""
+        self._newest = None
 
     def _open(self) -> None:
         self._scene.timeline.advance()

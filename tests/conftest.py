@@ -13,6 +13,7 @@ _BESIDE_EMULATORS = (
     "test_cell_devices",
     "test_conformance",
     "test_damiao",
+    "test_emulated_matrix",
     "test_emulator_process",
     "test_feetech",
     "test_franka",
