@@ -24,6 +24,7 @@ from cell.config import (
 )
 from cell.known_surface import KnownSurfaceSource
 from cell.messages import belief_message, pose_message
+from cell.surroundings import build_surroundings
 from cell.watch import OneProcess, Watch
 from control.interlocks import build_interlocks
 from control.latch import Latch
@@ -136,6 +137,7 @@ class Cell:
         arms: by role in the task, and those that only carry a sensor by their own name.
         sensors: by role.
         stop_categories: by which each arm stops when something is wrong, by role.
+        watched_joints: roles of arms whose joint angles an interlock looks at.
         scene: what is simulated around the arms, None in a cell of real devices, or where it is in another process.
         collection: where labelled frames go, None where the task labels none.
         watch: who looks after the loop.
@@ -149,6 +151,7 @@ class Cell:
     supervisor: Supervisor
     task: Task
     stop_categories: Mapping[str, StopCategory] = field(default_factory=dict)
+    watched_joints: frozenset[str] = frozenset()
     scene: Scene | None = None
     collection: Collection | None = None
     watch: Watch = field(default_factory=OneProcess)
@@ -223,19 +226,22 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
     arm_of |= {name: name for name in plan.arms if name not in arm_of}
     sensors = {role: _sensor(plan, name, devices, scene, arm_of) for role, name in plan.sensor_roles.items()}
     poses = {role: sensor.T_tcp_sensor for role, sensor in sensors.items()}
-    supervisor = Supervisor(build_interlocks(plan.cell.interlocks, poses), Latch())
+    arms = {role: cast(Arm, devices[name]) for name, role in arm_of.items()}
+    surroundings = build_surroundings(plan, arms, {role: name for name, role in arm_of.items()})
+    supervisor = Supervisor(build_interlocks(plan.cell.interlocks, poses, surroundings), Latch())
     collection = _collection(plan)
     kept = 0 if collection is None else collection.kept
     task = plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses, kept))
     return Cell(
         plan=plan,
         clock=cell_clock,
-        arms={role: cast(Arm, devices[name]) for name, role in arm_of.items()},
+        arms=arms,
         cameras={name: devices[name] for name in plan.sensors},
         sensors=sensors,
         supervisor=supervisor,
         task=task,
         stop_categories={role: StopCategory(plan.cell.arms[name].stop_category) for name, role in arm_of.items()},
+        watched_joints=frozenset(role for role, body in surroundings.bodies.items() if body.link_count),
         scene=scene,
         collection=collection,
         watch=OneProcess() if chain is None else _process_watch(chain, arm_of),

@@ -28,7 +28,7 @@ from drivers.abilities import ServoArm, TwistSink
 from drivers.commands import Sent, TwistCommand
 from drivers.errors import DeviceError
 from drivers.lease import Lease
-from drivers.samples import Stamped, TcpState
+from drivers.samples import JointState, Stamped, TcpState
 from geometry import se3
 from geometry.errors import TouchcellError
 from geometry.types import Array
@@ -334,10 +334,17 @@ class RunLoop:
     ) -> CellView:
         return CellView(
             now_ns,
-            {role: ArmView(state, action.twists.get(role), self._sent.get(role)) for role, state in states.items()},
+            {
+                role: ArmView(state, action.twists.get(role), self._sent.get(role), self._joints(role))
+                for role, state in states.items()
+            },
             {role: _sensor_view(estimate, self._cell.sensors[role]) for role, estimate in contacts.items()},
             self._cell.task.state,
         )
+
+    def _joints(self, role: str) -> Stamped[JointState] | None:
+        cell = self._cell
+        return cell.arms[role].joints() if role in cell.watched_joints else None
 
     def _count(self, stage: str, duration_ns: int) -> None:
         self._times.add(stage, duration_ns)
@@ -421,6 +428,9 @@ def _sensor_view(estimate: ContactEstimate, sensor: Sensor) -> SensorView:
         torsion_rad,
         content,
         brightness,
+        None if estimate.belief is None else estimate.belief.mean,
+        estimate.markers,
+        sensor.arm_role,
     )
 
 
