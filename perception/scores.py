@@ -74,22 +74,26 @@ class Scores:
     @property
     def errors(self) -> Array:
         """(n, 6) predicted less labelled contact, mm and degrees."""
-        return np.subtract(self.predicted_mm_deg, self.contact_mm_deg)
+        errors: Array = self.predicted_mm_deg - self.contact_mm_deg
+        return errors
 
     @property
     def residuals(self) -> Array:
         """(n, 6) labelled less predicted xi, mm and degrees."""
-        return np.divide(xi_from_contact(self.contact_mm_deg) - self.xi, XI_UNITS)
+        residuals: Array = (xi_from_contact(self.contact_mm_deg) - self.xi) / XI_UNITS
+        return residuals
 
     @property
     def sigma(self) -> Array:
         """(n, 6) predicted standard deviations of the components of xi, mm and degrees."""
-        return np.divide(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)), XI_UNITS)
+        sigma: Array = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)) / XI_UNITS
+        return sigma
 
     @property
     def standardised(self) -> Array:
         """(n, 6) residuals in predicted standard deviations; standard normal each, if sigma is right."""
-        return np.divide(self.residuals, self.sigma)
+        standardised: Array = self.residuals / self.sigma
+        return standardised
 
     @property
     def nees(self) -> Array:
