@@ -25,14 +25,19 @@ class Prediction:
 
     Attributes:
         xi: (6,) mean [v, w], m and rad.
-        sigma: (6,) standard deviation of each component, m and rad; the components are independent.
+        covariance: (6, 6) of xi, m and rad.
         in_range: the mean lies in the range of labels that the model was taught. Outside it, and out of contact, a
             prediction means little.
     """
 
     xi: Array
-    sigma: Array
+    covariance: Array
     in_range: bool
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) standard deviation of each component of xi, m and rad."""
+        return np.sqrt(np.diagonal(self.covariance))
 
 
 class ContactModel:
@@ -107,6 +112,6 @@ class ContactModel:
         )
         return Prediction(
             xi=self._centre + self._half_range * mean,
-            sigma=sigma,
+            covariance=np.diag(sigma**2),
             in_range=bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE)),
         )
