@@ -14,7 +14,7 @@ _MARKERS = {"onnxruntime": "o", "openvino": "s", "torch": "^", "own": "D"}
 def write_run_time_against_error(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """MAE of each component over CPU time per camera frame, one point for each estimator and runtime."""
     from matplotlib.figure import Figure
-    from matplotlib.ticker import NullFormatter, StrMethodFormatter
+    from matplotlib.ticker import StrMethodFormatter
 
     figure = Figure(figsize=(14, 8), layout="constrained")
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -31,9 +31,10 @@ def write_run_time_against_error(path: Path, rows: Sequence[Mapping[str, Any]]) 
         axes.set(xscale="log", yscale="log", title=component, xlabel="ms CPU per 640x480 frame", ylabel="MAE")
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            axis.set_minor_formatter(StrMethodFormatter("{x:g}") if axis is axes.yaxis else NullFormatter())
+            axis.set_minor_formatter(StrMethodFormatter("{x:g}"))
         axes.grid(alpha=0.3, which="both")
-    figure.axes[0].legend(fontsize=7)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
     figure.suptitle("Run time against error: one point for each estimator and runtime, one thread")
     figure.savefig(path, dpi=110)
 

@@ -71,7 +71,7 @@ def torch(model: Model) -> Runner:
         # TorchScript is on its way out, and still the fastest that PyTorch offers without a minute of compiling.
         warnings.simplefilter("ignore")
         traced = pytorch.jit.trace(Folded().eval(), example)  # type: ignore[no-untyped-call]
-        frozen = pytorch.jit.optimize_for_inference(pytorch.jit.freeze(traced))  # type: ignore[no-untyped-call]
+        frozen = pytorch.jit.optimize_for_inference(pytorch.jit.freeze(traced))
 
     def run(inputs: NDArray[np.float32]) -> NDArray[np.float32]:
         with pytorch.inference_mode():

@@ -1,4 +1,4 @@
-"""One estimator in one runtime, serving in a process of its own: what ``touchcell bench perception`` starts and measures.
+"""One estimator in one runtime, serving in a process of its own, as ``touchcell bench perception`` starts it.
 
 Run as ``python -m benchmarks.perception_serving MODEL RUNTIME FRAMES COUNT DATA SPLIT RESULT SPAWNED_NS``.
 """
@@ -65,7 +65,8 @@ def main(arguments: list[str]) -> None:
     del model
     frames = _Frames(Path(frames_path), preprocessing.input_size, int(count))
     estimator.predict(frames.read(0))
-    figures: dict[str, Any] = {"start_s": (time.monotonic_ns() - int(spawned_ns)) * 1e-9}
+    started_s = (time.monotonic_ns() - int(spawned_ns)) * 1e-9
+    figures: dict[str, Any] = {"start_s": started_s, "start_cpu_s": time.process_time()}
     other, again = _latency(estimator, frames)
     figures |= {"memory_mb": _memory_mb("VmRSS"), "peak_mb": _memory_mb("VmHWM")}
     served = [estimator.predict(frames.read(i)) for i in range(frames.count)]
