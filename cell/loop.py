@@ -18,7 +18,7 @@ import numpy as np
 
 from cell.compose import Cell, Sensor
 from cell.errors import RecordingError
-from cell.messages import command_message, contact_message, tcp_message, verdict_message
+from cell.messages import command_message, contact_message, pose_message, tcp_message, verdict_message
 from cell.recording import Recorder
 from cell.stopping import Stopper, StopReport
 from control.supervisor import Verdict
@@ -346,6 +346,10 @@ class RunLoop:
         for role, sensor in cell.sensors.items():
             for topic, t_ns, message in sensor.extra_messages(now_ns):
                 self._write(f"/sensors/{role}/{topic}", t_ns, message, boxed=topic != "image")
+        if cell.scene is not None:
+            objects = cell.scene.objects()
+            for name, T_world_object in objects.value.items():
+                self._write(f"/objects/{name}", objects.t_ns, pose_message(T_world_object))
         for role, command in sent.items():
             self._write(f"/arms/{role}/command", command.t_ns, command_message(command))
         if verdict.violations or not verdict.allow:
