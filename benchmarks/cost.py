@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 
 from benchmarks.perception import write_simulated
-from benchmarks.provenance import provenance
+from benchmarks.provenance import as_installed, provenance
 from cell.cli import find_cell
 from drivers.tactile_data import IMAGE_FOLDER
 
@@ -80,7 +80,7 @@ def _measure(cell: dict[str, Any], what: str) -> dict[str, Any]:
         rows: list[dict[str, Any]] = []
         for _ in range(3):
             command = [sys.executable, "-c", _PROGRAM, str(path), what, ",".join(_HEAVY), str(time.monotonic_ns())]
-            result = subprocess.run(command, capture_output=True, text=True, check=True)
+            result = subprocess.run(command, capture_output=True, text=True, check=True, env=as_installed(Path(folder)))
             rows.append(json.loads(result.stdout.splitlines()[-1]))
     return min(rows, key=lambda row: float(row["ready_s"]))
 

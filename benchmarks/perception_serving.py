@@ -1,6 +1,7 @@
 """One estimator in one runtime, serving in a process of its own, as ``touchcell bench perception`` starts it.
 
-Run as ``python -m benchmarks.perception_serving MODEL RUNTIME FRAMES COUNT DATA SPLIT RESULT SPAWNED_NS``.
+Run as ``python -m benchmarks.perception_serving MODEL RUNTIME FRAMES COUNT DATA SPLIT RESULT SPAWNED_NS`` with
+``--start-only`` behind it or not.
 """
 
 from __future__ import annotations
@@ -53,9 +54,10 @@ def main(arguments: list[str]) -> None:
     """Serve frames, then every image of a split, and leave the figures in RESULT (.npz).
 
     MODEL is a model file, RUNTIME one of ``perception_runtimes.RUNTIMES`` or ``OWN``, FRAMES a file of COUNT raw grey
-    frames, DATA and SPLIT a data set, SPAWNED_NS the time.monotonic_ns() at which the process was started.
+    frames, DATA and SPLIT a data set, SPAWNED_NS the time.monotonic_ns() at which the process was started. With
+    ``--start-only`` it ends after its first estimate.
     """
-    model_path, runtime, frames_path, count, data, split, result, spawned_ns = arguments
+    model_path, runtime, frames_path, count, data, split, result, spawned_ns, *start_only = arguments
     cv2.setNumThreads(1)
     model = load_model(Path(model_path))
     taught = model.header.preprocessing
@@ -67,6 +69,8 @@ def main(arguments: list[str]) -> None:
     estimator.predict(frames.read(0))
     started_s = (time.monotonic_ns() - int(spawned_ns)) * 1e-9
     figures: dict[str, Any] = {"start_s": started_s, "start_cpu_s": time.process_time()}
+    if start_only:
+        return
     other, again = _latency(estimator, frames)
     figures |= {"memory_mb": _memory_mb("VmRSS"), "peak_mb": _memory_mb("VmHWM")}
     served = [estimator.predict(frames.read(i)) for i in range(frames.count)]

@@ -24,6 +24,12 @@ def provenance() -> dict[str, str]:
     }
 
 
+def as_installed(folder: Path) -> dict[str, str]:
+    """Environment of a process that finds its modules compiled, as an installed package's are, in ``folder``."""
+    inherited = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    return {**inherited, "PYTHONPYCACHEPREFIX": str(folder / "bytecode")}
+
+
 def _cpu_model() -> str:
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
