@@ -14,7 +14,7 @@ from geometry.types import Array
 
 PUBLIC_DEPTH_MM = (0.5, 6.0)
 _IMAGES_PER_TIP = 16
-_ADDITIVE = {"centre_px", "image_rotation_rad", "layout_phase_rad"}
+_ADDITIVE = {"centre_px", "image_rotation_rad", "layout_phase_rad", "camera_tilt_rad"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +107,7 @@ def _scattered(middle: TipParameters, variation: Variation, rng: np.random.Gener
         each.name: getattr(middle, each.name) * (1.0 + rng.normal(0.0, variation.parameters))
         for each in fields(middle)
         if each.name not in _ADDITIVE | {"rings", "camera_distance_m", "focal_px", "ring_step_rad"}
+        and getattr(middle, each.name)
     }
     u, v = middle.centre_px + rng.normal(0.0, variation.shift_px, 2)
     # Focal length and camera distance together set the scale: scattered alone they would change it by too much.
