@@ -93,6 +93,15 @@ def _parser() -> argparse.ArgumentParser:
     train_sim.add_argument("--seed", type=int, default=0)
     train_sim.set_defaults(run=_train_sim)
 
+    calibrate_sim = commands.add_parser("calibrate-sim", help="make the simulated tip like a real one")
+    calibrate_sim.add_argument("--data", type=Path, required=True, help="data set folder with train/, better also val/")
+    calibrate_sim.add_argument("--out", type=Path, required=True, help="tip file to write (.yaml)")
+    calibrate_sim.add_argument("--frames", type=int, default=20, help="labelled images to fit to")
+    calibrate_sim.add_argument("--images", type=int, default=600, help="images that teach the matching, unlabelled")
+    calibrate_sim.add_argument("--rings", type=int, default=10, help="of the marker lattice")
+    calibrate_sim.add_argument("--seed", type=int, default=0)
+    calibrate_sim.set_defaults(run=_calibrate_sim)
+
     evaluate = commands.add_parser("evaluate", help="error, likelihood, calibration and latency on labelled images")
     evaluate.add_argument("--data", type=Path, required=True)
     evaluate.add_argument("--split", default="val", help="train, val or test")
@@ -194,6 +203,20 @@ def _train_sim(options: argparse.Namespace) -> int:
     from cell.train_sim import train_on_simulation
 
     train_on_simulation(options.out, samples=options.samples, epochs=options.epochs, seed=options.seed)
+    return EXIT_OK
+
+
+def _calibrate_sim(options: argparse.Namespace) -> int:
+    from cell.calibrate_sim import calibrate_sim
+
+    calibrate_sim(
+        options.data,
+        options.out,
+        frames=options.frames,
+        images=options.images,
+        rings=options.rings,
+        seed=options.seed,
+    )
     return EXIT_OK
 
 

@@ -207,9 +207,7 @@ def _fitted(
 
     scale, low, high = np.array([_FREE[key] for key in free]).T
     at = np.array([_value(start, key) for key in free])
-    x = robust_fit(
-        residuals, at, scale, low=low, high=high, prior=prior_px, soft=_SOFT_PX, turns=turns, told=told
-    )
+    x = robust_fit(residuals, at, scale, low=low, high=high, prior=prior_px, soft=_SOFT_PX, turns=turns, told=told)
     return _with(start, free, x)
 
 

@@ -93,4 +93,3 @@ def _about_z(angle: Array) -> Array:
     R[..., 0, 1] = -R[..., 1, 0]
     R[..., 2, 2] = 1.0
     return R
-
