@@ -120,6 +120,7 @@ class Cell:
         arms: by role in the task, and those that only carry a sensor by their own name.
         sensors: by role.
         stop_categories: by which each arm stops when something is wrong, by role.
+        scene: what is simulated around the arms, None in a cell of real devices.
     """
 
     plan: CellPlan
@@ -130,6 +131,7 @@ class Cell:
     supervisor: Supervisor
     task: Task
     stop_categories: Mapping[str, StopCategory] = field(default_factory=dict)
+    scene: Scene | None = None
     start_ns: int = 0
     _exit: ExitStack = field(default_factory=ExitStack, init=False)
 
@@ -205,6 +207,7 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
         supervisor=supervisor,
         task=task,
         stop_categories={role: StopCategory(plan.cell.arms[name].stop_category) for name, role in arm_of.items()},
+        scene=scene,
     )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from cell.compose import Cell, Sensor
 from cell.errors import RecordingError
-from cell.messages import command_message, contact_message, tcp_message, verdict_message
+from cell.messages import command_message, contact_message, pose_message, tcp_message, verdict_message
 from cell.recording import Recorder
 from cell.stopping import Stopper, StopReport
 from control.supervisor import Verdict
@@ -186,7 +186,7 @@ class RunLoop:
             self._reason = "stopped at once by the operator"
             return False
         try:
-            self._cycle(now_ns)
+            self._cycle()
         except TouchcellError as error:
             self._error = error
             return False
@@ -231,7 +231,7 @@ class RunLoop:
             stops,
         )
 
-    def _cycle(self, now_ns: int) -> None:
+    def _cycle(self) -> None:
         cell = self._cell
         started = time.perf_counter_ns()
         states = {role: arm.tcp() for role, arm in cell.arms.items()}
@@ -243,8 +243,10 @@ class RunLoop:
                 if np.isfinite(state.value.T_base_tcp).all():
                     T_base_sensor = se3.compose(state.value.T_base_tcp, sensor.T_tcp_sensor)
                     sensor.source.record_pose(state.t_ns, T_base_sensor)
-            if (estimate := sensor.source.update(now_ns)) is not None:
+            if (estimate := sensor.source.update(cell.clock.now_ns())) is not None:
                 contacts[role] = estimate
+        # Only now: what a device's own thread brought in the meantime would seem to come from the future.
+        now_ns = cell.clock.now_ns()
         perceived = time.perf_counter_ns()
         ended = bool(cell.sensors) and all(sensor.source.ended for sensor in cell.sensors.values())
         observation = Observation(now_ns, states, contacts, operator_stop=self._stop.count > 0, ended=ended)
@@ -346,6 +348,10 @@ class RunLoop:
         for role, sensor in cell.sensors.items():
             for topic, t_ns, message in sensor.extra_messages(now_ns):
                 self._write(f"/sensors/{role}/{topic}", t_ns, message, boxed=topic != "image")
+        if cell.scene is not None:
+            objects = cell.scene.objects()
+            for name, T_world_object in objects.value.items():
+                self._write(f"/objects/{name}", objects.t_ns, pose_message(T_world_object))
         for role, command in sent.items():
             self._write(f"/arms/{role}/command", command.t_ns, command_message(command))
         if verdict.violations or not verdict.allow:

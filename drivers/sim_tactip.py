@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from drivers.abilities import TcpSource
 from drivers.clock import Clock
 from drivers.device import Device, Lifecycle
 from drivers.errors import ConfigError, StaleData, TransportTimeout
@@ -16,7 +17,7 @@ from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSp
 from drivers.samples import Frame, Stamped
 from drivers.simulation.faults import FrameFaults
 from drivers.simulation.render import FrameRenderer, Lighting
-from drivers.simulation.scene import Carrier, Scene
+from drivers.simulation.scene import Carrier, MeasuredCarrier, Scene
 from drivers.simulation.tip import Tip
 from geometry import se3
 
@@ -72,7 +73,7 @@ class SimTactip(Device):
         self._processed = config.output == "processed"
         self._period_ns = round(1e9 / config.rate_hz)
         self._latency_ns = round(config.latency_ms * 1e6)
-        self._first = math.ceil(scene.timeline.t_ns / self._period_ns)
+        self._first = 0
         self._tip = Tip()
         self._renderer = FrameRenderer(
             self._tip.parameters.disc_radius_px,
@@ -81,8 +82,11 @@ class SimTactip(Device):
         )
         self._newest: Stamped[Frame] | None = None
         self._drawn = 0
-        T_tcp_s = se3.from_euler_mm_deg(config.tcp_to_sensor_mm_deg)
-        scene.mount(name, lambda: mount.T_world_tcp() @ T_tcp_s)
+        self._mount = mount
+        self._T_tcp_s = se3.from_euler_mm_deg(config.tcp_to_sensor_mm_deg)
+        scene.timeline.keep(lambda: self._forget)
+        if not isinstance(mount, MeasuredCarrier):
+            self._touch()
 
     def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
         """Newest frame; waits for the very first. Raises StaleData if it is older than ``max_age_s``."""
@@ -140,8 +144,19 @@ class SimTactip(Device):
         self._drawn += 1
         return Frame(image)
 
+    def _forget(self, later_ns: int) -> None:
+        """The newest picture may show what a restored scene has taken back."""
+        self._newest = None
+
     def _open(self) -> None:
         self._scene.timeline.advance()
+        if not self._scene.has(self.name):
+            self._touch()
+
+    def _touch(self) -> None:
+        mount, T_tcp_s = self._mount, self._T_tcp_s
+        self._scene.mount(self.name, lambda: mount.T_world_tcp() @ T_tcp_s)
+        self._first = math.ceil(self._scene.timeline.t_ns / self._period_ns)
 
     def _close(self) -> None:
         self._newest = None
@@ -149,12 +164,15 @@ class SimTactip(Device):
 
 def _build(name: str, config: Any, context: DriverContext) -> SimTactip:
     scene: object = context.scene
-    mount: object = context.devices.get(config.mounted_on)
+    arm: object = context.devices.get(config.mounted_on)
+    mount: object = arm
+    if not isinstance(arm, Carrier) and isinstance(arm, TcpSource):
+        mount = MeasuredCarrier(arm, np.eye(4))
     if not isinstance(scene, Scene):
         raise ConfigError("a simulated sensor needs a scene", key=name, hint="add a scene: section to the cell file")
     if not isinstance(mount, Carrier):
         raise ConfigError(
-            f"{config.mounted_on!r} is no simulated arm of this cell",
+            f"{config.mounted_on!r} is no arm of this cell",
             key=f"{name}.mounted_on",
             value=config.mounted_on,
             hint=f"devices so far: {', '.join(context.devices) or 'none'}",

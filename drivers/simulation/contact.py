@@ -7,11 +7,12 @@ inward normal and its origin one tip radius outside the surface, so that {f} = {
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from drivers.simulation.surfaces import Surface
+from drivers.simulation.timeline import Restore
 from geometry import se3
 from geometry.types import Array
 
@@ -117,7 +118,7 @@ class ContactModel:
         centre = R_world_b.T @ (T_world_s[:3, 3] - T_world_b[:3, 3])
         nearest = surface.shape.nearest(centre)
         depth = self.law.tip_radius_m - nearest.distance_m
-        R_tilt = _tilt(-nearest.normal @ R_b_s)
+        R_tilt = tilt_of(-nearest.normal @ R_b_s)
 
         if depth <= 0.0:
             self._anchor = None
@@ -147,11 +148,20 @@ class ContactModel:
         if abs(torsion) > largest:
             slipping = True
             held_torsion = math.copysign(largest, torsion)
-            anchor.R = anchor.R @ _about_z(torsion - held_torsion)
-            R_b_f = R_b_f @ _about_z(torsion - held_torsion)
+            anchor.R = anchor.R @ about_z(torsion - held_torsion)
+            R_b_f = R_b_f @ about_z(torsion - held_torsion)
             torsion = held_torsion
-        R_f_s = _about_z(torsion) @ R_tilt
+        R_f_s = about_z(torsion) @ R_tilt
         return self._state(T_world_s, R_world_b @ R_b_f, R_f_s, (shear[0], shear[1], depth), slipping=slipping)
+
+    def snapshot(self) -> Restore:
+        """What brings the contact back as it is now."""
+        held = self._anchor and replace(self._anchor)
+
+        def restore() -> None:
+            self._anchor = held and replace(held)
+
+        return restore
 
     def _state(
         self, T_world_s: Array, R_world_f: Array, R_f_s: Array, position: tuple[float, float, float], *, slipping: bool
@@ -171,21 +181,22 @@ def contact_at(T_f_s: Array, law: ContactLaw) -> ContactState:
     """The contact that a tip pressed and then sheared to ``T_f_s`` (4, 4) ends in: {f} at the world's origin, shear and
     torsion cut to what its depth holds. What data collection (Algorithm 1 of the paper) does, without the way there."""
     depth = float(T_f_s[2, 3])
-    R_tilt = _tilt(T_f_s[2, :3])
+    R_tilt = tilt_of(T_f_s[2, :3])
     R_gamma = T_f_s[:3, :3] @ R_tilt.T
     asked_torsion, asked_shear = math.atan2(R_gamma[1, 0], R_gamma[0, 0]), math.hypot(T_f_s[0, 3], T_f_s[1, 3])
     largest, longest = law.max_torsion_rad(depth), law.max_shear_m(depth)
     torsion = min(max(asked_torsion, -largest), largest)
     T = np.eye(4)
-    T[:3, :3] = _about_z(torsion) @ R_tilt
+    T[:3, :3] = about_z(torsion) @ R_tilt
     T[:2, 3] = T_f_s[:2, 3] * min(1.0, longest / max(asked_shear, 1e-12))
     T[2, 3] = depth
     slipping = asked_shear > longest or abs(asked_torsion) > largest
     return ContactState(T, np.eye(4), depth > 0.0, slipping, law.stiffness_n_m * max(depth, 0.0))
 
 
-def _tilt(inward_in_s: Array) -> Array:
-    """Ry(beta) Rx(alpha) that takes ``inward_in_s`` (3,), the inward normal in {s}, to the z axis of {f}."""
+def tilt_of(inward_in_s: Array) -> Array:
+    """Tilt (3, 3) of a sensor: the Ry(beta) Rx(alpha) that takes ``inward_in_s`` (3,), the inward normal in {s}, to the
+    z axis of {f}."""
     x, y, z = (float(value) for value in inward_in_s)
     # The inverse rotation takes z to (-sin beta, sin alpha cos beta, cos alpha cos beta).
     cos_beta = math.hypot(y, z)
@@ -201,7 +212,8 @@ def _tilt(inward_in_s: Array) -> Array:
     )
 
 
-def _about_z(angle: float) -> Array:
+def about_z(angle: float) -> Array:
+    """Rotation (3, 3) about the z axis."""
     sin, cos = math.sin(angle), math.cos(angle)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
