@@ -76,11 +76,12 @@ def calibrate_sim(
         told = _teller(bar)
         markers = learn_sensor(data, images=images, rings=rings, seed=seed, told=told)
         chosen = evenly(len(training.images), frames)
-        others = [i for i in evenly(len(training.images), _HELD_OUT + frames) if i not in set(chosen)][:_HELD_OUT]
+        rest = np.setdiff1d(np.arange(len(training.images)), chosen)
+        others = rest[evenly(len(rest), _HELD_OUT)]
         contacts, fitted_to = markers.contacts(training, np.array(chosen), told)
         sensor = fit_tip(contacts, markers.reference, rings, told=lambda done, total: told("fitted", done, total))
         sensor = replace(sensor, tip=replace(sensor.tip, disc_radius_px=markers.disc_radius_px))
-        held_out, shown = markers.contacts(training, np.array(others), told)
+        held_out, shown = markers.contacts(training, others, told)
         sets = {"fitted to": contacts, "train, held out": held_out}
         if (data / "val").is_dir():
             validation = read_split(data, "val")

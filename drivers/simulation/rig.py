@@ -7,6 +7,7 @@ surface_3d images needed; ``contact.ContactLaw`` is their simpler sibling for co
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,7 @@ class Rig:
     Attributes:
         offset_m: (x, y) of the point about which the arm tilts, from the sensor's axis. Tilting then changes the depth.
         depth_m: added to commanded depths.
+        level_rad: turn of the surface about its x, then y axis, from where the arm takes it to be.
         press_slant: (x, y) shear per depth that pressing alone makes, as on a surface that is not level.
         give: (along, across) of the symmetric, traceless part [[a, c], [c, -a]] of what lateral commands gain or lose.
         slip_at_1mm_m: shear that survives at 1 mm depth.
@@ -36,6 +38,7 @@ class Rig:
 
     offset_m: tuple[float, float] = (0.0, 0.0)
     depth_m: float = 0.0
+    level_rad: tuple[float, float] = (0.0, 0.0)
     press_slant: tuple[float, float] = (0.0, 0.0)
     give: tuple[float, float] = (0.0, 0.0)
     slip_at_1mm_m: float = 0.34e-3
@@ -53,7 +56,7 @@ class Rig:
         Returns:
             (..., 4, 4) contacts that the skin feels; out of contact there is no shear.
         """
-        R, command = T_f_s[..., :3, :3], T_f_s[..., :3, 3]
+        R, command = _turn(*self.level_rad) @ T_f_s[..., :3, :3], T_f_s[..., :3, 3]
         axis = R[..., 2, :]
         offset = axis[..., 0] * self.offset_m[0] + axis[..., 1] * self.offset_m[1]
         depth = command[..., 2] + self.depth_m + offset
@@ -84,6 +87,14 @@ class Rig:
         left[..., :2, 3] = np.einsum("...ij,...j->...i", back[..., :2, :2], shear) * share[..., None]
         left[..., 2, 3] = depth
         return left
+
+
+def _turn(alpha: float, beta: float) -> Array:
+    """(3, 3) Ry(beta) Rx(alpha)."""
+    sin_a, cos_a, sin_b, cos_b = math.sin(alpha), math.cos(alpha), math.sin(beta), math.cos(beta)
+    return np.array(
+        [[cos_b, sin_b * sin_a, sin_b * cos_a], [0.0, cos_a, -sin_a], [-sin_b, cos_b * sin_a, cos_b * cos_a]]
+    )
 
 
 def _about_z(angle: Array) -> Array:
