@@ -89,6 +89,9 @@ def _parser() -> argparse.ArgumentParser:
     train_sim = commands.add_parser("train-sim", help="train the estimator that ships, on simulated images")
     train_sim.add_argument("--out", type=Path, required=True, help="model file to write (.safetensors)")
     train_sim.add_argument("--samples", type=int, default=12_000)
+    train_sim.add_argument("--kind", choices=("gdn", "cnn", "markers"), default="gdn")
+    train_sim.add_argument("--tip", help="tip file of a real sensor (calibrate-sim), or the name of one that ships")
+    train_sim.add_argument("--processed", action="store_true", help="for images as the public data have them")
     train_sim.add_argument("--epochs", type=int)
     train_sim.add_argument("--seed", type=int, default=0)
     train_sim.set_defaults(run=_train_sim)
@@ -202,7 +205,15 @@ def _train(options: argparse.Namespace) -> int:
 def _train_sim(options: argparse.Namespace) -> int:
     from cell.train_sim import train_on_simulation
 
-    train_on_simulation(options.out, samples=options.samples, epochs=options.epochs, seed=options.seed)
+    train_on_simulation(
+        options.out,
+        samples=options.samples,
+        kind=options.kind,
+        tip=options.tip,
+        processed=options.processed,
+        epochs=options.epochs,
+        seed=options.seed,
+    )
     return EXIT_OK
 
 
