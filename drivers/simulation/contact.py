@@ -64,6 +64,7 @@ class ContactLaw:
     Attributes:
         tip_radius_m: radius of the hemisphere.
         stiffness_n_m: normal force per depth.
+        friction: tangential force per normal force with which the skin slips.
         slip_at_1mm_m: shear that survives at 1 mm depth, measured on public images (SIMULATION part 5).
         slip_exponent: growth of that shear with depth, measured on the same.
         torsion_grip: share of the shear that sticks by which the patch may turn before it slips. The same images fit
@@ -72,6 +73,7 @@ class ContactLaw:
 
     tip_radius_m: float = 0.020
     stiffness_n_m: float = 1500.0
+    friction: float = 0.9
     slip_at_1mm_m: float = 0.34e-3
     slip_exponent: float = 1.83
     torsion_grip: float = 0.15
@@ -79,6 +81,10 @@ class ContactLaw:
     def max_shear_m(self, depth_m: float) -> float:
         """Largest tangential displacement that sticks."""
         return self.slip_at_1mm_m * (1e3 * depth_m) ** self.slip_exponent if depth_m > 0.0 else 0.0
+
+    def shear_stiffness_n_m(self, depth_m: float) -> float:
+        """Tangential force per shear at a positive depth: what sticks is used up when friction is."""
+        return self.friction * self.stiffness_n_m * depth_m / self.max_shear_m(depth_m)
 
     def max_torsion_rad(self, depth_m: float) -> float:
         """Largest rotation about the normal that sticks.
@@ -119,6 +125,11 @@ class ContactModel:
 
     law: ContactLaw = field(default_factory=ContactLaw)
     _anchor: _Anchor | None = None
+
+    def held_point(self, surface: Surface) -> Array | None:
+        """(3,) m, where the skin holds on to ``surface``, in its own frame; None where it does not."""
+        anchor = self._anchor
+        return anchor.point if anchor is not None and anchor.surface is surface else None
 
     def step(self, T_world_s: Array, surface: Surface, t_s: float) -> ContactState:
         """Bring the contact to time ``t_s`` with the sensor at ``T_world_s`` (4, 4)."""

@@ -17,6 +17,7 @@ from drivers.samples import Stamped
 from drivers.simulation.contact import ContactLaw, ContactState
 from drivers.simulation.motions import Glide, Motion, Periodic, Still
 from drivers.simulation.objects import ObjectConfig, PoseMmDeg, TableConfig
+from drivers.simulation.quasi_static import QuasiStaticWorld
 from drivers.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
 from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeline
 from drivers.simulation.world import KinematicWorld, World
@@ -310,21 +311,22 @@ class TipLawConfig(_Part):
 
     radius_mm: float = Field(default=20.0, gt=0.0)
     stiffness_n_mm: float = Field(default=1.5, gt=0.0)
-    friction: float = Field(default=0.9, gt=0.0, le=3.0, description="of the skin, where the physics is dynamic")
+    friction: float = Field(default=0.9, gt=0.0, le=3.0, description="of the skin, where objects are free")
 
     def build(self) -> ContactLaw:
-        return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3)
+        return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3, self.friction)
 
 
 class SceneConfig(_Part):
     """The ``scene:`` section of a cell file. Poses are in the world frame.
 
     ``physics`` says how true it is (docs/simulation.md). ``kinematic``: surfaces move as they were told, whatever
-    touches them. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms`` within
-    ``step_ms``, the grid on which arms move and contacts are kept.
+    touches them. ``quasi_static``: besides, objects slide on the table where tips push them, without inertia and always
+    upright. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms`` within ``step_ms``,
+    the grid on which arms move and contacts are kept.
     """
 
-    physics: Literal["kinematic", "dynamic"] = "kinematic"
+    physics: Literal["kinematic", "quasi_static", "dynamic"] = "kinematic"
     surfaces: dict[
         str,
         Annotated[PlaneConfig | RampConfig | DomeConfig | SphereConfig, Field(discriminator="kind")],
@@ -354,6 +356,9 @@ class SceneConfig(_Part):
         surfaces = {name: config.build() for name, config in self.surfaces.items()}
         if self.physics == "kinematic":
             return KinematicWorld(surfaces, self.tip.build())
+        if self.physics == "quasi_static":
+            objects = {name: config.build(self.table) for name, config in self.objects.items()}
+            return QuasiStaticWorld(surfaces, objects, self.tip.build())
         return self._dynamic_world(surfaces)
 
     def _dynamic_world(self, surfaces: Mapping[str, Surface]) -> World:
