@@ -154,7 +154,12 @@ def _check(options: argparse.Namespace) -> int:
         print(f"  {device.spec.capabilities.kind:<8} {device.name}: {device.spec.name}, {device.spec.summary}")
     for name, interlock in plan.cell.interlocks.items():
         way = plan.overshoots.get(name)
-        print(f"  interlock {name}: {interlock.kind}" + (f"; beyond the box, {way}" if way else ""))
+        print(f"  interlock {name}: {interlock.kind}" + (f"; beyond its limit, {way}" if way else ""))
+    if plan.cell.processes == "separate":
+        from cell.processes import process_lines
+
+        for line in process_lines(plan):
+            print(f"  process  {line}")
     if plan.skipped:
         print(f"  not needed by this task and not built: {', '.join(plan.skipped)}")
     return EXIT_OK

@@ -24,6 +24,8 @@ from cell.config import (
 )
 from cell.known_surface import KnownSurfaceSource
 from cell.messages import belief_message, pose_message
+from cell.surroundings import build_surroundings
+from cell.watch import OneProcess, Watch
 from control.interlocks import build_interlocks
 from control.latch import Latch
 from control.supervisor import Supervisor
@@ -40,6 +42,7 @@ from perception.pipeline import ContactPipeline, ContactSource
 from tasks.interface import Task, TaskContext
 
 if TYPE_CHECKING:
+    from drivers.process.chain import Chain
     from drivers.simulation.scene import Scene
     from perception.filter import ContactFilter
 
@@ -134,8 +137,10 @@ class Cell:
         arms: by role in the task, and those that only carry a sensor by their own name.
         sensors: by role.
         stop_categories: by which each arm stops when something is wrong, by role.
-        scene: what is simulated around the arms, None in a cell of real devices.
+        watched_joints: roles of arms whose joint angles an interlock looks at.
+        scene: what is simulated around the arms, None in a cell of real devices, or where it is in another process.
         collection: where labelled frames go, None where the task labels none.
+        watch: who looks after the loop.
     """
 
     plan: CellPlan
@@ -146,8 +151,10 @@ class Cell:
     supervisor: Supervisor
     task: Task
     stop_categories: Mapping[str, StopCategory] = field(default_factory=dict)
+    watched_joints: frozenset[str] = frozenset()
     scene: Scene | None = None
     collection: Collection | None = None
+    watch: Watch = field(default_factory=OneProcess)
     start_ns: int = 0
     _exit: ExitStack = field(default_factory=ExitStack, init=False)
 
@@ -168,6 +175,7 @@ class Cell:
 
     def __enter__(self) -> Self:
         with self._exit:
+            self._exit.enter_context(self.watch)
             for device in self._devices():
                 self._exit.enter_context(device)
                 device.configure()
@@ -175,6 +183,7 @@ class Cell:
             for device in self._devices():
                 device.activate()
                 self._exit.callback(self._deactivate, device)
+            self.watch.prove()
             self.start_ns = self.clock.now_ns()
             self._exit = self._exit.pop_all()
         return self
@@ -207,27 +216,35 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
         RecordingError: the folder for labelled frames cannot be written.
     """
     cell_clock = clock or _clock(plan)
-    scene = _scene(plan, cell_clock)
-    devices = build_devices(plan, {**plan.arms, **plan.sensors}, cell_clock, scene)
+    chain = _chain(plan, cell_clock)
+    hosted = {} if chain is None else chain.devices
+    # A scene that lives in a host is not here too.
+    scene = _scene(plan, cell_clock) if chain is None else None
+    wanted = {name: device for name, device in {**plan.arms, **plan.sensors}.items() if name not in hosted}
+    devices = {**build_devices(plan, wanted, cell_clock, scene), **hosted}
     arm_of = {name: role for role, name in plan.arm_roles.items()}
     arm_of |= {name: name for name in plan.arms if name not in arm_of}
     sensors = {role: _sensor(plan, name, devices, scene, arm_of) for role, name in plan.sensor_roles.items()}
     poses = {role: sensor.T_tcp_sensor for role, sensor in sensors.items()}
-    supervisor = Supervisor(build_interlocks(plan.cell.interlocks, poses), Latch())
+    arms = {role: cast(Arm, devices[name]) for name, role in arm_of.items()}
+    surroundings = build_surroundings(plan, arms, {role: name for name, role in arm_of.items()})
+    supervisor = Supervisor(build_interlocks(plan.cell.interlocks, poses, surroundings), Latch())
     collection = _collection(plan)
     kept = 0 if collection is None else collection.kept
     task = plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses, kept))
     return Cell(
         plan=plan,
         clock=cell_clock,
-        arms={role: cast(Arm, devices[name]) for name, role in arm_of.items()},
+        arms=arms,
         cameras={name: devices[name] for name in plan.sensors},
         sensors=sensors,
         supervisor=supervisor,
         task=task,
         stop_categories={role: StopCategory(plan.cell.arms[name].stop_category) for name, role in arm_of.items()},
+        watched_joints=frozenset(role for role, body in surroundings.bodies.items() if body.link_count),
         scene=scene,
         collection=collection,
+        watch=OneProcess() if chain is None else _process_watch(chain, arm_of),
     )
 
 
@@ -244,7 +261,9 @@ def build_devices(
     """
     clock = clock or _clock(plan)
     devices: dict[str, Device] = {}
-    context = DriverContext(clock, devices, scene or _scene(plan, clock), plan.cell.seed)
+    if scene is None and wanted:
+        scene = _scene(plan, clock)
+    context = DriverContext(clock, devices, scene, plan.cell.seed)
     for name, device in wanted.items():
         devices[name] = device.spec.build(name, device.config, context)
     return devices
@@ -253,6 +272,20 @@ def build_devices(
 def model_path(name: str) -> Path:
     """The file behind a cell file's ``model:``: a path, or ``builtin:NAME`` for one that ships with touchcell."""
     return MODELS / f"{name.removeprefix(BUILTIN)}.safetensors" if name.startswith(BUILTIN) else Path(name)
+
+
+def _chain(plan: CellPlan, clock: Clock) -> Chain | None:
+    if plan.cell.processes == "one":
+        return None
+    from cell.processes import build_chain
+
+    return build_chain(plan, clock)
+
+
+def _process_watch(chain: Chain, role_of: Mapping[str, str]) -> Watch:
+    from cell.processes import ProcessWatch
+
+    return ProcessWatch(chain, role_of)
 
 
 def _clock(plan: CellPlan) -> Clock:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 
@@ -24,11 +24,11 @@ from cell.stopping import Stopper, StopReport
 from control.supervisor import Verdict
 from control.view import ArmView, CellView, SensorView
 from control.violation import Severity, Violation
-from drivers.arm import Arm
+from drivers.abilities import ServoArm, TwistSink
 from drivers.commands import Sent, TwistCommand
 from drivers.errors import DeviceError
 from drivers.lease import Lease
-from drivers.samples import Stamped, TcpState
+from drivers.samples import JointState, Stamped, TcpState
 from geometry import se3
 from geometry.errors import TouchcellError
 from geometry.types import Array
@@ -144,7 +144,7 @@ class RunLoop:
         self._on_cycle = on_cycle
         self._times = CycleTimes()
         self._transitions_written = 0
-        self._arms = {role: arm for role, arm in cell.arms.items() if isinstance(arm, Arm)}
+        self._arms = {role: cast(ServoArm, arm) for role, arm in cell.arms.items() if isinstance(arm, TwistSink)}
         self._stopper = Stopper(self._arms, cell.stop_categories, cell.clock, 1.0 / cell.rate_hz)
         self._leases: dict[str, Lease] = {}
         self._sent: Mapping[str, Sent[TwistCommand]] = {}
@@ -166,12 +166,13 @@ class RunLoop:
         return result
 
     def begin(self) -> None:
-        """Wait for each camera's first frame, and take the arms' leases."""
+        """Wait for each camera's first frame, take the arms' leases, and be watched from now on."""
         try:
             for sensor in self._cell.sensors.values():
                 sensor.await_frame()
             for role, arm in self._arms.items():
                 self._leases[role] = arm.acquire(self._cell.task_name)
+            self._cell.watch.begin()
         except TouchcellError as error:
             self._error = error
         self._start_ns = self._cell.clock.now_ns()
@@ -189,6 +190,7 @@ class RunLoop:
             self._reason = "stopped at once by the operator"
             return False
         try:
+            cell.watch.beat()
             self._cycle()
         except TouchcellError as error:
             self._error = error
@@ -201,11 +203,15 @@ class RunLoop:
         """Bring the arms to rest, give them back, and say how it went."""
         cell = self._cell
         self._ending = True
+        # Whoever looks on from outside may know better why a device does not answer.
+        if self._error is not None and (alarms := cell.watch.alarms(cell.clock.now_ns())):
+            cell.supervisor.latch.update(alarms)
         self._stop_arms(tripped=self._error is not None or cell.supervisor.latch.first_cause is not None)
         stops = self._stopper.watch(self._record_state, self._escalated)
         for role, report in stops.items():
             if report.problem:
                 self._event("stop failed", f"{role}: {report.problem}")
+        cell.watch.end()
         for role, lease in self._leases.items():
             # What an arm that is gone says to it has been told already.
             with suppress(DeviceError):
@@ -255,7 +261,7 @@ class RunLoop:
         observation = Observation(now_ns, states, contacts, operator_stop=self._stop.count > 0, ended=ended)
         action = cell.task.tick(observation)
         thought = time.perf_counter_ns()
-        verdict = cell.supervisor.review(self._view(now_ns, states, contacts, action))
+        verdict = cell.supervisor.review(self._view(now_ns, states, contacts, action), cell.watch.alarms(now_ns))
         judged = time.perf_counter_ns()
         sent: dict[str, Sent[TwistCommand]] = {}
         if verdict.allow:
@@ -306,6 +312,8 @@ class RunLoop:
         self._event("escalated", f"{role}: {reason}")
 
     def _record_state(self, role: str, state: Stamped[TcpState]) -> None:
+        # Arms on their way to rest are still guarded.
+        self._cell.watch.beat()
         try:
             message = tcp_message(state)
         except TouchcellError as error:
@@ -326,10 +334,17 @@ class RunLoop:
     ) -> CellView:
         return CellView(
             now_ns,
-            {role: ArmView(state, action.twists.get(role), self._sent.get(role)) for role, state in states.items()},
+            {
+                role: ArmView(state, action.twists.get(role), self._sent.get(role), self._joints(role))
+                for role, state in states.items()
+            },
             {role: _sensor_view(estimate, self._cell.sensors[role]) for role, estimate in contacts.items()},
             self._cell.task.state,
         )
+
+    def _joints(self, role: str) -> Stamped[JointState] | None:
+        cell = self._cell
+        return cell.arms[role].joints() if role in cell.watched_joints else None
 
     def _count(self, stage: str, duration_ns: int) -> None:
         self._times.add(stage, duration_ns)
@@ -413,6 +428,9 @@ def _sensor_view(estimate: ContactEstimate, sensor: Sensor) -> SensorView:
         torsion_rad,
         content,
         brightness,
+        None if estimate.belief is None else estimate.belief.mean,
+        estimate.markers,
+        sensor.arm_role,
     )
 
 

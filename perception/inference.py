@@ -28,11 +28,13 @@ class Prediction:
         sigma: (6,) standard deviation of each component, m and rad; the components are independent.
         in_range: the mean lies in the range of labels that the model was taught. Outside it, and out of contact, a
             prediction means little.
+        markers: share of the markers expected in view that were seen, where the model looks for markers.
     """
 
     xi: Array
     sigma: Array
     in_range: bool
+    markers: float | None = None
 
 
 class ContactModel:

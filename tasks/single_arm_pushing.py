@@ -44,7 +44,7 @@ class PushConfig(HandConfig):
     middle_mm: PositiveFloat = 60.0
     look_ahead_mm: PositiveFloat = 40.0
     align_kp_mm_s_per_deg: PositiveFloat = 3.0
-    align_ki_deg_per_mm_s: NonNegativeFloat = 0.15
+    align_ki_deg_per_mm_s: NonNegativeFloat = 0.2
     align_kd_mm_per_deg: NonNegativeFloat = 0.0
     align_max_mm_s: PositiveFloat = 10.0
     push_timeout_s: PositiveFloat = 120.0

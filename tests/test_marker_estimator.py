@@ -129,6 +129,11 @@ def test_images_that_show_no_lattice_are_told(trained: Path, name: str) -> None:
     }
     prediction = load_estimator(trained).predict(images[name])
     assert not prediction.in_range
+    assert prediction.markers is not None
+    assert prediction.markers < 0.9
+    whole = load_estimator(trained).predict(lit)
+    assert whole.markers is not None
+    assert whole.markers > 0.95
     assert np.isfinite(prediction.xi).all()
     assert np.isfinite(prediction.sigma).all()
     assert (prediction.sigma > 0.0).all()
