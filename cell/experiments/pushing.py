@@ -7,7 +7,7 @@ The paper names masses and not sizes. These follow from its masses at one densit
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,13 +25,8 @@ _TIP_MM = 20.0
 # How far an object stands from where it should: a person puts it there.
 _OFFSET_MM, _TURN_DEG = 3.0, 2.0
 
-LEARNED: Mapping[str, Any] = {
-    "kind": "network",
-    "model": "builtin:sim_gdn",
-    "gate": {"touch_percent": 4, "release_percent": 2.5},
-    "filter": {"drift_mm_per_sqrt_s": 1.5, "drift_deg_per_sqrt_s": 6},
-}
-ESTIMATORS: Mapping[str, Mapping[str, Any]] = {"learned": LEARNED, "true contact": {"kind": "true_contact"}}
+ESTIMATORS: Mapping[str, Mapping[str, Any] | None] = {"learned": None, "true contact": {"kind": "true_contact"}}
+"""Estimator sections by what rows call them; None for the cell file's own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +83,12 @@ def leader_changes(pushed: Pushed, surface: str, arm: str, height_mm: float) -> 
     }
 
 
+def estimator_changes(estimator: str, sensors: Iterable[str]) -> dict[str, Any]:
+    """Keys that give every sensor the estimator."""
+    section = ESTIMATORS[estimator]
+    return {} if section is None else {f"sensors.{sensor}.estimator": dict(section) for sensor in sensors}
+
+
 def object_changes(pushed: Pushed, pose_mm_deg: list[float]) -> dict[str, Any]:
     """Keys that put the object there."""
     section = {"shape": dict(pushed.shape), "mass_g": pushed.mass_g, "pose_mm_deg": pose_mm_deg}
@@ -97,12 +98,13 @@ def object_changes(pushed: Pushed, pose_mm_deg: list[float]) -> dict[str, Any]:
 def push_measures(run: RunFolder, sensor: str) -> dict[str, float]:
     """Where the object and the contact normal were to the target when the push ended, and how far the object leant.
 
-    ``error_mm`` is the paper's: the distance from the target to the true line of the contact normal, from above.
+    ``error_mm`` is the paper's: the distance from the target to the true line of the contact normal, from above. A push
+    that never arrived has none.
     """
     found = {"lean_max_deg": float(np.max(lean_deg(run)))}
     found["toppled"] = float(found["lean_max_deg"] > 45.0)
     end_s = pushed_until_s(run)
-    if end_s is None:
+    if end_s is None or not any(event.data.get("event") == "finished" for event in run.recording.events):
         return found
     point, direction = contact_normal(run, sensor, end_s)
     target = target_mm(run)

@@ -10,6 +10,7 @@ from cell.experiments.pushing import (
     ESTIMATORS,
     PRISMS,
     SURFACES,
+    estimator_changes,
     leader_changes,
     object_changes,
     push_measures,
@@ -27,13 +28,13 @@ _HEIGHT_MM = 30.0
 def trials(scale: Scale) -> list[Trial]:
     """Every prism on every surface with both estimators; each repetition starts a little elsewhere."""
     found = []
-    for estimator, section in ESTIMATORS.items():
+    for estimator in ESTIMATORS:
         for surface in SURFACES:
             for pushed in PRISMS:
                 row = f"{pushed.name}, {surface}, {estimator}"
                 for seed, pose in starts(scale.repetitions(5)):
                     changes = leader_changes(pushed, surface, "arm", _HEIGHT_MM) | object_changes(pushed, pose)
-                    changes |= {f"sensors.{SENSOR}.estimator": dict(section), "seed": seed}
+                    changes |= estimator_changes(estimator, [SENSOR]) | {"seed": seed}
                     found.append(Trial(f"{row.replace(', ', '_').replace(' ', '_')}_{seed}", row, CELL, changes))
     return found
 
