@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from cell.run_folder import Poses, RunFolder, object_poses, scene_time, sensor_poses, true_contacts
+from cell.trial_table import Column
 from geometry import se3
 from geometry.types import Array
 
@@ -27,6 +28,15 @@ _OFFSET_MM, _TURN_DEG = 3.0, 2.0
 
 ESTIMATORS: Mapping[str, Mapping[str, Any] | None] = {"learned": None, "true contact": {"kind": "true_contact"}}
 """Estimator sections by what rows call them; None for the cell file's own."""
+
+
+COLUMNS = (
+    Column("error_mm", "error mm", below=2.0),
+    Column("error_mm", "worst", "worst"),
+    Column("middle_mm", "middle to target mm"),
+    Column("lean_max_deg", "lean deg", "worst"),
+)
+ERROR_NOTE = "error: from the target to the true contact normal when the push ends, from above"
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +91,12 @@ def leader_changes(pushed: Pushed, surface: str, arm: str, height_mm: float) -> 
         f"arms.{arm}.start_pose_mm_deg": [x_mm, 0, height_mm, 180, 0, 0],
         "task.middle_mm": pushed.reach_mm + _TIP_MM,
     }
+
+
+def follower_changes(pushed: Pushed, height_mm: float) -> dict[str, Any]:
+    """Keys of a cell in which the follower stands on the other side, its base a metre away and turned round."""
+    start = [1000 - (pushed.reach_mm + _TIP_MM + _GAP_MM), 0, height_mm, 180, 0, 0]
+    return {"arms.follower.start_pose_mm_deg": start}
 
 
 def estimator_changes(estimator: str, sensors: Iterable[str]) -> dict[str, Any]:

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from cell.experiment import ExperimentSpec, Scale
-from cell.experiments.pushing import PRISMS, leader_changes, object_changes, push_measures, starts
+from cell.experiments.pushing import COLUMNS, ERROR_NOTE, PRISMS, leader_changes, object_changes, push_measures, starts
 from cell.run_folder import RunFolder
-from cell.trial_table import Column
 from cell.trials import Finished, Trial
 
 SENSOR = "sensor"
@@ -76,11 +75,7 @@ SPEC = ExperimentSpec(
     summary="single-arm pushing of the large square prism, with one thing after another made worse",
     trials=trials,
     measure=measure,
-    columns=(
-        Column("error_mm", "error mm", below=2.0),
-        Column("error_mm", "worst", "worst"),
-        Column("middle_mm", "middle to target mm"),
-        Column("lean_max_deg", "lean deg", "worst"),
-    ),
+    columns=COLUMNS,
     draw=draw,
+    notes=(ERROR_NOTE,),
 )

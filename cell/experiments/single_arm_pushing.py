@@ -7,6 +7,8 @@ from pathlib import Path
 
 from cell.experiment import ExperimentSpec, Scale
 from cell.experiments.pushing import (
+    COLUMNS,
+    ERROR_NOTE,
     ESTIMATORS,
     PRISMS,
     SURFACES,
@@ -17,7 +19,6 @@ from cell.experiments.pushing import (
     starts,
 )
 from cell.run_folder import RunFolder
-from cell.trial_table import Column
 from cell.trials import Finished, Trial
 
 SENSOR = "sensor"
@@ -54,23 +55,6 @@ def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
     ]
 
 
-def paper_figures(round_mm: str, other_mm: str) -> dict[str, str]:
-    """What the paper reports, by row."""
-    return {
-        f"{pushed.name}, {surface}, {estimator}": round_mm if pushed.name == "circular" else other_mm
-        for estimator in ESTIMATORS
-        for surface in SURFACES
-        for pushed in PRISMS
-    }
-
-
-COLUMNS = (
-    Column("error_mm", "error mm", below=2.0),
-    Column("error_mm", "worst", "worst"),
-    Column("middle_mm", "middle to target mm"),
-    Column("lean_max_deg", "lean deg", "worst"),
-)
-
 SPEC = ExperimentSpec(
     name="single_arm_pushing",
     summary="one arm pushes four prisms over two surfaces 300 mm to a target",
@@ -78,6 +62,11 @@ SPEC = ExperimentSpec(
     measure=measure,
     columns=COLUMNS,
     draw=draw,
-    paper=paper_figures("< 10 mm", "< 5 mm"),
-    notes=("error: from the target to the true contact normal when the push ends, from above",),
+    paper={
+        f"{pushed.name}, {surface}, {estimator}": "< 10 mm" if pushed.name == "circular" else "< 5 mm"
+        for pushed in PRISMS
+        for surface in SURFACES
+        for estimator in ESTIMATORS
+    },
+    notes=(ERROR_NOTE,),
 )
