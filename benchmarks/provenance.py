@@ -1,5 +1,16 @@
-"""Where benchmarks look for what ``cell.provenance`` tells."""
+"""Where benchmarks look for what ``cell.provenance`` tells, and the environment in which they start processes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
 
 from cell.provenance import provenance
 
-__all__ = ["provenance"]
+__all__ = ["as_installed", "provenance"]
+
+
+def as_installed(folder: Path) -> dict[str, str]:
+    """Environment of a process that finds its modules compiled, as an installed package's are, in ``folder``."""
+    inherited = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    return {**inherited, "PYTHONPYCACHEPREFIX": str(folder / "bytecode")}

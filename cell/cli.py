@@ -82,6 +82,7 @@ def _parser() -> argparse.ArgumentParser:
         help="Gaussian-density network, regression or marker estimator",
     )
     train.add_argument("--epochs", type=int)
+    train.add_argument("--networks", type=int, help="of a marker estimator, whose mixture it gives (default: 4)")
     train.add_argument("--seed", type=int, default=0)
     train.add_argument("--fresh", action="store_true", help="start again instead of resuming")
     train.set_defaults(run=_train)
@@ -89,9 +90,21 @@ def _parser() -> argparse.ArgumentParser:
     train_sim = commands.add_parser("train-sim", help="train the estimator that ships, on simulated images")
     train_sim.add_argument("--out", type=Path, required=True, help="model file to write (.safetensors)")
     train_sim.add_argument("--samples", type=int, default=12_000)
+    train_sim.add_argument("--kind", choices=("gdn", "cnn", "markers"), default="gdn")
+    train_sim.add_argument("--tip", help="tip file of a real sensor (calibrate-sim), or the name of one that ships")
+    train_sim.add_argument("--processed", action="store_true", help="for images as the public data have them")
     train_sim.add_argument("--epochs", type=int)
     train_sim.add_argument("--seed", type=int, default=0)
     train_sim.set_defaults(run=_train_sim)
+
+    calibrate_sim = commands.add_parser("calibrate-sim", help="make the simulated tip like a real one")
+    calibrate_sim.add_argument("--data", type=Path, required=True, help="data set folder with train/, better also val/")
+    calibrate_sim.add_argument("--out", type=Path, required=True, help="tip file to write (.yaml)")
+    calibrate_sim.add_argument("--frames", type=int, default=20, help="labelled images to fit to")
+    calibrate_sim.add_argument("--images", type=int, default=600, help="images that teach the matching, unlabelled")
+    calibrate_sim.add_argument("--rings", type=int, default=10, help="of the marker lattice")
+    calibrate_sim.add_argument("--seed", type=int, default=0)
+    calibrate_sim.set_defaults(run=_calibrate_sim)
 
     evaluate = commands.add_parser("evaluate", help="error, likelihood, calibration and latency on labelled images")
     evaluate.add_argument("--data", type=Path, required=True)
@@ -198,6 +211,7 @@ def _train(options: argparse.Namespace) -> int:
         options.out,
         kind=options.kind,
         epochs=options.epochs,
+        networks=options.networks,
         seed=options.seed,
         resume=not options.fresh,
     )
@@ -207,7 +221,29 @@ def _train(options: argparse.Namespace) -> int:
 def _train_sim(options: argparse.Namespace) -> int:
     from cell.train_sim import train_on_simulation
 
-    train_on_simulation(options.out, samples=options.samples, epochs=options.epochs, seed=options.seed)
+    train_on_simulation(
+        options.out,
+        samples=options.samples,
+        kind=options.kind,
+        tip=options.tip,
+        processed=options.processed,
+        epochs=options.epochs,
+        seed=options.seed,
+    )
+    return EXIT_OK
+
+
+def _calibrate_sim(options: argparse.Namespace) -> int:
+    from cell.calibrate_sim import calibrate_sim
+
+    calibrate_sim(
+        options.data,
+        options.out,
+        frames=options.frames,
+        images=options.images,
+        rings=options.rings,
+        seed=options.seed,
+    )
     return EXIT_OK
 
 

@@ -344,9 +344,13 @@ def _truth(name: str, mount: Device | None, scene: Scene | None, T_tcp_sensor: A
 
 
 def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Device) -> ContactPipeline:
+    import cv2
+
     from perception.contact_gate import ContactGate
     from perception.estimators import load_estimator
 
+    # A second thread gains nothing on images of this size (PERCEPTION part 5), and takes a core from other sensors.
+    cv2.setNumThreads(1)
     model = load_estimator(model_path(estimator.model))
     pose_filter = None if estimator.filter is None else build_filter(estimator.filter)
     contact_gate = None

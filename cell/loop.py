@@ -21,6 +21,7 @@ from cell.errors import RecordingError
 from cell.messages import command_message, contact_message, pose_message, tcp_message, verdict_message
 from cell.recording import Recorder
 from cell.stopping import Stopper, StopReport
+from cell.timing import CycleTimes
 from control.supervisor import Verdict
 from control.view import ArmView, CellView, SensorView
 from control.violation import Severity, Violation
@@ -54,17 +55,6 @@ class Progress:
     state: str
     contacts: Mapping[str, ContactEstimate]
     telemetry: Mapping[str, float]
-
-
-@dataclass(slots=True)
-class CycleTimes:
-    """Durations of the stages of every cycle, nanoseconds, for the latency budget."""
-
-    rows: dict[str, list[int]] = field(default_factory=dict)
-
-    def add(self, stage: str, duration_ns: int) -> None:
-        """Append one duration."""
-        self.rows.setdefault(stage, []).append(duration_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,9 +232,11 @@ class RunLoop:
 
     def _cycle(self) -> None:
         cell = self._cell
+        self._times.begin()
         started = time.perf_counter_ns()
         states = {role: arm.tcp() for role, arm in cell.arms.items()}
         contacts = {}
+        read = time.perf_counter_ns()
         for role, sensor in cell.sensors.items():
             if sensor.arm_role is not None:
                 state = states[sensor.arm_role]
@@ -278,15 +270,16 @@ class RunLoop:
         self._sent = sent
         self._keep(action.labels)
         done = time.perf_counter_ns()
-        self._count("sense", perceived - started)
-        self._count("task and control", thought - perceived)
-        self._count("supervisor", judged - thought)
-        self._count("gate and send", done - judged)
-        self._count("cycle", done - started)
         for sensor in cell.sensors.values():
             self._count_stages(sensor)
+        self._times.add("read arms", read - started)
+        self._times.add("sense", perceived - started)
+        self._times.add("task and control", thought - perceived)
+        self._times.add("supervisor", judged - thought)
+        self._times.add("gate and send", done - judged)
+        self._times.add("cycle", done - started)
         self._record(now_ns, states, contacts, action, sent, verdict)
-        self._count("record", time.perf_counter_ns() - done)
+        self._times.add("record", time.perf_counter_ns() - done)
         if self._on_cycle is not None:
             self._on_cycle(Progress((now_ns - cell.start_ns) * 1e-9, cell.task.state, contacts, action.telemetry))
 
@@ -346,9 +339,6 @@ class RunLoop:
         cell = self._cell
         return cell.arms[role].joints() if role in cell.watched_joints else None
 
-    def _count(self, stage: str, duration_ns: int) -> None:
-        self._times.add(stage, duration_ns)
-
     def _count_stages(self, sensor: Sensor) -> None:
         for stage, duration_ns in sensor.stage_times().items():
             if duration_ns:
@@ -382,6 +372,7 @@ class RunLoop:
         if verdict.violations or not verdict.allow:
             self._write("/safety", now_ns, verdict_message(verdict))
         self._write("/task", now_ns, {"state": cell.task.state, **action.telemetry})
+        self._write("/timing", now_ns, self._times.message())
         for record in cell.task.transitions[self._transitions_written :]:
             self._write(
                 "/events",

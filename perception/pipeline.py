@@ -148,7 +148,7 @@ class ContactPipeline:
         prediction = self._model.predict_reduced(reduced)
         infer_ns = self._timer() - start
         start = self._timer()
-        observed = gaussian.from_exponential(prediction.xi, np.diag(prediction.sigma**2))
+        observed = gaussian.from_exponential(prediction.xi, prediction.covariance)
         self.measurement = Measurement(frame.seq, frame.t_ns, observed)
         belief, nis = observed, None
         if self._filter is not None:
