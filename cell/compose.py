@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -120,7 +120,10 @@ class Cell:
         clock: its time.
         arms: by role in the task, and those that only carry a sensor by their own name.
         sensors: by role.
+        task: what the cell does.
+        new_task: makes it anew, in its first state, after a trip.
         stop_categories: by which each arm stops when something is wrong, by role.
+        holding: roles of arms that keep their power when another's fault stops them.
         watched_joints: roles of arms whose joint angles an interlock looks at.
         scene: what is simulated around the arms, None in a cell of real devices.
     """
@@ -132,7 +135,9 @@ class Cell:
     sensors: Mapping[str, Sensor]
     supervisor: Supervisor
     task: Task
+    new_task: Callable[[], Task]
     stop_categories: Mapping[str, StopCategory] = field(default_factory=dict)
+    holding: frozenset[str] = frozenset()
     watched_joints: frozenset[str] = frozenset()
     scene: Scene | None = None
     start_ns: int = 0
@@ -202,7 +207,10 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
     arms = {role: cast(Arm, devices[name]) for name, role in arm_of.items()}
     surroundings = build_surroundings(plan, arms, {role: name for name, role in arm_of.items()})
     supervisor = Supervisor(build_interlocks(plan.cell.interlocks, poses, surroundings), Latch())
-    task = plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses))
+
+    def new_task() -> Task:
+        return plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses))
+
     return Cell(
         plan=plan,
         clock=cell_clock,
@@ -210,8 +218,12 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
         cameras={name: devices[name] for name in plan.sensors},
         sensors=sensors,
         supervisor=supervisor,
-        task=task,
+        task=new_task(),
+        new_task=new_task,
         stop_categories={role: StopCategory(plan.cell.arms[name].stop_category) for name, role in arm_of.items()},
+        holding=frozenset(
+            arm_of[pair.follower] for pair in plan.cell.pairs if pair.on_stop == "hold" and pair.follower in arm_of
+        ),
         watched_joints=frozenset(role for role, body in surroundings.bodies.items() if body.link_count),
         scene=scene,
     )

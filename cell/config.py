@@ -178,8 +178,24 @@ class RecordingSection(_Section):
     frames: Literal["none", "jpeg", "png"] = "none"
 
 
+class PairSection(_Section):
+    """Two arms with something between them.
+
+    All arms of a cell stop together. With ``on_stop: hold`` the follower then keeps its power, and so what it holds,
+    whatever its ``stop_category`` says, unless it is itself what is wrong; with ``same`` it stops as that says.
+    """
+
+    leader: str
+    follower: str
+    on_stop: Literal["hold", "same"] = "hold"
+
+
 class CellFile(_Section):
-    """A whole cell file."""
+    """A whole cell file.
+
+    ``on_trip: end`` ends a run that has tripped; ``wait_for_reset`` keeps it up, with the arms stopped and watched,
+    until a person has reset it and lets the task start again.
+    """
 
     schema_: Literal[1] = Field(alias="schema")
     name: str
@@ -191,7 +207,9 @@ class CellFile(_Section):
     obstacles: dict[str, BoxSection] = {}
     arms: dict[str, ArmSection] = {}
     sensors: dict[str, SensorSection] = {}
+    pairs: tuple[PairSection, ...] = ()
     interlocks: InterlocksConfig = {}
+    on_trip: Literal["end", "wait_for_reset"] = "end"
     task: TaskSection
     recording: RecordingSection = RecordingSection()
 
@@ -278,6 +296,7 @@ class _Planner:
             self._require_abilities(task, arm_roles, arms)
             self._require_interlocks(cell, task)
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
+        self._require_pairs(cell)
         overshoots = self._require_margins(cell, arm_roles, sensor_roles, arms)
         if self._problems:
             raise InvalidCell(self._problems)
@@ -418,6 +437,19 @@ class _Planner:
                     value=role,
                     hint=suggest(role, sorted(roles)),
                 )
+
+    def _require_pairs(self, cell: CellFile) -> None:
+        for k, pair in enumerate(cell.pairs):
+            for key, name in (("leader", pair.leader), ("follower", pair.follower)):
+                if name not in cell.arms:
+                    self._add(
+                        ("pairs", str(k), key),
+                        f"there is no arm {name!r}",
+                        value=name,
+                        hint=suggest(name, sorted(cell.arms)),
+                    )
+            if pair.leader == pair.follower:
+                self._add(("pairs", str(k)), "one arm is no pair", value=pair.leader, hint="name two")
 
     def _require_margins(
         self,
