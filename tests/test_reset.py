@@ -172,16 +172,15 @@ def test_what_was_asked_before_the_trip_counts_for_nothing(tmp_path: Path) -> No
     assert run.end().outcome is Outcome.TRIPPED
 
 
-def test_an_arm_that_moves_while_it_waits_is_stopped_and_not_reset(tmp_path: Path) -> None:
+def test_an_arm_that_moves_while_it_waits_is_stopped_again_by_stronger_means(tmp_path: Path) -> None:
     run = tripped(tmp_path)
     run.fault(stale=False)
     run.go(2)
     run.fault(drift_m_s=0.005)
-    # As told to stand it sinks; stopped by its strongest category, it closes its brakes.
-    run.go(3)
-    assert "refused" in run.ask(Ask.RESET)
-    run.go(100)
+    # Told to stand it sinks; stopped by its strongest category it closes its brakes.
+    run.go(2)
     assert run.arm.state is Lifecycle.READY
+    assert [cause.interlock for cause in run.cell.supervisor.latch.causes] == ["stale_arm", "stop"]
     stood = run.pose()
     run.go(50)
     np.testing.assert_array_equal(run.pose(), stood)
