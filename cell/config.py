@@ -111,7 +111,17 @@ class TrueContact(_Section):
     kind: Literal["true_contact"]
 
 
-EstimatorSection = Annotated[NetworkEstimator | TrueContact, Field(discriminator="kind")]
+class KnownSurface(_Section):
+    """The contact from the arm's pose over a surface that stands where the file says, for collecting labels.
+
+    ``surface_mm_deg`` is where the sensor frame is, in the arm's base, when it just touches the surface, upright.
+    """
+
+    kind: Literal["known_surface"]
+    surface_mm_deg: Six
+
+
+EstimatorSection = Annotated[NetworkEstimator | TrueContact | KnownSurface, Field(discriminator="kind")]
 
 
 class CapsuleSection(_Section):
@@ -190,6 +200,15 @@ class PairSection(_Section):
     on_stop: Literal["hold", "same"] = "hold"
 
 
+class CollectSection(_Section):
+    """Where labelled frames go, and in which proportion to which split."""
+
+    data: Path
+    shares: dict[Literal["train", "val", "test"], Annotated[int, Field(ge=1)]] = Field(
+        default={"train": 3, "val": 1}, min_length=1
+    )
+
+
 class CellFile(_Section):
     """A whole cell file.
 
@@ -201,6 +220,7 @@ class CellFile(_Section):
     name: str
     time: Literal["simulated", "real"]
     rate_hz: Annotated[float, Field(gt=0, le=1000)]
+    processes: Literal["one", "separate"] = "one"
     seed: int = 0
     max_duration_s: PositiveFloat = 3600.0
     scene: dict[str, Any] | None = None
@@ -212,6 +232,7 @@ class CellFile(_Section):
     on_trip: Literal["end", "wait_for_reset"] = "end"
     task: TaskSection
     recording: RecordingSection = RecordingSection()
+    collect: CollectSection | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,6 +301,8 @@ class _Planner:
 
     def plan(self) -> CellPlan:
         file = self._file
+        if "data" in self._overrides and isinstance(collect := file.data.get("collect"), dict):
+            collect["data"] = self._overrides["data"]
         cell = file.validate(CellFile, file.data)
         self._require_scene_fits(cell)
         task, task_config = self._task(cell)
@@ -293,8 +316,10 @@ class _Planner:
         arms = {name: plan for name, plan in devices.items() if name in needed_arms}
         sensors = {name: plan for name, plan in devices.items() if name in needed_sensors}
         if task:
+            self._require_collection(cell, task)
             self._require_abilities(task, arm_roles, arms)
             self._require_interlocks(cell, task)
+            self._require_processes(cell, task, arm_roles)
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
         self._require_pairs(cell)
         overshoots = self._require_margins(cell, arm_roles, sensor_roles, arms)
@@ -427,6 +452,31 @@ class _Planner:
                 hint=f"add one: {INTERLOCKS[kind].summary}",
             )
 
+    def _require_processes(self, cell: CellFile, task: TaskSpec, arm_roles: Mapping[str, str]) -> None:
+        """What devices in other processes cannot do is not asked of them."""
+        if cell.processes == "one":
+            return
+        from drivers.process.groups import REMOTE_ABILITIES
+
+        if cell.time == "simulated":
+            self._add(
+                ("processes",), "several processes share real time only", value=cell.processes, hint="`time: real`"
+            )
+        for name, section in cell.sensors.items():
+            if section.estimator.kind == "true_contact":
+                self._add(
+                    ("sensors", name, "estimator"),
+                    "true_contact needs the scene in the task's own process",
+                    hint="use kind: network, or leave out `processes:`",
+                )
+        for role, abilities in task.arms.items():
+            if missing := abilities - REMOTE_ABILITIES:
+                self._add(
+                    ("processes",),
+                    f"{task.name} needs {', '.join(sorted(missing))} of {role!r}, which no other process passes on",
+                    hint="leave out `processes:`",
+                )
+
     def _require_guarded_arms(self, cell: CellFile, roles: set[str]) -> None:
         for name, entry in cell.interlocks.items():
             role = getattr(entry, "arm", None)
@@ -481,6 +531,12 @@ class _Planner:
                 )
         return found
 
+    def _require_collection(self, cell: CellFile, task: TaskSpec) -> None:
+        if task.labels_frames and cell.collect is None:
+            self._add(("collect",), f"{task.name} labels frames, and nothing says where they go", hint="add `collect:`")
+        if cell.collect is not None and not task.labels_frames:
+            self._add(("collect",), f"{task.name} labels no frames", hint="leave out `collect:`")
+
     def _require_clearance(
         self, cell: CellFile, name: str, entry: ClearanceConfig, arms: Mapping[str, DevicePlan]
     ) -> Overshoot:
@@ -488,10 +544,11 @@ class _Planner:
         ways = []
         for arm in arms.values():
             body = cell.arms[arm.name].body
-            if not body and "JointSource" not in arm.spec.capabilities.abilities:
+            tells_joints = "JointSource" in arm.spec.capabilities.abilities and cell.processes == "one"
+            if not (body or tells_joints):
                 self._add(
                     ("arms", arm.name, "body"),
-                    f"{arm.spec.name} tells only where its tool is; interlocks.{name} has to know its shape",
+                    f"{arm.spec.name} tells only where its tool is here; interlocks.{name} has to know its shape",
                     hint="name capsules: body: [{from_mm: [0, 0, 0], to_mm: [0, 0, -100], radius_mm: 40}]",
                 )
             ends = [end for part in body for end in (part.from_mm, part.to_mm) if end is not None]

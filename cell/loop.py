@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 
@@ -22,18 +22,20 @@ from cell.errors import RecordingError
 from cell.messages import command_message, contact_message, pose_message, tcp_message, verdict_message
 from cell.recording import Recorder
 from cell.stopping import Stopper, StopReport
+from cell.timing import CycleTimes
 from cell.waiting import Waiting
 from control.latch import ResetDone
 from control.supervisor import Verdict
 from control.view import ArmView, CellView, SensorView
 from control.violation import Severity, Violation
-from drivers.arm import Arm
+from drivers.abilities import ServoArm, TwistSink
 from drivers.commands import Sent, TwistCommand
 from drivers.errors import DeviceError
 from drivers.lease import Lease
 from drivers.samples import JointState, Stamped, TcpState
 from geometry import se3
 from geometry.errors import TouchcellError
+from geometry.types import Array
 from perception.estimate import ContactEstimate
 from tasks.interface import Action, Observation, TransitionRecord
 
@@ -58,17 +60,6 @@ class Progress:
     telemetry: Mapping[str, float]
     waiting: str = ""
     """What a person has to know while the run waits for a reset; empty while it goes on."""
-
-
-@dataclass(slots=True)
-class CycleTimes:
-    """Durations of the stages of every cycle, nanoseconds, for the latency budget."""
-
-    rows: dict[str, list[int]] = field(default_factory=dict)
-
-    def add(self, stage: str, duration_ns: int) -> None:
-        """Append one duration."""
-        self.rows.setdefault(stage, []).append(duration_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +145,7 @@ class RunLoop:
         self._on_cycle = on_cycle
         self._times = CycleTimes()
         self._transitions_written = 0
-        self._arms = {role: arm for role, arm in cell.arms.items() if isinstance(arm, Arm)}
+        self._arms = {role: cast(ServoArm, arm) for role, arm in cell.arms.items() if isinstance(arm, TwistSink)}
         self._stopper = Stopper(self._arms, cell.stop_categories, cell.clock, 1.0 / cell.rate_hz, cell.holding)
         self._leases: dict[str, Lease] = {}
         self._sent: Mapping[str, Sent[TwistCommand]] = {}
@@ -186,13 +177,16 @@ class RunLoop:
         return self._waiting is not None
 
     def begin(self) -> None:
-        """Take the arms' leases."""
-        self._start_ns = self._due_ns = self._cell.clock.now_ns()
+        """Wait for each camera's first frame, take the arms' leases, and be watched from now on."""
         try:
+            for sensor in self._cell.sensors.values():
+                sensor.await_frame()
             for role, arm in self._arms.items():
                 self._leases[role] = arm.acquire(self._cell.task_name)
+            self._cell.watch.begin()
         except TouchcellError as error:
             self._error = error
+        self._start_ns = self._due_ns = self._cell.clock.now_ns()
 
     def step(self) -> bool:
         """One cycle, and the wait for the next; returns whether there is to be one."""
@@ -218,6 +212,7 @@ class RunLoop:
             self._reason = "stopped at once by the operator"
             return False
         try:
+            cell.watch.beat()
             self._cycle()
         except DeviceError as error:
             if self._desk is None:
@@ -236,7 +231,7 @@ class RunLoop:
     def _distrust(self, error: DeviceError) -> None:
         """Latch what a device has raised: a run that waits gets over it like over any other fault."""
         cell = self._cell
-        roles = {arm.name: role for role, arm in self._arms.items()}
+        roles = {arm.name: role for role, arm in cell.arms.items()}
         now_ns, latch = cell.clock.now_ns(), cell.supervisor.latch
         fault = Violation("device", Severity.FAULT, roles.get(error.device, error.device), str(error), now_ns)
         is_new = (fault.interlock, fault.subject) not in {(cause.interlock, cause.subject) for cause in latch.causes}
@@ -250,7 +245,7 @@ class RunLoop:
     def _begin_waiting(self, desk: OperatorDesk) -> None:
         self._waited_from_ns = self._cell.clock.now_ns()
         stops = self._come_to_rest()
-        self._waiting = Waiting(self._cell, self._arms, self._leases, desk)
+        self._waiting = Waiting(self._cell, self._leases, desk)
         desk.open()
         self._due_ns = self._cell.clock.now_ns()
         self._event("waiting", "for a reset")
@@ -264,10 +259,11 @@ class RunLoop:
             self._reason = "ended by the operator after a trip"
             return False
         view = None
+        cell.watch.beat()
         try:
             states, contacts, now_ns = self._look()
             view = replace(self._view(now_ns, states, contacts, Action()), at_work=False)
-            cell.supervisor.review(view)
+            cell.supervisor.review(view, cell.watch.alarms(now_ns))
             if not all(arm.at_rest() for arm in self._arms.values()):
                 self._stop_arms(tripped=True)
                 self._come_to_rest()
@@ -303,8 +299,12 @@ class RunLoop:
         """Bring the arms to rest, give them back, and say how it went."""
         cell = self._cell
         self._ending = True
+        # Whoever looks on from outside may know better why a device does not answer.
+        if self._error is not None and (alarms := cell.watch.alarms(cell.clock.now_ns())):
+            cell.supervisor.latch.update(alarms)
         self._stop_arms(tripped=self._error is not None or cell.supervisor.latch.first_cause is not None)
         stops = self._come_to_rest()
+        cell.watch.end()
         if self._desk is not None:
             self._desk.close()
         for role, lease in self._leases.items():
@@ -360,7 +360,7 @@ class RunLoop:
         observation = Observation(now_ns, states, contacts, operator_stop=self._stop.count > 0, ended=ended)
         action = cell.task.tick(observation)
         thought = time.perf_counter_ns()
-        verdict = cell.supervisor.review(self._view(now_ns, states, contacts, action))
+        verdict = cell.supervisor.review(self._view(now_ns, states, contacts, action), cell.watch.alarms(now_ns))
         judged = time.perf_counter_ns()
         sent: dict[str, Sent[TwistCommand]] = {}
         if verdict.allow:
@@ -375,23 +375,27 @@ class RunLoop:
             if verdict.trip is not None:
                 cell.task.trip(now_ns, str(verdict.trip))
         self._sent = sent
+        self._keep(action.labels)
         done = time.perf_counter_ns()
-        self._count("sense", perceived - started)
-        self._count("task and control", thought - perceived)
-        self._count("supervisor", judged - thought)
-        self._count("gate and send", done - judged)
-        self._count("cycle", done - started)
         for sensor in cell.sensors.values():
             self._count_stages(sensor)
+        self._times.add("sense", perceived - started)
+        self._times.add("task and control", thought - perceived)
+        self._times.add("supervisor", judged - thought)
+        self._times.add("gate and send", done - judged)
+        self._times.add("cycle", done - started)
         self._record(now_ns, states, contacts, action, sent, verdict)
-        self._count("record", time.perf_counter_ns() - done)
+        self._times.add("record", time.perf_counter_ns() - done)
         if self._on_cycle is not None:
             self._on_cycle(Progress((now_ns - cell.start_ns) * 1e-9, cell.task.state, contacts, action.telemetry))
 
     def _look(self) -> tuple[dict[str, Stamped[TcpState]], dict[str, ContactEstimate], int]:
         """Read the arms and perceive; returns states, contacts and the time that they are for."""
         cell = self._cell
+        self._times.begin()
+        started = time.perf_counter_ns()
         states = {role: arm.tcp() for role, arm in cell.arms.items()}
+        self._times.add("read arms", time.perf_counter_ns() - started)
         contacts = {}
         for role, sensor in cell.sensors.items():
             if sensor.arm_role is not None:
@@ -405,6 +409,12 @@ class RunLoop:
         # Only now: what a device's own thread brought in the meantime would seem to come from the future.
         now_ns = cell.clock.now_ns()
         return states, contacts, now_ns
+
+    def _keep(self, labels: Mapping[str, Array]) -> None:
+        for role, T_f_s in labels.items():
+            frame = self._cell.sensors[role].frame
+            if self._cell.collection is not None and frame is not None:
+                self._cell.collection.keep(frame.value.image, T_f_s)
 
     def _stop_arms(self, *, tripped: bool) -> None:
         """Tell all arms to stop: as the cell file says when something is wrong, else holding where they are."""
@@ -422,6 +432,8 @@ class RunLoop:
         self._event("escalated", f"{role}: {reason}")
 
     def _record_state(self, role: str, state: Stamped[TcpState]) -> None:
+        # Arms on their way to rest are still guarded.
+        self._cell.watch.beat()
         try:
             message = tcp_message(state)
         except TouchcellError as error:
@@ -453,9 +465,6 @@ class RunLoop:
     def _joints(self, role: str) -> Stamped[JointState] | None:
         cell = self._cell
         return cell.arms[role].joints() if role in cell.watched_joints else None
-
-    def _count(self, stage: str, duration_ns: int) -> None:
-        self._times.add(stage, duration_ns)
 
     def _count_stages(self, sensor: Sensor) -> None:
         for stage, duration_ns in sensor.stage_times().items():
@@ -490,6 +499,7 @@ class RunLoop:
         if verdict.violations or not verdict.allow:
             self._write("/safety", now_ns, verdict_message(verdict))
         self._write("/task", now_ns, {"state": cell.task.state, **action.telemetry})
+        self._write("/timing", now_ns, self._times.message())
         for record in cell.task.transitions[self._transitions_written :]:
             self._write(
                 "/events",

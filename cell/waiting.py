@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from cell.compose import Cell
 from cell.desk import Ask, OperatorDesk, Request
 from control.latch import LatchState, ResetDone
 from control.view import CellView
-from drivers.arm import Arm
 from drivers.device import Device, Lifecycle, OperatorToken
 from drivers.errors import DeviceError
 from drivers.lease import Lease
@@ -19,17 +16,15 @@ class Waiting:
 
     Args:
         cell: whose latch is to be reset.
-        arms: that the task moves, by role.
-        leases: of the arms, renewed where a stop has voided them.
+        leases: of the arms that the task moves, by role, renewed where a stop has voided them.
         desk: where people ask.
 
     Attributes:
         resets: what has been cleared, and by whom.
     """
 
-    def __init__(self, cell: Cell, arms: Mapping[str, Arm], leases: dict[str, Lease], desk: OperatorDesk) -> None:
+    def __init__(self, cell: Cell, leases: dict[str, Lease], desk: OperatorDesk) -> None:
         self._cell = cell
-        self._arms = arms
         self._leases = leases
         self._desk = desk
         self.resets: list[ResetDone] = []
@@ -68,7 +63,7 @@ class Waiting:
             return False, f"refused: {error}"
         if view is None:
             return False, "refused: a device does not answer yet; if it has just been recovered, ask again"
-        outcome = self._cell.supervisor.reset(token, view)
+        outcome = self._cell.supervisor.reset(token, view, self._cell.watch.alarms(view.now_ns))
         if not isinstance(outcome, ResetDone):
             return False, f"refused: {outcome.reason.value}"
         self.resets.append(outcome)
@@ -81,12 +76,12 @@ class Waiting:
             for device in self._devices():
                 if device.state is Lifecycle.READY:
                     device.activate()
-            for role, arm in self._arms.items():
-                if arm.owner is None:
-                    self._leases[role] = arm.acquire(self._cell.task_name)
+            for role in self._leases:
+                if self._cell.arms[role].owner is None:
+                    self._leases[role] = self._cell.arms[role].acquire(self._cell.task_name)
         except DeviceError as error:
             return False, f"refused: {error}"
         return True, "the task starts again from its first state"
 
     def _devices(self) -> list[Device]:
-        return [*self._arms.values(), *self._cell.cameras.values()]
+        return [*self._cell.arms.values(), *self._cell.cameras.values()]

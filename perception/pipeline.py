@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -101,6 +102,11 @@ class ContactPipeline:
         """Whether the camera has come to its end."""
         return self._ended
 
+    def await_frame(self) -> None:
+        """Wait for the camera's first frame, which is processed by the next update. Raises DeviceError."""
+        with suppress(EndOfStream):
+            self._camera.latest()
+
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
         """Tell where the sensor was at ``t_ns``."""
         self._poses.record(t_ns, T_base_sensor)
@@ -142,7 +148,7 @@ class ContactPipeline:
         prediction = self._model.predict_reduced(reduced)
         infer_ns = self._timer() - start
         start = self._timer()
-        observed = gaussian.from_exponential(prediction.xi, np.diag(prediction.sigma**2))
+        observed = gaussian.from_exponential(prediction.xi, prediction.covariance)
         self.measurement = Measurement(frame.seq, frame.t_ns, observed)
         belief, nis = observed, None
         if self._filter is not None:

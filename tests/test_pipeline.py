@@ -37,7 +37,7 @@ class StubModel:
 
     def predict_reduced(self, reduced: ImageArray) -> Prediction:
         self.inferences += 1
-        return Prediction(XI, SIGMA, in_range=True, markers=0.75)
+        return Prediction(XI, np.diag(SIGMA**2), in_range=True, markers=0.75)
 
 
 class StubCamera:
