@@ -127,6 +127,14 @@ def _parser() -> argparse.ArgumentParser:
     stop.add_argument("--now", action="store_true", help="at once, without withdrawing first")
     stop.set_defaults(run=_stop)
 
+    for word, text in (
+        ("reset", "reset a run that has tripped and waits, once the cause has gone; nothing moves by it"),
+        ("resume", "let a run that has been reset start its task again"),
+    ):
+        asking = commands.add_parser(word, help=text)
+        asking.add_argument("folder", type=Path, nargs="?", help="run folder (default: the one run below runs/)")
+        asking.set_defaults(run=_ask, ask=word)
+
     bench = commands.add_parser("bench", help="run time against error")
     bench.add_argument("name", nargs="?", help="which; `touchcell list` names them")
     bench.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for tables and plots")
@@ -296,6 +304,21 @@ def _stop(options: argparse.Namespace) -> int:
     for folder, done in ended.items():
         print(f"{folder}: {'stopped' if done else 'asked, and still going on'}")
     return EXIT_OK if all(ended.values()) else EXIT_TASK_FAILED
+
+
+def _ask(options: argparse.Namespace) -> int:
+    import getpass
+
+    from cell.desk import Ask, ask_run, is_waiting
+    from cell.operator import NoSuchRun, running
+
+    folders = [options.folder] if options.folder else [run for run in running(Path("runs")) if is_waiting(run)]
+    if len(folders) != 1 or not is_waiting(folders[0]):
+        where = folders[0] if len(folders) == 1 else Path("runs")
+        raise NoSuchRun(where, "several runs wait: name one" if len(folders) > 1 else "no run waits for a reset here")
+    done, words = ask_run(folders[0], Ask(options.ask), getpass.getuser())
+    print(f"{folders[0]}: {words}")
+    return EXIT_OK if done else EXIT_TASK_FAILED
 
 
 def _bench(options: argparse.Namespace) -> int:
