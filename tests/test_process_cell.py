@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -28,25 +29,37 @@ from drivers.lease import Lease
 from drivers.process import selftest
 from drivers.process.selftest import SelfTestFailed
 
-RATE_HZ = 20.0
+RATE_HZ = 10.0
 """Slow, so that a machine that does other things besides is not taken for dead."""
 
 SHIPPED = Path(__file__).parent.parent / "configs" / "surface_follow_sim.yaml"
 
 
+def children() -> list[str]:
+    return Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
+
+
+def shared() -> list[str]:
+    """Descriptors of the kind that the chain opens."""
+    links = []
+    for fd in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):
+            links.append(os.readlink(f"/proc/self/fd/{fd}"))
+    return sorted(link for link in links if link.startswith(("/memfd:touchcell", "socket:", "anon_inode:[eventfd]")))
+
+
 @pytest.fixture(autouse=True)
 def nothing_is_left_behind() -> Iterator[None]:
-    segments, fds = set(os.listdir("/dev/shm")), len(os.listdir("/proc/self/fd"))
-    before = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
+    segments, blocks, before = set(os.listdir("/dev/shm")), shared(), children()
     yield
     assert set(os.listdir("/dev/shm")) <= segments
-    assert len(os.listdir("/proc/self/fd")) <= fds
-    assert Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split() == before
+    assert shared() == blocks
+    assert children() == before
 
 
 def separate_cell(tmp_path: Path, **changes: Any) -> Path:
-    data = yaml.safe_load(SHIPPED.read_text()) | {"time": "real", "processes": "separate", "rate_hz": 20} | changes
-    data["arms"]["arm"]["limits"]["tcp_speed_m_s"] = 0.05
+    data = yaml.safe_load(SHIPPED.read_text()) | {"time": "real", "processes": "separate", "rate_hz": RATE_HZ} | changes
+    data["arms"]["arm"]["limits"]["tcp_speed_m_s"] = 0.03
     path = tmp_path / "cell.yaml"
     path.write_text(yaml.safe_dump(data))
     return path
@@ -65,7 +78,8 @@ def test_a_remote_arm_is_as_an_arm_is(tmp_path: Path) -> None:
         assert isinstance(watch, ProcessWatch)
         assert [proof.link for proof in watch.proofs] == ["the task's heartbeat", "the watchdog"]
         for proof in watch.proofs:
-            assert watch.chain.silence_s < proof.time_s <= proof.declared_s
+            # The watchdog's last beat may have come a quarter of a period before it was stopped.
+            assert watch.chain.silence_s - 0.25 / RATE_HZ < proof.time_s <= proof.declared_s
         left, right = cell.arms["left"], cell.arms["right"]
         assert left.limits == local.limits
         assert left.stop_categories == local.stop_categories
@@ -125,7 +139,7 @@ def test_a_task_runs_on_pictures_from_another_process(tmp_path: Path, capsys: py
     assert main(["check", str(path)]) == 0
     told = capsys.readouterr().out
     assert "host 'scene': arm, sensor at 500 Hz" in told
-    assert "watchdog: stops all arms after 125 ms of silence" in told
+    assert "watchdog: stops all arms after 250 ms of silence" in told
     cell, stop = compose(plan_cell(path)), StopRequest()
     with cell:
         camera = cell.cameras["sensor"]
@@ -152,7 +166,7 @@ def test_activation_is_refused_when_the_chain_does_not_stop_in_time(
         pytest.fail("it was activated")
     assert caught.value.link == "the task's heartbeat"
     assert caught.value.measured_s is None
-    assert caught.value.declared_s < 0.1
+    assert caught.value.declared_s < 2.5 / RATE_HZ
 
 
 @pytest.mark.parametrize(
