@@ -147,7 +147,7 @@ class _Gate:
     def __init__(self) -> None:
         self._clock = VirtualClock()
         desk = LeaseDesk("arm")
-        self._gate = TwistGate("arm", TwistLimits(0.1, 10.0, 1.0, 100.0), desk, self._clock)
+        self._gate = TwistGate("arm", TwistLimits(0.1, 10.0, 1.0, 100.0, 1e4, 1e5), desk, self._clock)
         self._lease = desk.acquire("bench")
         self._T = np.eye(4)
 

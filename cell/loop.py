@@ -21,6 +21,7 @@ from cell.errors import RecordingError
 from cell.messages import command_message, contact_message, pose_message, tcp_message, verdict_message
 from cell.recording import Recorder
 from cell.stopping import Stopper, StopReport
+from cell.timing import CycleTimes
 from control.supervisor import Verdict
 from control.view import ArmView, CellView, SensorView
 from control.violation import Severity, Violation
@@ -28,9 +29,10 @@ from drivers.abilities import ServoArm, TwistSink
 from drivers.commands import Sent, TwistCommand
 from drivers.errors import DeviceError
 from drivers.lease import Lease
-from drivers.samples import Stamped, TcpState
+from drivers.samples import JointState, Stamped, TcpState
 from geometry import se3
 from geometry.errors import TouchcellError
+from geometry.types import Array
 from perception.estimate import ContactEstimate
 from tasks.interface import Action, Observation, TransitionRecord
 
@@ -53,17 +55,6 @@ class Progress:
     state: str
     contacts: Mapping[str, ContactEstimate]
     telemetry: Mapping[str, float]
-
-
-@dataclass(slots=True)
-class CycleTimes:
-    """Durations of the stages of every cycle, nanoseconds, for the latency budget."""
-
-    rows: dict[str, list[int]] = field(default_factory=dict)
-
-    def add(self, stage: str, duration_ns: int) -> None:
-        """Append one duration."""
-        self.rows.setdefault(stage, []).append(duration_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,14 +156,16 @@ class RunLoop:
         return result
 
     def begin(self) -> None:
-        """Take the arms' leases, and be watched from now on."""
-        self._start_ns = self._cell.clock.now_ns()
+        """Wait for each camera's first frame, take the arms' leases, and be watched from now on."""
         try:
+            for sensor in self._cell.sensors.values():
+                sensor.await_frame()
             for role, arm in self._arms.items():
                 self._leases[role] = arm.acquire(self._cell.task_name)
             self._cell.watch.begin()
         except TouchcellError as error:
             self._error = error
+        self._start_ns = self._cell.clock.now_ns()
 
     def step(self) -> bool:
         """One cycle, and the wait for the next; returns whether there is to be one."""
@@ -239,9 +232,11 @@ class RunLoop:
 
     def _cycle(self) -> None:
         cell = self._cell
+        self._times.begin()
         started = time.perf_counter_ns()
         states = {role: arm.tcp() for role, arm in cell.arms.items()}
         contacts = {}
+        read = time.perf_counter_ns()
         for role, sensor in cell.sensors.items():
             if sensor.arm_role is not None:
                 state = states[sensor.arm_role]
@@ -273,18 +268,26 @@ class RunLoop:
             if verdict.trip is not None:
                 cell.task.trip(now_ns, str(verdict.trip))
         self._sent = sent
+        self._keep(action.labels)
         done = time.perf_counter_ns()
-        self._count("sense", perceived - started)
-        self._count("task and control", thought - perceived)
-        self._count("supervisor", judged - thought)
-        self._count("gate and send", done - judged)
-        self._count("cycle", done - started)
         for sensor in cell.sensors.values():
             self._count_stages(sensor)
+        self._times.add("read arms", read - started)
+        self._times.add("sense", perceived - started)
+        self._times.add("task and control", thought - perceived)
+        self._times.add("supervisor", judged - thought)
+        self._times.add("gate and send", done - judged)
+        self._times.add("cycle", done - started)
         self._record(now_ns, states, contacts, action, sent, verdict)
-        self._count("record", time.perf_counter_ns() - done)
+        self._times.add("record", time.perf_counter_ns() - done)
         if self._on_cycle is not None:
             self._on_cycle(Progress((now_ns - cell.start_ns) * 1e-9, cell.task.state, contacts, action.telemetry))
+
+    def _keep(self, labels: Mapping[str, Array]) -> None:
+        for role, T_f_s in labels.items():
+            frame = self._cell.sensors[role].frame
+            if self._cell.collection is not None and frame is not None:
+                self._cell.collection.keep(frame.value.image, T_f_s)
 
     def _stop_arms(self, *, tripped: bool) -> None:
         """Tell all arms to stop: as the cell file says when something is wrong, else holding where they are."""
@@ -324,13 +327,17 @@ class RunLoop:
     ) -> CellView:
         return CellView(
             now_ns,
-            {role: ArmView(state, action.twists.get(role), self._sent.get(role)) for role, state in states.items()},
+            {
+                role: ArmView(state, action.twists.get(role), self._sent.get(role), self._joints(role))
+                for role, state in states.items()
+            },
             {role: _sensor_view(estimate, self._cell.sensors[role]) for role, estimate in contacts.items()},
             self._cell.task.state,
         )
 
-    def _count(self, stage: str, duration_ns: int) -> None:
-        self._times.add(stage, duration_ns)
+    def _joints(self, role: str) -> Stamped[JointState] | None:
+        cell = self._cell
+        return cell.arms[role].joints() if role in cell.watched_joints else None
 
     def _count_stages(self, sensor: Sensor) -> None:
         for stage, duration_ns in sensor.stage_times().items():
@@ -365,6 +372,7 @@ class RunLoop:
         if verdict.violations or not verdict.allow:
             self._write("/safety", now_ns, verdict_message(verdict))
         self._write("/task", now_ns, {"state": cell.task.state, **action.telemetry})
+        self._write("/timing", now_ns, self._times.message())
         for record in cell.task.transitions[self._transitions_written :]:
             self._write(
                 "/events",
@@ -411,6 +419,9 @@ def _sensor_view(estimate: ContactEstimate, sensor: Sensor) -> SensorView:
         torsion_rad,
         content,
         brightness,
+        None if estimate.belief is None else estimate.belief.mean,
+        estimate.markers,
+        sensor.arm_role,
     )
 
 

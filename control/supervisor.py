@@ -122,7 +122,7 @@ class Supervisor:
 
     def _escalated(self, found: Sequence[Violation], now_ns: int) -> tuple[Violation, ...]:
         """``found``, with a trip in place of each limit that has lasted for too long."""
-        limiting = {(v.interlock, v.subject) for v in found if v.severity is Severity.LIMIT}
+        limiting = {(v.interlock, v.subject) for v in found if v.severity is Severity.LIMIT and not v.may_last}
         self._limited_since_ns = {key: self._limited_since_ns.get(key, now_ns) for key in limiting}
         lasting = {key for key, since_ns in self._limited_since_ns.items() if now_ns - since_ns > LIMIT_FOR_NS}
         return tuple(

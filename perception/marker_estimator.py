@@ -92,11 +92,14 @@ class MarkerEstimator:
         field = self._matcher.match(detect_markers(reduced, self._size), self.field)
         self.field = field
         if not field.seen.any():
-            return Prediction(self._centre.copy(), self._half_range.copy(), in_range=False)
+            return Prediction(self._centre.copy(), np.diag(self._half_range**2), in_range=False, markers=0.0)
         mean, sigma = self._infer(field.displacements)
         in_range = field.valid and bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
         return Prediction(
-            xi=self._centre + self._half_range * mean, sigma=self._sigma_scale * sigma**self._power, in_range=in_range
+            xi=self._centre + self._half_range * mean,
+            covariance=np.diag((self._sigma_scale * sigma**self._power) ** 2),
+            in_range=in_range,
+            markers=field.score,
         )
 
     def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:

@@ -242,6 +242,6 @@ def test_physics_asks_for_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setitem(sys.modules, "mujoco", None)
     for name in ("drivers.simulation.dynamics", "drivers.simulation.dynamics_model"):
         monkeypatch.delitem(sys.modules, name, raising=False)
-    with pytest.raises(ConfigError, match="mujoco, which is not installed") as error:
+    with pytest.raises(ConfigError, match="needs mujoco, which is not installed") as error:
         SceneConfig.model_validate({"physics": "dynamic", **FLOOR}).build(VirtualClock())
     assert "touchcell[physics]" in str(error.value)
