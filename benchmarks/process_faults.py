@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks.two_arms import PERIOD_S, SPEED_M_S
-from cell.processes import NOTES
+from cell.watch import NOTES
 from drivers.arm import LimitsConfig
 from drivers.process.layouts import ARM, RecordReader
 from drivers.process.watchdog import silence_s

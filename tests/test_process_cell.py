@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import subprocess
 import sys
@@ -21,6 +22,8 @@ from cell.compose import Cell, compose
 from cell.config import plan_cell
 from cell.loop import Outcome, RunLoop, StopRequest
 from cell.processes import ProcessWatch, hosted_groups
+from cell.watch import NOTES
+from cell.why import explain
 from cell.yaml_file import InvalidCell
 from drivers.commands import TwistCommand, TwistFrame
 from drivers.device import Lifecycle
@@ -228,3 +231,13 @@ def test_a_cell_in_one_process_starts_none(tmp_path: Path) -> None:
     script = "import sys, cell.compose, cell.run; print([m for m in sys.modules if m.startswith('drivers.process')])"
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
+
+
+def test_why_tells_what_the_watchdog_saw_of_a_run_whose_process_died(tmp_path: Path) -> None:
+    stop = {"speed_m_s": 0.03, "time_s": 0.058, "distance_m": 0.001, "escalated": False}
+    note = {"words": "the task's process has gone", "value_s": 0.0, "limit_s": 0.0, "arms": {"left": stop}}
+    (tmp_path / NOTES).write_text(json.dumps(note))
+    assert explain(tmp_path).splitlines()[1:] == [
+        "  the task's process has gone",
+        "  left: told to stop at 30.0 mm/s; at rest after 0.058 s and 1.00 mm",
+    ]

@@ -16,7 +16,6 @@ from drivers.simulation.timeline import Restore
 from geometry import se3
 from geometry.types import Array
 
-
 _IDENTITY = np.eye(4)
 
 
