@@ -82,6 +82,7 @@ def _parser() -> argparse.ArgumentParser:
         help="Gaussian-density network, regression or marker estimator",
     )
     train.add_argument("--epochs", type=int)
+    train.add_argument("--networks", type=int, help="of a marker estimator, whose mixture it gives (default: 4)")
     train.add_argument("--seed", type=int, default=0)
     train.add_argument("--fresh", action="store_true", help="start again instead of resuming")
     train.set_defaults(run=_train)
@@ -210,6 +211,7 @@ def _train(options: argparse.Namespace) -> int:
         options.out,
         kind=options.kind,
         epochs=options.epochs,
+        networks=options.networks,
         seed=options.seed,
         resume=not options.fresh,
     )

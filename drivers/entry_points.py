@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from functools import cache
-from importlib.metadata import EntryPoint, EntryPoints, entry_points
-from typing import TypeVar
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, TypeVar
 
 from drivers.errors import ConfigError, suggest
 
@@ -17,8 +17,9 @@ def installed(group: str) -> dict[str, EntryPoint]:
 
 
 @cache
-def _everywhere() -> EntryPoints:
-    # Reading what every installed package declares takes 15 ms, and does not change while a process runs.
+def _everywhere() -> Any:
+    # Reading what every installed package declares takes 15 ms, and does not change while a process runs. Python 3.11
+    # and 3.12 differ in the type; both have `select`.
     return entry_points()
 
 

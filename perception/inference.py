@@ -82,9 +82,6 @@ class ContactModel:
         self.header: Header = model.header
         self.reference: ImageArray | None = model.reference
         self._preprocessing = model.header.preprocessing
-        self._centre = model.header.labels.centre
-        self._half_range = model.header.labels.half_range
-        self._sigma_scale = np.array(model.header.sigma_scale) * self._half_range
 
     @classmethod
     def load(cls, path: Path) -> ContactModel:
@@ -125,11 +122,6 @@ class ContactModel:
 
     def _decode(self, output: NDArray[np.float32]) -> Prediction:
         mean = output[:6].astype(np.float64)
-        sigma = (
-            self._sigma_scale * np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else self._sigma_scale.copy()
-        )
-        return Prediction(
-            xi=self._centre + self._half_range * mean,
-            covariance=np.diag(sigma**2),
-            in_range=bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE)),
-        )
+        sigma = np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else np.ones(6)
+        xi, covariance = self.header.labels.xi_gaussian(mean, self.header.calibrated(sigma))
+        return Prediction(xi, covariance, in_range=bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE)))
