@@ -186,7 +186,7 @@ def test_both_arms_stand_in_time_whatever_dies(tmp_path: Path, name: str, told_b
     fault = next(fault for fault in FAULTS if fault.name == name)
     case = run_fault(tmp_path, fault, RATE_HZ)
     assert list(case.problems) == []
-    assert len(case.arms) == (1 if fault.who == "left" else 2)
+    assert len(case.arms) == (1 if fault.who == "host" else 2)
     assert case.notes.get("reason") == told_by
     if fault.name != "task killed":
         assert case.outcome["outcome"] == "tripped"
