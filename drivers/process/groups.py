@@ -14,8 +14,6 @@ FASTEST_HZ: Final = 500.0
 REMOTE_ABILITIES: Final = frozenset(
     {"TcpSource", "TwistSink", "Stoppable", "JointSource", "FrameSource", "HealthSource"}
 )
-    {"TcpSource", "TwistSink", "Stoppable", "JointSource", "FrameSource", "HealthSource"}
-)
 """What devices can do for a task in another process."""
 
 
