@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from importlib.metadata import EntryPoint, distributions
 from typing import TypeVar
 
 from drivers.errors import ConfigError, suggest
@@ -13,13 +13,18 @@ S = TypeVar("S")
 
 def installed(group: str) -> dict[str, EntryPoint]:
     """Entry points of ``group`` by name; nothing is imported."""
-    return {point.name: point for point in _everywhere().select(group=group)}
+    return dict(_everywhere().get(group, {}))
 
 
 @cache
-def _everywhere() -> EntryPoints:
+def _everywhere() -> dict[str, dict[str, EntryPoint]]:
     # Reading what every installed package declares takes 15 ms, and does not change while a process runs.
-    return entry_points()
+    groups: dict[str, dict[str, EntryPoint]] = {}
+    for distribution in distributions():
+        for point in distribution.entry_points:
+            # The first on the path is the one that an import would find.
+            groups.setdefault(point.group, {}).setdefault(point.name, point)
+    return groups
 
 
 def load(group: str, word: str, name: str, kind: type[S]) -> S:
