@@ -104,6 +104,11 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("folder", type=Path)
     report.set_defaults(run=_report)
 
+    view = commands.add_parser("view", help="show in a browser what a run's sensors feel, live or from its recording")
+    view.add_argument("folder", type=Path, help="run folder")
+    view.add_argument("--port", type=int, default=8177, help="of the page on this machine")
+    view.set_defaults(run=_view)
+
     why = commands.add_parser("why", help="explain why a run tripped, from its black box")
     why.add_argument("folder", type=Path)
     why.set_defaults(run=_why)
@@ -220,6 +225,13 @@ def _report(options: argparse.Namespace) -> int:
     from cell.report import write_report
 
     print(write_report(options.folder))
+    return EXIT_OK
+
+
+def _view(options: argparse.Namespace) -> int:
+    from cell.view import view_run
+
+    view_run(options.folder, options.port)
     return EXIT_OK
 
 

@@ -157,6 +157,9 @@ class RunLoop:
     def begin(self) -> None:
         """Take the arms' leases."""
         self._start_ns = self._cell.clock.now_ns()
+        for role, sensor in self._cell.sensors.items():
+            if (about := sensor.about()) is not None:
+                self._write(f"/sensors/{role}/preprocessing", self._start_ns, about)
         try:
             for role, arm in self._arms.items():
                 self._leases[role] = arm.acquire(self._cell.task_name)

@@ -19,7 +19,7 @@ from cell.config import CellPlan, plan_cell
 from cell.errors import RecordingError
 from cell.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
 from cell.operator import reachable, stop_on_keys, stop_on_signals
-from cell.recording import Recorder
+from cell.recording import RECORDING, Recorder
 from cell.report import write_report
 
 _EXIT = {
@@ -74,7 +74,7 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
     box = BlackBox()
     with (
         reachable(folder),
-        Recorder(folder / "run.mcap") as recorder,
+        Recorder(folder / RECORDING) as recorder,
         cell,
         stop_on_signals(stop),
         stop_on_keys(stop) as look_at_keys,

@@ -24,6 +24,7 @@ from perception.estimate import ContactEstimate
 from perception.estimators import ContactEstimator
 from perception.filter import ContactFilter
 from perception.motion import PoseHistory
+from perception.preprocessing import Preprocessing
 
 Timer = Callable[[], int]
 
@@ -100,6 +101,11 @@ class ContactPipeline:
     def ended(self) -> bool:
         """Whether the camera has come to its end."""
         return self._ended
+
+    @property
+    def preprocessing(self) -> Preprocessing:
+        """Of the model, from camera images."""
+        return self._model.header.preprocessing
 
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
         """Tell where the sensor was at ``t_ns``."""
