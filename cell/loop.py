@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 
@@ -25,13 +25,14 @@ from cell.timing import CycleTimes
 from control.supervisor import Verdict
 from control.view import ArmView, CellView, SensorView
 from control.violation import Severity, Violation
-from drivers.arm import Arm
+from drivers.abilities import ServoArm, TwistSink
 from drivers.commands import Sent, TwistCommand
 from drivers.errors import DeviceError
 from drivers.lease import Lease
-from drivers.samples import Stamped, TcpState
+from drivers.samples import JointState, Stamped, TcpState
 from geometry import se3
 from geometry.errors import TouchcellError
+from geometry.types import Array
 from perception.estimate import ContactEstimate
 from tasks.interface import Action, Observation, TransitionRecord
 
@@ -133,7 +134,7 @@ class RunLoop:
         self._on_cycle = on_cycle
         self._times = CycleTimes()
         self._transitions_written = 0
-        self._arms = {role: arm for role, arm in cell.arms.items() if isinstance(arm, Arm)}
+        self._arms = {role: cast(ServoArm, arm) for role, arm in cell.arms.items() if isinstance(arm, TwistSink)}
         self._stopper = Stopper(self._arms, cell.stop_categories, cell.clock, 1.0 / cell.rate_hz)
         self._leases: dict[str, Lease] = {}
         self._sent: Mapping[str, Sent[TwistCommand]] = {}
@@ -155,16 +156,18 @@ class RunLoop:
         return result
 
     def begin(self) -> None:
-        """Take the arms' leases."""
-        self._start_ns = self._cell.clock.now_ns()
-        for role, sensor in self._cell.sensors.items():
-            if (about := sensor.about()) is not None:
-                self._write(f"/sensors/{role}/preprocessing", self._start_ns, about)
+        """Wait for each camera's first frame, take the arms' leases, and be watched from now on."""
         try:
+            for role, sensor in self._cell.sensors.items():
+                sensor.await_frame()
+                if (about := sensor.about()) is not None:
+                    self._write(f"/sensors/{role}/preprocessing", self._cell.clock.now_ns(), about)
             for role, arm in self._arms.items():
                 self._leases[role] = arm.acquire(self._cell.task_name)
+            self._cell.watch.begin()
         except TouchcellError as error:
             self._error = error
+        self._start_ns = self._cell.clock.now_ns()
 
     def step(self) -> bool:
         """One cycle, and the wait for the next; returns whether there is to be one."""
@@ -179,7 +182,8 @@ class RunLoop:
             self._reason = "stopped at once by the operator"
             return False
         try:
-            self._cycle(now_ns)
+            cell.watch.beat()
+            self._cycle()
         except TouchcellError as error:
             self._error = error
             return False
@@ -191,11 +195,15 @@ class RunLoop:
         """Bring the arms to rest, give them back, and say how it went."""
         cell = self._cell
         self._ending = True
+        # Whoever looks on from outside may know better why a device does not answer.
+        if self._error is not None and (alarms := cell.watch.alarms(cell.clock.now_ns())):
+            cell.supervisor.latch.update(alarms)
         self._stop_arms(tripped=self._error is not None or cell.supervisor.latch.first_cause is not None)
         stops = self._stopper.watch(self._record_state, self._escalated)
         for role, report in stops.items():
             if report.problem:
                 self._event("stop failed", f"{role}: {report.problem}")
+        cell.watch.end()
         for role, lease in self._leases.items():
             # What an arm that is gone says to it has been told already.
             with suppress(DeviceError):
@@ -224,7 +232,7 @@ class RunLoop:
             stops,
         )
 
-    def _cycle(self, now_ns: int) -> None:
+    def _cycle(self) -> None:
         cell = self._cell
         self._times.begin()
         started = time.perf_counter_ns()
@@ -238,14 +246,16 @@ class RunLoop:
                 if np.isfinite(state.value.T_base_tcp).all():
                     T_base_sensor = se3.compose(state.value.T_base_tcp, sensor.T_tcp_sensor)
                     sensor.source.record_pose(state.t_ns, T_base_sensor)
-            if (estimate := sensor.source.update(now_ns)) is not None:
+            if (estimate := sensor.source.update(cell.clock.now_ns())) is not None:
                 contacts[role] = estimate
+        # Only now: what a device's own thread brought in the meantime would seem to come from the future.
+        now_ns = cell.clock.now_ns()
         perceived = time.perf_counter_ns()
         ended = bool(cell.sensors) and all(sensor.source.ended for sensor in cell.sensors.values())
         observation = Observation(now_ns, states, contacts, operator_stop=self._stop.count > 0, ended=ended)
         action = cell.task.tick(observation)
         thought = time.perf_counter_ns()
-        verdict = cell.supervisor.review(self._view(now_ns, states, contacts, action))
+        verdict = cell.supervisor.review(self._view(now_ns, states, contacts, action), cell.watch.alarms(now_ns))
         judged = time.perf_counter_ns()
         sent: dict[str, Sent[TwistCommand]] = {}
         if verdict.allow:
@@ -260,6 +270,7 @@ class RunLoop:
             if verdict.trip is not None:
                 cell.task.trip(now_ns, str(verdict.trip))
         self._sent = sent
+        self._keep(action.labels)
         done = time.perf_counter_ns()
         for sensor in cell.sensors.values():
             self._count_stages(sensor)
@@ -273,6 +284,12 @@ class RunLoop:
         self._times.add("record", time.perf_counter_ns() - done)
         if self._on_cycle is not None:
             self._on_cycle(Progress((now_ns - cell.start_ns) * 1e-9, cell.task.state, contacts, action.telemetry))
+
+    def _keep(self, labels: Mapping[str, Array]) -> None:
+        for role, T_f_s in labels.items():
+            frame = self._cell.sensors[role].frame
+            if self._cell.collection is not None and frame is not None:
+                self._cell.collection.keep(frame.value.image, T_f_s)
 
     def _stop_arms(self, *, tripped: bool) -> None:
         """Tell all arms to stop: as the cell file says when something is wrong, else holding where they are."""
@@ -290,6 +307,8 @@ class RunLoop:
         self._event("escalated", f"{role}: {reason}")
 
     def _record_state(self, role: str, state: Stamped[TcpState]) -> None:
+        # Arms on their way to rest are still guarded.
+        self._cell.watch.beat()
         try:
             message = tcp_message(state)
         except TouchcellError as error:
@@ -310,10 +329,17 @@ class RunLoop:
     ) -> CellView:
         return CellView(
             now_ns,
-            {role: ArmView(state, action.twists.get(role), self._sent.get(role)) for role, state in states.items()},
+            {
+                role: ArmView(state, action.twists.get(role), self._sent.get(role), self._joints(role))
+                for role, state in states.items()
+            },
             {role: _sensor_view(estimate, self._cell.sensors[role]) for role, estimate in contacts.items()},
             self._cell.task.state,
         )
+
+    def _joints(self, role: str) -> Stamped[JointState] | None:
+        cell = self._cell
+        return cell.arms[role].joints() if role in cell.watched_joints else None
 
     def _count_stages(self, sensor: Sensor) -> None:
         for stage, duration_ns in sensor.stage_times().items():
@@ -395,6 +421,9 @@ def _sensor_view(estimate: ContactEstimate, sensor: Sensor) -> SensorView:
         torsion_rad,
         content,
         brightness,
+        None if estimate.belief is None else estimate.belief.mean,
+        estimate.markers,
+        sensor.arm_role,
     )
 
 

@@ -80,6 +80,9 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
         stop_on_keys(stop) as look_at_keys,
         _live_line(cell.plan, live) as show,
     ):
+        cell.watch.note_to(folder)
+        if live:
+            print("\n".join(cell.watch.words()))
 
         def after_cycle(progress: Progress) -> None:
             look_at_keys()

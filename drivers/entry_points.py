@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from functools import cache
-from importlib.metadata import EntryPoint, distributions
-from typing import TypeVar
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, TypeVar
 
 from drivers.errors import ConfigError, suggest
 
@@ -13,18 +13,14 @@ S = TypeVar("S")
 
 def installed(group: str) -> dict[str, EntryPoint]:
     """Entry points of ``group`` by name; nothing is imported."""
-    return dict(_everywhere().get(group, {}))
+    return {point.name: point for point in _everywhere().select(group=group)}
 
 
 @cache
-def _everywhere() -> dict[str, dict[str, EntryPoint]]:
-    # Reading what every installed package declares takes 15 ms, and does not change while a process runs.
-    groups: dict[str, dict[str, EntryPoint]] = {}
-    for distribution in distributions():
-        for point in distribution.entry_points:
-            # The first on the path is the one that an import would find.
-            groups.setdefault(point.group, {}).setdefault(point.name, point)
-    return groups
+def _everywhere() -> Any:
+    # Reading what every installed package declares takes 15 ms, and does not change while a process runs. Python 3.11
+    # and 3.12 differ in the type; both have `select`.
+    return entry_points()
 
 
 def load(group: str, word: str, name: str, kind: type[S]) -> S:

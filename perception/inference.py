@@ -31,11 +31,13 @@ class Prediction:
         covariance: (6, 6) of xi, m and rad.
         in_range: the mean lies in the range of labels that the model was taught. Outside it, and out of contact, a
             prediction means little.
+        markers: share of the markers expected in view that were seen, where the model looks for markers.
     """
 
     xi: Array
     covariance: Array
     in_range: bool
+    markers: float | None = None
 
     @property
     def sigma(self) -> Array:
@@ -82,9 +84,6 @@ class ContactModel:
         self.header: Header = model.header
         self.reference: ImageArray | None = model.reference
         self._preprocessing = model.header.preprocessing
-        self._centre = model.header.labels.centre
-        self._half_range = model.header.labels.half_range
-        self._sigma_scale = np.array(model.header.sigma_scale) * self._half_range
 
     @classmethod
     def load(cls, path: Path) -> ContactModel:
@@ -125,11 +124,6 @@ class ContactModel:
 
     def _decode(self, output: NDArray[np.float32]) -> Prediction:
         mean = output[:6].astype(np.float64)
-        sigma = (
-            self._sigma_scale * np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else self._sigma_scale.copy()
-        )
-        return Prediction(
-            xi=self._centre + self._half_range * mean,
-            covariance=np.diag(sigma**2),
-            in_range=bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE)),
-        )
+        sigma = np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else np.ones(6)
+        xi, covariance = self.header.labels.xi_gaussian(mean, self.header.calibrated(sigma))
+        return Prediction(xi, covariance, in_range=bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE)))

@@ -13,10 +13,12 @@ _BESIDE_EMULATORS = (
     "test_cell_devices",
     "test_conformance",
     "test_damiao",
+    "test_emulated_matrix",
     "test_emulator_process",
     "test_feetech",
     "test_franka",
     "test_opencv_camera",
+    "test_process_cell",
     "test_ur",
     "test_v4l2",
 )

@@ -193,6 +193,21 @@ def test_senseless_configuration_is_refused(changes: dict[str, object]) -> None:
         SimTactipConfig.model_validate({"mounted_on": "arm", **changes})
 
 
+def test_a_snapshot_takes_arm_contact_and_picture_back() -> None:
+    cell = Cell()
+    cell.move(0.02, 0.2)
+    restore, pose = cell.scene.snapshot(), cell.arm.T_world_tcp()
+    cell.move(0.02, 0.2)
+    deep = cell.tip.latest().value.image
+    arrived = cell.arm.T_world_tcp()
+    restore()
+    np.testing.assert_array_equal(cell.arm.T_world_tcp(), pose)
+    assert np.abs(cell.tip.latest().value.image.astype(int) - deep.astype(int)).max() > 100
+    cell.move(0.02, 0.2)
+    cell.scene.timeline.advance()
+    np.testing.assert_allclose(cell.arm.T_world_tcp(), arrived, atol=1e-12)
+
+
 DOWN = se3.from_euler_mm_deg([400, 0, 0, 180, 0, 0])
 
 

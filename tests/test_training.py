@@ -19,6 +19,7 @@ from perception.architecture import Architecture  # noqa: E402
 from perception.checkpoint import EpochRecord, checkpoint_path  # noqa: E402
 from perception.dataset import LabelledImages  # noqa: E402
 from perception.errors import ModelError, TrainingError  # noqa: E402
+from perception.labels import contact_from_xi  # noqa: E402
 from perception.model_file import Model, load_model  # noqa: E402
 from perception.training import Settings, learning_rate, train, train_on_arrays  # noqa: E402
 from perception.training_display import Display  # noqa: E402
@@ -81,7 +82,8 @@ def test_learns_and_writes_model_and_figures(
     header = load_model(out).header
     assert header == model.header
     assert header.training["images"] == 240
-    np.testing.assert_allclose(header.labels.low, sets[0].xi.min(axis=0))
+    np.testing.assert_allclose(header.labels.low, contact_from_xi(sets[0].xi).min(axis=0))
+    assert header.labels.are_contacts
     np.testing.assert_array_equal(load_model(out).reference, reference)
     assert sorted(path.name for path in out.parent.iterdir()) == [
         "model.safetensors",

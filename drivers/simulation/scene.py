@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -16,8 +17,9 @@ from drivers.samples import Stamped
 from drivers.simulation.contact import ContactLaw, ContactState
 from drivers.simulation.motions import Glide, Motion, Periodic, Still
 from drivers.simulation.objects import ObjectConfig, PoseMmDeg, TableConfig
+from drivers.simulation.quasi_static import QuasiStaticWorld
 from drivers.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
-from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Timeline
+from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeline
 from drivers.simulation.world import KinematicWorld, World
 from geometry import se3
 from geometry.errors import TouchcellError
@@ -47,6 +49,15 @@ class Carrier(Protocol):
 
     def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
         """(4, 4) at the present step of the simulation; must not advance time."""
+        ...
+
+
+@runtime_checkable
+class LoadBearer(Protocol):
+    """A simulated arm that gives way to what its sensors touch."""
+
+    def bear(self, force_world: Array, point_world: Array) -> None:
+        """From now on feel ``force_world`` (3,) N at ``point_world`` (3,) m."""
         ...
 
 
@@ -97,18 +108,30 @@ class Scene:
         self.timeline = Timeline(clock, step_s)
         self._start_ns = self.timeline.t_ns
         self._poses: dict[str, Callable[[], Array]] = {}
-        self._felt: dict[str, deque[Stamped[ContactState]]] = {}
+        self._bearers: dict[str, Callable[[Array, Array], None]] = {}
+        # The last one is of the timeline's present step, the one before it of the step before.
+        self._felt: dict[str, deque[ContactState]] = {}
         self._kept = round(HISTORY_S * 1e9 / self.timeline.step_ns)
         self.timeline.add(Phase.CONTACT, self._step)
+        self.timeline.keep(self._snapshot)
 
-    def mount(self, sensor: str, pose: Callable[[], Array]) -> None:
-        """Let ``sensor`` feel. ``pose`` gives T_world_s (4, 4) at the present step and must not advance time."""
+    def mount(self, sensor: str, pose: Callable[[], Array], bear: Callable[[Array, Array], None] | None = None) -> None:
+        """Let ``sensor`` feel.
+
+        Args:
+            sensor: its name.
+            pose: gives T_world_s (4, 4) at the present step and must not advance time.
+            bear: told after every step with which force (3,) N what is touched pushes the sensor, and at which point
+                (3,) m, both in the world frame.
+        """
         if sensor in self._poses:
             raise ConfigError(f"sensor {sensor!r} is mounted already", key="scene", value=sensor)
         t_ns = self.timeline.t_ns
         state = self.world.mount(sensor, pose(), self.seconds(t_ns))
         self._poses[sensor] = pose
-        self._felt[sensor] = deque([Stamped(state, t_ns, t_ns // self.timeline.step_ns)], maxlen=self._kept)
+        if bear is not None:
+            self._bearers[sensor] = bear
+        self._felt[sensor] = deque([state], maxlen=self._kept)
 
     def has(self, sensor: str) -> bool:
         """Whether ``sensor`` is mounted."""
@@ -124,17 +147,28 @@ class Scene:
         if sensor not in self._felt:
             raise ConfigError(f"no sensor {sensor!r} is mounted", key="scene", value=sensor)
         now_ns = self.timeline.advance()
-        felt = self._felt[sensor]
-        t_ns = now_ns if t_ns is None else t_ns
-        back = felt[-1].seq - t_ns // self.timeline.step_ns
-        if not 0 <= back < len(felt):
-            raise ContactNotKept(t_ns, felt[0].t_ns, felt[-1].t_ns)
-        return felt[-1 - back]
+        felt, step_ns = self._felt[sensor], self.timeline.step_ns
+        newest = now_ns // step_ns
+        seq = newest if t_ns is None else t_ns // step_ns
+        if not 0 <= newest - seq < len(felt):
+            raise ContactNotKept(seq * step_ns, (newest - len(felt) + 1) * step_ns, now_ns)
+        return Stamped(felt[seq - newest - 1], seq * step_ns, seq)
 
     def objects(self) -> Stamped[Mapping[str, Array]]:
         """T_world_object (4, 4) of every free object now."""
         t_ns = self.timeline.advance()
         return Stamped(self.world.objects(), t_ns, t_ns // self.timeline.step_ns)
+
+    def snapshot(self) -> Restore:
+        """What puts the world, its contacts and the arms in it back as they are now, at whatever time it is called.
+
+        The clock goes on: a surface that moves as it was told goes on from where it was. Lifecycles and leases of
+        devices are not touched.
+
+        Raises (when called):
+            ConfigError: a sensor was mounted since.
+        """
+        return self.timeline.snapshot()
 
     def seconds(self, t_ns: int) -> float:
         """Time of the world at ``t_ns``."""
@@ -143,7 +177,36 @@ class Scene:
     def _step(self, t_ns: int) -> None:
         poses = {sensor: pose() for sensor, pose in self._poses.items()}
         for sensor, state in self.world.step(poses, self.seconds(t_ns)).items():
-            self._felt[sensor].append(Stamped(state, t_ns, t_ns // self.timeline.step_ns))
+            self._felt[sensor].append(state)
+            if sensor in self._bearers:
+                self._bearers[sensor](state.force_world_n, poses[sensor][:3, 3])
+
+    def _snapshot(self) -> Callable[[int], None]:
+        start_ns, world = self._start_ns, self.world.snapshot()
+        felt = {sensor: states.copy() for sensor, states in self._felt.items()}
+
+        def restore(later_ns: int) -> None:
+            if felt.keys() != self._felt.keys():
+                raise ConfigError("a sensor was mounted after the snapshot was taken", key="scene")
+            self._start_ns = start_ns + later_ns
+            self._felt = {sensor: states.copy() for sensor, states in felt.items()}
+            world()
+
+        return restore
+
+
+@contextmanager
+def physics_engine(key: str, value: str) -> Iterator[None]:
+    """Around imports that need MuJoCo. Raises ConfigError, with what to install, where it is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"needs {error.name}, which is not installed",
+            key=key,
+            value=value,
+            hint="pip install 'touchcell[physics]'",
+        ) from None
 
 
 _HERE: PoseMmDeg = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -248,18 +311,22 @@ class TipLawConfig(_Part):
 
     radius_mm: float = Field(default=20.0, gt=0.0)
     stiffness_n_mm: float = Field(default=1.5, gt=0.0)
+    friction: float = Field(default=0.9, gt=0.0, le=3.0, description="of the skin, where objects are free")
 
     def build(self) -> ContactLaw:
-        return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3)
+        return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3, self.friction)
 
 
 class SceneConfig(_Part):
     """The ``scene:`` section of a cell file. Poses are in the world frame.
 
-    ``physics`` says how true it is. ``kinematic``: surfaces move as they were told, whatever touches them.
+    ``physics`` says how true it is (docs/simulation.md). ``kinematic``: surfaces move as they were told, whatever
+    touches them. ``quasi_static``: besides, objects slide on the table where tips push them, without inertia and always
+    upright. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms`` within ``step_ms``,
+    the grid on which arms move and contacts are kept.
     """
 
-    physics: Literal["kinematic"] = "kinematic"
+    physics: Literal["kinematic", "quasi_static", "dynamic"] = "kinematic"
     surfaces: dict[
         str,
         Annotated[PlaneConfig | RampConfig | DomeConfig | SphereConfig, Field(discriminator="kind")],
@@ -268,6 +335,7 @@ class SceneConfig(_Part):
     table: TableConfig = TableConfig()
     tip: TipLawConfig = TipLawConfig()
     step_ms: float = Field(default=2.0, ge=0.1, le=10.0)
+    physics_step_ms: float = Field(default=1.0, ge=0.05, le=5.0)
 
     @model_validator(mode="after")
     def _something_to_touch(self) -> SceneConfig:
@@ -275,9 +343,32 @@ class SceneConfig(_Part):
             raise ValueError("the scene has neither surfaces nor objects to touch")
         if self.physics == "kinematic" and self.objects:
             raise ValueError("free objects need another physics than kinematic")
+        steps = self.step_ms / self.physics_step_ms
+        if self.physics == "dynamic" and abs(steps - max(round(steps), 1)) > 1e-6:
+            raise ValueError(f"step_ms {self.step_ms:g} is no multiple of physics_step_ms {self.physics_step_ms:g}")
         return self
 
     def build(self, clock: Clock) -> Scene:
         """The scene, with its motions starting now."""
+        return Scene(self._world(), clock, self.step_ms * 1e-3)
+
+    def _world(self) -> World:
         surfaces = {name: config.build() for name, config in self.surfaces.items()}
-        return Scene(KinematicWorld(surfaces, self.tip.build()), clock, self.step_ms * 1e-3)
+        if self.physics == "kinematic":
+            return KinematicWorld(surfaces, self.tip.build())
+        if self.physics == "quasi_static":
+            objects = {name: config.build(self.table) for name, config in self.objects.items()}
+            return QuasiStaticWorld(surfaces, objects, self.tip.build())
+        return self._dynamic_world(surfaces)
+
+    def _dynamic_world(self, surfaces: Mapping[str, Surface]) -> World:
+        with physics_engine("scene.physics", "dynamic"):
+            from drivers.simulation.dynamics import DynamicWorld
+            from drivers.simulation.dynamics_model import TipMechanics
+        tip = TipMechanics(
+            radius_m=1e-3 * self.tip.radius_mm,
+            stiffness_n_m=1e3 * self.tip.stiffness_n_mm,
+            friction=self.tip.friction,
+        )
+        objects = {name: config.build(self.table) for name, config in self.objects.items()}
+        return DynamicWorld(surfaces, objects, 1e-3 * self.table.height_mm, tip, 1e-3 * self.physics_step_ms)

@@ -8,6 +8,7 @@ from typing import Protocol
 from drivers.errors import ConfigError
 from drivers.simulation.contact import ContactLaw, ContactModel, ContactState
 from drivers.simulation.surfaces import Surface
+from drivers.simulation.timeline import Restore
 from geometry.types import Array
 
 
@@ -24,6 +25,10 @@ class World(Protocol):
 
     def objects(self) -> Mapping[str, Array]:
         """T_world_object (4, 4) of every free object at the last step."""
+        ...
+
+    def snapshot(self) -> Restore:
+        """What puts it back as it is at the last step; no sensor may be mounted in between."""
         ...
 
 
@@ -57,6 +62,16 @@ class KinematicWorld:
     def objects(self) -> Mapping[str, Array]:
         """Nothing is free here."""
         return {}
+
+    def snapshot(self) -> Restore:
+        """What brings every contact back."""
+        contacts = [model.snapshot() for model in self._models.values()]
+
+        def restore() -> None:
+            for contact in contacts:
+                contact()
+
+        return restore
 
     def _feel(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
         surfaces = list(self.surfaces.values())
