@@ -118,6 +118,11 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("--animate", action="store_true", help="also write animation.gif")
     report.set_defaults(run=_report)
 
+    view = commands.add_parser("view", help="show in a browser what a run's sensors feel, live or from its recording")
+    view.add_argument("folder", type=Path, help="run folder")
+    view.add_argument("--port", type=int, default=8177, help="of the page on this machine")
+    view.set_defaults(run=_view)
+
     why = commands.add_parser("why", help="explain why a run tripped, from its black box")
     why.add_argument("folder", type=Path)
     why.set_defaults(run=_why)
@@ -282,6 +287,13 @@ def _report(options: argparse.Namespace) -> int:
         from cell.animation import animate
 
         print(animate(options.folder))
+    return EXIT_OK
+
+
+def _view(options: argparse.Namespace) -> int:
+    from cell.view import view_run
+
+    view_run(options.folder, options.port)
     return EXIT_OK
 
 

@@ -108,6 +108,12 @@ class Sensor:
             "filter": times.filter_ns,
         }
 
+    def about(self) -> dict[str, Any] | None:
+        """What recorded images need to be understood: the preprocessing; None when none are recorded."""
+        if self.frames == "none" or not isinstance(self.source, ContactPipeline):
+            return None
+        return self.source.preprocessing.model_dump(mode="json")
+
     def extra_messages(self, now_ns: int) -> Iterator[tuple[str, int, dict[str, Any]]]:
         """What else is recorded of this sensor in this cycle: the frame's own measurement, its image, the truth."""
         if isinstance(self.source, ContactPipeline):
