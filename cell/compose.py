@@ -282,7 +282,8 @@ def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Devic
     from perception.contact_gate import ContactGate
     from perception.estimators import load_estimator
 
-    model = load_estimator(model_path(estimator.model))
+    calibration = None if estimator.calibration is None else Path(estimator.calibration)
+    model = load_estimator(model_path(estimator.model), calibration)
     pose_filter = None if estimator.filter is None else build_filter(estimator.filter)
     contact_gate = None
     if (gate := estimator.gate) is not None:
