@@ -19,7 +19,7 @@ from perception.architecture import Architecture  # noqa: E402
 from perception.checkpoint import EpochRecord, checkpoint_path  # noqa: E402
 from perception.dataset import LabelledImages  # noqa: E402
 from perception.errors import ModelError, TrainingError  # noqa: E402
-from perception.labels import contact_from_xi  # noqa: E402
+from perception.labels import contact_from_xi, xi_from_contact  # noqa: E402
 from perception.model_file import Model, load_model  # noqa: E402
 from perception.training import Settings, learning_rate, train, train_on_arrays  # noqa: E402
 from perception.training_display import Display  # noqa: E402
@@ -172,10 +172,10 @@ def test_impossible_settings(changes: dict[str, float]) -> None:
 
 
 def test_constant_labels(sets: tuple[LabelledImages, LabelledImages], tmp_path: Path) -> None:
-    constant = sets[0].xi.copy()
-    constant[:, 2] = -1e-3
+    constant = contact_from_xi(sets[0].xi)
+    constant[:, 2] = 1.0
     with pytest.raises(TrainingError, match="z_mm"):
-        quick_train((LabelledImages(sets[0].images, constant), sets[1]), tmp_path / "m.safetensors")
+        quick_train((LabelledImages(sets[0].images, xi_from_contact(constant)), sets[1]), tmp_path / "m.safetensors")
 
 
 @pytest.mark.parametrize("which", [0, 1])
@@ -217,7 +217,7 @@ def test_trains_from_a_folder(tmp_path: Path) -> None:
     assert recorder.decoded == {"train": 64, "val": 32}
     header = load_model(out).header
     assert header.preprocessing.input_size == (44, 48)
-    assert header.architecture == Architecture()
+    assert header.architecture == Architecture(input_size=(44, 48))
     assert header.training["seed"] == 3
 
     display = Display(Console(file=text, width=80))
