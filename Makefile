@@ -9,8 +9,10 @@ SOURCES := pyproject.toml setup.py $(wildcard geometry/*.c geometry/*.h)
 demo: .venv/core
 	$(BIN)/touchcell run configs/surface_follow_sim.yaml
 
+# Tests beside emulators one after another, since they have deadlines; the others on all cores.
 test: check
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not emulated and not stress"
+	$(BIN)/python -m pytest -m "emulated and not stress"
 
 fast: .venv/dev
 	$(BIN)/python -m pytest -m "not slow and not stress"

@@ -7,6 +7,7 @@ gate.
 
 from __future__ import annotations
 
+import argparse
 import json
 import tempfile
 import time
@@ -37,7 +38,16 @@ _PERIOD_NS = 10_000_000
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Print both tables; writes ``safety.json`` into ``out``."""
+    """Print both tables; writes ``safety.json`` into ``out``. ``--processes``: see ``benchmarks.process_bench``."""
+    parser = argparse.ArgumentParser("touchcell bench safety --")
+    parser.add_argument("--processes", action="store_true", help="faults of whole processes, with two arms")
+    parser.add_argument("--repeats", type=int, default=3, help="how often each fault of a process is tried")
+    options = parser.parse_args(arguments)
+    if options.processes:
+        from benchmarks import process_bench
+
+        process_bench.run(options.repeats, out)
+        return
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         cases = list(matrix(Path(folder)))
@@ -137,7 +147,7 @@ class _Gate:
     def __init__(self) -> None:
         self._clock = VirtualClock()
         desk = LeaseDesk("arm")
-        self._gate = TwistGate("arm", TwistLimits(0.1, 10.0, 1.0, 100.0), desk, self._clock)
+        self._gate = TwistGate("arm", TwistLimits(0.1, 10.0, 1.0, 100.0, 1e4, 1e5), desk, self._clock)
         self._lease = desk.acquire("bench")
         self._T = np.eye(4)
 

@@ -69,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     probe.add_argument("cell", type=Path)
     probe.set_defaults(run=_probe)
 
-    listing = commands.add_parser("list", help="known drivers, tasks, interlocks, emulators, benchmarks and cells")
+    listing = commands.add_parser("list", help="known drivers, tasks, interlocks, experiments, cells")
     listing.set_defaults(run=_list)
 
     train = commands.add_parser("train", help="train an estimator on labelled images")
@@ -90,9 +90,21 @@ def _parser() -> argparse.ArgumentParser:
     train_sim = commands.add_parser("train-sim", help="train the estimator that ships, on simulated images")
     train_sim.add_argument("--out", type=Path, required=True, help="model file to write (.safetensors)")
     train_sim.add_argument("--samples", type=int, default=12_000)
+    train_sim.add_argument("--kind", choices=("gdn", "cnn", "markers"), default="gdn")
+    train_sim.add_argument("--tip", help="tip file of a real sensor (calibrate-sim), or the name of one that ships")
+    train_sim.add_argument("--processed", action="store_true", help="for images as the public data have them")
     train_sim.add_argument("--epochs", type=int)
     train_sim.add_argument("--seed", type=int, default=0)
     train_sim.set_defaults(run=_train_sim)
+
+    calibrate_sim = commands.add_parser("calibrate-sim", help="make the simulated tip like a real one")
+    calibrate_sim.add_argument("--data", type=Path, required=True, help="data set folder with train/, better also val/")
+    calibrate_sim.add_argument("--out", type=Path, required=True, help="tip file to write (.yaml)")
+    calibrate_sim.add_argument("--frames", type=int, default=20, help="labelled images to fit to")
+    calibrate_sim.add_argument("--images", type=int, default=600, help="images that teach the matching, unlabelled")
+    calibrate_sim.add_argument("--rings", type=int, default=10, help="of the marker lattice")
+    calibrate_sim.add_argument("--seed", type=int, default=0)
+    calibrate_sim.set_defaults(run=_calibrate_sim)
 
     evaluate = commands.add_parser("evaluate", help="error, likelihood, calibration and latency on labelled images")
     evaluate.add_argument("--data", type=Path, required=True)
@@ -103,6 +115,7 @@ def _parser() -> argparse.ArgumentParser:
 
     report = commands.add_parser("report", help="make a run's summary and plots again from its recording")
     report.add_argument("folder", type=Path)
+    report.add_argument("--animate", action="store_true", help="also write animation.gif")
     report.set_defaults(run=_report)
 
     why = commands.add_parser("why", help="explain why a run tripped, from its black box")
@@ -119,6 +132,14 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for tables and plots")
     bench.add_argument("rest", nargs="*", help="arguments of the benchmark; its options follow after --")
     bench.set_defaults(run=_bench)
+
+    experiment = commands.add_parser("experiment", help="the paper's experiments: trials, table and plots")
+    experiment.add_argument("name", help="which, or `all`; `touchcell list` names them")
+    experiment.add_argument("--out", type=Path, default=Path("runs/experiments"), help="folder with one for each")
+    experiment.add_argument("--jobs", type=int, help="trials at a time (default: one for each core)")
+    experiment.add_argument("--trials", type=int, help="repetitions of each row (default: the experiment's own number)")
+    experiment.add_argument("--quick", action="store_true", help="the least that still shows every kind of row")
+    experiment.set_defaults(run=_experiment)
 
     commands.add_parser("emulate", help="emulate a device on the wire", add_help=False)
     return parser
@@ -146,7 +167,12 @@ def _check(options: argparse.Namespace) -> int:
         print(f"  {device.spec.capabilities.kind:<8} {device.name}: {device.spec.name}, {device.spec.summary}")
     for name, interlock in plan.cell.interlocks.items():
         way = plan.overshoots.get(name)
-        print(f"  interlock {name}: {interlock.kind}" + (f"; beyond the box, {way}" if way else ""))
+        print(f"  interlock {name}: {interlock.kind}" + (f"; beyond its limit, {way}" if way else ""))
+    if plan.cell.processes == "separate":
+        from cell.processes import process_lines
+
+        for line in process_lines(plan):
+            print(f"  process  {line}")
     if plan.skipped:
         print(f"  not needed by this task and not built: {', '.join(plan.skipped)}")
     return EXIT_OK
@@ -195,7 +221,29 @@ def _train(options: argparse.Namespace) -> int:
 def _train_sim(options: argparse.Namespace) -> int:
     from cell.train_sim import train_on_simulation
 
-    train_on_simulation(options.out, samples=options.samples, epochs=options.epochs, seed=options.seed)
+    train_on_simulation(
+        options.out,
+        samples=options.samples,
+        kind=options.kind,
+        tip=options.tip,
+        processed=options.processed,
+        epochs=options.epochs,
+        seed=options.seed,
+    )
+    return EXIT_OK
+
+
+def _calibrate_sim(options: argparse.Namespace) -> int:
+    from cell.calibrate_sim import calibrate_sim
+
+    calibrate_sim(
+        options.data,
+        options.out,
+        frames=options.frames,
+        images=options.images,
+        rings=options.rings,
+        seed=options.seed,
+    )
     return EXIT_OK
 
 
@@ -222,6 +270,10 @@ def _report(options: argparse.Namespace) -> int:
     from cell.report import write_report
 
     print(write_report(options.folder))
+    if options.animate:
+        from cell.animation import animate
+
+        print(animate(options.folder))
     return EXIT_OK
 
 
@@ -255,6 +307,28 @@ def _bench(options: argparse.Namespace) -> int:
         return EXIT_BAD_INPUT
     options.out.mkdir(parents=True, exist_ok=True)
     known[options.name].load()([*options.rest, *options.passed_on], options.out)
+    return EXIT_OK
+
+
+def _experiment(options: argparse.Namespace) -> int:
+    # Each trial has a core; libraries that start a thread for every core would only be in each other's way.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from cell.experiment import Scale, installed, run_experiment, spec
+
+    experiments = [spec(name) for name in (installed() if options.name == "all" else [options.name])]
+    scale = Scale(options.trials, options.quick)
+    jobs = options.jobs or os.cpu_count() or 1
+    tables = []
+    for experiment in experiments:
+        folder = options.out / experiment.name
+        try:
+            tables.append(run_experiment(experiment, folder, scale, jobs=jobs, live=sys.stdout.isatty()))
+        except KeyboardInterrupt:
+            print(f"touchcell: what has finished is kept in {folder}; the same command goes on", file=sys.stderr)
+            raise
+        print(tables[-1], flush=True)
+    if len(tables) > 1:
+        (options.out / "summary.txt").write_text("\n\n".join(tables) + "\n")
     return EXIT_OK
 
 

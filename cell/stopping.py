@@ -14,8 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.abilities import StopCategory
-from drivers.arm import Arm
+from drivers.abilities import ServoArm, StopCategory
 from drivers.clock import Clock
 from drivers.errors import DeviceError
 from drivers.samples import Stamped, TcpState
@@ -65,7 +64,7 @@ def declared_stop(speed_m_s: float, accel_m_s2: float, margin_s: float = STOP_MA
 class _Stopping:
     """One arm on its way to rest."""
 
-    arm: Arm
+    arm: ServoArm
     category: StopCategory
     told_ns: int
     start: Array | None
@@ -103,7 +102,7 @@ class Stopper:
     """
 
     def __init__(
-        self, arms: Mapping[str, Arm], categories: Mapping[str, StopCategory], clock: Clock, period_s: float
+        self, arms: Mapping[str, ServoArm], categories: Mapping[str, StopCategory], clock: Clock, period_s: float
     ) -> None:
         self._arms = arms
         self._categories = categories
@@ -157,7 +156,7 @@ class Stopper:
         self._stopping.clear()
         return reports
 
-    def _begin(self, arm: Arm, category: StopCategory) -> _Stopping:
+    def _begin(self, arm: ServoArm, category: StopCategory) -> _Stopping:
         now_ns, limits = self._clock.now_ns(), arm.limits
         start = speed_m_s = None
         turn_s = limits.rot_speed_rad_s / limits.rot_accel_rad_s2

@@ -31,8 +31,9 @@ class TrueContactSource:
         """The scene knows already."""
 
     def update(self, now_ns: int) -> ContactEstimate | None:
-        """The contact as it is now, after slip."""
-        contact = self._scene.contact(self._sensor)
+        """The contact as it was at ``now_ns``, after slip."""
+        # In real time the scene is ahead of a cycle that began a moment ago.
+        contact = self._scene.contact(self._sensor, now_ns)
         belief = PoseGaussian(contact.value.T_s_f, _COVARIANCE) if contact.value.in_contact else None
         return ContactEstimate(contact.value.in_contact, belief, contact.t_ns, contact.seq, contact.t_ns)
 

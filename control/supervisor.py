@@ -88,9 +88,14 @@ class Supervisor:
         """The latch, to be read."""
         return self._latch
 
-    def review(self, view: CellView) -> Verdict:
-        """Check ``view``, latch what it shows, and say whether its commands may be sent. Never raises."""
-        violations = self._violations(view)
+    def review(self, view: CellView, alarms: Sequence[Violation] = ()) -> Verdict:
+        """Check ``view``, latch what it shows, and say whether its commands may be sent. Never raises.
+
+        Args:
+            view: what is known in this cycle.
+            alarms: what others have found, the watchdog for one; taken as it is.
+        """
+        violations = (*alarms, *self._violations(view))
         self._latch.update(violations)
         first = self._latch.first_cause
         return Verdict(
@@ -117,7 +122,7 @@ class Supervisor:
 
     def _escalated(self, found: Sequence[Violation], now_ns: int) -> tuple[Violation, ...]:
         """``found``, with a trip in place of each limit that has lasted for too long."""
-        limiting = {(v.interlock, v.subject) for v in found if v.severity is Severity.LIMIT}
+        limiting = {(v.interlock, v.subject) for v in found if v.severity is Severity.LIMIT and not v.may_last}
         self._limited_since_ns = {key: self._limited_since_ns.get(key, now_ns) for key in limiting}
         lasting = {key for key, since_ns in self._limited_since_ns.items() if now_ns - since_ns > LIMIT_FOR_NS}
         return tuple(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivers.commands import Sent, TwistCommand, in_base_axes
-from drivers.samples import Stamped, TcpState
+from drivers.samples import JointState, Stamped, TcpState
 from geometry.types import Array
 
 
@@ -20,11 +20,13 @@ class ArmView:
         state: newest measured state.
         command: what is about to be sent; None when it is told to stop.
         sent: what its gate let through in the cycle before, and why it differs; None when it was told to stop.
+        joints: newest joint angles, where an interlock looks at them.
     """
 
     state: Stamped[TcpState]
     command: TwistCommand | None = None
     sent: Sent[TwistCommand] | None = None
+    joints: Stamped[JointState] | None = None
 
     def commanded_twist(self) -> Array | None:
         """(6,) the command's twist of the tool centre point along base axes; None without a command."""
@@ -55,6 +57,9 @@ class SensorView:
         torsion_rad: estimated rotation about the surface normal; None without contact.
         content: number that changes with the frame's picture, noise included; None where nobody looks at it.
         brightness: the frame's mean grey level; None likewise.
+        T_s_f: (4, 4) estimated pose of the surface in the sensor's frame; None without contact.
+        markers: share of the markers expected in view that are seen; None where the estimator looks at none.
+        arm: role of the arm that carries it; None where nothing moves it.
     """
 
     t_frame_ns: int
@@ -68,6 +73,9 @@ class SensorView:
     torsion_rad: float | None = None
     content: int | None = None
     brightness: float | None = None
+    T_s_f: Array | None = None
+    markers: float | None = None
+    arm: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ from enum import IntEnum
 from typing import Protocol, runtime_checkable
 
 from drivers.commands import Sent, TwistCommand
+from drivers.gate import TwistLimits
 from drivers.lease import Lease
 from drivers.samples import Frame, JointState, Stamped, TcpState
 from geometry.types import Array
@@ -73,6 +74,20 @@ class Stoppable(Protocol):
 
     def at_rest(self) -> bool:
         """Whether it stands still now."""
+        ...
+
+
+class ServoArm(TcpSource, TwistSink, Stoppable, Protocol):
+    """What a run loop needs of an arm that it moves, in this process or in another."""
+
+    @property
+    def limits(self) -> TwistLimits:
+        """What its gate allows."""
+        ...
+
+    @property
+    def stop_categories(self) -> frozenset[StopCategory]:
+        """Stop categories that it offers in software."""
         ...
 
 

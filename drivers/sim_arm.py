@@ -5,6 +5,7 @@ It has no joints, no singularities and no tracking error beyond those limits; it
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -72,6 +73,7 @@ class SimArm(Arm):
         self._powered = False
         self._told: Stamped[TcpState] | None = None
         self._timeline.add(Phase.MOTION, self._step)
+        self._timeline.keep(self._snapshot)
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
         """State at the last step of the simulation. Raises StaleData if it is older than ``max_age_s``."""
@@ -129,6 +131,16 @@ class SimArm(Arm):
             T = self._body.T_base_tcp.copy()
             T[2, 3] -= drift_m_s * self._timeline.step_ns * 1e-9
             self._body.T_base_tcp = T
+
+    def _snapshot(self) -> Callable[[int], None]:
+        """The body alone: who may command it is no matter of the simulation."""
+        powered, body = self._powered, self._body.snapshot()
+
+        def restore(later_ns: int) -> None:
+            self._powered = powered
+            body(later_ns)
+
+        return restore
 
     def _velocity(self) -> Array:
         velocity = self._body.velocity.copy()

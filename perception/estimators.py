@@ -7,7 +7,7 @@ from typing import Protocol
 
 from geometry.types import ImageArray
 from perception.inference import ContactModel, Prediction
-from perception.model_file import Header, load_model
+from perception.model_file import Header, Model, load_model
 
 
 class ContactEstimator(Protocol):
@@ -42,7 +42,11 @@ def load_estimator(path: Path) -> ContactEstimator:
     Raises:
         ModelError: as ``model_file.load_model``.
     """
-    model = load_model(path)
+    return estimator_of(load_model(path))
+
+
+def estimator_of(model: Model) -> ContactEstimator:
+    """The estimator that a model of any kind describes."""
     if model.header.architecture.kind == "markers":
         from perception.marker_estimator import MarkerEstimator
 

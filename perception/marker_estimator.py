@@ -89,10 +89,11 @@ class MarkerEstimator:
         self.field = field
         labels = self.header.labels
         if not field.seen.any():
-            return Prediction(*labels.xi_gaussian(np.zeros(6), np.ones(6)), in_range=False)
+            return Prediction(*labels.xi_gaussian(np.zeros(6), np.ones(6)), in_range=False, markers=0.0)
         mean, sigma = self._infer(field.displacements)
         in_range = field.valid and bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
-        return Prediction(*labels.xi_gaussian(mean, self.header.calibrated(sigma)), in_range=in_range)
+        xi, covariance = labels.xi_gaussian(mean, self.header.calibrated(sigma))
+        return Prediction(xi, covariance, in_range, markers=field.score)
 
     def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:
         """``predict`` of a camera's sample; the prediction keeps the stamp, number and quality of the frame."""

@@ -28,6 +28,7 @@ _SETTLED_PX = 0.1
 _CONVINCING = 0.965
 _COMPLETE = 0.985
 _STILL_THERE = 0.6
+_BANKED_AT_ONCE = 32
 _NEAR = 0.2  # Spacings that a first guess may be off; where it fails, it is off by 0.3 and more.
 _ALIKE = 6
 _MOST_STARTS = 2
@@ -222,7 +223,11 @@ class MarkerMatcher:
         self._neighbours = np.where(is_near, nearest, len(apart))
         # Where a contact is far from those that taught it, a guess is off by more than its own standard deviation.
         self._guess_sd = np.hypot(3.0 * guess.sd, 0.1 * model.sd)
-        self._bank_density = guess.density(model.positions(self._bank))
+        self._bank_density = np.empty((len(self._bank), guess.hidden_weight.shape[1]), np.float32)
+        # All at once would take 100 MB for a moment, which a process does not give back.
+        for i in range(0, len(self._bank), _BANKED_AT_ONCE):
+            part = slice(i, i + _BANKED_AT_ONCE)
+            self._bank_density[part] = guess.density(model.positions(self._bank[part]))
         self._bank_squares = (self._bank_density**2).sum(axis=1)
 
     def match(self, discs: Discs, previous: MarkerField | None = None) -> MarkerField:

@@ -8,6 +8,7 @@ import json
 import math
 import os
 import tempfile
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -242,6 +243,7 @@ def train_on_discs(
                 "images_matched": int(matched.taught.sum()),
                 "epochs_run": len(run.progress.history),
                 "best_epoch": run.progress.best_epoch,
+                "epochs_cpu_s": round(run.progress.cpu_s, 1),
                 "validation_loss": run.progress.best_loss,
                 "validation_mae": list(best.mae.values()),
             },
@@ -420,6 +422,7 @@ class _Run:
         return mixed(outputs[..., :6], outputs[..., 12:], self.labels)
 
     def _epoch_and_its_validation(self, epoch: int) -> None:
+        started_s = time.process_time()
         train_loss = self._epoch(epoch)
         mean, _ = self.predict()
         loss = float(np.abs(mean - self.validation_targets.numpy()).mean(axis=0).sum())
@@ -427,7 +430,8 @@ class _Run:
             raise TrainingError("the validation loss is no number", epoch=epoch, hint="lower the learning rate")
         contacts = self.labels.contacts(mean)
         mae = np.abs(contacts - contact_from_xi(self.validation_xi)).mean(axis=0)
-        record = EpochRecord(epoch, train_loss, loss, dict(zip(CONTACT_NAMES, mae.tolist(), strict=True)))
+        errors = dict(zip(CONTACT_NAMES, mae.tolist(), strict=True))
+        record = EpochRecord(epoch, train_loss, loss, errors, time.process_time() - started_s)
         self.progress.add(record, self.average)
         if self.observer is not None:
             self.observer.epoch(record, best=self.progress.best_epoch == epoch)

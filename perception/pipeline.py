@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -105,6 +106,11 @@ class ContactPipeline:
         """Whether the camera has come to its end."""
         return self._ended
 
+    def await_frame(self) -> None:
+        """Wait for the camera's first frame, which is processed by the next update. Raises DeviceError."""
+        with suppress(EndOfStream):
+            self._camera.latest()
+
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
         """Tell where the sensor was at ``t_ns``."""
         self._poses.record(t_ns, T_base_sensor)
@@ -159,16 +165,23 @@ class ContactPipeline:
             elif self._filtering:
                 belief = self._filter.predict(T_base_sensor, frame.t_ns)
         self.times = StageTimes(read_ns, preprocess_ns, infer_ns, self._timer() - start)
-        return ContactEstimate(True, belief, frame.t_ns, frame.seq, frame.t_ns, in_range=prediction.in_range, nis=nis)
+        return ContactEstimate(
+            True,
+            belief,
+            frame.t_ns,
+            frame.seq,
+            frame.t_ns,
+            in_range=prediction.in_range,
+            nis=nis,
+            markers=prediction.markers,
+        )
 
     def _replayed(self, estimate: ContactEstimate, now_ns: int) -> ContactEstimate:
         """The estimate carried from its frame to now by the sensor's own motion since."""
         if self._filter is None or not self._filtering or estimate.belief is None or now_ns <= estimate.t_frame_ns:
             return estimate
         belief = self._filter.predict(self._sensor_pose(now_ns), now_ns)
-        return ContactEstimate(
-            True, belief, estimate.t_frame_ns, estimate.seq, now_ns, in_range=estimate.in_range, nis=estimate.nis
-        )
+        return replace(estimate, belief=belief, t_ns=now_ns)
 
     def _sensor_pose(self, t_ns: int) -> Array:
         return self._poses.at(t_ns) if len(self._poses) else np.eye(4)

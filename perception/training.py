@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -110,7 +111,7 @@ def train(
         kind: gdn predicts a Gaussian, cnn means alone; markers as ``marker_training``.
         epochs: None for the default of ``Settings`` or ``MarkerSettings``.
         networks: of a marker estimator; None for the default of ``MarkerSettings``.
-        seed: of everything random; the same seed on the same machine gives the same file.
+        seed: of everything random; the same seed on the same machine gives the same file, but for the time it took.
         resume: go on with an interrupted training; False begins anew.
         cache: folder for preprocessed images; None for ``dataset.default_cache()``.
         observer: is told of the progress; None shows it on the terminal.
@@ -253,6 +254,7 @@ def train_on_arrays(
                 "images": len(training),
                 "epochs_run": len(run.progress.history),
                 "best_epoch": run.progress.best_epoch,
+                "epochs_cpu_s": round(run.progress.cpu_s, 1),
                 "validation_loss": run.progress.best_loss,
                 "validation_mae": list(run.progress.history[run.progress.best_epoch - 1].mae.values()),
             },
@@ -334,6 +336,7 @@ class _Run:
         for epoch in range(len(self.progress.history) + 1, self.settings.epochs + 1):
             if epoch - self.progress.best_epoch > self.settings.patience:
                 break
+            started_s = time.process_time()
             train_loss = self._epoch(epoch)
             outputs = self.outputs(self.validation.images)
             loss = self._loss(torch.from_numpy(outputs), self.validation_labels).item()
@@ -342,7 +345,8 @@ class _Run:
             mae = np.abs(
                 self.labels.contacts(outputs[:, :6].astype(np.float64)) - contact_from_xi(self.validation.xi)
             ).mean(axis=0)
-            record = EpochRecord(epoch, train_loss, loss, dict(zip(CONTACT_NAMES, mae.tolist(), strict=True)))
+            errors = dict(zip(CONTACT_NAMES, mae.tolist(), strict=True))
+            record = EpochRecord(epoch, train_loss, loss, errors, time.process_time() - started_s)
             self.progress.add(record, self.average)
             save_checkpoint(out, recipe, self.network, self.average, self.optimizer, self.progress)
             if self.observer is not None:

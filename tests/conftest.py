@@ -1,7 +1,8 @@
 """Tests against emulators run beside processes with clocks of their own.
 
 A machine that is starved for a tenth of a second can make a lawful driver fault, as the real device would. Such tests
-are tried again, twice at most, and pytest counts every such case in its summary; all others have to pass at once.
+are tried again, twice at most, and pytest counts every such case in its summary; all others have to pass at once. They
+run one after another (`-m emulated`), the others on all cores.
 """
 
 from __future__ import annotations
@@ -12,16 +13,20 @@ _BESIDE_EMULATORS = (
     "test_cell_devices",
     "test_conformance",
     "test_damiao",
+    "test_emulated_matrix",
     "test_emulator_process",
     "test_feetech",
     "test_franka",
     "test_opencv_camera",
+    "test_process_cell",
     "test_ur",
     "test_v4l2",
 )
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.name.startswith(_BESIDE_EMULATORS):
+            item.add_marker(pytest.mark.emulated)
             item.add_marker(pytest.mark.flaky(reruns=2))

@@ -38,7 +38,7 @@ class StubModel:
 
     def predict_reduced(self, reduced: ImageArray) -> Prediction:
         self.inferences += 1
-        return Prediction(XI, np.diag(SIGMA**2), in_range=True)
+        return Prediction(XI, np.diag(SIGMA**2), in_range=True, markers=0.75)
 
 
 class StubCamera:
@@ -68,6 +68,14 @@ def pipeline(images: list[ImageArray], **parts: object) -> tuple[ContactPipeline
     clock, model = VirtualClock(), StubModel()
     made = ContactPipeline(StubCamera(clock, images), model, **parts)  # type: ignore[arg-type]
     return made, model, clock
+
+
+def test_what_the_estimator_tells_of_its_markers_comes_with_the_estimate() -> None:
+    made, _, clock = pipeline([np.zeros((8, 8), np.uint8)] * 2)
+    for now_ns in ticks(clock, 5):
+        estimate = made.update(now_ns)
+        assert estimate is not None
+        assert estimate.markers == 0.75
 
 
 def pose(x_mm: float) -> Array:

@@ -9,6 +9,7 @@ from drivers.simulation.motions import Glide
 from drivers.simulation.scene import ContactNotKept, Scene, SceneConfig
 from drivers.simulation.surfaces import Plane, Sphere, Surface
 from drivers.simulation.timeline import Phase, Timeline
+from drivers.simulation.world import KinematicWorld
 from geometry import se3
 
 DOWN = se3.from_euler_mm_deg([0, 0, 0, 180, 0, 0])
@@ -42,7 +43,7 @@ def test_asking_for_the_time_within_a_step_changes_nothing() -> None:
 
 def sliding_scene(clock: VirtualClock) -> Scene:
     plate = Surface(Plane(), Glide(np.eye(4), np.array([0.05, 0, 0, 0, 0, 0.0]), start_s=0.0, duration_s=1.0))
-    scene = Scene({"plate": plate}, ContactLaw(), clock)
+    scene = Scene(KinematicWorld({"plate": plate}, ContactLaw()), clock)
     scene.mount("tip", lambda: above(20.0 - 3.0))
     return scene
 
@@ -84,7 +85,7 @@ def test_the_nearest_surface_is_felt() -> None:
     clock = VirtualClock()
     ball = Surface(Sphere(0.03))
     x_mm = [0.0]
-    scene = Scene({"floor": Surface(Plane()), "ball": ball}, ContactLaw(), clock)
+    scene = Scene(KinematicWorld({"floor": Surface(Plane()), "ball": ball}, ContactLaw()), clock)
     scene.mount("tip", lambda: above(20.0 - 1.0 if x_mm[0] else 30 + 20 - 2.0, x_mm[0]))
     assert scene.contact("tip").value.depth_m == pytest.approx(0.002)
     x_mm[0] = 200.0
@@ -100,7 +101,7 @@ def test_mounting_mistakes_are_named() -> None:
     with pytest.raises(ConfigError, match="no sensor 'palm'"):
         scene.contact("palm")
     with pytest.raises(ConfigError, match="no surface"):
-        Scene({}, ContactLaw(), clock).mount("tip", lambda: DOWN)
+        KinematicWorld({}, ContactLaw())
 
 
 def test_a_scene_is_built_from_its_configuration() -> None:
@@ -138,14 +139,16 @@ def test_a_scene_is_built_from_its_configuration() -> None:
     clock = VirtualClock(7_000_000_000)
     scene = config.build(clock)
     assert scene.timeline.step_ns == 1_000_000
-    assert scene.law.tip_radius_m == 0.015
+    world = scene.world
+    assert isinstance(world, KinematicWorld)
+    assert world.law.tip_radius_m == 0.015
     far = np.array([0.3, 0.0, 0.3])
-    assert scene.surfaces["bump"].nearest(far, 0.0).distance_m == pytest.approx(0.26)
-    assert scene.surfaces["ball"].nearest(np.array([0.6, 0, 0.2]), 0.0).distance_m == pytest.approx(0.075)
-    assert scene.surfaces["plate"].nearest(far, 9.0).distance_m == pytest.approx(0.7)
-    assert scene.surfaces["plate"].nearest(far, 0.0).distance_m == pytest.approx(0.8)
+    assert world.surfaces["bump"].nearest(far, 0.0).distance_m == pytest.approx(0.26)
+    assert world.surfaces["ball"].nearest(np.array([0.6, 0, 0.2]), 0.0).distance_m == pytest.approx(0.075)
+    assert world.surfaces["plate"].nearest(far, 9.0).distance_m == pytest.approx(0.7)
+    assert world.surfaces["plate"].nearest(far, 0.0).distance_m == pytest.approx(0.8)
     assert scene.seconds(7_500_000_000) == pytest.approx(0.5)
-    np.testing.assert_array_equal(scene.surfaces["orbit"].motion.pose(0.0), np.eye(4))
+    np.testing.assert_array_equal(world.surfaces["orbit"].motion.pose(0.0), np.eye(4))
 
 
 @pytest.mark.parametrize(
@@ -178,3 +181,11 @@ def test_a_scene_is_built_from_its_configuration() -> None:
 def test_senseless_scenes_are_refused(config: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         SceneConfig.model_validate(config)
+
+
+def test_free_objects_are_refused_where_nothing_moves_them() -> None:
+    prism = {"shape": {"kind": "box", "size_mm": [80, 80, 60]}, "mass_g": 479}
+    with pytest.raises(ValidationError, match="need another physics"):
+        SceneConfig.model_validate({"objects": {"prism": prism}})
+    with pytest.raises(ValidationError, match="neither surfaces nor objects"):
+        SceneConfig.model_validate({})

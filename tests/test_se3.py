@@ -206,7 +206,7 @@ def with_entry(row: int, column: int, value: float) -> Array:
 
 
 BAD_NUMBERS = [
-    *(None, "pose", object(), 1.0, [], [1.0, "a"], [[1.0], [1.0, 2.0]]),
+    *(None, "pose", ..., 1.0, [], [1.0, "a"], [[1.0], [1.0, 2.0]]),
     1j * np.ones(6),
     np.ones(6, dtype=bool),
 ]

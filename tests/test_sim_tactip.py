@@ -6,12 +6,14 @@ from drivers import registry
 from drivers.abilities import FrameSource, HealthSource
 from drivers.clock import VirtualClock
 from drivers.commands import TwistCommand, TwistFrame
-from drivers.errors import ConfigError, LifecycleError, StaleData, TransportTimeout
+from drivers.errors import ConfigError, DeviceGone, LifecycleError, StaleData, TransportTimeout
 from drivers.registry import DriverContext
+from drivers.samples import Stamped, TcpState
 from drivers.sim_arm import SimArm
 from drivers.sim_tactip import SimTactip, SimTactipConfig
 from drivers.simulation.faults import FrameFaults
 from drivers.simulation.scene import Scene, SceneConfig
+from geometry import se3
 
 
 class Cell:
@@ -178,7 +180,7 @@ def test_it_needs_a_scene_and_a_simulated_arm() -> None:
     config = SimTactipConfig(mounted_on="arm")
     with pytest.raises(ConfigError, match="needs a scene"):
         spec.build("tip2", config, DriverContext(cell.clock, {"arm": cell.arm}))
-    with pytest.raises(ConfigError, match="no simulated arm") as caught:
+    with pytest.raises(ConfigError, match="no arm of this cell") as caught:
         spec.build("tip2", config, DriverContext(cell.clock, {"tip": cell.tip}, cell.scene))
     assert caught.value.key == "tip2.mounted_on"
 
@@ -189,3 +191,56 @@ def test_it_needs_a_scene_and_a_simulated_arm() -> None:
 def test_senseless_configuration_is_refused(changes: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         SimTactipConfig.model_validate({"mounted_on": "arm", **changes})
+
+
+def test_a_snapshot_takes_arm_contact_and_picture_back() -> None:
+    cell = Cell()
+    cell.move(0.02, 0.2)
+    restore, pose = cell.scene.snapshot(), cell.arm.T_world_tcp()
+    cell.move(0.02, 0.2)
+    deep = cell.tip.latest().value.image
+    arrived = cell.arm.T_world_tcp()
+    restore()
+    np.testing.assert_array_equal(cell.arm.T_world_tcp(), pose)
+    assert np.abs(cell.tip.latest().value.image.astype(int) - deep.astype(int)).max() > 100
+    cell.move(0.02, 0.2)
+    cell.scene.timeline.advance()
+    np.testing.assert_allclose(cell.arm.T_world_tcp(), arrived, atol=1e-12)
+
+
+DOWN = se3.from_euler_mm_deg([400, 0, 0, 180, 0, 0])
+
+
+class Told:
+    """An arm that tells whatever it was given, or that it is gone."""
+
+    def __init__(self) -> None:
+        self.z_m: float | None = None
+
+    def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
+        if self.z_m is None:
+            raise DeviceGone("arm", "cable")
+        T = DOWN.copy()
+        T[2, 3] = self.z_m
+        return Stamped(TcpState(T, np.zeros(6)), 0, 0)
+
+
+def test_a_simulated_sensor_sits_on_any_arm_that_tells_its_pose() -> None:
+    clock, arm = VirtualClock(), Told()
+    scene: Scene = SceneConfig.model_validate({"surfaces": {"table": {"kind": "plane"}}}).build(clock)
+    config = SimTactipConfig(mounted_on="arm", rate_hz=50, latency_ms=0)
+    tip = registry.spec("sim_tactip").build("tip", config, DriverContext(clock, {"arm": arm}, scene, 0))  # type: ignore[dict-item]
+    assert isinstance(tip, SimTactip)
+    with pytest.raises(DeviceGone):
+        tip.connect()
+    clock.advance_s(0.1)
+    arm.z_m = 0.025
+    tip.connect()
+    tip.configure()
+    tip.activate()
+    assert tip.next(-1, timeout_s=1.0).t_ns == 100_000_000
+    assert scene.contact("tip").value.depth_m == pytest.approx(-0.005)
+    for z_m, depth_m in ((0.017, 0.003), (float("nan"), 0.003), (None, 0.003)):
+        arm.z_m = z_m
+        clock.advance_s(0.01)
+        assert scene.contact("tip").value.depth_m == pytest.approx(depth_m)

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from drivers.clock import Clock, MonotonicClock
 from drivers.device import Device
-from drivers.registry import DriverSpec
+from drivers.registry import DriverConfig, DriverSpec
 
 
 class Emulated(Protocol):
@@ -52,6 +52,7 @@ class Rig:
         spec: the driver.
         start: starts a fresh emulator and waits until it is ready; None on a real bench, where nothing knows the truth.
         build: makes the DISCONNECTED device that will find that emulator; called again after a restart.
+        config: the arm's part of a cell file, for running tasks on the emulator; None for other devices.
         energising: entry of the emulator's ``state()`` that counts messages which change power, mode or zero; None for
             a device that has no such messages.
         position: entry with the tool's true position [x, y, z] in m (arms), or None for cameras.
@@ -71,6 +72,7 @@ class Rig:
     spec: DriverSpec
     start: Callable[[], Emulated] | None
     build: Callable[[Clock], Device]
+    config: DriverConfig | None = None
     energising: str | None = "energising"
     position: str | None = "position_m"
     pose: str | None = None

@@ -7,13 +7,16 @@ inward normal and its origin one tip radius outside the surface, so that {f} = {
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from drivers.simulation.surfaces import Surface
+from drivers.simulation.timeline import Restore
 from geometry import se3
 from geometry.types import Array
+
+_IDENTITY = np.eye(4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +30,7 @@ class ContactState:
         in_contact: whether the tip touches.
         slipping: whether the contact slid in the last step.
         normal_force_n: force on the tip along the surface normal.
+        shear_force_n: force on the tip along the x and y axes of {f}; zero where the physics does not tell it.
     """
 
     T_f_s: Array
@@ -34,6 +38,7 @@ class ContactState:
     in_contact: bool
     slipping: bool
     normal_force_n: float
+    shear_force_n: tuple[float, float] = (0.0, 0.0)
 
     @property
     def T_s_f(self) -> Array:  # noqa: N802  the field's own name
@@ -45,6 +50,12 @@ class ContactState:
         """Indentation, negative out of contact."""
         return float(self.T_f_s[2, 3])
 
+    @property
+    def force_world_n(self) -> Array:
+        """(3,) force on the tip along the world's axes."""
+        force: Array = self.T_world_f[:3, :3] @ np.array([*self.shear_force_n, -self.normal_force_n])
+        return force
+
 
 @dataclass(frozen=True, slots=True)
 class ContactLaw:
@@ -53,6 +64,7 @@ class ContactLaw:
     Attributes:
         tip_radius_m: radius of the hemisphere.
         stiffness_n_m: normal force per depth.
+        friction: tangential force per normal force with which the skin slips.
         slip_at_1mm_m: shear that survives at 1 mm depth, measured on public images (SIMULATION part 5).
         slip_exponent: growth of that shear with depth, measured on the same.
         torsion_grip: share of the shear that sticks by which the patch may turn before it slips. The same images fit
@@ -61,6 +73,7 @@ class ContactLaw:
 
     tip_radius_m: float = 0.020
     stiffness_n_m: float = 1500.0
+    friction: float = 0.9
     slip_at_1mm_m: float = 0.34e-3
     slip_exponent: float = 1.83
     torsion_grip: float = 0.15
@@ -68,6 +81,10 @@ class ContactLaw:
     def max_shear_m(self, depth_m: float) -> float:
         """Largest tangential displacement that sticks."""
         return self.slip_at_1mm_m * (1e3 * depth_m) ** self.slip_exponent if depth_m > 0.0 else 0.0
+
+    def shear_stiffness_n_m(self, depth_m: float) -> float:
+        """Tangential force per shear at a positive depth: what sticks is used up when friction is."""
+        return self.friction * self.stiffness_n_m * depth_m / self.max_shear_m(depth_m)
 
     def max_torsion_rad(self, depth_m: float) -> float:
         """Largest rotation about the normal that sticks.
@@ -109,6 +126,11 @@ class ContactModel:
     law: ContactLaw = field(default_factory=ContactLaw)
     _anchor: _Anchor | None = None
 
+    def held_point(self, surface: Surface) -> Array | None:
+        """(3,) m, where the skin holds on to ``surface``, in its own frame; None where it does not."""
+        anchor = self._anchor
+        return anchor.point if anchor is not None and anchor.surface is surface else None
+
     def step(self, T_world_s: Array, surface: Surface, t_s: float) -> ContactState:
         """Bring the contact to time ``t_s`` with the sensor at ``T_world_s`` (4, 4)."""
         T_world_b = surface.motion.pose(t_s)
@@ -117,7 +139,7 @@ class ContactModel:
         centre = R_world_b.T @ (T_world_s[:3, 3] - T_world_b[:3, 3])
         nearest = surface.shape.nearest(centre)
         depth = self.law.tip_radius_m - nearest.distance_m
-        R_tilt = _tilt(-nearest.normal @ R_b_s)
+        R_tilt = tilt_of(-nearest.normal @ R_b_s)
 
         if depth <= 0.0:
             self._anchor = None
@@ -147,19 +169,28 @@ class ContactModel:
         if abs(torsion) > largest:
             slipping = True
             held_torsion = math.copysign(largest, torsion)
-            anchor.R = anchor.R @ _about_z(torsion - held_torsion)
-            R_b_f = R_b_f @ _about_z(torsion - held_torsion)
+            anchor.R = anchor.R @ about_z(torsion - held_torsion)
+            R_b_f = R_b_f @ about_z(torsion - held_torsion)
             torsion = held_torsion
-        R_f_s = _about_z(torsion) @ R_tilt
+        R_f_s = about_z(torsion) @ R_tilt
         return self._state(T_world_s, R_world_b @ R_b_f, R_f_s, (shear[0], shear[1], depth), slipping=slipping)
+
+    def snapshot(self) -> Restore:
+        """What brings the contact back as it is now."""
+        held = self._anchor and replace(self._anchor)
+
+        def restore() -> None:
+            self._anchor = held and replace(held)
+
+        return restore
 
     def _state(
         self, T_world_s: Array, R_world_f: Array, R_f_s: Array, position: tuple[float, float, float], *, slipping: bool
     ) -> ContactState:
-        T_f_s = np.eye(4)
+        T_f_s = _IDENTITY.copy()
         T_f_s[:3, :3] = R_f_s
         T_f_s[:3, 3] = position
-        T_world_f = np.eye(4)
+        T_world_f = _IDENTITY.copy()
         T_world_f[:3, :3] = R_world_f
         T_world_f[:3, 3] = T_world_s[:3, 3] - R_world_f @ T_f_s[:3, 3]
         depth = position[2]
@@ -171,21 +202,22 @@ def contact_at(T_f_s: Array, law: ContactLaw) -> ContactState:
     """The contact that a tip pressed and then sheared to ``T_f_s`` (4, 4) ends in: {f} at the world's origin, shear and
     torsion cut to what its depth holds. What data collection (Algorithm 1 of the paper) does, without the way there."""
     depth = float(T_f_s[2, 3])
-    R_tilt = _tilt(T_f_s[2, :3])
+    R_tilt = tilt_of(T_f_s[2, :3])
     R_gamma = T_f_s[:3, :3] @ R_tilt.T
     asked_torsion, asked_shear = math.atan2(R_gamma[1, 0], R_gamma[0, 0]), math.hypot(T_f_s[0, 3], T_f_s[1, 3])
     largest, longest = law.max_torsion_rad(depth), law.max_shear_m(depth)
     torsion = min(max(asked_torsion, -largest), largest)
     T = np.eye(4)
-    T[:3, :3] = _about_z(torsion) @ R_tilt
+    T[:3, :3] = about_z(torsion) @ R_tilt
     T[:2, 3] = T_f_s[:2, 3] * min(1.0, longest / max(asked_shear, 1e-12))
     T[2, 3] = depth
     slipping = asked_shear > longest or abs(asked_torsion) > largest
     return ContactState(T, np.eye(4), depth > 0.0, slipping, law.stiffness_n_m * max(depth, 0.0))
 
 
-def _tilt(inward_in_s: Array) -> Array:
-    """Ry(beta) Rx(alpha) that takes ``inward_in_s`` (3,), the inward normal in {s}, to the z axis of {f}."""
+def tilt_of(inward_in_s: Array) -> Array:
+    """Tilt (3, 3) of a sensor: the Ry(beta) Rx(alpha) that takes ``inward_in_s`` (3,), the inward normal in {s}, to the
+    z axis of {f}."""
     x, y, z = (float(value) for value in inward_in_s)
     # The inverse rotation takes z to (-sin beta, sin alpha cos beta, cos alpha cos beta).
     cos_beta = math.hypot(y, z)
@@ -201,7 +233,8 @@ def _tilt(inward_in_s: Array) -> Array:
     )
 
 
-def _about_z(angle: float) -> Array:
+def about_z(angle: float) -> Array:
+    """Rotation (3, 3) about the z axis."""
     sin, cos = math.sin(angle), math.cos(angle)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -51,6 +52,17 @@ class TwistFollower:
     def at_rest(self) -> bool:
         """Whether it neither moves nor is about to."""
         return not (self.velocity.any() or self._target.any())
+
+    def snapshot(self) -> Callable[[int], None]:
+        """What brings pose, velocity and command back, given how many nanoseconds later it is then."""
+        kept = self.T_base_tcp, self.velocity, self._target
+        expires_ns = self._expires_ns
+
+        def restore(later_ns: int) -> None:
+            self.T_base_tcp, self.velocity, self._target = kept
+            self._expires_ns = expires_ns + later_ns
+
+        return restore
 
     def step(self, t_ns: int) -> None:
         """Move over the step that ends at ``t_ns``."""

@@ -1,21 +1,26 @@
-"""A simulated scene: surfaces, and the contacts of the sensors that arms carry through it."""
+"""A simulated scene: what there is to touch, and the contacts of the sensors that arms carry through it."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from drivers.abilities import TcpSource
 from drivers.clock import Clock
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, DeviceError
 from drivers.samples import Stamped
-from drivers.simulation.contact import ContactLaw, ContactModel, ContactState
+from drivers.simulation.contact import ContactLaw, ContactState
 from drivers.simulation.motions import Glide, Motion, Periodic, Still
+from drivers.simulation.objects import ObjectConfig, PoseMmDeg, TableConfig
+from drivers.simulation.quasi_static import QuasiStaticWorld
 from drivers.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
-from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Timeline
+from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeline
+from drivers.simulation.world import KinematicWorld, World
 from geometry import se3
 from geometry.errors import TouchcellError
 from geometry.types import Array
@@ -47,36 +52,90 @@ class Carrier(Protocol):
         ...
 
 
-class Scene:
-    """Surfaces and the sensors that touch them. One thread only.
+@runtime_checkable
+class LoadBearer(Protocol):
+    """A simulated arm that gives way to what its sensors touch."""
 
-    Contacts are stepped on the timeline's fixed grid to the clock's now whenever somebody reads one or an arm is asked.
+    def bear(self, force_world: Array, point_world: Array) -> None:
+        """From now on feel ``force_world`` (3,) N at ``point_world`` (3,) m."""
+        ...
+
+
+class MeasuredCarrier:
+    """Any other arm, as what it tells: so that a simulated sensor sits on a real or an emulated arm.
+
+    Where the arm tells nothing, because it is gone or has not begun, it is where it was last.
 
     Args:
-        surfaces: by name; motions count seconds from when the scene was made.
-        law: how every tip gives and slips.
+        arm: tells its pose.
+        T_world_base: (4, 4) where its base stands.
+    """
+
+    def __init__(self, arm: TcpSource, T_world_base: Array) -> None:
+        self._arm = arm
+        self._T_world_base = T_world_base
+        self._T_base_tcp: Array | None = None
+
+    def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
+        """(4, 4) newest measured pose. Raises DeviceError if there has never been one."""
+        try:
+            T_base_tcp = self._arm.tcp().value.T_base_tcp
+        except DeviceError:
+            if self._T_base_tcp is None:
+                raise
+        else:
+            # What is not finite is for the supervisor to see, not for the physics.
+            if self._T_base_tcp is None or np.isfinite(T_base_tcp).all():
+                self._T_base_tcp = T_base_tcp
+        assert self._T_base_tcp is not None
+        return self._T_world_base @ self._T_base_tcp
+
+
+class Scene:
+    """A world and the sensors that touch it. One thread only.
+
+    The world is stepped on the timeline's fixed grid to the clock's now whenever somebody reads a contact or an arm is
+    asked.
+
+    Args:
+        world: what decides what is felt; its time counts from when the scene was made.
         clock: injected time.
         step_s: grid of the simulation.
     """
 
-    def __init__(
-        self, surfaces: Mapping[str, Surface], law: ContactLaw, clock: Clock, step_s: float = DEFAULT_STEP_S
-    ) -> None:
-        self.surfaces = dict(surfaces)
-        self.law = law
+    def __init__(self, world: World, clock: Clock, step_s: float = DEFAULT_STEP_S) -> None:
+        self.world = world
         self.timeline = Timeline(clock, step_s)
         self._start_ns = self.timeline.t_ns
-        self._sensors: dict[str, _MountedSensor] = {}
+        self._poses: dict[str, Callable[[], Array]] = {}
+        self._bearers: dict[str, Callable[[Array, Array], None]] = {}
+        # The last one is of the timeline's present step, the one before it of the step before.
+        self._felt: dict[str, deque[ContactState]] = {}
+        self._kept = round(HISTORY_S * 1e9 / self.timeline.step_ns)
+        self.timeline.add(Phase.CONTACT, self._step)
+        self.timeline.keep(self._snapshot)
 
-    def mount(self, sensor: str, pose: Callable[[], Array]) -> None:
-        """Let ``sensor`` feel. ``pose`` gives T_world_s (4, 4) at the present step and must not advance time."""
-        if not self.surfaces:
-            raise ConfigError("the scene has no surface to touch", key="scene.surfaces")
-        if sensor in self._sensors:
+    def mount(self, sensor: str, pose: Callable[[], Array], bear: Callable[[Array, Array], None] | None = None) -> None:
+        """Let ``sensor`` feel.
+
+        Args:
+            sensor: its name.
+            pose: gives T_world_s (4, 4) at the present step and must not advance time.
+            bear: told after every step with which force (3,) N what is touched pushes the sensor, and at which point
+                (3,) m, both in the world frame.
+        """
+        if sensor in self._poses:
             raise ConfigError(f"sensor {sensor!r} is mounted already", key="scene", value=sensor)
-        mounted = _MountedSensor(self, pose)
-        self._sensors[sensor] = mounted
-        self.timeline.add(Phase.CONTACT, mounted.step)
+        t_ns = self.timeline.t_ns
+        state = self.world.mount(sensor, pose(), self.seconds(t_ns))
+        self._poses[sensor] = pose
+        if bear is not None:
+            self._bearers[sensor] = bear
+        self._felt[sensor] = deque([state], maxlen=self._kept)
+
+    def has(self, sensor: str) -> bool:
+        """Whether ``sensor`` is mounted."""
+        return sensor in self._poses
 
     def contact(self, sensor: str, t_ns: int | None = None) -> Stamped[ContactState]:
         """What ``sensor`` feels now, or felt at ``t_ns`` (the step before it), at most HISTORY_S ago.
@@ -85,42 +144,71 @@ class Scene:
             ConfigError: no such sensor.
             ContactNotKept: ``t_ns`` lies in the future or too far back.
         """
-        if sensor not in self._sensors:
+        if sensor not in self._felt:
             raise ConfigError(f"no sensor {sensor!r} is mounted", key="scene", value=sensor)
         now_ns = self.timeline.advance()
-        return self._sensors[sensor].at(now_ns if t_ns is None else t_ns)
+        felt, step_ns = self._felt[sensor], self.timeline.step_ns
+        newest = now_ns // step_ns
+        seq = newest if t_ns is None else t_ns // step_ns
+        if not 0 <= newest - seq < len(felt):
+            raise ContactNotKept(seq * step_ns, (newest - len(felt) + 1) * step_ns, now_ns)
+        return Stamped(felt[seq - newest - 1], seq * step_ns, seq)
+
+    def objects(self) -> Stamped[Mapping[str, Array]]:
+        """T_world_object (4, 4) of every free object now."""
+        t_ns = self.timeline.advance()
+        return Stamped(self.world.objects(), t_ns, t_ns // self.timeline.step_ns)
+
+    def snapshot(self) -> Restore:
+        """What puts the world, its contacts and the arms in it back as they are now, at whatever time it is called.
+
+        The clock goes on: a surface that moves as it was told goes on from where it was. Lifecycles and leases of
+        devices are not touched.
+
+        Raises (when called):
+            ConfigError: a sensor was mounted since.
+        """
+        return self.timeline.snapshot()
 
     def seconds(self, t_ns: int) -> float:
-        """Time of the surfaces' motions at ``t_ns``."""
+        """Time of the world at ``t_ns``."""
         return (t_ns - self._start_ns) * 1e-9
 
+    def _step(self, t_ns: int) -> None:
+        poses = {sensor: pose() for sensor, pose in self._poses.items()}
+        for sensor, state in self.world.step(poses, self.seconds(t_ns)).items():
+            self._felt[sensor].append(state)
+            if sensor in self._bearers:
+                self._bearers[sensor](state.force_world_n, poses[sensor][:3, 3])
 
-class _MountedSensor:
-    def __init__(self, scene: Scene, pose: Callable[[], Array]) -> None:
-        self._scene = scene
-        self._pose = pose
-        self._model = ContactModel(scene.law)
-        self._step_ns = scene.timeline.step_ns
-        self._history: deque[Stamped[ContactState]] = deque(maxlen=round(HISTORY_S * 1e9 / self._step_ns))
-        self.step(scene.timeline.t_ns)
+    def _snapshot(self) -> Callable[[int], None]:
+        start_ns, world = self._start_ns, self.world.snapshot()
+        felt = {sensor: states.copy() for sensor, states in self._felt.items()}
 
-    def step(self, t_ns: int) -> None:
-        T_world_s, t_s = self._pose(), self._scene.seconds(t_ns)
-        surfaces = list(self._scene.surfaces.values())
-        surface = surfaces[0]
-        if len(surfaces) > 1:
-            surface = min(surfaces, key=lambda each: each.nearest(T_world_s[:3, 3], t_s).distance_m)
-        state = self._model.step(T_world_s, surface, t_s)
-        self._history.append(Stamped(state, t_ns, t_ns // self._step_ns))
+        def restore(later_ns: int) -> None:
+            if felt.keys() != self._felt.keys():
+                raise ConfigError("a sensor was mounted after the snapshot was taken", key="scene")
+            self._start_ns = start_ns + later_ns
+            self._felt = {sensor: states.copy() for sensor, states in felt.items()}
+            world()
 
-    def at(self, t_ns: int) -> Stamped[ContactState]:
-        back = self._history[-1].seq - t_ns // self._step_ns
-        if not 0 <= back < len(self._history):
-            raise ContactNotKept(t_ns, self._history[0].t_ns, self._history[-1].t_ns)
-        return self._history[-1 - back]
+        return restore
 
 
-PoseMmDeg = tuple[float, float, float, float, float, float]
+@contextmanager
+def physics_engine(key: str, value: str) -> Iterator[None]:
+    """Around imports that need MuJoCo. Raises ConfigError, with what to install, where it is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"needs {error.name}, which is not installed",
+            key=key,
+            value=value,
+            hint="pip install 'touchcell[physics]'",
+        ) from None
+
+
 _HERE: PoseMmDeg = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _SI = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
 
@@ -223,22 +311,64 @@ class TipLawConfig(_Part):
 
     radius_mm: float = Field(default=20.0, gt=0.0)
     stiffness_n_mm: float = Field(default=1.5, gt=0.0)
+    friction: float = Field(default=0.9, gt=0.0, le=3.0, description="of the skin, where objects are free")
 
     def build(self) -> ContactLaw:
-        return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3)
+        return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3, self.friction)
 
 
 class SceneConfig(_Part):
-    """The ``scene:`` section of a cell file. Poses are in the world frame."""
+    """The ``scene:`` section of a cell file. Poses are in the world frame.
 
+    ``physics`` says how true it is (docs/simulation.md). ``kinematic``: surfaces move as they were told, whatever
+    touches them. ``quasi_static``: besides, objects slide on the table where tips push them, without inertia and always
+    upright. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms`` within ``step_ms``,
+    the grid on which arms move and contacts are kept.
+    """
+
+    physics: Literal["kinematic", "quasi_static", "dynamic"] = "kinematic"
     surfaces: dict[
         str,
         Annotated[PlaneConfig | RampConfig | DomeConfig | SphereConfig, Field(discriminator="kind")],
-    ] = Field(min_length=1)
+    ] = {}
+    objects: dict[str, ObjectConfig] = {}
+    table: TableConfig = TableConfig()
     tip: TipLawConfig = TipLawConfig()
     step_ms: float = Field(default=2.0, ge=0.1, le=10.0)
+    physics_step_ms: float = Field(default=1.0, ge=0.05, le=5.0)
+
+    @model_validator(mode="after")
+    def _something_to_touch(self) -> SceneConfig:
+        if not (self.surfaces or self.objects):
+            raise ValueError("the scene has neither surfaces nor objects to touch")
+        if self.physics == "kinematic" and self.objects:
+            raise ValueError("free objects need another physics than kinematic")
+        steps = self.step_ms / self.physics_step_ms
+        if self.physics == "dynamic" and abs(steps - max(round(steps), 1)) > 1e-6:
+            raise ValueError(f"step_ms {self.step_ms:g} is no multiple of physics_step_ms {self.physics_step_ms:g}")
+        return self
 
     def build(self, clock: Clock) -> Scene:
         """The scene, with its motions starting now."""
+        return Scene(self._world(), clock, self.step_ms * 1e-3)
+
+    def _world(self) -> World:
         surfaces = {name: config.build() for name, config in self.surfaces.items()}
-        return Scene(surfaces, self.tip.build(), clock, self.step_ms * 1e-3)
+        if self.physics == "kinematic":
+            return KinematicWorld(surfaces, self.tip.build())
+        if self.physics == "quasi_static":
+            objects = {name: config.build(self.table) for name, config in self.objects.items()}
+            return QuasiStaticWorld(surfaces, objects, self.tip.build())
+        return self._dynamic_world(surfaces)
+
+    def _dynamic_world(self, surfaces: Mapping[str, Surface]) -> World:
+        with physics_engine("scene.physics", "dynamic"):
+            from drivers.simulation.dynamics import DynamicWorld
+            from drivers.simulation.dynamics_model import TipMechanics
+        tip = TipMechanics(
+            radius_m=1e-3 * self.tip.radius_mm,
+            stiffness_n_m=1e3 * self.tip.stiffness_n_mm,
+            friction=self.tip.friction,
+        )
+        objects = {name: config.build(self.table) for name, config in self.objects.items()}
+        return DynamicWorld(surfaces, objects, 1e-3 * self.table.height_mm, tip, 1e-3 * self.physics_step_ms)

@@ -9,6 +9,9 @@ from drivers.clock import Clock
 
 DEFAULT_STEP_S = 0.002
 
+Restore = Callable[[], None]
+"""Puts something back as it was when this was made; may be called any number of times."""
+
 
 class Phase(IntEnum):
     """Order within a step: bodies move first, then contacts follow."""
@@ -31,6 +34,7 @@ class Timeline:
         self._t_ns = clock.now_ns() // self.step_ns * self.step_ns
         self._participants: list[tuple[Phase, Callable[[int], None]]] = []
         self._advancing = False
+        self._kept: list[Callable[[], Callable[[int], None]]] = []
 
     @property
     def t_ns(self) -> int:
@@ -41,6 +45,24 @@ class Timeline:
         """Call ``step(t_ns)`` for every step, with the time at the step's end."""
         self._participants.append((phase, step))
         self._participants.sort(key=lambda participant: participant[0])
+
+    def keep(self, snapshot: Callable[[], Callable[[int], None]]) -> None:
+        """Let snapshots cover a participant. ``snapshot()`` returns what puts it back, given how many nanoseconds later
+        it is then."""
+        self._kept.append(snapshot)
+
+    def snapshot(self) -> Restore:
+        """All participants as they are now. Putting them back leaves the clock alone: what they had before them then
+        begins anew."""
+        t_ns = self.advance()
+        parts = [snapshot() for snapshot in self._kept]
+
+        def restore() -> None:
+            later_ns = self.advance() - t_ns
+            for part in parts:
+                part(later_ns)
+
+        return restore
 
     def advance(self) -> int:
         """Make all steps up to the clock's now; returns ``t_ns``. Within a step it does nothing."""

@@ -45,6 +45,7 @@ def rig(folder: Path, address: int) -> Rig:
         spec=damiao_can.SPEC,
         start=start,
         build=lambda clock: damiao_can.DamiaoCanArm("arm", config(channel), clock),
+        config=config(channel),
         state_rate_hz=125.0,
         pose="T_base_tcp",
         reset="reset",

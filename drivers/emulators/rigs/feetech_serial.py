@@ -48,6 +48,7 @@ def rig(folder: Path, address: int) -> Rig:
         spec=feetech_serial.SPEC,
         start=lambda: emulator(port).start(),
         build=lambda clock: feetech_serial.FeetechSerialArm("arm", config(port), clock),
+        config=config(port),
         pose="T_base_tcp",
         reset="reset",
         state_rate_hz=40.0,

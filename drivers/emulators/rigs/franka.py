@@ -32,6 +32,7 @@ def rig(folder: Path, address: int) -> Rig:
         spec=SPEC,
         start=start,
         build=build,
+        config=config,
         time="t_s",
         pose="T_base_ee",
         faults={

@@ -48,6 +48,7 @@ def rig(folder: Path, address: int) -> Rig:
         spec=SPEC,
         start=start,
         build=build,
+        config=config_of(address),
         time="t_s",
         pose="T_base_tcp",
         faults={

@@ -1,0 +1,270 @@
+"""Full dynamics of free objects and soft tips, by MuJoCo: pushing, slipping, toppling, holding.
+
+Each sensor rides on a heavy carriage that coasts from pose to pose; between it and what it touches are springs and a
+rigid sphere (``dynamics_model.TipMechanics``). A carriage keeps its z axis along the surface normal: tilting about the
+tip's centre shears nothing, as in SPEC part 2, and the springs' deflection is the contact's shear and torsion.
+Surfaces that move as they were told are given to each tip as the patch that is tangent before it.
+
+Free objects touch the table, tips and each other, no prescribed surfaces.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+
+from drivers.errors import ConfigError
+from drivers.simulation.contact import ContactState, about_z, tilt_of
+from drivers.simulation.dynamics_model import TipMechanics, build_model, cross, quaternion, rotation
+from drivers.simulation.motions import Still
+from drivers.simulation.objects import FreeObject
+from drivers.simulation.solids import shape_of
+from drivers.simulation.surfaces import Plane, Surface, SurfacePoint
+from drivers.simulation.timeline import Restore
+from geometry.types import Array
+
+# A carriage that would turn faster than this in one step has come to another face: it is set there, not swung.
+_SWING_RAD = 0.1
+# Friction is regularised: what slides carries a little less than the cone allows.
+_SLIDING_SHARE = 0.97
+_IDENTITY = np.eye(4)
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+@dataclass(slots=True)
+class _Mounted:
+    """One sensor's carriage at the last step.
+
+    Attributes:
+        T_world_s: (4, 4) pose of the sensor.
+        R_world_c: (3, 3) axes of the carriage.
+        normal: (3,) outward, of what was nearest.
+    """
+
+    T_world_s: Array
+    R_world_c: Array
+    normal: Array
+
+
+class DynamicWorld:
+    """A world that MuJoCo moves.
+
+    Args:
+        surfaces: that move as they were told, by name.
+        objects: free ones, by name.
+        table_height_m: of the level plane under them.
+        tip: what every tip is made of.
+        step_s: time step of the physics; steps of the scene must be multiples of it.
+
+    Raises:
+        ConfigError: there is nothing to touch.
+    """
+
+    def __init__(
+        self,
+        surfaces: Mapping[str, Surface],
+        objects: Mapping[str, FreeObject],
+        table_height_m: float,
+        tip: TipMechanics,
+        step_s: float,
+    ) -> None:
+        if not (surfaces or objects):
+            raise ConfigError("the scene has nothing to touch", key="scene")
+        self.tip = tip
+        self._surfaces = list(surfaces.values())
+        self._things = dict(objects)
+        self._shapes = {name: shape_of(thing.solid) for name, thing in objects.items()}
+        self._table_height_m = table_height_m if objects else None
+        T_world_table = np.eye(4)
+        T_world_table[2, 3] = table_height_m
+        self._table = Surface(Plane(), Still(T_world_table)) if objects else None
+        self._step_s = step_s
+        self._mounted: dict[str, _Mounted] = {}
+        self._t_s = 0.0
+        self._build({})
+
+    def mount(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
+        """Let ``sensor`` feel; returns what it feels at ``T_world_s`` (4, 4) at ``t_s``. Its tip begins undeformed."""
+        normal = self._nearest(T_world_s[:3, 3], t_s).normal
+        self._mounted[sensor] = _Mounted(T_world_s, _upright(T_world_s, normal), normal)
+        self._t_s = t_s
+        self._build(self.objects())
+        return self._feel(sensor, T_world_s, t_s)
+
+    def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, ContactState]:
+        """Go on to ``t_s``."""
+        span_s = t_s - self._t_s
+        for sensor, pose in T_world_s.items():
+            self._carry(sensor, pose, span_s)
+        mujoco.mj_step(self._at.model, self._data, round(span_s / self._step_s))
+        self._t_s = t_s
+        return {sensor: self._feel(sensor, pose, t_s) for sensor, pose in T_world_s.items()}
+
+    def objects(self) -> Mapping[str, Array]:
+        """T_world_object (4, 4) of every free object now."""
+        return {name: self._pose(name) for name in self._things}
+
+    def snapshot(self) -> Restore:
+        """What puts objects, tips and carriages back."""
+        model, data = self._at.model, self._data
+        state = np.empty(mujoco.mj_stateSize(model, _STATE))
+        mujoco.mj_getState(model, data, state, _STATE)
+        t_s, mounted = self._t_s, {sensor: replace(each) for sensor, each in self._mounted.items()}
+
+        def restore() -> None:
+            mujoco.mj_setState(model, data, state, _STATE)
+            self._t_s, self._mounted = t_s, {sensor: replace(each) for sensor, each in mounted.items()}
+
+        return restore
+
+    def _build(self, T_world_object: Mapping[str, Array]) -> None:
+        """Compile the model anew, with objects at ``T_world_object`` (4, 4) or else where they stand at first."""
+        self._at = build_model(
+            self._things,
+            self._table_height_m,
+            list(self._mounted),
+            self.tip,
+            self._step_s,
+            patches=bool(self._surfaces),
+        )
+        self._data = mujoco.MjData(self._at.model)
+        self._qpos, self._qvel = self._data.qpos, self._data.qvel
+        for name, pose in T_world_object.items():
+            self._place(self._at.objects[name].qpos, pose[:3, 3], pose[:3, :3])
+
+    def _carry(self, sensor: str, T_world_s: Array, span_s: float) -> None:
+        """Let the carriage coast from where it is to ``T_world_s``, and put the surface before its tip.
+
+        The normal that keeps it upright is the last step's: what moves is not known yet where it will be.
+        """
+        mounted, at = self._mounted[sensor], self._at.carriages[sensor]
+        position = mounted.T_world_s[:3, 3]
+        R_end = _upright(T_world_s, mounted.normal)
+        R_start, swing = mounted.R_world_c, _swing(mounted.R_world_c, R_end)
+        if swing is None:
+            R_start, swing = R_end, np.zeros(3)
+        self._place(at.qpos, position, R_start)
+        self._qvel[at.qvel : at.qvel + 3] = (T_world_s[:3, 3] - position) / span_s
+        self._qvel[at.qvel + 3 : at.qvel + 6] = R_start.T @ swing / span_s
+        if self._surfaces:
+            tip = self._at.tips[sensor].qpos
+            self._place_patch(sensor, position + R_start @ self._qpos[tip : tip + 3])
+        mounted.T_world_s, mounted.R_world_c = T_world_s, R_end
+
+    def _place_patch(self, sensor: str, tip_centre: Array) -> None:
+        """Put the tangent of the surface that is nearest to the tip where it is now, moving as the surface does."""
+        surface, found = self._nearest_surface(tip_centre, self._t_s)
+        at = self._at.patches[sensor]
+        R = _facing(found.normal)
+        self._place(at.qpos, found.point, R)
+        twist = surface.motion.twist(self._t_s)
+        if twist.any():
+            arm = found.point - surface.motion.pose(self._t_s)[:3, 3]
+            self._qvel[at.qvel : at.qvel + 3] = twist[:3] + cross(twist[3:], arm)
+            self._qvel[at.qvel + 3 : at.qvel + 6] = R.T @ twist[3:]
+        else:
+            self._qvel[at.qvel : at.qvel + 6] = 0.0
+
+    def _feel(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
+        nearest = self._nearest(T_world_s[:3, 3], t_s)
+        self._mounted[sensor].normal = nearest.normal
+        R_tilt = tilt_of(-nearest.normal @ T_world_s[:3, :3])
+        depth = self.tip.radius_m - nearest.distance_m
+        if depth <= 0.0:
+            return _state(T_world_s, R_tilt, 0.0, (0.0, 0.0, depth))
+        tip, at = self.tip, self._at.tips[sensor]
+        dx, dy, dz, turned = self._qpos[at.qpos : at.qpos + 4].tolist()
+        # The sphere stays behind with the surface, so its deflection is the sensor's own displacement reversed.
+        sin, cos = math.sin(turned), math.cos(turned)
+        shear = (-cos * dx - sin * dy, sin * dx - cos * dy)
+        pressing = -tip.stiffness_n_m * dz
+        held = math.hypot(
+            tip.shear_stiffness_n_m * math.hypot(dx, dy) / tip.friction,
+            tip.torsion_stiffness_n_m_rad * turned / tip.torsion_friction_m,
+        )
+        force = max(pressing - tip.damping_n_s_m * float(self._qvel[at.qvel + 2]), 0.0)
+        slipping = held >= _SLIDING_SHARE * pressing
+        pull = (-tip.shear_stiffness_n_m * shear[0], -tip.shear_stiffness_n_m * shear[1])
+        return _state(T_world_s, R_tilt, -turned, (*shear, depth), slipping=slipping, force_n=force, pull_n=pull)
+
+    def _nearest(self, point: Array, t_s: float) -> SurfacePoint:
+        """What is nearest to ``point`` (3,): a surface, the table, or an object where it is now."""
+        found: SurfacePoint | None = None
+        if self._surfaces:
+            found = self._nearest_surface(point, t_s)[1]
+        if self._table is not None:
+            found = _nearer(found, self._table.nearest(point, t_s))
+        for name, shape in self._shapes.items():
+            T = self._pose(name)
+            R, origin = T[:3, :3], T[:3, 3]
+            local = shape.nearest((point - origin) @ R)
+            if found is None or local.distance_m < found.distance_m:
+                found = SurfacePoint(local.distance_m, R @ local.normal, R @ local.point + origin)
+        assert found is not None
+        return found
+
+    def _nearest_surface(self, point: Array, t_s: float) -> tuple[Surface, SurfacePoint]:
+        found = ((surface, surface.nearest(point, t_s)) for surface in self._surfaces)
+        return min(found, key=lambda each: each[1].distance_m)
+
+    def _pose(self, name: str) -> Array:
+        at = self._at.objects[name].qpos
+        T = _IDENTITY.copy()
+        T[:3, :3] = rotation(self._qpos[at + 3 : at + 7])
+        T[:3, 3] = self._qpos[at : at + 3]
+        return T
+
+    def _place(self, at: int, position: Array, R: Array) -> None:
+        self._qpos[at : at + 3] = position
+        self._qpos[at + 3 : at + 7] = quaternion(R)
+
+
+def _state(
+    T_world_s: Array,
+    R_tilt: Array,
+    torsion: float,
+    position: tuple[float, float, float],
+    *,
+    slipping: bool = False,
+    force_n: float = 0.0,
+    pull_n: tuple[float, float] = (0.0, 0.0),
+) -> ContactState:
+    T_f_s = _IDENTITY.copy()
+    T_f_s[:3, :3] = about_z(torsion) @ R_tilt
+    T_f_s[:3, 3] = position
+    T_world_f = _IDENTITY.copy()
+    T_world_f[:3, :3] = T_world_s[:3, :3] @ T_f_s[:3, :3].T
+    T_world_f[:3, 3] = T_world_s[:3, 3] - T_world_f[:3, :3] @ T_f_s[:3, 3]
+    return ContactState(T_f_s, T_world_f, position[2] > 0.0, slipping, force_n, pull_n)
+
+
+def _nearer(a: SurfacePoint | None, b: SurfacePoint) -> SurfacePoint:
+    return b if a is None or b.distance_m < a.distance_m else a
+
+
+def _swing(R_start: Array, R_end: Array) -> Array | None:
+    """Rotation vector (3,) along world axes from one to the other; None if it is no small one."""
+    R = R_end @ R_start.T
+    turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return turn if float(np.trace(R)) > 1.0 + 2.0 * math.cos(_SWING_RAD) else None
+
+
+def _upright(T_world_s: Array, normal: Array) -> Array:
+    """Axes of {s} without its tilt: z along the inward normal, turned about it as the sensor is."""
+    R = T_world_s[:3, :3]
+    upright: Array = R @ tilt_of(-normal @ R).T
+    return upright
+
+
+def _facing(normal: Array) -> Array:
+    """Axes (3, 3) with z along the unit vector ``normal``."""
+    x, y, z = normal.tolist()
+    # A rotation about an axis normal to both takes the world's z axis, or its opposite, there.
+    sign = math.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return np.array([[1.0 + sign * x * x * a, b, x], [sign * b, sign + y * y * a, y], [-sign * x, -y, z]])

@@ -1,0 +1,187 @@
+"""What follows from the shape of a free object: its nearest point, its inertia, and how a table resists its turning."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.simulation.objects import Ball, Prism, Solid, Turned
+from drivers.simulation.surfaces import Shape, Sphere, SurfacePoint
+from geometry.types import Array
+
+
+@dataclass(frozen=True, slots=True)
+class MassProperties:
+    """Of an evenly dense solid, in its own frame, whose axes are principal through the centre of mass.
+
+    Attributes:
+        com_m: (3,) centre of mass.
+        inertia_per_kg_m2: (3,) principal moments over the mass.
+    """
+
+    com_m: Array
+    inertia_per_kg_m2: Array
+
+
+def shape_of(solid: Solid) -> Shape:
+    """The solid's outside, in its own frame; exact for points outside."""
+    match solid:
+        case Prism():
+            return _PrismShape(_edges(solid.outline_m), solid.height_m)
+        case Turned():
+            return _TurnedShape(_sections(solid))
+        case Ball():
+            return Sphere(solid.radius_m)
+
+
+def mass_properties(solid: Solid) -> MassProperties:
+    """Centre of mass and moments of inertia at even density.
+
+    A prism's outline must be symmetric about its axes, as those are that a scene can describe.
+    """
+    match solid:
+        case Ball():
+            return MassProperties(np.zeros(3), np.full(3, 0.4 * solid.radius_m**2))
+        case Prism():
+            xx, yy = _second_moments(solid.outline_m)
+            along_z = solid.height_m**2 / 12.0
+            moments = np.array([yy + along_z, xx + along_z, xx + yy])
+            return MassProperties(np.array([0.0, 0.0, 0.5 * solid.height_m]), moments)
+        case Turned():
+            parts = [
+                (radius**2 * (top - bottom), 0.5 * (top + bottom), top - bottom, radius)
+                for bottom, top, radius in _sections(solid)
+            ]
+            total = sum(weight for weight, *_ in parts)
+            z = sum(weight * middle for weight, middle, *_ in parts) / total
+            across = sum(w * (r**2 / 4.0 + h**2 / 12.0 + (m - z) ** 2) for w, m, h, r in parts) / total
+            about = sum(w * r**2 / 2.0 for w, _, _, r in parts) / total
+            return MassProperties(np.array([0.0, 0.0, z]), np.array([across, across, about]))
+
+
+def friction_radius_m(solid: Prism | Turned) -> float:
+    """Lever of the friction against turning in place: the mean distance of the bottom from its middle.
+
+    That is what uniform pressure gives: 2 R / 3 for a disc and 0.3826 w for a square.
+    """
+    if isinstance(solid, Turned):
+        return 2.0 / 3.0 * solid.sections_m[0][1]
+    area = moment = 0.0
+    for (ax, ay), (bx, by) in _edges(solid.outline_m):
+        # In polar coordinates about the origin an edge at distance d is r = d / cos(angle - its normal's).
+        length = math.hypot(bx - ax, by - ay)
+        d = (ax * by - ay * bx) / length
+        along_a, along_b = ((ax * (bx - ax) + ay * (by - ay)) / length, (bx * (bx - ax) + by * (by - ay)) / length)
+        area += 0.5 * d * (along_b - along_a)
+        moment += d / 3.0 * (_integral(along_b, d) - _integral(along_a, d))
+    return moment / area
+
+
+def _integral(s: float, d: float) -> float:
+    """Of sqrt(s^2 + d^2) over s."""
+    r = math.hypot(s, d)
+    return 0.5 * (s * r + d * d * math.asinh(s / d))
+
+
+_Point = tuple[float, float]
+
+
+def _edges(outline_m: Array) -> tuple[tuple[_Point, _Point], ...]:
+    corners = [(float(x), float(y)) for x, y in outline_m]
+    return tuple(zip(corners, [*corners[1:], corners[0]], strict=True))
+
+
+def _sections(solid: Turned) -> tuple[tuple[float, float, float], ...]:
+    """(bottom, top, radius) of each."""
+    sections, bottom = [], 0.0
+    for height, radius in solid.sections_m:
+        sections.append((bottom, bottom + height, radius))
+        bottom += height
+    return tuple(sections)
+
+
+def _second_moments(outline_m: Array) -> tuple[float, float]:
+    """Mean of x^2 and of y^2 over the outline's area."""
+    a, b = outline_m, np.roll(outline_m, -1, axis=0)
+    cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    xx, yy = (cross[:, None] * (a * a + a * b + b * b)).sum(axis=0) / (6.0 * cross.sum())
+    return float(xx), float(yy)
+
+
+@dataclass(frozen=True, slots=True)
+class _PrismShape:
+    edges: tuple[tuple[_Point, _Point], ...]
+    height_m: float
+
+    def nearest(self, p: Array) -> SurfacePoint:
+        x, y, z = (float(value) for value in p)
+        outside, best_sq, foot, out, face = False, math.inf, (0.0, 0.0), (1.0, 0.0), (1.0, 0.0)
+        deepest = -math.inf
+        for (ax, ay), (bx, by) in self.edges:
+            ex, ey = bx - ax, by - ay
+            length = math.hypot(ex, ey)
+            beyond = ((x - ax) * ey - (y - ay) * ex) / length
+            outside = outside or beyond > 0.0
+            if beyond > deepest:
+                deepest, out = beyond, (ey / length, -ex / length)
+            u = min(max(((x - ax) * ex + (y - ay) * ey) / length**2, 0.0), 1.0)
+            px, py = ax + u * ex, ay + u * ey
+            distance_sq = (x - px) ** 2 + (y - py) ** 2
+            if distance_sq < best_sq:
+                best_sq, foot = distance_sq, (px, py)
+                # Near a face its normal is exact, where the way to its nearest point is only rounding.
+                face = (ey / length, -ex / length) if 0.0 < u < 1.0 else (0.0, 0.0)
+        if outside:
+            beyond = math.sqrt(best_sq)
+            if face == (0.0, 0.0):
+                face = ((x - foot[0]) / beyond, (y - foot[1]) / beyond) if beyond > 0.0 else out
+            return _off_a_rim(z, foot, face, beyond, self.height_m)
+        over, under = z - self.height_m, -z
+        if deepest >= max(over, under):
+            normal = np.array([out[0], out[1], 0.0])
+            return SurfacePoint(deepest, normal, np.array([x, y, z]) - deepest * normal)
+        return _off_an_end(x, y, self.height_m, over, under)
+
+
+@dataclass(frozen=True, slots=True)
+class _TurnedShape:
+    sections: tuple[tuple[float, float, float], ...]
+
+    def nearest(self, p: Array) -> SurfacePoint:
+        x, y, z = (float(value) for value in p)
+        off_axis = math.hypot(x, y)
+        ux, uy = (x / off_axis, y / off_axis) if off_axis > 0.0 else (1.0, 0.0)
+        found: SurfacePoint | None = None
+        for bottom, top, radius in self.sections:
+            beyond, height = off_axis - radius, top - bottom
+            over, under = z - top, bottom - z
+            if beyond > 0.0:
+                point = _off_a_rim(z - bottom, (ux * radius, uy * radius), (ux, uy), beyond, height)
+            elif beyond >= max(over, under):
+                point = SurfacePoint(beyond, np.array([ux, uy, 0.0]), np.array([ux * radius, uy * radius, z - bottom]))
+            else:
+                point = _off_an_end(x, y, height, over, under)
+            if found is None or point.distance_m < found.distance_m:
+                point.point[2] += bottom
+                found = point
+        assert found is not None
+        return found
+
+
+def _off_a_rim(z: float, foot: _Point, out: _Point, beyond: float, height: float) -> SurfacePoint:
+    """Nearest point to one that is ``beyond`` the outline along the unit vector ``out``, its nearest point ``foot``."""
+    on_z = min(max(z, 0.0), height)
+    distance = math.hypot(beyond, z - on_z)
+    point = np.array([foot[0], foot[1], on_z])
+    if distance == 0.0:
+        return SurfacePoint(0.0, np.array([out[0], out[1], 0.0]), point)
+    return SurfacePoint(distance, np.array([out[0] * beyond, out[1] * beyond, z - on_z]) / distance, point)
+
+
+def _off_an_end(x: float, y: float, height: float, over: float, under: float) -> SurfacePoint:
+    """Nearest point of the top or the bottom to one within the outline."""
+    if over >= under:
+        return SurfacePoint(over, np.array([0.0, 0.0, 1.0]), np.array([x, y, height]))
+    return SurfacePoint(under, np.array([0.0, 0.0, -1.0]), np.array([x, y, 0.0]))
