@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 import cv2
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from drivers.errors import ConfigError
@@ -208,7 +209,7 @@ def similarity(here: Array, there: Array) -> tuple[complex, float]:
     return linear, float(np.sqrt((np.abs(linear * a - b) ** 2).mean()))
 
 
-def lattice_turns(rings: int) -> list[Array]:
+def lattice_turns(rings: int) -> list[NDArray[np.intp]]:
     """Six orders (m,) of a lattice's markers, each turned by a sixth of a round."""
     first = np.concatenate([[0], 1 + 3 * np.arange(rings) * np.arange(1, rings + 1)])
     turns = []
