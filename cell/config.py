@@ -97,10 +97,11 @@ class GateSection(_Section):
 
 
 class NetworkEstimator(_Section):
-    """Image -> network -> filter."""
+    """Image -> network -> filter. ``calibration`` is a file of ``touchcell calibrate``."""
 
     kind: Literal["network"]
     model: str
+    calibration: str | None = None
     gate: GateSection | None = None
     filter: FilterSection | None = None
 
