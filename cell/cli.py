@@ -118,6 +118,11 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("--animate", action="store_true", help="also write animation.gif")
     report.set_defaults(run=_report)
 
+    view = commands.add_parser("view", help="show in a browser what a run's sensors feel, live or from its recording")
+    view.add_argument("folder", type=Path, help="run folder")
+    view.add_argument("--port", type=int, default=8177, help="of the page on this machine")
+    view.set_defaults(run=_view)
+
     why = commands.add_parser("why", help="explain why a run tripped, from its black box")
     why.add_argument("folder", type=Path)
     why.set_defaults(run=_why)
@@ -126,6 +131,14 @@ def _parser() -> argparse.ArgumentParser:
     stop.add_argument("folder", type=Path, nargs="?", help="run folder (default: every run below runs/)")
     stop.add_argument("--now", action="store_true", help="at once, without withdrawing first")
     stop.set_defaults(run=_stop)
+
+    for word, text in (
+        ("reset", "reset a run that has tripped and waits, once the cause has gone; nothing moves by it"),
+        ("resume", "let a run that has been reset start its task again"),
+    ):
+        asking = commands.add_parser(word, help=text)
+        asking.add_argument("folder", type=Path, nargs="?", help="run folder (default: the one run below runs/)")
+        asking.set_defaults(run=_ask, ask=word)
 
     bench = commands.add_parser("bench", help="run time against error")
     bench.add_argument("name", nargs="?", help="which; `touchcell list` names them")
@@ -277,6 +290,13 @@ def _report(options: argparse.Namespace) -> int:
     return EXIT_OK
 
 
+def _view(options: argparse.Namespace) -> int:
+    from cell.view import view_run
+
+    view_run(options.folder, options.port)
+    return EXIT_OK
+
+
 def _why(options: argparse.Namespace) -> int:
     from cell.why import explain
 
@@ -296,6 +316,21 @@ def _stop(options: argparse.Namespace) -> int:
     for folder, done in ended.items():
         print(f"{folder}: {'stopped' if done else 'asked, and still going on'}")
     return EXIT_OK if all(ended.values()) else EXIT_TASK_FAILED
+
+
+def _ask(options: argparse.Namespace) -> int:
+    import getpass
+
+    from cell.desk import Ask, ask_run, is_waiting
+    from cell.operator import NoSuchRun, running
+
+    folders = [options.folder] if options.folder else [run for run in running(Path("runs")) if is_waiting(run)]
+    if len(folders) != 1 or not is_waiting(folders[0]):
+        where = folders[0] if len(folders) == 1 else Path("runs")
+        raise NoSuchRun(where, "several runs wait: name one" if len(folders) > 1 else "no run waits for a reset here")
+    done, words = ask_run(folders[0], Ask(options.ask), getpass.getuser())
+    print(f"{folders[0]}: {words}")
+    return EXIT_OK if done else EXIT_TASK_FAILED
 
 
 def _bench(options: argparse.Namespace) -> int:

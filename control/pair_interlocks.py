@@ -57,7 +57,7 @@ class Carried:
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """Leader and follower, in the task's ``states``, or in all if none are named."""
+    """Leader and follower, while the task is at work in one of ``states``, or in any if none are named."""
 
     leader: Carried
     follower: Carried
@@ -65,7 +65,7 @@ class _Pair:
 
     def contacts(self, view: CellView) -> tuple[SensorView, SensorView] | None:
         """Both contacts, where both are made."""
-        if self.states and view.task_state not in self.states:
+        if not view.works_in(self.states):
             return None
         leading, following = self.leader.contact(view), self.follower.contact(view)
         return None if leading is None or following is None else (leading, following)
@@ -101,7 +101,7 @@ class ObjectLost:
 
     def judge(self, view: CellView, past: Past) -> Judgement:
         """The sensor whose contact has been missing for longest, if too long."""
-        if self.states and view.task_state not in self.states:
+        if not view.works_in(self.states):
             return None, {}
         touching = {role: role in view.sensors and view.sensors[role].in_contact for role in self.sensors}
         if not past and not all(touching.values()):
@@ -139,7 +139,7 @@ class Toppling:
 
     def judge(self, view: CellView, past: Past) -> Judgement:
         """The first of lean, rate and slide that is too large for too long."""
-        if self.states and view.task_state not in self.states:
+        if not view.works_in(self.states):
             return None, {}
         marks: dict[str, Mark] = {}
         turned, slides, seq = [], [], None
