@@ -12,7 +12,7 @@ PRIORITY: Final = 40
 """Below the kernel's own interrupt threads (50), above everything ordinary."""
 
 LONGEST_US: Final = 200_000
-"""Computing for so long without a pause, a process falls back to ordinary scheduling: nobody else could run beside it."""
+"""Computing for so long without a pause, a process falls back to ordinary scheduling: nobody else could run."""
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
