@@ -106,10 +106,22 @@ def _parser() -> argparse.ArgumentParser:
     calibrate_sim.add_argument("--seed", type=int, default=0)
     calibrate_sim.set_defaults(run=_calibrate_sim)
 
+    calibrate = commands.add_parser("calibrate", help="zoom, turn and shift of a camera from images out of contact")
+    calibrate.add_argument("--model", type=Path, required=True)
+    calibrate.add_argument("--out", type=Path, required=True, help="calibration file to write (.yaml)")
+    source = calibrate.add_mutually_exclusive_group(required=True)
+    source.add_argument("--frames", type=Path, help="folder with PNG images of the tip out of contact")
+    source.add_argument("--cell", type=Path, help="cell file whose sensor takes them now")
+    calibrate.add_argument("--sensor", help="which sensor of the cell")
+    calibrate.add_argument("--count", type=int, default=20, help="images that the cell's sensor takes")
+    calibrate.add_argument("--reference", type=Path, help="such images of the sensor that taught the model")
+    calibrate.set_defaults(run=_calibrate)
+
     evaluate = commands.add_parser("evaluate", help="error, likelihood, calibration and latency on labelled images")
     evaluate.add_argument("--data", type=Path, required=True)
     evaluate.add_argument("--split", default="val", help="train, val or test")
     evaluate.add_argument("--model", type=Path, required=True)
+    evaluate.add_argument("--calibration", type=Path, help="file of `touchcell calibrate`")
     evaluate.add_argument("--json", type=Path, help="also write the figures there")
     evaluate.set_defaults(run=_evaluate)
 
@@ -117,6 +129,11 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("folder", type=Path)
     report.add_argument("--animate", action="store_true", help="also write animation.gif")
     report.set_defaults(run=_report)
+
+    view = commands.add_parser("view", help="show in a browser what a run's sensors feel, live or from its recording")
+    view.add_argument("folder", type=Path, help="run folder")
+    view.add_argument("--port", type=int, default=8177, help="of the page on this machine")
+    view.set_defaults(run=_view)
 
     why = commands.add_parser("why", help="explain why a run tripped, from its black box")
     why.add_argument("folder", type=Path)
@@ -255,6 +272,26 @@ def _calibrate_sim(options: argparse.Namespace) -> int:
     return EXIT_OK
 
 
+def _calibrate(options: argparse.Namespace) -> int:
+    from cell.calibrate import calibrate
+
+    change = calibrate(
+        options.model,
+        options.out,
+        frames=options.frames,
+        cell=None if options.cell is None else find_cell(options.cell),
+        sensor=options.sensor,
+        count=options.count,
+        taught=options.reference,
+    )
+    u, v = change.shift_px
+    print(
+        f"zoom {change.zoom:.4f}, turn {change.turn_deg:.2f} deg, shift {u:.2f} {v:.2f} px, {change.rms_px:.2f} px left"
+    )
+    print(f"{change.frames} images; wrote {options.out}")
+    return EXIT_OK
+
+
 def _evaluate(options: argparse.Namespace) -> int:
     from rich.progress import Progress
 
@@ -266,6 +303,7 @@ def _evaluate(options: argparse.Namespace) -> int:
             options.data,
             options.split,
             options.model,
+            calibration=options.calibration,
             progress=lambda done, total: bar.update(images, completed=done, total=total),
         )
     print_table(result)
@@ -282,6 +320,13 @@ def _report(options: argparse.Namespace) -> int:
         from cell.animation import animate
 
         print(animate(options.folder))
+    return EXIT_OK
+
+
+def _view(options: argparse.Namespace) -> int:
+    from cell.view import view_run
+
+    view_run(options.folder, options.port)
     return EXIT_OK
 
 

@@ -108,6 +108,12 @@ class Sensor:
             "filter": times.filter_ns,
         }
 
+    def about(self) -> dict[str, Any] | None:
+        """What recorded images need to be understood: the preprocessing; None when none are recorded."""
+        if self.frames == "none" or not isinstance(self.source, ContactPipeline):
+            return None
+        return self.source.preprocessing.model_dump(mode="json")
+
     def extra_messages(self, now_ns: int) -> Iterator[tuple[str, int, dict[str, Any]]]:
         """What else is recorded of this sensor in this cycle: the frame's own measurement, its image, the truth."""
         if isinstance(self.source, ContactPipeline):
@@ -363,7 +369,8 @@ def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Devic
 
     # A second thread gains nothing on images of this size (PERCEPTION part 5), and takes a core from other sensors.
     cv2.setNumThreads(1)
-    model = load_estimator(model_path(estimator.model))
+    calibration = None if estimator.calibration is None else Path(estimator.calibration)
+    model = load_estimator(model_path(estimator.model), calibration)
     pose_filter = None if estimator.filter is None else build_filter(estimator.filter)
     contact_gate = None
     if (gate := estimator.gate) is not None:

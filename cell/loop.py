@@ -179,8 +179,10 @@ class RunLoop:
     def begin(self) -> None:
         """Wait for each camera's first frame, take the arms' leases, and be watched from now on."""
         try:
-            for sensor in self._cell.sensors.values():
+            for role, sensor in self._cell.sensors.items():
                 sensor.await_frame()
+                if (about := sensor.about()) is not None:
+                    self._write(f"/sensors/{role}/preprocessing", self._cell.clock.now_ns(), about)
             for role, arm in self._arms.items():
                 self._leases[role] = arm.acquire(self._cell.task_name)
             self._cell.watch.begin()

@@ -20,7 +20,7 @@ from cell.desk import OperatorDesk
 from cell.errors import RecordingError
 from cell.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
 from cell.operator import reachable, stop_on_keys, stop_on_signals
-from cell.recording import Recorder
+from cell.recording import RECORDING, Recorder
 from cell.report import write_report
 from drivers.clock import VirtualClock
 
@@ -76,7 +76,7 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
     box = BlackBox()
     with (
         reachable(folder),
-        Recorder(folder / "run.mcap") as recorder,
+        Recorder(folder / RECORDING) as recorder,
         cell,
         stop_on_signals(stop),
         stop_on_keys(stop, desk=desk) as look_at_keys,

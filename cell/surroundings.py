@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -11,8 +11,7 @@ from cell.config import ArmSection, BoxSection, CapsuleSection, CellPlan
 from control.clearance import ClearanceConfig
 from control.collision import BASE, TOOL, Box, Capsule
 from control.surroundings import Body, Surroundings
-from drivers.abilities import TwistSink
-from drivers.arm import Arm
+from drivers.abilities import ServoArm, TwistSink
 from drivers.errors import ConfigError
 from drivers.kinematics import CapsuleShape, ChainDescription
 from geometry import se3
@@ -35,15 +34,16 @@ def build_surroundings(plan: CellPlan, arms: Mapping[str, Any], names: Mapping[s
     if not any(isinstance(entry, ClearanceConfig) for entry in plan.cell.interlocks.values()):
         return Surroundings(placed)
     bodies = {
-        role: _body(sections[role], placed[role], arm) for role, arm in arms.items() if isinstance(arm, TwistSink)
+        role: _body(sections[role], placed[role], cast(ServoArm, arm))
+        for role, arm in arms.items()
+        if isinstance(arm, TwistSink)
     }
     return Surroundings(placed, bodies, [_box(name, section) for name, section in plan.cell.obstacles.items()])
 
 
-def _body(section: ArmSection, T_world_base: Array, arm: Any) -> Body:
+def _body(section: ArmSection, T_world_base: Array, arm: ServoArm) -> Body:
     parts = [_part(k, part) for k, part in enumerate(section.body)]
-    # Of an arm in another process the joints are not passed on.
-    ik = arm.kinematics() if isinstance(arm, Arm) else None
+    ik = arm.kinematics()
     links = [] if ik is None else link_capsules(ik.chain.description)
     if not links:
         if not parts:

@@ -144,7 +144,7 @@ class SerialChain:
         gravity_m_s2: (3,) along base axes, for arms that hang or stand on a wall.
 
     Attributes:
-        description: the arm.
+        description, tool: the arm, and what its flange carries.
         joint_names, lower, upper, speed, accel, torque: (n,) per joint, rad, rad, rad/s, rad/s2, N m.
     """
 
@@ -153,7 +153,7 @@ class SerialChain:
     ) -> None:
         self.description = description
         joints = description.joints
-        tool = tool or Tool()
+        self.tool = tool = tool or Tool()
         self.joint_names = tuple(joint.name for joint in joints)
         self.lower = np.deg2rad([joint.lower_deg for joint in joints])
         self.upper = np.deg2rad([joint.upper_deg for joint in joints])

@@ -123,10 +123,11 @@ def test_a_pushed_prism_resists_with_the_friction_of_its_weight() -> None:
 @pytest.mark.parametrize("width_mm", [(80, 80), (80, 140)])
 def test_an_off_centre_push_turns_as_uniform_pressure_says(width_mm: tuple[int, int]) -> None:
     block = {"shape": {"kind": "box", "size_mm": [*width_mm, 60]}, "mass_g": 400}
-    # A small and hard tip that does not slip is a point that pushes: 10 mm beside the middle.
-    point = {"radius_mm": 2, "stiffness_n_mm": 20, "friction": 1.5}
+    # A small tip that does not slip is a point that pushes: 10 mm beside the middle.
+    point = {"radius_mm": 2, "friction": 1.5}
     hand = Hand({"objects": {"block": block}, "tip": point}, (-42.2, 10, 30, 0, 90, 0))
-    hand.move((0, 0, 20, 0, 0, 0), 3.01)
+    # It gives way by 0.7 mm.
+    hand.move((0, 0, 20, 0, 0, 0), 3.045)
     T = hand.object()
     yaw = np.arctan2(T[1, 0], T[0, 0])
     expected = uniform_pressure_yaw(1e-3 * np.array(width_mm), np.array([-0.042, 0.010]), 0.060)

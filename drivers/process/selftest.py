@@ -140,7 +140,11 @@ def _until_all_move(chain: Chain, leases: Mapping[str, Lease], link: str, within
     while unseen:
         if chain.now_ns() > deadline_ns:
             raise SelfTestFailed(min(unseen), link, "it was not seen to move at 1 mm/s", within_s, None)
-        _cycle(chain, leases, beats=True)
+        try:
+            _cycle(chain, leases, beats=True)
+        except CommandRejected as error:
+            reason = f"stopped before anything was withheld: {error.message}"
+            raise SelfTestFailed(error.device, link, reason, within_s, None) from error
         unseen = {
             name for name in unseen if arms[name].at_rest() or math.dist(_position(arms[name]), started[name]) < _SEEN_M
         }
