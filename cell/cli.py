@@ -54,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--data", type=Path, help="data set folder for drivers that replay one")
     run.add_argument("--model", help="model file in place of the one that the cell names")
     run.add_argument("--out", type=Path, help="run folder (default: runs/NAME-TIME)")
+    run.add_argument("--animate", action="store_true", help="also write animation.gif, of a simulated run")
     run.add_argument("--quiet", action="store_true", help="no live progress line")
     run.set_defaults(run=_run)
 
@@ -69,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     probe.add_argument("cell", type=Path)
     probe.set_defaults(run=_probe)
 
-    listing = commands.add_parser("list", help="known drivers, tasks, interlocks, emulators, benchmarks and cells")
+    listing = commands.add_parser("list", help="known drivers, tasks, interlocks, experiments, cells")
     listing.set_defaults(run=_list)
 
     train = commands.add_parser("train", help="train an estimator on labelled images")
@@ -82,6 +83,7 @@ def _parser() -> argparse.ArgumentParser:
         help="Gaussian-density network, regression or marker estimator",
     )
     train.add_argument("--epochs", type=int)
+    train.add_argument("--networks", type=int, help="of a marker estimator, whose mixture it gives (default: 4)")
     train.add_argument("--seed", type=int, default=0)
     train.add_argument("--fresh", action="store_true", help="start again instead of resuming")
     train.set_defaults(run=_train)
@@ -89,20 +91,50 @@ def _parser() -> argparse.ArgumentParser:
     train_sim = commands.add_parser("train-sim", help="train the estimator that ships, on simulated images")
     train_sim.add_argument("--out", type=Path, required=True, help="model file to write (.safetensors)")
     train_sim.add_argument("--samples", type=int, default=12_000)
+    train_sim.add_argument("--kind", choices=("gdn", "cnn", "markers"), default="gdn")
+    train_sim.add_argument("--tip", help="tip file of a real sensor (calibrate-sim), or the name of one that ships")
+    train_sim.add_argument("--processed", action="store_true", help="for images as the public data have them")
     train_sim.add_argument("--epochs", type=int)
     train_sim.add_argument("--seed", type=int, default=0)
     train_sim.set_defaults(run=_train_sim)
+
+    calibrate_sim = commands.add_parser("calibrate-sim", help="make the simulated tip like a real one")
+    calibrate_sim.add_argument("--data", type=Path, required=True, help="data set folder with train/, better also val/")
+    calibrate_sim.add_argument("--out", type=Path, required=True, help="tip file to write (.yaml)")
+    calibrate_sim.add_argument("--frames", type=int, default=20, help="labelled images to fit to")
+    calibrate_sim.add_argument("--images", type=int, default=600, help="images that teach the matching, unlabelled")
+    calibrate_sim.add_argument("--rings", type=int, default=10, help="of the marker lattice")
+    calibrate_sim.add_argument("--seed", type=int, default=0)
+    calibrate_sim.set_defaults(run=_calibrate_sim)
+
+    calibrate = commands.add_parser("calibrate", help="zoom, turn and shift of a camera from images out of contact")
+    calibrate.add_argument("--model", type=Path, required=True)
+    calibrate.add_argument("--out", type=Path, required=True, help="calibration file to write (.yaml)")
+    source = calibrate.add_mutually_exclusive_group(required=True)
+    source.add_argument("--frames", type=Path, help="folder with PNG images of the tip out of contact")
+    source.add_argument("--cell", type=Path, help="cell file whose sensor takes them now")
+    calibrate.add_argument("--sensor", help="which sensor of the cell")
+    calibrate.add_argument("--count", type=int, default=20, help="images that the cell's sensor takes")
+    calibrate.add_argument("--reference", type=Path, help="such images of the sensor that taught the model")
+    calibrate.set_defaults(run=_calibrate)
 
     evaluate = commands.add_parser("evaluate", help="error, likelihood, calibration and latency on labelled images")
     evaluate.add_argument("--data", type=Path, required=True)
     evaluate.add_argument("--split", default="val", help="train, val or test")
     evaluate.add_argument("--model", type=Path, required=True)
+    evaluate.add_argument("--calibration", type=Path, help="file of `touchcell calibrate`")
     evaluate.add_argument("--json", type=Path, help="also write the figures there")
     evaluate.set_defaults(run=_evaluate)
 
     report = commands.add_parser("report", help="make a run's summary and plots again from its recording")
     report.add_argument("folder", type=Path)
+    report.add_argument("--animate", action="store_true", help="also write animation.gif")
     report.set_defaults(run=_report)
+
+    view = commands.add_parser("view", help="show in a browser what a run's sensors feel, live or from its recording")
+    view.add_argument("folder", type=Path, help="run folder")
+    view.add_argument("--port", type=int, default=8177, help="of the page on this machine")
+    view.set_defaults(run=_view)
 
     why = commands.add_parser("why", help="explain why a run tripped, from its black box")
     why.add_argument("folder", type=Path)
@@ -113,11 +145,27 @@ def _parser() -> argparse.ArgumentParser:
     stop.add_argument("--now", action="store_true", help="at once, without withdrawing first")
     stop.set_defaults(run=_stop)
 
+    for word, text in (
+        ("reset", "reset a run that has tripped and waits, once the cause has gone; nothing moves by it"),
+        ("resume", "let a run that has been reset start its task again"),
+    ):
+        asking = commands.add_parser(word, help=text)
+        asking.add_argument("folder", type=Path, nargs="?", help="run folder (default: the one run below runs/)")
+        asking.set_defaults(run=_ask, ask=word)
+
     bench = commands.add_parser("bench", help="run time against error")
     bench.add_argument("name", nargs="?", help="which; `touchcell list` names them")
     bench.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for tables and plots")
     bench.add_argument("rest", nargs="*", help="arguments of the benchmark; its options follow after --")
     bench.set_defaults(run=_bench)
+
+    experiment = commands.add_parser("experiment", help="the paper's experiments: trials, table and plots")
+    experiment.add_argument("name", help="which, or `all`; `touchcell list` names them")
+    experiment.add_argument("--out", type=Path, default=Path("runs/experiments"), help="folder with one for each")
+    experiment.add_argument("--jobs", type=int, help="trials at a time (default: one for each core)")
+    experiment.add_argument("--trials", type=int, help="repetitions of each row (default: the experiment's own number)")
+    experiment.add_argument("--quick", action="store_true", help="the least that still shows every kind of row")
+    experiment.set_defaults(run=_experiment)
 
     commands.add_parser("emulate", help="emulate a device on the wire", add_help=False)
     return parser
@@ -132,6 +180,7 @@ def _run(options: argparse.Namespace) -> int:
         model=options.model,
         out=options.out,
         live=not options.quiet and sys.stdout.isatty(),
+        moving=options.animate,
     )
 
 
@@ -145,7 +194,12 @@ def _check(options: argparse.Namespace) -> int:
         print(f"  {device.spec.capabilities.kind:<8} {device.name}: {device.spec.name}, {device.spec.summary}")
     for name, interlock in plan.cell.interlocks.items():
         way = plan.overshoots.get(name)
-        print(f"  interlock {name}: {interlock.kind}" + (f"; beyond the box, {way}" if way else ""))
+        print(f"  interlock {name}: {interlock.kind}" + (f"; beyond its limit, {way}" if way else ""))
+    if plan.cell.processes == "separate":
+        from cell.processes import process_lines
+
+        for line in process_lines(plan):
+            print(f"  process  {line}")
     if plan.skipped:
         print(f"  not needed by this task and not built: {', '.join(plan.skipped)}")
     return EXIT_OK
@@ -184,6 +238,7 @@ def _train(options: argparse.Namespace) -> int:
         options.out,
         kind=options.kind,
         epochs=options.epochs,
+        networks=options.networks,
         seed=options.seed,
         resume=not options.fresh,
     )
@@ -193,7 +248,49 @@ def _train(options: argparse.Namespace) -> int:
 def _train_sim(options: argparse.Namespace) -> int:
     from cell.train_sim import train_on_simulation
 
-    train_on_simulation(options.out, samples=options.samples, epochs=options.epochs, seed=options.seed)
+    train_on_simulation(
+        options.out,
+        samples=options.samples,
+        kind=options.kind,
+        tip=options.tip,
+        processed=options.processed,
+        epochs=options.epochs,
+        seed=options.seed,
+    )
+    return EXIT_OK
+
+
+def _calibrate_sim(options: argparse.Namespace) -> int:
+    from cell.calibrate_sim import calibrate_sim
+
+    calibrate_sim(
+        options.data,
+        options.out,
+        frames=options.frames,
+        images=options.images,
+        rings=options.rings,
+        seed=options.seed,
+    )
+    return EXIT_OK
+
+
+def _calibrate(options: argparse.Namespace) -> int:
+    from cell.calibrate import calibrate
+
+    change = calibrate(
+        options.model,
+        options.out,
+        frames=options.frames,
+        cell=None if options.cell is None else find_cell(options.cell),
+        sensor=options.sensor,
+        count=options.count,
+        taught=options.reference,
+    )
+    u, v = change.shift_px
+    print(
+        f"zoom {change.zoom:.4f}, turn {change.turn_deg:.2f} deg, shift {u:.2f} {v:.2f} px, {change.rms_px:.2f} px left"
+    )
+    print(f"{change.frames} images; wrote {options.out}")
     return EXIT_OK
 
 
@@ -208,6 +305,7 @@ def _evaluate(options: argparse.Namespace) -> int:
             options.data,
             options.split,
             options.model,
+            calibration=options.calibration,
             progress=lambda done, total: bar.update(images, completed=done, total=total),
         )
     print_table(result)
@@ -220,6 +318,17 @@ def _report(options: argparse.Namespace) -> int:
     from cell.report import write_report
 
     print(write_report(options.folder))
+    if options.animate:
+        from cell.animation import animate
+
+        print(animate(options.folder))
+    return EXIT_OK
+
+
+def _view(options: argparse.Namespace) -> int:
+    from cell.view import view_run
+
+    view_run(options.folder, options.port)
     return EXIT_OK
 
 
@@ -244,6 +353,21 @@ def _stop(options: argparse.Namespace) -> int:
     return EXIT_OK if all(ended.values()) else EXIT_TASK_FAILED
 
 
+def _ask(options: argparse.Namespace) -> int:
+    import getpass
+
+    from cell.desk import Ask, ask_run, is_waiting
+    from cell.operator import NoSuchRun, running
+
+    folders = [options.folder] if options.folder else [run for run in running(Path("runs")) if is_waiting(run)]
+    if len(folders) != 1 or not is_waiting(folders[0]):
+        where = folders[0] if len(folders) == 1 else Path("runs")
+        raise NoSuchRun(where, "several runs wait: name one" if len(folders) > 1 else "no run waits for a reset here")
+    done, words = ask_run(folders[0], Ask(options.ask), getpass.getuser())
+    print(f"{folders[0]}: {words}")
+    return EXIT_OK if done else EXIT_TASK_FAILED
+
+
 def _bench(options: argparse.Namespace) -> int:
     from drivers import entry_points
 
@@ -253,6 +377,28 @@ def _bench(options: argparse.Namespace) -> int:
         return EXIT_BAD_INPUT
     options.out.mkdir(parents=True, exist_ok=True)
     known[options.name].load()([*options.rest, *options.passed_on], options.out)
+    return EXIT_OK
+
+
+def _experiment(options: argparse.Namespace) -> int:
+    # Each trial has a core; libraries that start a thread for every core would only be in each other's way.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from cell.experiment import Scale, installed, run_experiment, spec
+
+    experiments = [spec(name) for name in (installed() if options.name == "all" else [options.name])]
+    scale = Scale(options.trials, options.quick)
+    jobs = options.jobs or os.cpu_count() or 1
+    tables = []
+    for experiment in experiments:
+        folder = options.out / experiment.name
+        try:
+            tables.append(run_experiment(experiment, folder, scale, jobs=jobs, live=sys.stdout.isatty()))
+        except KeyboardInterrupt:
+            print(f"touchcell: what has finished is kept in {folder}; the same command goes on", file=sys.stderr)
+            raise
+        print(tables[-1], flush=True)
+    if len(tables) > 1:
+        (options.out / "summary.txt").write_text("\n\n".join(tables) + "\n")
     return EXIT_OK
 
 

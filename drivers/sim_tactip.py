@@ -17,8 +17,9 @@ from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSp
 from drivers.samples import Frame, Stamped
 from drivers.simulation.faults import FrameFaults
 from drivers.simulation.render import FrameRenderer, Lighting
-from drivers.simulation.scene import Carrier, MeasuredCarrier, Scene
+from drivers.simulation.scene import Carrier, LoadBearer, MeasuredCarrier, Scene
 from drivers.simulation.tip import Tip
+from drivers.simulation.tip_file import load_tip
 from geometry import se3
 
 CAPABILITIES = Capabilities(
@@ -32,13 +33,22 @@ _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
 
 
 class SimTactipConfig(DriverConfig):
-    """Where the sensor is mounted and how its camera behaves."""
+    """Where the sensor is mounted and how its camera behaves.
+
+    ``exposure`` is a factor on grey levels, ``blur_px`` the standard deviation of a Gaussian, ``dropped`` the share of
+    frames that never come, ``tip`` a tip file (``touchcell calibrate-sim``) or the name of one that ships. Exposure,
+    blur and noise are of ``output: raw``; processed images are black and white.
+    """
 
     mounted_on: str
     tcp_to_sensor_mm_deg: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     rate_hz: float = Field(default=30.0, ge=1.0, le=500.0)
     latency_ms: float = Field(default=10.0, ge=0.0, le=1000.0)
     noise: float = Field(default=2.0, ge=0.0, le=40.0)
+    exposure: float = Field(default=1.0, gt=0.0, le=10.0)
+    blur_px: float = Field(default=0.0, ge=0.0, le=20.0)
+    dropped: float = Field(default=0.0, ge=0.0, le=0.9)
+    tip: str | None = None
     output: Literal["raw", "processed"] = "raw"
 
 
@@ -74,11 +84,13 @@ class SimTactip(Device):
         self._period_ns = round(1e9 / config.rate_hz)
         self._latency_ns = round(config.latency_ms * 1e6)
         self._first = 0
-        self._tip = Tip()
+        self._tip = Tip() if config.tip is None else Tip(load_tip(config.tip).tip)
+        self._dropped = config.dropped
+        self._seed = (seed, zlib.crc32(name.encode()))
         self._renderer = FrameRenderer(
             self._tip.parameters.disc_radius_px,
-            Lighting(noise=config.noise),
-            seed=(seed, zlib.crc32(name.encode())),
+            Lighting(noise=config.noise, exposure=config.exposure, blur_px=config.blur_px),
+            seed=self._seed,
         )
         self._newest: Stamped[Frame] | None = None
         self._drawn = 0
@@ -91,7 +103,7 @@ class SimTactip(Device):
     def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
         """Newest frame; waits for the very first. Raises StaleData if it is older than ``max_age_s``."""
         self._require("deliver frames", *_READABLE)
-        self._clock.sleep_until_ns(self._available_ns(self._first))
+        self._clock.sleep_until_ns(self._available_ns(self._from(self._first)))
         now_ns = self._clock.now_ns()
         seq = self._newest_seq(now_ns)
         age_s = (now_ns - seq * self._period_ns) * 1e-9
@@ -103,7 +115,7 @@ class SimTactip(Device):
         """Newest frame if its ``seq > after_seq``, else the first that is. Raises TransportTimeout."""
         self._require("deliver frames", *_READABLE)
         now_ns = self._clock.now_ns()
-        seq = max(self._newest_seq(now_ns), after_seq + 1, self._first)
+        seq = self._from(max(self._newest_seq(now_ns), after_seq + 1, self._first))
         deadline_ns = now_ns + round(timeout_s * 1e9)
         if self._available_ns(seq) > deadline_ns or self._never_comes(seq):
             self._clock.sleep_until_ns(deadline_ns)
@@ -123,7 +135,21 @@ class SimTactip(Device):
 
     def _newest_seq(self, now_ns: int) -> int:
         seq = (now_ns - self._delay_ns()) // self._period_ns
-        return seq if self.faults.last_seq is None else min(seq, self.faults.last_seq)
+        if self.faults.last_seq is not None:
+            seq = min(seq, self.faults.last_seq)
+        while seq > self._first and not self._comes(seq):
+            seq -= 1
+        return seq
+
+    def _from(self, seq: int) -> int:
+        """The first frame that comes, from ``seq`` on."""
+        while not self._comes(seq):
+            seq += 1
+        return seq
+
+    def _comes(self, seq: int) -> bool:
+        """Whether frame ``seq`` is not dropped: the same for the same seed."""
+        return not self._dropped or np.random.default_rng((*self._seed, max(seq, 0), 1)).random() >= self._dropped
 
     def _never_comes(self, seq: int) -> bool:
         return self.faults.last_seq is not None and seq > self.faults.last_seq
@@ -155,7 +181,8 @@ class SimTactip(Device):
 
     def _touch(self) -> None:
         mount, T_tcp_s = self._mount, self._T_tcp_s
-        self._scene.mount(self.name, lambda: mount.T_world_tcp() @ T_tcp_s)
+        bear = mount.bear if isinstance(mount, LoadBearer) else None
+        self._scene.mount(self.name, lambda: mount.T_world_tcp() @ T_tcp_s, bear)
         self._first = math.ceil(self._scene.timeline.t_ns / self._period_ns)
 
     def _close(self) -> None:

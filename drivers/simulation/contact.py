@@ -16,6 +16,8 @@ from drivers.simulation.timeline import Restore
 from geometry import se3
 from geometry.types import Array
 
+_IDENTITY = np.eye(4)
+
 
 @dataclass(frozen=True, slots=True)
 class ContactState:
@@ -28,6 +30,7 @@ class ContactState:
         in_contact: whether the tip touches.
         slipping: whether the contact slid in the last step.
         normal_force_n: force on the tip along the surface normal.
+        shear_force_n: force on the tip along the x and y axes of {f}; zero where the physics does not tell it.
     """
 
     T_f_s: Array
@@ -35,6 +38,7 @@ class ContactState:
     in_contact: bool
     slipping: bool
     normal_force_n: float
+    shear_force_n: tuple[float, float] = (0.0, 0.0)
 
     @property
     def T_s_f(self) -> Array:  # noqa: N802  the field's own name
@@ -45,6 +49,12 @@ class ContactState:
     def depth_m(self) -> float:
         """Indentation, negative out of contact."""
         return float(self.T_f_s[2, 3])
+
+    @property
+    def force_world_n(self) -> Array:
+        """(3,) force on the tip along the world's axes."""
+        force: Array = self.T_world_f[:3, :3] @ np.array([*self.shear_force_n, -self.normal_force_n])
+        return force
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,10 +187,10 @@ class ContactModel:
     def _state(
         self, T_world_s: Array, R_world_f: Array, R_f_s: Array, position: tuple[float, float, float], *, slipping: bool
     ) -> ContactState:
-        T_f_s = np.eye(4)
+        T_f_s = _IDENTITY.copy()
         T_f_s[:3, :3] = R_f_s
         T_f_s[:3, 3] = position
-        T_world_f = np.eye(4)
+        T_world_f = _IDENTITY.copy()
         T_world_f[:3, :3] = R_world_f
         T_world_f[:3, 3] = T_world_s[:3, 3] - R_world_f @ T_f_s[:3, 3]
         depth = position[2]

@@ -75,12 +75,16 @@ class Lighting:
         pin: pin at the image centre.
         vignetting: share of brightness lost in the corners.
         noise: standard deviation of the sensor noise.
+        exposure: factor on the grey levels before the noise.
+        blur_px: standard deviation of the lens's blur, 0 for none.
     """
 
     background: float = 60.0
     pin: float = 190.0
     vignetting: float = 0.25
     noise: float = 2.0
+    exposure: float = 1.0
+    blur_px: float = 0.0
 
 
 class FrameRenderer:
@@ -99,8 +103,11 @@ class FrameRenderer:
         v, u = np.mgrid[:height, :width]
         corner = math.hypot(width, height) / 2.0
         fade = 1.0 - light.vignetting * ((u - width / 2.0) ** 2 + (v - height / 2.0) ** 2) / corner**2
-        self._background = np.round(light.background * fade).astype(np.uint8)
-        self._contrast = np.round((light.pin - light.background) * fade).astype(np.uint8)
+        background = np.minimum(np.round(light.exposure * light.background * fade), 255.0)
+        pin = np.minimum(np.round(light.exposure * light.pin * fade), 255.0)
+        self._background = background.astype(np.uint8)
+        self._contrast = (pin - background).astype(np.uint8)
+        self._blur_px = light.blur_px
         self._seed = (seed,) if isinstance(seed, int) else tuple(seed)
         # Drawing 307 200 normal numbers takes longer than the rest of the frame: frames take windows of one sheet.
         sheet = np.random.default_rng(self._seed).normal(0.0, light.noise, (height + 64, width + 64))
@@ -112,6 +119,8 @@ class FrameRenderer:
         cover = np.zeros((height, width), np.uint8)
         self._stamps.paint(cover, pixels)
         clean = cv2.add(cv2.multiply(cover, self._contrast, scale=1.0 / 255.0), self._background)
+        if self._blur_px:
+            clean = cv2.GaussianBlur(clean, (0, 0), self._blur_px)
         top, left = np.random.default_rng((*self._seed, frame)).integers(0, 65, 2)
         noise: NDArray[np.int8] = np.ascontiguousarray(self._noise[top : top + height, left : left + width])
         return np.asarray(cv2.add(clean, noise, dtype=cv2.CV_8U), dtype=np.uint8)

@@ -8,13 +8,14 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from drivers.simulation.contact import ContactLaw, contact_at
+from drivers.simulation.rig import Rig
 from drivers.simulation.tip import Tip, TipParameters
 from geometry import se3
 from geometry.types import Array
 
 PUBLIC_DEPTH_MM = (0.5, 6.0)
 _IMAGES_PER_TIP = 16
-_ADDITIVE = {"centre_px", "image_rotation_rad", "layout_phase_rad"}
+_ADDITIVE = {"centre_px", "image_rotation_rad", "layout_phase_rad", "camera_tilt_rad"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +29,9 @@ class Variation:
         marker_px: standard deviation of each marker's place, in the frame.
         disc_radius: relative standard deviation of the discs' radius from image to image.
         missing: share of markers that are not seen.
+        field: what no parameter can say: standard deviation of a smooth displacement of the whole field, as a share of
+            the markers' mean displacement.
+        slip: relative standard deviation of what a rig lets slip, from one batch of contacts to the next.
     """
 
     parameters: float = 0.03
@@ -36,6 +40,8 @@ class Variation:
     marker_px: float = 0.3
     disc_radius: float = 0.08
     missing: float = 0.003
+    field: float = 0.0
+    slip: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +49,7 @@ class SampledContact:
     """One random contact as one random sensor sees it.
 
     Attributes:
-        T_f_s: (4, 4) label, after slip.
+        T_f_s: (4, 4) label: after slip, or with a rig the command.
         pixels: (markers, 2) px of the markers that are seen, in the 640x480 frame.
         disc_radius_px: of the markers.
     """
@@ -60,12 +66,14 @@ def contacts(
     depth_mm: tuple[float, float] = PUBLIC_DEPTH_MM,
     parameters: TipParameters | None = None,
     law: ContactLaw | None = None,
+    rig: Rig | None = None,
     variation: Variation | None = None,
 ) -> Iterator[SampledContact]:
     """Yield ``n`` random contacts, the same for the same seed.
 
     Depth is even in ``depth_mm``, tilt in a 25 deg disc, shear in a 5 mm disc, torsion in +-5 deg; what the depth
-    cannot hold slips, and the label is the pose that is left.
+    cannot hold slips, and the label is the pose that is left. With a ``rig`` the label is the command, as in collected
+    data, and the rig says what is left of it.
 
     Args:
         n: how many.
@@ -73,6 +81,7 @@ def contacts(
         depth_mm: least and greatest depth.
         parameters: of the sensor around which the others scatter.
         law: how the tips slip.
+        rig: how they are mounted and slip, in place of ``law``.
         variation: how far they scatter.
     """
     rng = np.random.default_rng(seed)
@@ -80,8 +89,15 @@ def contacts(
     for start in range(0, n, _IMAGES_PER_TIP):
         count = min(_IMAGES_PER_TIP, n - start)
         tip = Tip(_scattered(middle, variation, rng))
-        T_f_s = np.stack([contact_at(pose, law).T_f_s for pose in random_poses(count, rng, depth_mm)])
-        pixels = tip.pixels(T_f_s)
+        poses = random_poses(count, rng, depth_mm)
+        if rig is None:
+            T_f_s = np.stack([contact_at(pose, law).T_f_s for pose in poses])
+            pixels = tip.pixels(T_f_s)
+        else:
+            T_f_s = poses
+            pixels = tip.pixels(_slipping(rig, variation, rng).contact(poses))
+        if variation.field:
+            pixels += _smooth_fields(tip.project(tip.rest_positions), pixels, variation.field, rng)
         pixels += rng.normal(0.0, variation.marker_px, pixels.shape)
         seen = rng.random(pixels.shape[:2]) >= variation.missing
         radius = tip.parameters.disc_radius_px * (1.0 + rng.normal(0.0, variation.disc_radius, count))
@@ -89,10 +105,18 @@ def contacts(
             yield SampledContact(T_f_s[i], pixels[i][seen[i]], float(radius[i]))
 
 
-def random_poses(n: int, rng: np.random.Generator, depth_mm: tuple[float, float] = PUBLIC_DEPTH_MM) -> Array:
+def random_poses(
+    n: int,
+    rng: np.random.Generator,
+    depth_mm: tuple[float, float] = PUBLIC_DEPTH_MM,
+    *,
+    tilt_deg: float = 25.0,
+    shear_mm: float = 5.0,
+    torsion_deg: float = 5.0,
+) -> Array:
     """(n, 4, 4) contacts T_f_s over the ranges of the public data, before any slip."""
-    tilt, shear = _disc(n, 25.0, rng), _disc(n, 5.0, rng)
-    depth, gamma = rng.uniform(*depth_mm, n), rng.uniform(-5.0, 5.0, n)
+    tilt, shear = _disc(n, tilt_deg, rng), _disc(n, shear_mm, rng)
+    depth, gamma = rng.uniform(*depth_mm, n), rng.uniform(-torsion_deg, torsion_deg, n)
     return se3.from_euler_mm_deg(np.column_stack([shear, depth, tilt, gamma]))
 
 
@@ -102,11 +126,32 @@ def _disc(n: int, radius: float, rng: np.random.Generator) -> Array:
     return np.column_stack([length * np.cos(angle), length * np.sin(angle)])
 
 
+def _slipping(rig: Rig, variation: Variation, rng: np.random.Generator) -> Rig:
+    longer, steeper, looser = 1.0 + variation.slip * rng.normal(0.0, 1.0, 3)
+    return replace(
+        rig,
+        slip_at_1mm_m=rig.slip_at_1mm_m * max(longer, 0.2),
+        uphill=rig.uphill * steeper,
+        torsion_release=rig.torsion_release * max(looser, 0.2),
+    )
+
+
+def _smooth_fields(rest: Array, pixels: Array, share: float, rng: np.random.Generator) -> Array:
+    """(n, markers, 2) px: random polynomials of third degree over the lattice, growing with the displacements."""
+    u, v = ((rest - rest.mean(axis=0)) / np.abs(rest - rest.mean(axis=0)).max()).T
+    terms = np.stack([np.ones_like(u), u, v, u * v, u * u, v * v, u**3, v**3])
+    size = share * np.linalg.norm(pixels - rest, axis=2).mean(axis=1)
+    weights = rng.normal(0.0, 1.0, (len(pixels), 2, len(terms))) * size[:, None, None]
+    fields: Array = np.einsum("nck,km->nmc", weights, terms)
+    return fields
+
+
 def _scattered(middle: TipParameters, variation: Variation, rng: np.random.Generator) -> TipParameters:
     changed = {
         each.name: getattr(middle, each.name) * (1.0 + rng.normal(0.0, variation.parameters))
         for each in fields(middle)
         if each.name not in _ADDITIVE | {"rings", "camera_distance_m", "focal_px", "ring_step_rad"}
+        and getattr(middle, each.name)
     }
     u, v = middle.centre_px + rng.normal(0.0, variation.shift_px, 2)
     # Focal length and camera distance together set the scale: scattered alone they would change it by too much.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -48,6 +49,15 @@ class Carrier(Protocol):
 
     def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
         """(4, 4) at the present step of the simulation; must not advance time."""
+        ...
+
+
+@runtime_checkable
+class LoadBearer(Protocol):
+    """A simulated arm that gives way to what its sensors touch."""
+
+    def bear(self, force_world: Array, point_world: Array) -> None:
+        """From now on feel ``force_world`` (3,) N at ``point_world`` (3,) m."""
         ...
 
 
@@ -98,19 +108,29 @@ class Scene:
         self.timeline = Timeline(clock, step_s)
         self._start_ns = self.timeline.t_ns
         self._poses: dict[str, Callable[[], Array]] = {}
+        self._bearers: dict[str, Callable[[Array, Array], None]] = {}
         # The last one is of the timeline's present step, the one before it of the step before.
         self._felt: dict[str, deque[ContactState]] = {}
         self._kept = round(HISTORY_S * 1e9 / self.timeline.step_ns)
         self.timeline.add(Phase.CONTACT, self._step)
         self.timeline.keep(self._snapshot)
 
-    def mount(self, sensor: str, pose: Callable[[], Array]) -> None:
-        """Let ``sensor`` feel. ``pose`` gives T_world_s (4, 4) at the present step and must not advance time."""
+    def mount(self, sensor: str, pose: Callable[[], Array], bear: Callable[[Array, Array], None] | None = None) -> None:
+        """Let ``sensor`` feel.
+
+        Args:
+            sensor: its name.
+            pose: gives T_world_s (4, 4) at the present step and must not advance time.
+            bear: told after every step with which force (3,) N what is touched pushes the sensor, and at which point
+                (3,) m, both in the world frame.
+        """
         if sensor in self._poses:
             raise ConfigError(f"sensor {sensor!r} is mounted already", key="scene", value=sensor)
         t_ns = self.timeline.t_ns
         state = self.world.mount(sensor, pose(), self.seconds(t_ns))
         self._poses[sensor] = pose
+        if bear is not None:
+            self._bearers[sensor] = bear
         self._felt[sensor] = deque([state], maxlen=self._kept)
 
     def has(self, sensor: str) -> bool:
@@ -158,6 +178,8 @@ class Scene:
         poses = {sensor: pose() for sensor, pose in self._poses.items()}
         for sensor, state in self.world.step(poses, self.seconds(t_ns)).items():
             self._felt[sensor].append(state)
+            if sensor in self._bearers:
+                self._bearers[sensor](state.force_world_n, poses[sensor][:3, 3])
 
     def _snapshot(self) -> Callable[[int], None]:
         start_ns, world = self._start_ns, self.world.snapshot()
@@ -171,6 +193,20 @@ class Scene:
             world()
 
         return restore
+
+
+@contextmanager
+def physics_engine(key: str, value: str) -> Iterator[None]:
+    """Around imports that need MuJoCo. Raises ConfigError, with what to install, where it is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"needs {error.name}, which is not installed",
+            key=key,
+            value=value,
+            hint="pip install 'touchcell[physics]'",
+        ) from None
 
 
 _HERE: PoseMmDeg = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -326,20 +362,9 @@ class SceneConfig(_Part):
         return self._dynamic_world(surfaces)
 
     def _dynamic_world(self, surfaces: Mapping[str, Surface]) -> World:
-        try:
+        with physics_engine("scene.physics", "dynamic"):
             from drivers.simulation.dynamics import DynamicWorld
             from drivers.simulation.dynamics_model import TipMechanics
-        except ModuleNotFoundError as error:
-            raise ConfigError(
-                f"physics: dynamic needs {error.name}, which is not installed",
-                key="scene.physics",
-                value="dynamic",
-                hint="pip install 'touchcell[physics]'",
-            ) from None
-        tip = TipMechanics(
-            radius_m=1e-3 * self.tip.radius_mm,
-            stiffness_n_m=1e3 * self.tip.stiffness_n_mm,
-            friction=self.tip.friction,
-        )
+        tip = TipMechanics(1e-3 * self.tip.radius_mm, 1e3 * self.tip.stiffness_n_mm, self.tip.friction)
         objects = {name: config.build(self.table) for name, config in self.objects.items()}
         return DynamicWorld(surfaces, objects, 1e-3 * self.table.height_mm, tip, 1e-3 * self.physics_step_ms)
