@@ -40,9 +40,11 @@ class DualArmPushingConfig(PushConfig, ServoConfig):
     """Parameters of dual-arm pushing; what is said of pushing is the leader's, in the leader's base frame.
 
     Attributes:
+        align_max_mm_s: largest sideways speed: more than alone, since the follower drags behind.
         follower: the other hand's.
     """
 
+    align_max_mm_s: PositiveFloat = 15.0
     follower: FollowerConfig = FollowerConfig()
 
 
