@@ -170,7 +170,7 @@ def _sensor_errors(run: Run, sensor: str) -> dict[str, dict[str, dict[str, float
             if (error := _difference(measured, selected, truth)) is not None:
                 found["single_frame"] = error
     achieved = truth if truth is not None else contact
-    if (error := _reference_error(run, achieved)) is not None:
+    if (error := _reference_error(run, sensor, achieved)) is not None:
         found["control"] = error
     return found
 
@@ -184,7 +184,7 @@ def _difference(series: Series, selected: NDArray[np.bool_], truth: Series) -> d
     return _statistics(error) if len(error) else None
 
 
-def _reference_error(run: Run, achieved: Series) -> dict[str, dict[str, float]] | None:
+def _reference_error(run: Run, sensor: str, achieved: Series) -> dict[str, dict[str, float]] | None:
     """Achieved contact against the reference that the task recorded, for the components that it controls."""
     task = run.series("/task")
     if task is None:
@@ -194,7 +194,9 @@ def _reference_error(run: Run, achieved: Series) -> dict[str, dict[str, float]] 
     poses = achieved.poses()
     errors = {}
     for i, name in enumerate(COMPONENTS):
-        reference = task.column(f"reference_{name}")[index]
+        # A task with several sensors says whose reference it is.
+        told = task.column(f"{sensor}_reference_{name}")
+        reference = (told if np.isfinite(told).any() else task.column(f"reference_{name}"))[index]
         error = (poses[:, i] - reference)[running]
         error = error[np.isfinite(error)]
         if len(error):

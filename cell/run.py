@@ -150,8 +150,8 @@ def _live_line(plan: CellPlan, live: bool) -> Iterator[Any]:
                 display.update(Text(f"{plan.cell.name}  {progress.waiting}"))
                 return
             parts = [f"{plan.cell.name}  {progress.state:<10} t {progress.t_s:6.2f} s"]
-            errors = [item for item in progress.telemetry.items() if item[0].startswith("error_")]
-            parts += [f"{name.removeprefix('error_')} {value:+.2f}" for name, value in errors[:3]]
+            errors = [(name, value) for name, value in progress.telemetry.items() if "error_" in name]
+            parts += [f"{name.replace('error_', '')} {value:+.2f}" for name, value in errors[:3]]
             parts.append(f"{progress.t_s / max(wall_s, 1e-3):.1f}x real time")
             if sys.stdin.isatty():
                 parts.append("[space stops, q ends]")
