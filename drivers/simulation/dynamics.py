@@ -248,9 +248,10 @@ def _nearer(a: SurfacePoint | None, b: SurfacePoint) -> SurfacePoint:
 
 def _swing(R_start: Array, R_end: Array) -> Array | None:
     """Rotation vector (3,) along world axes from one to the other; None if it is no small one."""
-    R = R_end @ R_start.T
-    turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return turn if float(np.trace(R)) > 1.0 + 2.0 * math.cos(_SWING_RAD) else None
+    (a, b, c), (d, e, f), (g, h, i) = (R_end @ R_start.T).tolist()
+    if a + e + i <= 1.0 + 2.0 * math.cos(_SWING_RAD):
+        return None
+    return np.array([0.5 * (h - f), 0.5 * (c - g), 0.5 * (d - b)])
 
 
 def _upright(T_world_s: Array, normal: Array) -> Array:
