@@ -25,6 +25,7 @@ from drivers.simulation.objects import FreeObject
 from drivers.simulation.solids import shape_of
 from drivers.simulation.surfaces import Plane, Surface, SurfacePoint
 from drivers.simulation.timeline import Restore
+from geometry.errors import TouchcellError
 from geometry.types import Array
 
 # A carriage that would turn faster than this in one step has come to another face: it is set there, not swung.
@@ -48,6 +49,23 @@ class _Mounted:
     T_world_s: Array
     R_world_c: Array
     normal: Array
+
+
+class PhysicsError(TouchcellError, ArithmeticError):
+    """The physics was given, or came to, numbers that are not finite.
+
+    Attributes:
+        what: where they are.
+        t_s: time of the scene.
+    """
+
+    def __init__(self, what: str, t_s: float) -> None:
+        super().__init__(
+            f"{what} is not finite at {t_s:.3f} s of the scene",
+            hint="a smaller physics_step_ms helps where motions are very fast or tips very stiff",
+        )
+        self.what = what
+        self.t_s = t_s
 
 
 class DynamicWorld:
@@ -96,11 +114,13 @@ class DynamicWorld:
         return self._feel(sensor, T_world_s, t_s)
 
     def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, ContactState]:
-        """Go on to ``t_s``."""
+        """Go on to ``t_s``. Raises PhysicsError."""
         span_s = t_s - self._t_s
         for sensor, pose in T_world_s.items():
             self._carry(sensor, pose, span_s)
         mujoco.mj_step(self._at.model, self._data, round(span_s / self._step_s))
+        if not math.isfinite(float(self._qpos.sum())):
+            raise PhysicsError("the state", t_s)
         self._t_s = t_s
         return {sensor: self._feel(sensor, pose, t_s) for sensor, pose in T_world_s.items()}
 
@@ -141,6 +161,8 @@ class DynamicWorld:
 
         The normal that keeps it upright is the last step's: what moves is not known yet where it will be.
         """
+        if not math.isfinite(float(T_world_s.sum())):
+            raise PhysicsError(f"the pose of {sensor!r}", self._t_s)
         mounted, at = self._mounted[sensor], self._at.carriages[sensor]
         position = mounted.T_world_s[:3, 3]
         R_end = _upright(T_world_s, mounted.normal)
