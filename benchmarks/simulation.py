@@ -1,9 +1,9 @@
 """``touchcell bench simulation``: how true the simulated scenes are, and how fast.
 
 First, numbers of the dynamic scene against theory. Second, scripted touches at every fidelity against MuJoCo at 0.1 ms.
-Third, whole cells in closed loop, dynamic ones told every 5 ms: simulated seconds per second of one core, and where that
-second went. Times are of the processor, not of the wall, because cores are shared; other load still makes them longer.
-``--quick`` runs the first script and the first cell alone.
+Third, whole cells in closed loop, dynamic ones told every 5 ms: simulated seconds per second of one core, and where
+that second went. Times are of the processor, not of the wall, because cores are shared; other load still makes them
+longer. ``--quick`` runs the first script and the first cell alone.
 """
 
 from __future__ import annotations
