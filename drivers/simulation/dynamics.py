@@ -106,7 +106,8 @@ class DynamicWorld:
         self._build({})
 
     def mount(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
-        """Let ``sensor`` feel; returns what it feels at ``T_world_s`` (4, 4) at ``t_s``. Its tip begins undeformed."""
+        """Let ``sensor`` feel; returns what it feels at ``T_world_s`` (4, 4) at ``t_s``. All tips begin undeformed
+        and all objects at rest."""
         normal = self._nearest(T_world_s[:3, 3], t_s).normal
         self._mounted[sensor] = _Mounted(T_world_s, _upright(T_world_s, normal), normal)
         self._t_s = t_s
