@@ -67,7 +67,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
 
 def _print_costs() -> dict[str, float]:
     found = costs()
-    print(f"{'cost per cycle':<64}{'median us':>11}")
+    print(f"{'cost per cycle':<64}{'us of CPU':>11}")
     for name, cost_us in found.items():
         print(f"{name:<64}{cost_us:11.1f}")
     return found
