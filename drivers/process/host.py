@@ -113,7 +113,7 @@ class ArmSeat:
 
     def _answer(self, command: Any, number: int, refuse: str, now_ns: int) -> None:
         answer = self._answers.value
-        answer["number"], answer["written_ns"] = number, command["written_ns"]
+        answer["number"] = number
         try:
             if refuse:
                 raise CommandRejected(self.arm.name, Rejection.MODE, refuse)
@@ -458,7 +458,10 @@ def main() -> None:
     with ExitStack() as exits:
         for device in host.devices.values():
             exits.callback(device.disconnect)
-        send(control, {"ok": True, "realtime": ask_for_realtime()})
+        realtime = ask_for_realtime()
+        # The first beat: from now on silence means something.
+        host.cycle()
+        send(control, {"ok": True, "realtime": realtime})
         host.run()
 
 

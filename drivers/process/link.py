@@ -21,6 +21,7 @@ from drivers.process.wire import decode_error, receive, send
 _START_S: Final = 30.0
 _CALL_S: Final = 20.0
 _END_S: Final = 5.0
+_HANGING_NS: Final = 2_000_000_000
 
 
 class Child:
@@ -99,16 +100,16 @@ class Child:
         return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"has ended with code {code}"
 
     def close(self) -> None:
-        """End it: by closing the socket; a stopped one is continued; one that does not end is killed."""
+        """End it: by a message and by closing the socket, also if it was stopped; one that does not end is killed."""
         with suppress(OSError):
             send(self._socket, {"call": "end"})
         self._socket.close()
-        for action in (signal.SIGCONT, signal.SIGKILL):
-            with suppress(subprocess.TimeoutExpired):
-                self.process.wait(_END_S)
-                return
-            self.process.send_signal(action)
-        self.process.wait()
+        self.process.send_signal(signal.SIGCONT)
+        try:
+            self.process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
 
 
 class HostLink(Child):
@@ -160,6 +161,10 @@ class HostLink(Child):
         """How long (s) it has been silent, if that is too long; 0 while its arms are not guarded."""
         silent_s = (self._clock.now_ns() - int(self.beats.read()["t_ns"])) * 1e-9
         return silent_s if self.judged and silent_s > self._silence_s else 0.0
+
+    def hangs(self) -> bool:
+        """Whether a call would wait in vain; a host beats also while nobody judges it."""
+        return self._clock.now_ns() - int(self.beats.read()["t_ns"]) > _HANGING_NS
 
     def latched(self) -> Cause | None:
         """Why it has stopped its arms, or None."""
