@@ -54,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--data", type=Path, help="data set folder for drivers that replay one")
     run.add_argument("--model", help="model file in place of the one that the cell names")
     run.add_argument("--out", type=Path, help="run folder (default: runs/NAME-TIME)")
+    run.add_argument("--animate", action="store_true", help="also write animation.gif, of a simulated run")
     run.add_argument("--quiet", action="store_true", help="no live progress line")
     run.set_defaults(run=_run)
 
@@ -106,10 +107,22 @@ def _parser() -> argparse.ArgumentParser:
     calibrate_sim.add_argument("--seed", type=int, default=0)
     calibrate_sim.set_defaults(run=_calibrate_sim)
 
+    calibrate = commands.add_parser("calibrate", help="zoom, turn and shift of a camera from images out of contact")
+    calibrate.add_argument("--model", type=Path, required=True)
+    calibrate.add_argument("--out", type=Path, required=True, help="calibration file to write (.yaml)")
+    source = calibrate.add_mutually_exclusive_group(required=True)
+    source.add_argument("--frames", type=Path, help="folder with PNG images of the tip out of contact")
+    source.add_argument("--cell", type=Path, help="cell file whose sensor takes them now")
+    calibrate.add_argument("--sensor", help="which sensor of the cell")
+    calibrate.add_argument("--count", type=int, default=20, help="images that the cell's sensor takes")
+    calibrate.add_argument("--reference", type=Path, help="such images of the sensor that taught the model")
+    calibrate.set_defaults(run=_calibrate)
+
     evaluate = commands.add_parser("evaluate", help="error, likelihood, calibration and latency on labelled images")
     evaluate.add_argument("--data", type=Path, required=True)
     evaluate.add_argument("--split", default="val", help="train, val or test")
     evaluate.add_argument("--model", type=Path, required=True)
+    evaluate.add_argument("--calibration", type=Path, help="file of `touchcell calibrate`")
     evaluate.add_argument("--json", type=Path, help="also write the figures there")
     evaluate.set_defaults(run=_evaluate)
 
@@ -167,6 +180,7 @@ def _run(options: argparse.Namespace) -> int:
         model=options.model,
         out=options.out,
         live=not options.quiet and sys.stdout.isatty(),
+        moving=options.animate,
     )
 
 
@@ -260,6 +274,26 @@ def _calibrate_sim(options: argparse.Namespace) -> int:
     return EXIT_OK
 
 
+def _calibrate(options: argparse.Namespace) -> int:
+    from cell.calibrate import calibrate
+
+    change = calibrate(
+        options.model,
+        options.out,
+        frames=options.frames,
+        cell=None if options.cell is None else find_cell(options.cell),
+        sensor=options.sensor,
+        count=options.count,
+        taught=options.reference,
+    )
+    u, v = change.shift_px
+    print(
+        f"zoom {change.zoom:.4f}, turn {change.turn_deg:.2f} deg, shift {u:.2f} {v:.2f} px, {change.rms_px:.2f} px left"
+    )
+    print(f"{change.frames} images; wrote {options.out}")
+    return EXIT_OK
+
+
 def _evaluate(options: argparse.Namespace) -> int:
     from rich.progress import Progress
 
@@ -271,6 +305,7 @@ def _evaluate(options: argparse.Namespace) -> int:
             options.data,
             options.split,
             options.model,
+            calibration=options.calibration,
             progress=lambda done, total: bar.update(images, completed=done, total=total),
         )
     print_table(result)

@@ -369,7 +369,8 @@ def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Devic
 
     # A second thread gains nothing on images of this size (PERCEPTION part 5), and takes a core from other sensors.
     cv2.setNumThreads(1)
-    model = load_estimator(model_path(estimator.model))
+    calibration = None if estimator.calibration is None else Path(estimator.calibration)
+    model = load_estimator(model_path(estimator.model), calibration)
     pose_filter = None if estimator.filter is None else build_filter(estimator.filter)
     contact_gate = None
     if (gate := estimator.gate) is not None:

@@ -189,7 +189,8 @@ class MarkerMatcher:
         model: how the markers move.
         guess: a start for frames without a near frame before them.
         image_size: (height, width) px.
-        bank: (b, k) learned coefficients, of which those like the guess are tried when the guess leads nowhere.
+        bank: (b, k) learned coefficients, one or more. Those whose discs lie alike are tried where the guess leads
+            nowhere.
         least_score: below this a match is not believed.
         most_rms_px: above this a match is not believed.
     """
@@ -200,14 +201,14 @@ class MarkerMatcher:
         guess: FirstGuess,
         image_size: tuple[int, int],
         *,
-        bank: Array | None = None,
+        bank: Array,
         least_score: float = 0.9,
         most_rms_px: float = 2.0,
     ) -> None:
         self.model = model
         self._guess = guess
         self._size = np.array(image_size[::-1], dtype=np.float64)
-        self._bank = np.empty((0, len(model.sd))) if bank is None else bank
+        self._bank = bank
         self._least_score = least_score
         self._most_rms_px = most_rms_px
         self._base = model.base
@@ -275,7 +276,7 @@ class MarkerMatcher:
         alike = self._alike(density)
         offs = [self._off(start, search) for start in alike]
         order = np.argsort(offs)[:_MOST_STARTS]
-        if off >= _NEAR * self._spacing_px and (not len(order) or off <= offs[order[0]]):
+        if _NEAR * self._spacing_px <= off <= offs[order[0]]:
             yield guess, self._guess_sd
         for i in order:
             yield alike[i], 0.4 * self.model.sd
@@ -286,8 +287,6 @@ class MarkerMatcher:
 
     def _alike(self, density: NDArray[np.float32]) -> Array:
         """(s, k) coefficients of the learned contacts whose discs are dense where this image's are."""
-        if not len(self._bank):
-            return self._bank
         # The distance less what is the same for all.
         apart = self._bank_squares - 2.0 * np.einsum("ij,j->i", self._bank_density, density)
         return self._bank[np.argsort(apart)[:_ALIKE]]

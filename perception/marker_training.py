@@ -42,6 +42,7 @@ from perception.preprocessing import AdaptiveThreshold, Preprocessing
 from perception.training_display import Display, Observer
 
 _LEAST_SCORE_TAUGHT = 0.9
+_MATCHING = 2  # Counts the ways of matching there have been, so that no other way's result is taken from the cache.
 
 
 @dataclass(frozen=True)
@@ -291,7 +292,7 @@ def _matched(
     cache: Path | None,
     observer: Observer | None,
 ) -> _Matched:
-    matching = [settings.rings, settings.modes, settings.guess_steps, settings.seed]
+    matching = [_MATCHING, settings.rings, settings.modes, settings.guess_steps, settings.seed]
     key = json.dumps([training_data, validation.digest(), *matching])
     name = f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.markers.npz"
     stored = _load(cache / name) if cache is not None else None

@@ -72,7 +72,7 @@ class ContactNetwork(nn.Module):
             x = functional.relu(normalisation(functional.max_pool2d(convolution(x), 2)))
         x = functional.dropout(x.flatten(1), self.architecture.feature_dropout, self.training)
         x = functional.relu(self.hidden(x))
-        x = self._each_output_behind_its_own_dropout(x) if self.training else self.output(x)
+        x = self._each_output_behind_its_own_dropout(x) if self.training and self.rates.any() else self.output(x)
         return softbound(x, self.low, self.high) if self.architecture.kind == "gdn" else x
 
     def folded(self) -> dict[str, NDArray[np.float32]]:

@@ -69,6 +69,9 @@ class Measurement:
 class ContactPipeline:
     """Camera, network, contact gate and filter of one sensor.
 
+    What an estimator says of an image outside the range that it was taught is told as such, and not fused: its sigma
+    means nothing there, and the filter carries the contact on by the sensor's own motion.
+
     Args:
         camera: an opened frame source.
         model: any estimator, with its preprocessing.
@@ -94,6 +97,7 @@ class ContactPipeline:
         self._poses = PoseHistory()
         self._newest: ContactEstimate | None = None
         self._ended = False
+        self._filtering = False
         self.measurement: Measurement | None = None
         self.frame: Stamped[Frame] | None = None
         self.times = StageTimes()
@@ -149,6 +153,7 @@ class ContactPipeline:
             self.measurement = Measurement(frame.seq, frame.t_ns, None)
             if self._filter is not None:
                 self._filter.reset()
+                self._filtering = False
             return ContactEstimate(False, None, frame.t_ns, frame.seq, frame.t_ns)
         start = self._timer()
         prediction = self._model.predict_reduced(reduced)
@@ -158,8 +163,13 @@ class ContactPipeline:
         self.measurement = Measurement(frame.seq, frame.t_ns, observed)
         belief, nis = observed, None
         if self._filter is not None:
-            state = self._filter.update(observed, self._sensor_pose(frame.t_ns), frame.t_ns)
-            belief, nis = state.belief, state.nis
+            T_base_sensor = self._sensor_pose(frame.t_ns)
+            if prediction.in_range:
+                state = self._filter.update(observed, T_base_sensor, frame.t_ns)
+                self._filtering = True
+                belief, nis = state.belief, state.nis
+            elif self._filtering:
+                belief = self._filter.predict(T_base_sensor, frame.t_ns)
         self.times = StageTimes(read_ns, preprocess_ns, infer_ns, self._timer() - start)
         return ContactEstimate(
             True,
@@ -174,7 +184,7 @@ class ContactPipeline:
 
     def _replayed(self, estimate: ContactEstimate, now_ns: int) -> ContactEstimate:
         """The estimate carried from its frame to now by the sensor's own motion since."""
-        if self._filter is None or estimate.belief is None or now_ns <= estimate.t_frame_ns:
+        if self._filter is None or not self._filtering or estimate.belief is None or now_ns <= estimate.t_frame_ns:
             return estimate
         belief = self._filter.predict(self._sensor_pose(now_ns), now_ns)
         return replace(estimate, belief=belief, t_ns=now_ns)

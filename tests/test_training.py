@@ -19,9 +19,9 @@ from perception.architecture import Architecture  # noqa: E402
 from perception.checkpoint import EpochRecord, checkpoint_path  # noqa: E402
 from perception.dataset import LabelledImages  # noqa: E402
 from perception.errors import ModelError, TrainingError  # noqa: E402
-from perception.labels import contact_from_xi  # noqa: E402
+from perception.labels import contact_from_xi, xi_from_contact  # noqa: E402
 from perception.model_file import Model, load_model  # noqa: E402
-from perception.training import Settings, learning_rate, train, train_on_arrays  # noqa: E402
+from perception.training import Settings, learning_rate, preprocessing_for, train, train_on_arrays  # noqa: E402
 from perception.training_display import Display  # noqa: E402
 
 ARCHITECTURE = Architecture(input_size=(32, 32), channels=(8, 16), hidden=32)
@@ -172,10 +172,10 @@ def test_impossible_settings(changes: dict[str, float]) -> None:
 
 
 def test_constant_labels(sets: tuple[LabelledImages, LabelledImages], tmp_path: Path) -> None:
-    constant = sets[0].xi.copy()
-    constant[:, 2] = -1e-3
+    constant = contact_from_xi(sets[0].xi)
+    constant[:, 2] = 1.0
     with pytest.raises(TrainingError, match="z_mm"):
-        quick_train((LabelledImages(sets[0].images, constant), sets[1]), tmp_path / "m.safetensors")
+        quick_train((LabelledImages(sets[0].images, xi_from_contact(constant)), sets[1]), tmp_path / "m.safetensors")
 
 
 @pytest.mark.parametrize("which", [0, 1])
@@ -217,7 +217,7 @@ def test_trains_from_a_folder(tmp_path: Path) -> None:
     assert recorder.decoded == {"train": 64, "val": 32}
     header = load_model(out).header
     assert header.preprocessing.input_size == (44, 48)
-    assert header.architecture == Architecture()
+    assert header.architecture == Architecture(input_size=(44, 48))
     assert header.training["seed"] == 3
 
     display = Display(Console(file=text, width=80))
@@ -228,6 +228,27 @@ def test_trains_from_a_folder(tmp_path: Path) -> None:
     assert len(lines) == 3
     assert "gamma_deg" in lines[0]
     assert f"{recorder.records[1].mae['gamma_deg']:.3f}" in lines[2]
+
+
+@pytest.mark.parametrize(
+    ("size", "crop", "reduced"),
+    [
+        ((440, 445), (0, 0, 444, 440), (110, 111)),
+        ((480, 640), None, (120, 160)),
+        ((44, 48), None, (44, 48)),
+    ],
+)
+def test_images_shrink_by_whole_numbers(
+    size: tuple[int, int], crop: tuple[int, ...] | None, reduced: tuple[int, int]
+) -> None:
+    preprocessing = preprocessing_for(np.zeros(size, np.uint8))
+    assert preprocessing.crop == crop
+    assert preprocessing.output_size == reduced
+
+
+def test_number_of_networks_is_for_markers_alone(tmp_path: Path) -> None:
+    with pytest.raises(TrainingError):
+        train(tmp_path, tmp_path / "m.safetensors", kind="gdn", networks=2, observer=Recorder())
 
 
 def test_damaged_data_set_writes_nothing(tmp_path: Path) -> None:
