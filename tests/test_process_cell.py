@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.process_faults import FAULTS, run_fault
+from benchmarks.process_faults import FAULTS, ProcessCase, ProcessFault, TooBusy, run_fault
 from benchmarks.two_arms import two_arm_plan
 from cell.cli import main
 from cell.compose import Cell, compose
@@ -41,6 +41,8 @@ from drivers.process.selftest import SelfTestFailed, self_test
 
 RATE_HZ = 10.0
 """Slow, so that a machine that does other things besides is not taken for dead."""
+
+TRIES = 4
 
 SHIPPED = Path(__file__).parent.parent / "configs" / "surface_follow_sim.yaml"
 
@@ -203,6 +205,14 @@ def test_activation_is_refused_when_the_chain_does_not_stop_in_time(
     assert caught.value.declared_s < 2.5 / RATE_HZ
 
 
+def hurt(tmp_path: Path, fault: ProcessFault) -> ProcessCase:
+    """The fault in a cell that ran until then; where this machine starves one, the watchdog has done its work before."""
+    for k in range(TRIES - 1):
+        with contextlib.suppress(TooBusy):
+            return run_fault(tmp_path / str(k), fault, RATE_HZ)
+    return run_fault(tmp_path / "last", fault, RATE_HZ)
+
+
 @pytest.mark.parametrize(
     ("name", "told_by"),
     [
@@ -215,7 +225,7 @@ def test_activation_is_refused_when_the_chain_does_not_stop_in_time(
 def test_both_arms_stand_in_time_whatever_dies(tmp_path: Path, name: str, told_by: str | None) -> None:
     """The others of ``FAULTS`` are in ``touchcell bench safety -- --processes``."""
     fault = next(fault for fault in FAULTS if fault.name == name)
-    case = run_fault(tmp_path, fault, RATE_HZ)
+    case = hurt(tmp_path, fault)
     assert list(case.problems) == []
     assert len(case.arms) == (1 if fault.who == "host" else 2)
     assert case.notes.get("reason") == told_by

@@ -354,7 +354,7 @@ class Host:
         # So that who asked finds what has become of it.
         self._tell(self._clock.now_ns())
         with suppress(OSError):
-            send(self._control, answer)
+            send(self._control, {**answer, "number": message["number"]})
 
     def _call(self, message: Mapping[str, Any]) -> dict[str, Any]:
         if message["call"] == "clear":
@@ -451,7 +451,7 @@ def main() -> None:
     try:
         host = Host(spec, control, MonotonicClock())
     except TouchcellError as error:
-        send(control, {"ok": False, "error": encode_error(error)})
+        send(control, {"ok": False, "number": 0, "error": encode_error(error)})
         return
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda *_: setattr(host, "ending", True))
@@ -461,7 +461,7 @@ def main() -> None:
         realtime = ask_for_realtime()
         # The first beat: from now on silence means something.
         host.cycle()
-        send(control, {"ok": True, "realtime": realtime})
+        send(control, {"ok": True, "number": 0, "realtime": realtime})
         host.run()
 
 

@@ -19,7 +19,9 @@ from drivers.process.layouts import Cause, RecordReader, cause_of
 from drivers.process.wire import decode_error, receive, send
 
 _START_S: Final = 30.0
-_CALL_S: Final = 20.0
+_CALL_S: Final = 60.0
+"""Parking an arm takes its time."""
+
 _END_S: Final = 5.0
 _HANGING_NS: Final = 2_000_000_000
 
@@ -40,6 +42,7 @@ class Child:
     def __init__(self, name: str, module: str, spec: Mapping[str, Any], fds: Sequence[int]) -> None:
         self.name = name
         self.realtime = ""
+        self._calls = 0
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         spec = {**spec, "fds": {**spec["fds"], "socket": theirs.fileno()}}
         with theirs:
@@ -69,8 +72,9 @@ class Child:
             TransportTimeout: it does not answer.
             TouchcellError: what it raised.
         """
+        self._calls += 1
         try:
-            send(self._socket, {"call": call, **arguments})
+            send(self._socket, {"call": call, "number": self._calls, **arguments})
         except OSError:
             raise self._gone() from None
         return self._answer(_CALL_S)
@@ -78,7 +82,9 @@ class Child:
     def _answer(self, wait_s: float) -> dict[str, Any]:
         self._socket.settimeout(wait_s)
         try:
-            message = receive(self._socket)
+            # What answers a call that was given up is not for this one.
+            while (message := receive(self._socket)) is not None and message["number"] != self._calls:
+                continue
         except TimeoutError:
             raise TransportTimeout(self.name, "answer of its process", wait_s) from None
         if message is None:
