@@ -39,10 +39,10 @@ from drivers.process.groups import Group, HostedDevice
 from drivers.process.proxies import RemoteJointArm
 from drivers.process.selftest import SelfTestFailed, self_test
 
-RATE_HZ = 10.0
+RATE_HZ = 5.0
 """Slow, so that a machine that does other things besides is not taken for dead."""
 
-TRIES = 4
+TRIES = 2
 
 SHIPPED = Path(__file__).parent.parent / "configs" / "surface_follow_sim.yaml"
 
@@ -175,7 +175,7 @@ def test_a_task_runs_on_pictures_from_another_process(tmp_path: Path, capsys: py
     assert main(["check", str(path)]) == 0
     told = capsys.readouterr().out
     assert "host 'scene': arm, sensor at 500 Hz" in told
-    assert "watchdog: stops all arms after 250 ms of silence" in told
+    assert "watchdog: stops all arms after 500 ms of silence" in told
     cell, stop = compose(plan_cell(path)), StopRequest()
     with cell:
         camera = cell.cameras["sensor"]
@@ -206,7 +206,7 @@ def test_activation_is_refused_when_the_chain_does_not_stop_in_time(
 
 
 def hurt(tmp_path: Path, fault: ProcessFault) -> ProcessCase:
-    """The fault in a cell that ran until then; where this machine starves one, the watchdog has done its work before."""
+    """The fault in a cell that ran until then; where this machine starves it, the watchdog has done its work before."""
     for k in range(TRIES - 1):
         with contextlib.suppress(TooBusy):
             return run_fault(tmp_path / str(k), fault, RATE_HZ)
@@ -219,7 +219,6 @@ def hurt(tmp_path: Path, fault: ProcessFault) -> ProcessCase:
         ("task killed", "TASK_GONE"),
         ("task stopped", "TASK_SILENT"),
         ("watchdog killed", None),
-        ("host killed", "HOST_SILENT"),
     ],
 )
 def test_both_arms_stand_in_time_whatever_dies(tmp_path: Path, name: str, told_by: str | None) -> None:
@@ -227,7 +226,7 @@ def test_both_arms_stand_in_time_whatever_dies(tmp_path: Path, name: str, told_b
     fault = next(fault for fault in FAULTS if fault.name == name)
     case = hurt(tmp_path, fault)
     assert list(case.problems) == []
-    assert len(case.arms) == (1 if fault.who == "host" else 2)
+    assert len(case.arms) == 2
     assert case.notes.get("reason") == told_by
     if fault.name != "task killed":
         assert case.outcome["outcome"] == "tripped"
