@@ -1,12 +1,9 @@
 """Tall objects (paper 5.7.2): four prisms of double height and five bottles, pushed high up, with and without follower.
 
 The paper tells masses and neither sizes nor how high it pushes. Prisms are the short ones doubled; bottles are turned
-bodies of about the size of those that the paper names; each is pushed just below the top of its straight part.
-
-By the balance of moments about its leading feet an object topples where it is pushed higher than
-h = r / (mu / (1 - mu mu_tip)) + mu_tip (r + a), with its feet at r and the pushed side at a from its middle: a sticky tip
-holds the pushed side down. With the 0.3 of short objects most of these would stand. The paper says why its own did not:
-their leading edges catch. Friction of 0.4 stands for that, in both arrangements.
+bodies of about the size of those that the paper names. With the friction of short objects most of these would stand;
+the paper says why its own did not: their leading edges catch. Friction of 0.4 stands for that, in both arrangements.
+Each is pushed a tenth higher than where it begins to topple alone, or just below the top of its straight part.
 """
 
 from __future__ import annotations
@@ -34,6 +31,9 @@ WITH, WITHOUT = "with follower", "alone"
 _CELLS = {WITH: "dual_push_tall_sim.yaml", WITHOUT: "single_push_sim.yaml"}
 _BELOW_TOP_MM = 15.0
 _CATCHING = 0.4
+_TIP_FRICTION = 0.9
+# Feet of simulated objects, as a share of the way from the middle to the side (docs/simulation.md).
+_FEET = {"box": 0.766, "hexagon": 0.766, "cylinder": 2.0 / 3.0, "bottle": 2.0 / 3.0}
 _TALL_G = (566.0, 436.0, 324.0, 373.0)
 
 
@@ -57,7 +57,7 @@ def trials(scale: Scale) -> list[Trial]:
     found = []
     for arms, cell in _CELLS.items():
         for pushed in OBJECTS[::4] if scale.quick else OBJECTS:
-            height_mm = _straight_mm(pushed) - _BELOW_TOP_MM
+            height_mm = round(min(1.1 * topples_at_mm(pushed), _straight_mm(pushed) - _BELOW_TOP_MM), 1)
             if arms == WITH:
                 changes = two_arms(pushed, "mdf", height_mm)
                 changes |= _boxes_up_to(height_mm, "leader_box", "follower_box")
@@ -88,6 +88,17 @@ def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
         plot_pushes([each for each in first if WITHOUT in each.trial.row], folder / "alone_side.png", view=SIDE),
         plot_leans(first, folder / "leans.png"),
     ]
+
+
+def topples_at_mm(pushed: Pushed) -> float:
+    """Height of a push by one sticky tip above which an object topples over its leading feet.
+
+    Balance of moments about the feet, at r from the middle, with the pushed side at a: the push F = mu (m g + mu_tip F)
+    against m g r and the tip's grip mu_tip F (r + a), which holds the pushed side down.
+    """
+    r_mm = _FEET[str(pushed.shape["kind"])] * pushed.reach_mm
+    grip = 1.0 - _CATCHING * _TIP_FRICTION
+    return r_mm * grip / _CATCHING + _TIP_FRICTION * (r_mm + pushed.reach_mm)
 
 
 def _straight_mm(pushed: Pushed) -> float:
