@@ -8,7 +8,7 @@ from typing import Any
 
 from perception.scores import SCORE_NAMES
 
-_MARKERS = {"onnxruntime": "o", "openvino": "s", "torch": "^", "own": "D"}
+_MARKERS = {"onnxruntime": "o", "opencv": "v", "openvino": "s", "torch": "^", "own": "D"}
 
 
 def write_run_time_against_error(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

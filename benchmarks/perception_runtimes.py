@@ -81,9 +81,28 @@ def torch(model: Model) -> Runner:
     return run
 
 
-RUNTIMES: dict[str, Callable[[Model], Runner]] = {"onnxruntime": onnx_runtime, "openvino": openvino, "torch": torch}
+def opencv(model: Model) -> Runner:
+    """OpenCV's DNN module, which every serving process has loaded anyway."""
+    import cv2
+
+    network = cv2.dnn.readNetFromONNX(np.frombuffer(onnx_model(model), np.uint8))
+
+    def run(inputs: NDArray[np.float32]) -> NDArray[np.float32]:
+        network.setInput(inputs)
+        outputs: NDArray[np.float32] = network.forward()
+        return outputs
+
+    return run
+
+
+RUNTIMES: dict[str, Callable[[Model], Runner]] = {
+    "onnxruntime": onnx_runtime,
+    "opencv": opencv,
+    "openvino": openvino,
+    "torch": torch,
+}
 
 
 def installed() -> list[str]:
     """The runtimes that are here."""
-    return [name for name in RUNTIMES if find_spec(name) is not None]
+    return [name for name in RUNTIMES if find_spec(name.replace("opencv", "cv2")) is not None]

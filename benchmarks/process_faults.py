@@ -1,6 +1,6 @@
 """Faults of whole processes, each while two arms move, and what the hosts' own records say became of the arms.
 
-The arms are those of ``benchmarks.two_arms``, in a process tree of their own. Nothing that the tree says of itself is
+The cells are those of ``benchmarks.two_arms``, in a process tree of their own. Nothing that the tree says of itself is
 believed but the records of the hosts, which are read from their memory, also when the processes have gone.
 """
 
@@ -22,18 +22,19 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.two_arms import PERIOD_S, SPEED_M_S
-from cell.processes import NOTES
+from benchmarks.two_arms import PERIOD_S
+from cell.watch import NOTES
 from drivers.arm import LimitsConfig
 from drivers.process.layouts import ARM, RecordReader
 from drivers.process.watchdog import silence_s
 
 _READY_S: Final = 60.0
-_MOVING_S: Final = 10.0
+_MOVING_S: Final = 30.0
+_MOVING_M_S: Final = 0.005
 _WATCHED_S: Final = 8.0
 _AFTERWARDS_S: Final = 0.3
 _END_S: Final = 30.0
-_CLEAR_OF_TURN_S: Final = 0.1
+_STEADY_S: Final = 0.1
 MARGIN_S: Final = 0.1
 
 
@@ -43,9 +44,9 @@ class ProcessFault:
 
     Attributes:
         name: in words.
-        who: "task", "watchdog" or "left", whose host it is.
+        who: "task", "watchdog", or "host" for the first of these.
         signal: what it is sent.
-        inner: word for ``two_arms``, for faults within the task's process.
+        inner: word for ``process_victim``, for faults within the task's process.
         at_once: whether it takes effect when it is injected; a full disk is only met by the next write.
     """
 
@@ -61,8 +62,8 @@ FAULTS: Final = (
     ProcessFault("task stopped", "task", signal.SIGSTOP),
     ProcessFault("watchdog killed", "watchdog", signal.SIGKILL),
     ProcessFault("watchdog stopped", "watchdog", signal.SIGSTOP),
-    ProcessFault("host killed", "left", signal.SIGKILL),
-    ProcessFault("host stopped", "left", signal.SIGSTOP),
+    ProcessFault("host killed", "host", signal.SIGKILL),
+    ProcessFault("host stopped", "host", signal.SIGSTOP),
     ProcessFault("task holds the GIL", "task", signal.SIGUSR1, "gil"),
     ProcessFault("task out of memory", "task", signal.SIGUSR1, "memory"),
     ProcessFault("disk full", "task", signal.SIGUSR1, "disk", at_once=False),
@@ -113,27 +114,29 @@ class TooBusy(RuntimeError):
     """The cell stopped before anything was done to it: this machine does not let it run."""
 
 
-def declared_s(rate_hz: float) -> float:
+def declared_s(rate_hz: float, speed_m_s: float) -> float:
     """Longest time (s) from a fault until both arms stand: two missed beats, a cycle of everybody, braking, margin."""
     limits = LimitsConfig().build()
-    return silence_s(1.0 / rate_hz) + 1.0 / rate_hz + SPEED_M_S / limits.accel_m_s2 + MARGIN_S
+    return silence_s(1.0 / rate_hz) + 1.0 / rate_hz + speed_m_s / limits.accel_m_s2 + MARGIN_S
 
 
-def run_fault(folder: Path, fault: ProcessFault, rate_hz: float) -> ProcessCase:
-    """Let two arms move, let ``fault`` happen, and judge what the hosts' records say.
+def run_fault(folder: Path, fault: ProcessFault, rate_hz: float, what: str = "sway") -> ProcessCase:
+    """Let two arms ``sway`` or ``push``, let ``fault`` happen, and judge what the hosts' records say.
 
     Raises:
         TooBusy: the cell did not run long enough to be hurt.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "fault").write_text(fault.inner)
-    with _cell(folder, rate_hz) as (process, who, states):
+    with _cell(folder, rate_hz, what) as (process, who, states):
         _await_motion(process, states)
+        host = next(iter(who["hosts"]))
+        victim = {"task": who["task"], "watchdog": who["watchdog"], "host": who["hosts"][host]}[fault.who]
+        hurt_arms = set(who["arms"][host]) if fault.who == "host" else set()
         before = {name: state.read() for name, state in states.items()}
-        victim = {"task": who["task"], "watchdog": who["watchdog"], **who["hosts"]}[fault.who]
         hurt_ns = time.monotonic_ns()
         os.kill(victim, fault.signal)
-        survivors = {name: state for name, state in states.items() if name != fault.who}
+        survivors = {name: state for name, state in states.items() if name not in hurt_arms}
         _await_rest(survivors)
         at_rest = {name: state.read() for name, state in survivors.items()}
         if fault.signal is signal.SIGSTOP:
@@ -145,12 +148,12 @@ def run_fault(folder: Path, fault: ProcessFault, rate_hz: float) -> ProcessCase:
         outcome = _last_line(process)
         problems = _left_over([who["task"], who["watchdog"], *who["hosts"].values()])
         arms = [_arm_case(name, before[name], record, hurt_ns) for name, record in at_rest.items()]
-        longest_s = declared_s(rate_hz)
+        longest_s = declared_s(rate_hz, max(_speed_m_s(record) for record in before.values()))
         for case in arms:
             problems += _judged(case, fault, longest_s)
         for name, record in afterwards.items():
             # A killed host obeys nothing any more, and its record ends where it was killed.
-            if fault.signal is signal.SIGKILL and name == fault.who:
+            if fault.signal is signal.SIGKILL and name in hurt_arms:
                 continue
             if not record["at_rest"]:
                 problems.append(f"{name} moved afterwards")
@@ -185,13 +188,13 @@ def _arm_case(name: str, before: Any, record: Any, hurt_ns: int) -> ArmCase:
 
 @contextmanager
 def _cell(
-    folder: Path, rate_hz: float
+    folder: Path, rate_hz: float, what: str
 ) -> Iterator[tuple[subprocess.Popen[bytes], dict[str, Any], dict[str, RecordReader]]]:
     """The running cell, who takes part in it, and the records of its arms."""
-    command = [sys.executable, "-m", "benchmarks.two_arms", str(folder), f"{rate_hz:g}"]
+    command = [sys.executable, "-m", "benchmarks.process_victim", str(folder), f"{rate_hz:g}", what]
     with ExitStack() as exits, (folder / "stderr").open("wb") as stderr:
         process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=stderr, env=os.environ | {"OMP_NUM_THREADS": "1"}
+            command, bufsize=0, stdout=subprocess.PIPE, stderr=stderr, env=os.environ | {"OMP_NUM_THREADS": "1"}
         )
         exits.enter_context(process)
         exits.callback(process.kill)
@@ -211,19 +214,26 @@ def _cell(
 
 
 def _await_motion(process: subprocess.Popen[bytes], states: Mapping[str, RecordReader]) -> None:
-    """Return when both arms have been going at full speed for a while."""
-    deadline_s = time.monotonic() + _MOVING_S
-    since_s = None
-    while since_s is None or time.monotonic() < since_s + _CLEAR_OF_TURN_S:
+    """Return when both arms are at work, and going as fast as they do."""
+    assert process.stdout is not None
+    if not select.select([process.stdout], [], [], _MOVING_S)[0]:
+        raise TooBusy(f"not at work within {_MOVING_S:g} s")
+    if b"moving" not in (line := process.stdout.readline()):
+        raise TooBusy(f"it stopped by itself: {line.decode()}")
+    deadline_s, since_s = time.monotonic() + _MOVING_S, None
+    while since_s is None or time.monotonic() < since_s + _STEADY_S:
         if process.poll() is not None or time.monotonic() > deadline_s:
             raise TooBusy("it stopped by itself")
-        speeds = [np.linalg.norm(state.read()["twist"][:3]) for state in states.values()]
         turning = (time.monotonic() * 2.0 / PERIOD_S) % 1.0 > 0.5
-        if turning or min(speeds) < 0.99 * SPEED_M_S:
+        if turning or min(_speed_m_s(state.read()) for state in states.values()) < _MOVING_M_S:
             since_s = None
         elif since_s is None:
             since_s = time.monotonic()
         time.sleep(0.005)
+
+
+def _speed_m_s(record: Any) -> float:
+    return float(np.linalg.norm(record["twist"][:3]))
 
 
 def _await_rest(states: Mapping[str, RecordReader]) -> None:

@@ -1,30 +1,17 @@
-"""A cell with two simulated arms that sway to and fro, each in a process of its own: for faults of the watchdog chain.
-
-``python -m benchmarks.two_arms FOLDER RATE_HZ`` runs it until it is told to end or something stops it, and tells on
-standard output who takes part. SIGUSR1 and a word in the file ``fault`` of the folder make something go wrong inside.
-"""
+"""Cells with two simulated arms in processes of their own, for faults of the watchdog chain: they sway, or push."""
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import resource
-import signal
-import sys
-import threading
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+import yaml
 
-from cell.blackbox import BlackBox
-from cell.compose import Cell, compose
-from cell.config import CellFile, CellPlan, DevicePlan
-from cell.loop import RunLoop, StopRequest
-from cell.processes import ProcessWatch
-from cell.recording import Recorder
+from cell.cli import find_cell
+from cell.config import CellFile, CellPlan, DevicePlan, plan_cell
 from drivers import registry
 from drivers.commands import TwistCommand, TwistFrame
 from tasks.interface import Action, Observation, TaskConfig, TaskContext, TaskSpec, TransitionRecord
@@ -109,57 +96,16 @@ def two_arm_plan(
     return CellPlan(folder / "cell.yaml", cell, devices, {}, roles, {}, SPEC, TaskConfig(), (), devices)
 
 
-def _participants(cell: Cell) -> dict[str, Any]:
-    """Processes and descriptors, by which somebody outside can hurt them and read the hosts' records."""
-    watch = cell.watch
-    assert isinstance(watch, ProcessWatch)
-    return {
-        "task": os.getpid(),
-        "watchdog": watch.chain.watchdog.pid,
-        "hosts": {link.name: link.pid for link in watch.chain.hosts},
-        "states": watch.chain.state_fds,
-        "proofs": [[proof.link, proof.time_s, proof.declared_s] for proof in watch.proofs],
-        "period_s": watch.chain.period_s,
-    }
+def pushing_plan(folder: Path, rate_hz: float) -> CellPlan:
+    """The cell in which two arms push, as it ships but in real time, in several processes, and at this rate.
 
-
-class _InnerFault:
-    """What goes wrong inside the task's process when SIGUSR1 comes."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._balloon: list[bytearray] = []
-
-    def __call__(self, *_: Any) -> None:
-        match (self._folder / "fault").read_text():
-            case "gil":
-                # One instruction of the interpreter that takes seconds, in another thread.
-                threading.Thread(target=pow, args=(7, 2_500_000), daemon=True).start()
-            case "memory":
-                used = 4096 * int(Path("/proc/self/statm").read_text().split()[0])
-                resource.setrlimit(resource.RLIMIT_AS, (used + (64 << 20), used + (64 << 20)))
-                while True:
-                    self._balloon.append(bytearray(8 << 20))
-            case "disk":
-                written = (self._folder / "run.mcap").stat().st_size
-                resource.setrlimit(resource.RLIMIT_FSIZE, (written, written))
-
-
-def main() -> None:
-    """Run the cell; the last line on standard output tells how it ended."""
-    folder, rate_hz = Path(sys.argv[1]), float(sys.argv[2])
-    stop = StopRequest()
-    signal.signal(signal.SIGTERM, lambda *_: stop.ask())
-    signal.signal(signal.SIGUSR1, _InnerFault(folder))
-    box = BlackBox()
-    with Recorder(folder / "run.mcap") as recorder, compose(two_arm_plan(folder, rate_hz)) as cell:
-        cell.watch.note_to(folder)
-        print(json.dumps(_participants(cell)), flush=True)
-        result = RunLoop(cell, recorder, box=box, stop=stop).run()
-        causes = [[cause.interlock, cause.subject, cause.reason] for cause in result.causes]
-        kind = type(result.error).__name__ if result.error else ""
-        print(json.dumps({"outcome": result.outcome.value, "causes": causes, "error": kind}), flush=True)
-
-
-if __name__ == "__main__":
-    main()
+    Raises:
+        ConfigError: the cell cannot run so slowly.
+    """
+    data = yaml.safe_load(find_cell(Path("configs/dual_push_sim.yaml")).read_text())
+    data |= {"time": "real", "processes": "separate", "rate_hz": rate_hz}
+    # A cycle is longer than in the cell that ships, and a state is as old as the perception that follows it takes.
+    data["interlocks"]["stale_arm"]["limit_ms"] = 4e3 / rate_hz
+    path = folder / "cell.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return plan_cell(path)

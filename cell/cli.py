@@ -54,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--data", type=Path, help="data set folder for drivers that replay one")
     run.add_argument("--model", help="model file in place of the one that the cell names")
     run.add_argument("--out", type=Path, help="run folder (default: runs/NAME-TIME)")
+    run.add_argument("--animate", action="store_true", help="also write animation.gif, of a simulated run")
     run.add_argument("--quiet", action="store_true", help="no live progress line")
     run.set_defaults(run=_run)
 
@@ -106,10 +107,22 @@ def _parser() -> argparse.ArgumentParser:
     calibrate_sim.add_argument("--seed", type=int, default=0)
     calibrate_sim.set_defaults(run=_calibrate_sim)
 
+    calibrate = commands.add_parser("calibrate", help="zoom, turn and shift of a camera from images out of contact")
+    calibrate.add_argument("--model", type=Path, required=True)
+    calibrate.add_argument("--out", type=Path, required=True, help="calibration file to write (.yaml)")
+    source = calibrate.add_mutually_exclusive_group(required=True)
+    source.add_argument("--frames", type=Path, help="folder with PNG images of the tip out of contact")
+    source.add_argument("--cell", type=Path, help="cell file whose sensor takes them now")
+    calibrate.add_argument("--sensor", help="which sensor of the cell")
+    calibrate.add_argument("--count", type=int, default=20, help="images that the cell's sensor takes")
+    calibrate.add_argument("--reference", type=Path, help="such images of the sensor that taught the model")
+    calibrate.set_defaults(run=_calibrate)
+
     evaluate = commands.add_parser("evaluate", help="error, likelihood, calibration and latency on labelled images")
     evaluate.add_argument("--data", type=Path, required=True)
     evaluate.add_argument("--split", default="val", help="train, val or test")
     evaluate.add_argument("--model", type=Path, required=True)
+    evaluate.add_argument("--calibration", type=Path, help="file of `touchcell calibrate`")
     evaluate.add_argument("--json", type=Path, help="also write the figures there")
     evaluate.set_defaults(run=_evaluate)
 
@@ -117,6 +130,11 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("folder", type=Path)
     report.add_argument("--animate", action="store_true", help="also write animation.gif")
     report.set_defaults(run=_report)
+
+    view = commands.add_parser("view", help="show in a browser what a run's sensors feel, live or from its recording")
+    view.add_argument("folder", type=Path, help="run folder")
+    view.add_argument("--port", type=int, default=8177, help="of the page on this machine")
+    view.set_defaults(run=_view)
 
     why = commands.add_parser("why", help="explain why a run tripped, from its black box")
     why.add_argument("folder", type=Path)
@@ -126,6 +144,14 @@ def _parser() -> argparse.ArgumentParser:
     stop.add_argument("folder", type=Path, nargs="?", help="run folder (default: every run below runs/)")
     stop.add_argument("--now", action="store_true", help="at once, without withdrawing first")
     stop.set_defaults(run=_stop)
+
+    for word, text in (
+        ("reset", "reset a run that has tripped and waits, once the cause has gone; nothing moves by it"),
+        ("resume", "let a run that has been reset start its task again"),
+    ):
+        asking = commands.add_parser(word, help=text)
+        asking.add_argument("folder", type=Path, nargs="?", help="run folder (default: the one run below runs/)")
+        asking.set_defaults(run=_ask, ask=word)
 
     bench = commands.add_parser("bench", help="run time against error")
     bench.add_argument("name", nargs="?", help="which; `touchcell list` names them")
@@ -154,6 +180,7 @@ def _run(options: argparse.Namespace) -> int:
         model=options.model,
         out=options.out,
         live=not options.quiet and sys.stdout.isatty(),
+        moving=options.animate,
     )
 
 
@@ -247,6 +274,26 @@ def _calibrate_sim(options: argparse.Namespace) -> int:
     return EXIT_OK
 
 
+def _calibrate(options: argparse.Namespace) -> int:
+    from cell.calibrate import calibrate
+
+    change = calibrate(
+        options.model,
+        options.out,
+        frames=options.frames,
+        cell=None if options.cell is None else find_cell(options.cell),
+        sensor=options.sensor,
+        count=options.count,
+        taught=options.reference,
+    )
+    u, v = change.shift_px
+    print(
+        f"zoom {change.zoom:.4f}, turn {change.turn_deg:.2f} deg, shift {u:.2f} {v:.2f} px, {change.rms_px:.2f} px left"
+    )
+    print(f"{change.frames} images; wrote {options.out}")
+    return EXIT_OK
+
+
 def _evaluate(options: argparse.Namespace) -> int:
     from rich.progress import Progress
 
@@ -258,6 +305,7 @@ def _evaluate(options: argparse.Namespace) -> int:
             options.data,
             options.split,
             options.model,
+            calibration=options.calibration,
             progress=lambda done, total: bar.update(images, completed=done, total=total),
         )
     print_table(result)
@@ -274,6 +322,13 @@ def _report(options: argparse.Namespace) -> int:
         from cell.animation import animate
 
         print(animate(options.folder))
+    return EXIT_OK
+
+
+def _view(options: argparse.Namespace) -> int:
+    from cell.view import view_run
+
+    view_run(options.folder, options.port)
     return EXIT_OK
 
 
@@ -296,6 +351,21 @@ def _stop(options: argparse.Namespace) -> int:
     for folder, done in ended.items():
         print(f"{folder}: {'stopped' if done else 'asked, and still going on'}")
     return EXIT_OK if all(ended.values()) else EXIT_TASK_FAILED
+
+
+def _ask(options: argparse.Namespace) -> int:
+    import getpass
+
+    from cell.desk import Ask, ask_run, is_waiting
+    from cell.operator import NoSuchRun, running
+
+    folders = [options.folder] if options.folder else [run for run in running(Path("runs")) if is_waiting(run)]
+    if len(folders) != 1 or not is_waiting(folders[0]):
+        where = folders[0] if len(folders) == 1 else Path("runs")
+        raise NoSuchRun(where, "several runs wait: name one" if len(folders) > 1 else "no run waits for a reset here")
+    done, words = ask_run(folders[0], Ask(options.ask), getpass.getuser())
+    print(f"{folders[0]}: {words}")
+    return EXIT_OK if done else EXIT_TASK_FAILED
 
 
 def _bench(options: argparse.Namespace) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -108,6 +108,12 @@ class Sensor:
             "filter": times.filter_ns,
         }
 
+    def about(self) -> dict[str, Any] | None:
+        """What recorded images need to be understood: the preprocessing; None when none are recorded."""
+        if self.frames == "none" or not isinstance(self.source, ContactPipeline):
+            return None
+        return self.source.preprocessing.model_dump(mode="json")
+
     def extra_messages(self, now_ns: int) -> Iterator[tuple[str, int, dict[str, Any]]]:
         """What else is recorded of this sensor in this cycle: the frame's own measurement, its image, the truth."""
         if isinstance(self.source, ContactPipeline):
@@ -136,7 +142,10 @@ class Cell:
         clock: its time.
         arms: by role in the task, and those that only carry a sensor by their own name.
         sensors: by role.
+        task: what the cell does.
+        new_task: makes it anew, in its first state, after a trip.
         stop_categories: by which each arm stops when something is wrong, by role.
+        holding: roles of arms that keep their power when another's fault stops them.
         watched_joints: roles of arms whose joint angles an interlock looks at.
         scene: what is simulated around the arms, None in a cell of real devices, or where it is in another process.
         collection: where labelled frames go, None where the task labels none.
@@ -150,7 +159,9 @@ class Cell:
     sensors: Mapping[str, Sensor]
     supervisor: Supervisor
     task: Task
+    new_task: Callable[[], Task]
     stop_categories: Mapping[str, StopCategory] = field(default_factory=dict)
+    holding: frozenset[str] = frozenset()
     watched_joints: frozenset[str] = frozenset()
     scene: Scene | None = None
     collection: Collection | None = None
@@ -231,7 +242,10 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
     supervisor = Supervisor(build_interlocks(plan.cell.interlocks, poses, surroundings), Latch())
     collection = _collection(plan)
     kept = 0 if collection is None else collection.kept
-    task = plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses, kept))
+
+    def new_task() -> Task:
+        return plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses, kept))
+
     return Cell(
         plan=plan,
         clock=cell_clock,
@@ -239,8 +253,12 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
         cameras={name: devices[name] for name in plan.sensors},
         sensors=sensors,
         supervisor=supervisor,
-        task=task,
+        task=new_task(),
+        new_task=new_task,
         stop_categories={role: StopCategory(plan.cell.arms[name].stop_category) for name, role in arm_of.items()},
+        holding=frozenset(
+            arm_of[pair.follower] for pair in plan.cell.pairs if pair.on_stop == "hold" and pair.follower in arm_of
+        ),
         watched_joints=frozenset(role for role, body in surroundings.bodies.items() if body.link_count),
         scene=scene,
         collection=collection,
@@ -351,7 +369,8 @@ def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Devic
 
     # A second thread gains nothing on images of this size (PERCEPTION part 5), and takes a core from other sensors.
     cv2.setNumThreads(1)
-    model = load_estimator(model_path(estimator.model))
+    calibration = None if estimator.calibration is None else Path(estimator.calibration)
+    model = load_estimator(model_path(estimator.model), calibration)
     pose_filter = None if estimator.filter is None else build_filter(estimator.filter)
     contact_gate = None
     if (gate := estimator.gate) is not None:

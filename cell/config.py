@@ -97,10 +97,11 @@ class GateSection(_Section):
 
 
 class NetworkEstimator(_Section):
-    """Image -> network -> filter."""
+    """Image -> network -> filter. ``calibration`` is a file of ``touchcell calibrate``."""
 
     kind: Literal["network"]
     model: str
+    calibration: str | None = None
     gate: GateSection | None = None
     filter: FilterSection | None = None
 
@@ -188,6 +189,18 @@ class RecordingSection(_Section):
     frames: Literal["none", "jpeg", "png"] = "none"
 
 
+class PairSection(_Section):
+    """Two arms with something between them.
+
+    All arms of a cell stop together. With ``on_stop: hold`` the follower then keeps its power, and so what it holds,
+    whatever its ``stop_category`` says, unless it is itself what is wrong; with ``same`` it stops as that says.
+    """
+
+    leader: str
+    follower: str
+    on_stop: Literal["hold", "same"] = "hold"
+
+
 class CollectSection(_Section):
     """Where labelled frames go, and in which proportion to which split."""
 
@@ -198,7 +211,11 @@ class CollectSection(_Section):
 
 
 class CellFile(_Section):
-    """A whole cell file."""
+    """A whole cell file.
+
+    ``on_trip: end`` ends a run that has tripped; ``wait_for_reset`` keeps it up, with the arms stopped and watched,
+    until a person has reset it and lets the task start again.
+    """
 
     schema_: Literal[1] = Field(alias="schema")
     name: str
@@ -211,7 +228,9 @@ class CellFile(_Section):
     obstacles: dict[str, BoxSection] = {}
     arms: dict[str, ArmSection] = {}
     sensors: dict[str, SensorSection] = {}
+    pairs: tuple[PairSection, ...] = ()
     interlocks: InterlocksConfig = {}
+    on_trip: Literal["end", "wait_for_reset"] = "end"
     task: TaskSection
     recording: RecordingSection = RecordingSection()
     collect: CollectSection | None = None
@@ -303,6 +322,7 @@ class _Planner:
             self._require_interlocks(cell, task)
             self._require_processes(cell, task, arm_roles)
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
+        self._require_pairs(cell)
         overshoots = self._require_margins(cell, arm_roles, sensor_roles, arms)
         if self._problems:
             raise InvalidCell(self._problems)
@@ -468,6 +488,19 @@ class _Planner:
                     value=role,
                     hint=suggest(role, sorted(roles)),
                 )
+
+    def _require_pairs(self, cell: CellFile) -> None:
+        for k, pair in enumerate(cell.pairs):
+            for key, name in (("leader", pair.leader), ("follower", pair.follower)):
+                if name not in cell.arms:
+                    self._add(
+                        ("pairs", str(k), key),
+                        f"there is no arm {name!r}",
+                        value=name,
+                        hint=suggest(name, sorted(cell.arms)),
+                    )
+            if pair.leader == pair.follower:
+                self._add(("pairs", str(k)), "one arm is no pair", value=pair.leader, hint="name two")
 
     def _require_margins(
         self,

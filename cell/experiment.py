@@ -7,6 +7,7 @@ experiment that is run again with the same settings does only what is missing, s
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -95,7 +96,13 @@ def run_experiment(experiment: ExperimentSpec, folder: Path, scale: Scale, *, jo
     rows = _rows(finished)
     text = table(f"{experiment.name}: {experiment.summary}", rows, experiment.columns, experiment.paper)
     pictures = experiment.draw(finished, folder)
-    lines = [text, *experiment.notes, f"folder: {folder}", *(f"  {picture.name}" for picture in pictures)]
+    lines = [
+        text,
+        *_troubles(finished),
+        *experiment.notes,
+        f"folder: {folder}",
+        *(f"  {picture.name}" for picture in pictures),
+    ]
     whole = "\n".join(lines)
     (folder / "summary.txt").write_text(whole + "\n")
     (folder / "summary.json").write_text(json.dumps(_summary(experiment, scale, rows), indent=1) + "\n")
@@ -110,6 +117,12 @@ def _rows(finished: Sequence[Finished]) -> list[Row]:
         Row(name, tuple(each.measures for each in members), sum(each.done for each in members))
         for name, members in by_row.items()
     ]
+
+
+def _troubles(finished: Sequence[Finished]) -> list[str]:
+    """Why trials did not come to their end, one line for each reason of a row."""
+    lines = [f"{each.trial.row}: {each.outcome}: {each.reason}" for each in finished if not each.done]
+    return [f"{line} ({count}x)" for line, count in Counter(lines).items()]
 
 
 def _summary(experiment: ExperimentSpec, scale: Scale, rows: Sequence[Row]) -> dict[str, Any]:

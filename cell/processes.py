@@ -7,15 +7,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
+from cell.watch import NOTES
 from control.violation import Severity, Violation
 from drivers.process.groups import Group, HostedDevice
 
 if TYPE_CHECKING:
     from cell.config import CellPlan, DevicePlan
     from drivers.process.chain import Chain
-
-NOTES: Final = "watchdog.json"
-"""What the watchdog leaves in the run folder when it has stopped the arms."""
 
 SCENE: Final = "scene"
 

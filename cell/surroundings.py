@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from cell.config import ArmSection, BoxSection, CapsuleSection, CellPlan
 from control.clearance import ClearanceConfig
 from control.collision import BASE, TOOL, Box, Capsule
 from control.surroundings import Body, Surroundings
-from drivers.arm import Arm
+from drivers.abilities import ServoArm, TwistSink
 from drivers.errors import ConfigError
 from drivers.kinematics import CapsuleShape, ChainDescription
 from geometry import se3
@@ -33,14 +33,18 @@ def build_surroundings(plan: CellPlan, arms: Mapping[str, Any], names: Mapping[s
     placed = {role: se3.from_euler_mm_deg(np.array(each.base_pose_mm_deg)) for role, each in sections.items()}
     if not any(isinstance(entry, ClearanceConfig) for entry in plan.cell.interlocks.values()):
         return Surroundings(placed)
-    bodies = {role: _body(sections[role], placed[role], arm) for role, arm in arms.items() if isinstance(arm, Arm)}
+    bodies = {
+        role: _body(sections[role], placed[role], cast(ServoArm, arm))
+        for role, arm in arms.items()
+        if isinstance(arm, TwistSink)
+    }
     return Surroundings(placed, bodies, [_box(name, section) for name, section in plan.cell.obstacles.items()])
 
 
-def _body(section: ArmSection, T_world_base: Array, arm: Arm) -> Body:
+def _body(section: ArmSection, T_world_base: Array, arm: ServoArm) -> Body:
     parts = [_part(k, part) for k, part in enumerate(section.body)]
     ik = arm.kinematics()
-    links = [] if ik is None else _links(ik.chain.description)
+    links = [] if ik is None else link_capsules(ik.chain.description)
     if not links:
         if not parts:
             raise ConfigError(
@@ -53,7 +57,8 @@ def _body(section: ArmSection, T_world_base: Array, arm: Arm) -> Body:
     return Body(T_world_base, links + parts, arm.kinematics, ik.chain.joint_count)
 
 
-def _links(description: ChainDescription) -> list[Capsule]:
+def link_capsules(description: ChainDescription) -> list[Capsule]:
+    """The capsules of an arm's base and links, as its chain file has them."""
     found = [_capsule("its base", BASE, shape) for shape in description.base_capsules]
     for k, joint in enumerate(description.joints, start=1):
         found += [_capsule(f"the link at {joint.name}", k, shape) for shape in joint.capsules]

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Final, Protocol, Self
 
 from control.violation import Violation
+
+NOTES: Final = "watchdog.json"
+"""What the watchdog leaves in the run folder when it has stopped the arms."""
 
 
 class Watch(Protocol):

@@ -105,9 +105,9 @@ class Supervisor:
             trip=None if first is None else first.as_error(),
         )
 
-    def reset(self, token: OperatorToken, view: CellView) -> ResetDone | ResetRefused:
-        """Clear the latch on a person's request, judged on ``view`` as it is now; nothing moves by it."""
-        self._latch.update(self._violations(view))
+    def reset(self, token: OperatorToken, view: CellView, alarms: Sequence[Violation] = ()) -> ResetDone | ResetRefused:
+        """Clear the latch on a person's request, judged on ``view`` and ``alarms`` as they are; nothing moves by it."""
+        self._latch.update((*alarms, *self._violations(view)))
         return self._latch.reset(
             token,
             at_rest=all(self._at_rest(arm.state.value.twist) for arm in view.arms.values()),

@@ -137,7 +137,7 @@ class _ShearPerDepth:
     states: frozenset[str]
 
     def __call__(self, view: CellView) -> Iterator[Reading]:
-        if self.states and view.task_state not in self.states:
+        if not view.works_in(self.states):
             return
         for role, sensor in view.sensors.items():
             if sensor.shear_m is not None and sensor.depth_m is not None and sensor.depth_m >= self.min_depth_m:
@@ -255,7 +255,7 @@ class TorsionConfig(GradedSettings):
 
 
 class SlipConfig(GradedSettings):
-    """Largest tangential shear of a contact for its depth, in the task's ``states``, or in all if none are named.
+    """Largest tangential shear of a contact for its depth, while the task is at work in ``states``, or in any state.
 
     On the real images estimates of shear fall behind the motion once shear exceeds depth: there the skin begins to
     slide. Contacts more shallow than ``min_depth_mm`` are not judged.

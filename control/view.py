@@ -80,9 +80,17 @@ class SensorView:
 
 @dataclass(frozen=True, slots=True)
 class CellView:
-    """The cell at ``now_ns``, arms and sensors by their role in the task, and the state that the task is in."""
+    """The cell at ``now_ns``: arms and sensors by their role in the task, and the state that the task is in.
+
+    ``at_work`` is False while a run that has tripped waits for a person: then nothing is being pushed or held.
+    """
 
     now_ns: int
     arms: Mapping[str, ArmView] = field(default_factory=dict)
     sensors: Mapping[str, SensorView] = field(default_factory=dict)
     task_state: str = ""
+    at_work: bool = True
+
+    def works_in(self, states: frozenset[str]) -> bool:
+        """Whether the task is at work, and in one of ``states`` if any are named."""
+        return self.at_work and (not states or self.task_state in states)

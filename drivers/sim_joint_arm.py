@@ -19,6 +19,7 @@ from drivers.device import Lifecycle, OperatorToken
 from drivers.errors import ConfigError
 from drivers.inverse_kinematics import joints_for_pose
 from drivers.joint_arm import JointArm
+from drivers.joint_limits import JointLimitsConfig
 from drivers.joint_setpoint import JointSetpoint
 from drivers.kinematics import ChainDescription, DifferentialIk, SerialChain, Tool
 from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
@@ -66,6 +67,7 @@ class SimJointArmConfig(DriverConfig):
     base_pose_mm_deg: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     tool: Literal["straight", "right_angle"] | Tool = "straight"
     limits: LimitsConfig = LimitsConfig()
+    joint_limits: JointLimitsConfig = JointLimitsConfig()
     max_ttl_s: float = Field(default=1.0, gt=0.0, le=10.0)
     physics_step_ms: float = Field(default=1.0, ge=0.05, le=2.0)
 
@@ -96,7 +98,8 @@ class SimJointArm(JointArm):
         description = ChainDescription.shipped(config.model)
         tool = TOOLS[config.tool] if isinstance(config.tool, str) else config.tool
         self._chain = SerialChain(description, tool)
-        self._setpoint = JointSetpoint(self._chain, DifferentialIk(self._chain), self.limits)
+        self._ik = DifferentialIk(self._chain, config.joint_limits.settings())
+        self._setpoint = JointSetpoint(self._chain, self._ik, self.limits)
         self._trouble = None
         self.T_world_base = se3.from_euler_mm_deg(config.base_pose_mm_deg)
         self._timeline = timeline or Timeline(clock)

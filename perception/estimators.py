@@ -36,13 +36,23 @@ class ContactEstimator(Protocol):
         ...
 
 
-def load_estimator(path: Path) -> ContactEstimator:
+def load_estimator(path: Path, calibration: Path | None = None) -> ContactEstimator:
     """Open a model file of any kind.
+
+    Args:
+        path: model file.
+        calibration: of the camera, where it is not the one that taught the model (``touchcell calibrate``).
 
     Raises:
         ModelError: as ``model_file.load_model``.
+        ConfigError: the calibration file cannot be used.
     """
-    return estimator_of(load_model(path))
+    estimator = estimator_of(load_model(path))
+    if calibration is None:
+        return estimator
+    from perception.camera_change import CalibratedEstimator, load_change
+
+    return CalibratedEstimator(estimator, load_change(calibration))
 
 
 def estimator_of(model: Model) -> ContactEstimator:

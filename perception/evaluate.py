@@ -61,7 +61,13 @@ class Evaluation:
 
 
 def evaluate(
-    data: Path, split: str, model: Path, *, clock: Clock | None = None, progress: Progress | None = None
+    data: Path,
+    split: str,
+    model: Path,
+    *,
+    calibration: Path | None = None,
+    clock: Clock | None = None,
+    progress: Progress | None = None,
 ) -> Evaluation:
     """Predict every image of a split, one by one as a cell would, and compare with the labels.
 
@@ -69,6 +75,7 @@ def evaluate(
         data: data set, see ``dataset``.
         split: train, val or test.
         model: model file.
+        calibration: of the camera, as ``load_estimator`` takes it.
         clock: measures the latency; None for the machine's.
         progress: told (images done, images in all).
 
@@ -79,7 +86,7 @@ def evaluate(
     """
     clock = clock or MonotonicClock()
     labelled = read_split(data, split)
-    contact_model = load_estimator(model)
+    contact_model = load_estimator(model, calibration)
     n = len(labelled.images)
     predictions: list[Prediction] = []
     latencies_ns = np.empty(n)

@@ -124,4 +124,4 @@ def evenly(n: int, wanted: int) -> list[int]:
     """``wanted`` numbers below ``n``, evenly spread and neither the first nor the last where there is a choice."""
     if wanted >= n:
         return list(range(n))
-    return [round(k * (n - 1) / (wanted + 1)) for k in range(1, wanted + 1)]
+    return [int(each) for each in np.linspace(0, n - 1, wanted + 2).round()[1:-1]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,8 +13,11 @@ from perception.errors import ModelError
 from perception.inference import RANGE_TOLERANCE, Prediction
 from perception.marker_architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture
 from perception.marker_matching import DisplacementModel, FirstGuess, MarkerField, MarkerMatcher
-from perception.markers import detect_markers
+from perception.markers import Discs, detect_markers
 from perception.model_file import Header, Labels, Model, load_model
+
+if TYPE_CHECKING:
+    from perception.camera_change import CameraChange
 
 
 class MarkerEstimator:
@@ -26,6 +30,7 @@ class MarkerEstimator:
         header: of the model file.
         reference: preprocessed image out of contact, or None.
         field: the markers of the last image, None before the first.
+        change: between this camera and the one that taught the model, in pixels of the crop; None for none.
     """
 
     def __init__(self, model: Model) -> None:
@@ -39,6 +44,7 @@ class MarkerEstimator:
         self.header: Header = model.header
         self.reference: ImageArray | None = model.reference
         self.field: MarkerField | None = None
+        self.change: CameraChange | None = None
         self._size = architecture.size
         self._matcher = matcher_of(model, architecture)
         layers = range(len(architecture.hidden) + 1)
@@ -85,7 +91,10 @@ class MarkerEstimator:
         Where the markers cannot be matched with certainty, ``in_range`` is False. Where next to nothing can be, the
         prediction is the middle of the taught range, with sigmas as wide as the range.
         """
-        field = self._matcher.match(detect_markers(reduced, self._size), self.field)
+        discs = detect_markers(reduced, self._size)
+        if self.change is not None:
+            discs = Discs(self.change.points(discs.centres), discs.areas)
+        field = self._matcher.match(discs, self.field)
         self.field = field
         labels = self.header.labels
         if not field.seen.any():

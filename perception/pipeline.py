@@ -25,6 +25,7 @@ from perception.estimate import ContactEstimate
 from perception.estimators import ContactEstimator
 from perception.filter import ContactFilter
 from perception.motion import PoseHistory
+from perception.preprocessing import Preprocessing
 
 Timer = Callable[[], int]
 
@@ -105,6 +106,11 @@ class ContactPipeline:
     def ended(self) -> bool:
         """Whether the camera has come to its end."""
         return self._ended
+
+    @property
+    def preprocessing(self) -> Preprocessing:
+        """Of the model, from camera images."""
+        return self._model.header.preprocessing
 
     def await_frame(self) -> None:
         """Wait for the camera's first frame, which is processed by the next update. Raises DeviceError."""

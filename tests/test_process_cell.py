@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import subprocess
 import sys
@@ -20,33 +22,52 @@ from cell.compose import Cell, compose
 from cell.config import plan_cell
 from cell.loop import Outcome, RunLoop, StopRequest
 from cell.processes import ProcessWatch, hosted_groups
+from cell.watch import NOTES
+from cell.why import explain
 from cell.yaml_file import InvalidCell
+from drivers.clock import MonotonicClock
 from drivers.commands import TwistCommand, TwistFrame
 from drivers.device import Lifecycle
+from drivers.emulators.rigs.ur import rig
 from drivers.errors import CommandRejected, DeviceFault, LifecycleError, Rejection, StaleData
 from drivers.lease import Lease
 from drivers.process import selftest
-from drivers.process.selftest import SelfTestFailed
+from drivers.process.chain import Chain
+from drivers.process.groups import Group, HostedDevice
+from drivers.process.proxies import RemoteJointArm
+from drivers.process.selftest import SelfTestFailed, self_test
 
-RATE_HZ = 20.0
+RATE_HZ = 10.0
 """Slow, so that a machine that does other things besides is not taken for dead."""
 
 SHIPPED = Path(__file__).parent.parent / "configs" / "surface_follow_sim.yaml"
 
 
+def children() -> list[str]:
+    return Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
+
+
+def shared() -> list[str]:
+    """Descriptors of the kind that the chain opens."""
+    links = []
+    for fd in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):
+            links.append(os.readlink(f"/proc/self/fd/{fd}"))
+    return sorted(link for link in links if link.startswith(("/memfd:touchcell", "socket:", "anon_inode:[eventfd]")))
+
+
 @pytest.fixture(autouse=True)
 def nothing_is_left_behind() -> Iterator[None]:
-    segments, fds = set(os.listdir("/dev/shm")), len(os.listdir("/proc/self/fd"))
-    before = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
+    segments, blocks, before = set(os.listdir("/dev/shm")), shared(), children()
     yield
     assert set(os.listdir("/dev/shm")) <= segments
-    assert len(os.listdir("/proc/self/fd")) <= fds
-    assert Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split() == before
+    assert shared() == blocks
+    assert children() == before
 
 
 def separate_cell(tmp_path: Path, **changes: Any) -> Path:
-    data = yaml.safe_load(SHIPPED.read_text()) | {"time": "real", "processes": "separate", "rate_hz": 20} | changes
-    data["arms"]["arm"]["limits"]["tcp_speed_m_s"] = 0.05
+    data = yaml.safe_load(SHIPPED.read_text()) | {"time": "real", "processes": "separate", "rate_hz": RATE_HZ} | changes
+    data["arms"]["arm"]["limits"]["tcp_speed_m_s"] = 0.03
     path = tmp_path / "cell.yaml"
     path.write_text(yaml.safe_dump(data))
     return path
@@ -65,7 +86,8 @@ def test_a_remote_arm_is_as_an_arm_is(tmp_path: Path) -> None:
         assert isinstance(watch, ProcessWatch)
         assert [proof.link for proof in watch.proofs] == ["the task's heartbeat", "the watchdog"]
         for proof in watch.proofs:
-            assert watch.chain.silence_s < proof.time_s <= proof.declared_s
+            # The watchdog's last beat may have come a quarter of a period before it was stopped.
+            assert watch.chain.silence_s - 0.25 / RATE_HZ < proof.time_s <= proof.declared_s
         left, right = cell.arms["left"], cell.arms["right"]
         assert left.limits == local.limits
         assert left.stop_categories == local.stop_categories
@@ -120,12 +142,36 @@ def test_a_remote_arm_is_as_an_arm_is(tmp_path: Path) -> None:
         left.tcp()
 
 
+def test_the_chain_stops_an_arm_on_the_wire(tmp_path: Path) -> None:
+    """An emulated UR: its host tells its joints, and the self-test stops its controller."""
+    wired = rig(tmp_path, 4_517_000 + os.getpid() % 1000)
+    assert wired.start is not None
+    assert wired.config is not None
+    emulator = wired.start()
+    group = Group("arm", (HostedDevice("arm", wired.spec, wired.config, 2, "hold"),), "an arm by itself")
+    try:
+        with Chain([group], RATE_HZ, 0, MonotonicClock()) as chain:
+            arm = chain.arms["arm"]
+            assert isinstance(arm, RemoteJointArm)
+            arm.connect()
+            arm.configure()
+            arm.activate()
+            ik, q, state = arm.kinematics(), arm.joints().value.q, arm.tcp().value
+            assert ik is not None
+            np.testing.assert_allclose(ik.chain.forward(q), state.T_base_tcp, atol=1e-4)
+            assert len(self_test(chain)) == 2
+            arm.deactivate()
+            arm.disconnect()
+    finally:
+        emulator.stop()
+
+
 def test_a_task_runs_on_pictures_from_another_process(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = separate_cell(tmp_path)
     assert main(["check", str(path)]) == 0
     told = capsys.readouterr().out
     assert "host 'scene': arm, sensor at 500 Hz" in told
-    assert "watchdog: stops all arms after 125 ms of silence" in told
+    assert "watchdog: stops all arms after 250 ms of silence" in told
     cell, stop = compose(plan_cell(path)), StopRequest()
     with cell:
         camera = cell.cameras["sensor"]
@@ -147,12 +193,12 @@ def test_a_task_runs_on_pictures_from_another_process(tmp_path: Path, capsys: py
 def test_activation_is_refused_when_the_chain_does_not_stop_in_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(selftest, "MARGIN_S", -0.1)
+    monkeypatch.setattr(selftest, "MARGIN_S", -0.2)
     with pytest.raises(SelfTestFailed) as caught, compose(two_arm_plan(tmp_path, RATE_HZ)):
         pytest.fail("it was activated")
     assert caught.value.link == "the task's heartbeat"
     assert caught.value.measured_s is None
-    assert caught.value.declared_s < 0.1
+    assert caught.value.declared_s < 2.5 / RATE_HZ
 
 
 @pytest.mark.parametrize(
@@ -169,7 +215,7 @@ def test_both_arms_stand_in_time_whatever_dies(tmp_path: Path, name: str, told_b
     fault = next(fault for fault in FAULTS if fault.name == name)
     case = run_fault(tmp_path, fault, RATE_HZ)
     assert list(case.problems) == []
-    assert len(case.arms) == (1 if fault.who == "left" else 2)
+    assert len(case.arms) == (1 if fault.who == "host" else 2)
     assert case.notes.get("reason") == told_by
     if fault.name != "task killed":
         assert case.outcome["outcome"] == "tripped"
@@ -214,3 +260,13 @@ def test_a_cell_in_one_process_starts_none(tmp_path: Path) -> None:
     script = "import sys, cell.compose, cell.run; print([m for m in sys.modules if m.startswith('drivers.process')])"
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
+
+
+def test_why_tells_what_the_watchdog_saw_of_a_run_whose_process_died(tmp_path: Path) -> None:
+    stop = {"speed_m_s": 0.03, "time_s": 0.058, "distance_m": 0.001, "escalated": False}
+    note = {"words": "the task's process has gone", "value_s": 0.0, "limit_s": 0.0, "arms": {"left": stop}}
+    (tmp_path / NOTES).write_text(json.dumps(note))
+    assert explain(tmp_path).splitlines()[1:] == [
+        "  the task's process has gone",
+        "  left: told to stop at 30.0 mm/s; at rest after 0.058 s and 1.00 mm",
+    ]

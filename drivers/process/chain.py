@@ -10,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
+from drivers.arm import Arm
 from drivers.clock import Clock
 from drivers.device import Device
 from drivers.errors import DeviceFault, FaultClass, Remedy
@@ -31,8 +32,9 @@ from drivers.process.layouts import (
     new_block,
 )
 from drivers.process.link import Child, HostLink
-from drivers.process.proxies import RemoteArm, RemoteCamera, RemoteDevice
+from drivers.process.proxies import RemoteArm, RemoteCamera, RemoteDevice, RemoteJointArm
 from drivers.process.watchdog import SLOW_PERIODS, silence_s
+from drivers.registry import DriverContext
 
 _GUARD_S: Final = 1.0
 
@@ -56,11 +58,7 @@ class Chain:
         self.period_s = 1.0 / control_hz
         self._seed = seed
         self._clock = clock
-        self.devices: dict[str, Device] = {
-            each.name: (RemoteArm if each.is_arm else RemoteCamera)(each.name, clock)
-            for group in groups
-            for each in group.devices
-        }
+        self.devices: dict[str, Device] = {each.name: _proxy(each, clock) for group in groups for each in group.devices}
         self.state_fds: dict[str, int] = {}
         self._links: list[HostLink] = []
         self._watchdog: Child | None = None
@@ -258,6 +256,16 @@ class Chain:
         fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._exit.callback(close_fd, fd)
         return fd
+
+
+def _proxy(device: HostedDevice, clock: Clock) -> RemoteDevice:
+    if not device.is_arm:
+        return RemoteCamera(device.name, clock)
+    if "JointSource" not in device.spec.capabilities.abilities:
+        return RemoteArm(device.name, clock)
+    # Never connected: it knows the arm's links by its configuration.
+    twin = device.spec.build(device.name, device.config, DriverContext(clock))
+    return RemoteJointArm(device.name, clock, twin.kinematics() if isinstance(twin, Arm) else None)
 
 
 def _numbers(fds: Any) -> tuple[int, ...]:

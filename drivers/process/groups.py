@@ -11,7 +11,9 @@ from drivers.registry import DriverConfig, DriverSpec
 FASTEST_HZ: Final = 500.0
 """Device cycles per second of a host at most: a process in Python holds no more beside others."""
 
-REMOTE_ABILITIES: Final = frozenset({"TcpSource", "TwistSink", "Stoppable", "FrameSource", "HealthSource"})
+REMOTE_ABILITIES: Final = frozenset(
+    {"TcpSource", "TwistSink", "Stoppable", "JointSource", "FrameSource", "HealthSource"}
+)
 """What devices can do for a task in another process."""
 
 

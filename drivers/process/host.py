@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from drivers import registry
-from drivers.abilities import FrameSource, HealthSource, StopCategory
+from drivers.abilities import FrameSource, HealthSource, JointSource, StopCategory
 from drivers.arm import Arm
 from drivers.clock import Clock, MonotonicClock
 from drivers.commands import TwistCommand, TwistFrame
@@ -46,7 +46,7 @@ from drivers.process.realtime import ask_for_realtime
 from drivers.process.watchdog import silence_s
 from drivers.process.wire import encode_adjustments, encode_error, error_note, receive, send
 from drivers.registry import DriverContext
-from drivers.samples import Frame, Quality, Stamped
+from drivers.samples import Frame, JointState, Quality, Stamped
 from geometry.errors import TouchcellError
 
 LIFECYCLES: Final = tuple(Lifecycle)
@@ -170,6 +170,8 @@ class ArmSeat:
                 value["t_ns"], value["seq"] = sample.t_ns, sample.seq
                 value["suspect"] = sample.quality is Quality.SUSPECT
                 value["T_base_tcp"], value["twist"] = sample.value.T_base_tcp, sample.value.twist
+                if isinstance(self.arm, JointSource):
+                    self._put_joints(self.arm.joints())
                 value["at_rest"] = self.arm.at_rest()
                 value["failed"] = False
             except TouchcellError as error:
@@ -181,6 +183,14 @@ class ArmSeat:
         if self._deadline_ns:
             self._follow_stop(now_ns)
         self._state.publish(note)
+
+    def _put_joints(self, sample: Stamped[JointState]) -> None:
+        value, joints, count = self._state.value, sample.value, len(sample.value.q)
+        value["joints_t_ns"], value["joints_seq"], value["joint_count"] = sample.t_ns, sample.seq, count
+        value["q"][:count], value["dq"][:count] = joints.q, joints.dq
+        value["has_torque"] = joints.tau is not None
+        if joints.tau is not None:
+            value["tau"][:count] = joints.tau
 
     def _follow_stop(self, now_ns: int) -> None:
         value = self._state.value
@@ -353,7 +363,7 @@ class Host:
         device = self.devices[name]
         calls: dict[str, Callable[[], dict[str, Any] | None]] = {
             "connect": lambda: self._connect(device),
-            "configure": device.configure,
+            "configure": lambda: self._configure(device),
             "activate": device.activate,
             "deactivate": lambda: device.deactivate(DeactivatePolicy(message["policy"])),
             "disconnect": device.disconnect,
@@ -369,6 +379,19 @@ class Host:
         if not isinstance(device, Arm):
             return {}
         return {"limits": asdict(device.limits), "stop_categories": sorted(device.stop_categories)}
+
+    def _configure(self, device: Device) -> dict[str, Any]:
+        device.configure()
+        # Only now do some controllers tell their tool.
+        ik = device.kinematics() if isinstance(device, Arm) else None
+        if ik is None:
+            return {}
+        kinematics = {
+            "chain": ik.chain.description.model_dump(mode="json"),
+            "tool": ik.chain.tool.model_dump(mode="json"),
+            "settings": asdict(ik.settings),
+        }
+        return {"kinematics": kinematics}
 
     def _clear(self) -> dict[str, Any]:
         watch = self._watch.read()

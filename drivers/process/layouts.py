@@ -18,6 +18,8 @@ VERSION: Final = 1
 MAX_IMAGE_BYTES: Final = 1920 * 1080 * 3
 """Largest picture that a frame block holds; what is not used costs no memory."""
 
+MAX_JOINTS: Final = 16
+
 MAX_NOTE_BYTES: Final = 2048
 """Longest JSON text behind a record."""
 
@@ -110,6 +112,13 @@ ARM: Final = np.dtype(
         ("suspect", "u8"),
         ("T_base_tcp", "f8", (4, 4)),
         ("twist", "f8", (6,)),
+        ("joints_t_ns", "i8"),
+        ("joints_seq", "i8"),
+        ("joint_count", "u8"),
+        ("has_torque", "u8"),
+        ("q", "f8", (MAX_JOINTS,)),
+        ("dq", "f8", (MAX_JOINTS,)),
+        ("tau", "f8", (MAX_JOINTS,)),
         ("at_rest", "u8"),
         ("told_ns", "i8"),  # when the host looked
         # The host's own record, for whoever asks afterwards what happened.

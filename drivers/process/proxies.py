@@ -23,12 +23,14 @@ from drivers.errors import (
     TransportTimeout,
 )
 from drivers.gate import TwistLimits
+from drivers.joint_limits import IkSettings
+from drivers.kinematics import ChainDescription, DifferentialIk, SerialChain, Tool
 from drivers.lease import Lease
 from drivers.process.host import LIFECYCLES
 from drivers.process.layouts import ANSWER, ARM, COMMAND, FRAME, RecordReader, RecordWriter
 from drivers.process.link import HostLink
 from drivers.process.wire import decode_adjustments, decode_note
-from drivers.samples import Frame, Quality, Stamped, TcpState
+from drivers.samples import Frame, JointState, Quality, Stamped, TcpState
 
 _FRAME_POLL_NS: Final = 1_000_000
 _FIRST_FRAME_S: Final = 5.0
@@ -187,6 +189,10 @@ class RemoteArm(RemoteDevice):
         record, _ = self._look()
         return int(record["rest_ns"]) or None
 
+    def kinematics(self) -> DifferentialIk | None:
+        """None: it tells no joints."""
+        return None
+
     def send_twist(self, command: TwistCommand, lease: Lease) -> Sent[TwistCommand]:
         """Have the host follow ``command`` until it expires; returns what its gate let pass.
 
@@ -273,6 +279,44 @@ class RemoteArm(RemoteDevice):
         answer = self._call("connect")
         self._limits = TwistLimits(**answer["limits"])
         self._categories = frozenset(StopCategory(each) for each in answer["stop_categories"])
+
+
+class RemoteJointArm(RemoteArm):
+    """An arm in another process that also tells its joints.
+
+    Args:
+        name: the device's name in the cell.
+        clock: CLOCK_MONOTONIC.
+        ik: kinematics as the driver knows them before it is connected.
+    """
+
+    def __init__(self, name: str, clock: Clock, ik: DifferentialIk | None) -> None:
+        super().__init__(name, clock)
+        self._ik = ik
+
+    def kinematics(self) -> DifferentialIk | None:
+        """Of its joints; from ``configure`` on with the tool that the device has."""
+        return self._ik
+
+    def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
+        """Newest joint state that the host has told. Raises as ``tcp``."""
+        record, note = self._look()
+        if record["failed"]:
+            raise decode_note(note, self.name)
+        count = int(record["joint_count"])
+        tau = record["tau"][:count].copy() if record["has_torque"] else None
+        state = JointState(record["q"][:count].copy(), record["dq"][:count].copy(), tau)
+        sample = Stamped(state, int(record["joints_t_ns"]), int(record["joints_seq"]))
+        age_s = sample.age_s(self._clock.now_ns())
+        if max_age_s is not None and age_s > max_age_s:
+            raise StaleData(self.name, age_s, max_age_s, sample.seq)
+        return sample
+
+    def _configure(self) -> None:
+        told = self._call("configure").get("kinematics")
+        if told is not None:
+            chain = SerialChain(ChainDescription.model_validate(told["chain"]), Tool.model_validate(told["tool"]))
+            self._ik = DifferentialIk(chain, IkSettings(**told["settings"]))
 
 
 class RemoteCamera(RemoteDevice):

@@ -365,10 +365,6 @@ class SceneConfig(_Part):
         with physics_engine("scene.physics", "dynamic"):
             from drivers.simulation.dynamics import DynamicWorld
             from drivers.simulation.dynamics_model import TipMechanics
-        tip = TipMechanics(
-            radius_m=1e-3 * self.tip.radius_mm,
-            stiffness_n_m=1e3 * self.tip.stiffness_n_mm,
-            friction=self.tip.friction,
-        )
+        tip = TipMechanics(1e-3 * self.tip.radius_mm, 1e3 * self.tip.stiffness_n_mm, self.tip.friction)
         objects = {name: config.build(self.table) for name, config in self.objects.items()}
         return DynamicWorld(surfaces, objects, 1e-3 * self.table.height_mm, tip, 1e-3 * self.physics_step_ms)
