@@ -1,8 +1,8 @@
 """``touchcell bench simulation``: how true the simulated scenes are, and how fast.
 
-First, scripted touches at every fidelity against MuJoCo at 0.1 ms. Second, whole cells in closed loop: simulated
-seconds per second of one core, and where that second went. Times are of the processor, not of the wall, because cores
-are shared; ``--quick`` runs the first script and the first cell alone.
+First, numbers of the dynamic scene against theory. Second, scripted touches at every fidelity against MuJoCo at 0.1 ms.
+Third, whole cells in closed loop: simulated seconds per second of one core, and where that second went. Times are of
+the processor, not of the wall, because cores are shared; ``--quick`` runs the first script and the first cell alone.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import json
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -21,6 +21,7 @@ import yaml
 
 from benchmarks.cpu_shares import cpu_shares
 from benchmarks.provenance import provenance
+from benchmarks.simulation_checks import Check, checks
 from benchmarks.simulation_scripts import SCRIPTS, Script, Trace, perform
 from cell.compose import compose
 from cell.config import plan_cell
@@ -74,17 +75,32 @@ _FIDELITIES = (
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Print both tables; writes ``simulation.json`` and ``simulation.png`` into ``out``."""
+    """Print three tables; writes ``simulation.json`` and ``simulation.png`` into ``out``."""
     parser = argparse.ArgumentParser(prog="touchcell bench simulation")
     parser.add_argument("--quick", action="store_true", help="the first script and the first cell alone")
     quick = parser.parse_args(arguments).quick
     scripts = dict(list(SCRIPTS.items())[: 1 if quick else None])
+    checked = [] if quick else _check()
     fidelity = {name: _compare(name, script) for name, script in scripts.items()}
     print()
     speed = _speeds(quick=quick, out=out)
-    result = {**provenance(), "reference_step_ms": _FINEST_MS, "fidelity": fidelity, "speed": speed}
+    result = {
+        **provenance(),
+        "checks": [asdict(each) for each in checked],
+        "reference_step_ms": _FINEST_MS,
+        "fidelity": fidelity,
+        "speed": speed,
+    }
     (out / "simulation.json").write_text(json.dumps(result, indent=1) + "\n")
     _plot(fidelity, speed, out / "simulation.png")
+
+
+def _check() -> list[Check]:
+    found = checks()
+    for each in found:
+        print(f"{each.what:<72}{each.value:>12}  {each.aim:<12}{'' if each.passed else 'MISSED'}", flush=True)
+    print()
+    return found
 
 
 def _compare(name: str, script: Script) -> dict[str, dict[str, float]]:

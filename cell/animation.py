@@ -1,4 +1,4 @@
-"""``touchcell report RUN --animate``: a run as a small moving picture, made from its recording."""
+"""``touchcell run|report ... --animate``: a run as a small moving picture, made from its recording."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from cell.outlines import ABOVE, SIDE, View, height_mm, solid_outlines_mm, tip_outlines_mm
 from cell.recording import read
 from cell.run_folder import Poses, RunFolder, object_poses, scene, scene_time, sensor_poses, true_contacts
+from drivers.errors import ConfigError
 from drivers.simulation.render import FrameRenderer
 from drivers.simulation.scene import SceneConfig
 from drivers.simulation.tip import Tip
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 _INCHES, _DPI = (9.0, 5.4), 80
 _FRAMES_PER_S = 12
-_COLOURS = 64
+_COLOURS = 128
 _TIP_COLOURS = ("#4c72b0", "#dd8452", "#55a868")
 _BODY_COLOUR, _OBJECT_COLOUR, _TABLE_COLOUR, _TARGET_COLOUR = "#e8e8e8", "#e5c494", "#bfb8ae", "#d62728"
 # Over the tips, so that a tip looks pressed flat where it is.
@@ -70,9 +71,11 @@ def animate(folder: Path, *, max_frames: int = 90) -> Path:
         max_frames: the run is shown as fast as these allow, and never slower than it was.
 
     Raises:
-        RecordingError, ConfigError: the folder holds no run.
+        RecordingError, ConfigError: the folder holds no run, or one of real devices.
     """
     run = RunFolder(folder)
+    if run.plan.cell.scene is None:
+        raise ConfigError("only a simulated run can be animated: nobody knows where things were", key="scene")
     roles = list(run.plan.sensor_roles)
     shown = _Shown(
         run,
@@ -183,8 +186,8 @@ class _Stage:
             self._views[SIDE].set_ylim(low, high)
         target = shown.run.plan.task_config.model_dump().get("target_mm")
         if target is not None:
-            self._views[ABOVE].plot(target[0], target[1], "o", ms=9, mfc="none", mec=_TARGET_COLOUR, mew=1.2, zorder=5)
-            self._views[ABOVE].plot(target[0], target[1], ".", ms=4, color=_TARGET_COLOUR, zorder=5)
+            self._views[ABOVE].plot(target[0], target[1], "o", ms=9, mfc="none", mec=_TARGET_COLOUR, mew=1.2, zorder=6)
+            self._views[ABOVE].plot(target[0], target[1], ".", ms=4, color=_TARGET_COLOUR, zorder=6)
             self._views[SIDE].axvline(target[0], color=_TARGET_COLOUR, lw=0.8, ls=":")
         for config in shown.scene.surfaces.values():
             if config.motion is None:

@@ -54,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--data", type=Path, help="data set folder for drivers that replay one")
     run.add_argument("--model", help="model file in place of the one that the cell names")
     run.add_argument("--out", type=Path, help="run folder (default: runs/NAME-TIME)")
+    run.add_argument("--animate", action="store_true", help="also write animation.gif, of a simulated run")
     run.add_argument("--quiet", action="store_true", help="no live progress line")
     run.set_defaults(run=_run)
 
@@ -179,6 +180,7 @@ def _run(options: argparse.Namespace) -> int:
         model=options.model,
         out=options.out,
         live=not options.quiet and sys.stdout.isatty(),
+        moving=options.animate,
     )
 
 

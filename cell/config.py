@@ -545,11 +545,10 @@ class _Planner:
         ways = []
         for arm in arms.values():
             body = cell.arms[arm.name].body
-            tells_joints = "JointSource" in arm.spec.capabilities.abilities and cell.processes == "one"
-            if not (body or tells_joints):
+            if not body and "JointSource" not in arm.spec.capabilities.abilities:
                 self._add(
                     ("arms", arm.name, "body"),
-                    f"{arm.spec.name} tells only where its tool is here; interlocks.{name} has to know its shape",
+                    f"{arm.spec.name} tells only where its tool is; interlocks.{name} has to know its shape",
                     hint="name capsules: body: [{from_mm: [0, 0, 0], to_mm: [0, 0, -100], radius_mm: 40}]",
                 )
             ends = [end for part in body for end in (part.from_mm, part.to_mm) if end is not None]

@@ -34,7 +34,13 @@ _EXIT = {
 
 
 def run_cell(
-    path: Path, *, data: Path | None = None, model: str | None = None, out: Path | None = None, live: bool = True
+    path: Path,
+    *,
+    data: Path | None = None,
+    model: str | None = None,
+    out: Path | None = None,
+    live: bool = True,
+    moving: bool = False,
 ) -> int:
     """Run a cell file to its end and report; returns the exit code.
 
@@ -44,6 +50,7 @@ def run_cell(
         model: estimator model in place of the file's own.
         out: run folder.
         live: show a progress line.
+        moving: also make the animation of a simulated run.
 
     Raises:
         ConfigError, ModelError, ConnectError: before anything moves.
@@ -57,6 +64,10 @@ def run_cell(
     result = _run(cell, folder, live)
     (folder / "result.json").write_text(json.dumps(_result_json(plan, result), indent=1) + "\n")
     print(write_report(folder))
+    if moving:
+        from cell.animation import animate
+
+        print(f"  {animate(folder).name}")
     if result.outcome in (Outcome.TRIPPED, Outcome.ERROR):
         print(f"`touchcell why {folder}` explains")
     return _EXIT[result.outcome]

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,14 +63,9 @@ def sensor_poses(run: RunFolder, role: str) -> Poses:
     arm_role = next((each for each, name in plan.arm_roles.items() if name == arm), arm)
     series = run.recording.series(f"/arms/{arm_role}/tcp")
     assert series is not None
-    T_world_base = se3.from_euler_mm_deg(np.array(base_pose_mm_deg(plan.cell.arms[arm])))
+    T_world_base = se3.from_euler_mm_deg(np.array(plan.cell.arms[arm].base_pose_mm_deg))
     T_tcp_sensor = se3.from_euler_mm_deg(np.array(section.tcp_to_sensor_mm_deg))
     return Poses(scene_time(run, series), T_world_base @ tip_points(series) @ T_tcp_sensor)
-
-
-def base_pose_mm_deg(arm: Any) -> Any:
-    """Where an arm of a cell file stands in the world."""
-    return (arm.model_extra or {}).get("base_pose_mm_deg", (0.0,) * 6)
 
 
 def during(run: RunFolder, series: Series, state: str = "run") -> NDArray[np.bool_]:

@@ -44,7 +44,7 @@ def build_surroundings(plan: CellPlan, arms: Mapping[str, Any], names: Mapping[s
 def _body(section: ArmSection, T_world_base: Array, arm: ServoArm) -> Body:
     parts = [_part(k, part) for k, part in enumerate(section.body)]
     ik = arm.kinematics()
-    links = [] if ik is None else _links(ik.chain.description)
+    links = [] if ik is None else link_capsules(ik.chain.description)
     if not links:
         if not parts:
             raise ConfigError(
@@ -57,7 +57,8 @@ def _body(section: ArmSection, T_world_base: Array, arm: ServoArm) -> Body:
     return Body(T_world_base, links + parts, arm.kinematics, ik.chain.joint_count)
 
 
-def _links(description: ChainDescription) -> list[Capsule]:
+def link_capsules(description: ChainDescription) -> list[Capsule]:
+    """The capsules of an arm's base and links, as its chain file has them."""
     found = [_capsule("its base", BASE, shape) for shape in description.base_capsules]
     for k, joint in enumerate(description.joints, start=1):
         found += [_capsule(f"the link at {joint.name}", k, shape) for shape in joint.capsules]

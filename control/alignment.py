@@ -15,7 +15,7 @@ from geometry.types import Array
 
 MAX_CRAB_RAD: Final = math.radians(15.0)
 """Furthest that an object is headed aside to go straight: it is pushed this far beside its middle."""
-MAX_INTEGRATED_M: Final = 0.006
+MAX_INTEGRATED_M: Final = 0.015
 """Larger distances from the path are not integrated: on the way back to it the integral would only gather overshoot."""
 
 

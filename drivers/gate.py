@@ -205,10 +205,11 @@ def _limited(twist: Array, max_linear: float, max_angular: float, adjustments: l
 
 def _within(local: LocalIk, twist: Array, adjustments: list[Adjustment]) -> Array:
     """``twist`` scaled so that no joint exceeds its limits; each joint is named once."""
-    motion = local.motion(twist)
-    named = {adjustment.limit for adjustment in adjustments}
-    adjustments.extend(adjustment for adjustment in motion.adjustments if adjustment.limit not in named)
-    return twist if motion.scale == 1.0 else motion.scale * twist
+    _, scale, why = local.limited(twist)
+    if why:
+        named = {adjustment.limit for adjustment in adjustments}
+        adjustments.extend(adjustment for adjustment in why if adjustment.limit not in named)
+    return twist if scale == 1.0 else scale * twist
 
 
 def _norm(vector: Array) -> float:

@@ -321,6 +321,8 @@ class LocalIk:
         self._weights = weights
         self._J = self._weighted_jacobian(q)
         self._inverse, self._smallest = self._inverted(self._J)
+        chain, margin_rad = ik.chain, ik.settings.limit_margin_rad
+        self._bounds = speed_bounds(q, chain.lower, chain.upper, chain.speed, margin_rad)
 
     def acceleration_scale(self, step: Array, dt_s: float) -> tuple[float, tuple[Adjustment, ...]]:
         """Share of the change of twist ``step`` (6,) within ``dt_s`` that no joint is too slow for, and why."""
@@ -329,8 +331,13 @@ class LocalIk:
 
     def motion(self, twist: Array) -> JointMotion:
         """Joint velocities for ``twist`` (6,), within every limit."""
+        dq, scale, adjustments = self.limited(twist)
+        return JointMotion(dq, (self._J @ dq) / self._weights, scale, self._smallest, adjustments)
+
+    def limited(self, twist: Array) -> tuple[Array, float, tuple[Adjustment, ...]]:
+        """Joint velocities (n,) for ``twist`` (6,), within every limit, what share of it that is, and why."""
         chain, settings = self._chain, self._settings
-        lowest, highest = speed_bounds(self._q, chain.lower, chain.upper, chain.speed, settings.limit_margin_rad)
+        lowest, highest = self._bounds
         dq = self._inverse @ (self._weights * twist)
         if settings.goes_round and len(dq) > 6:
             dq = self._saturated(dq, self._weights * twist, lowest, highest)
@@ -340,7 +347,7 @@ class LocalIk:
         if self._smallest < settings.singular_value_m and dq.any():
             left, why = self._off_singularity(dq)
             scale, dq, adjustments = scale * left, dq * left, adjustments + why
-        return JointMotion(dq, (self._J @ dq) / self._weights, scale, self._smallest, adjustments)
+        return dq, scale, adjustments
 
     def _weighted_jacobian(self, q: Array) -> Array:
         J = self._chain.jacobian(q)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
+from pydantic import PositiveFloat
 
 from geometry.types import Array
 from tasks.hand import Hand, HandConfig, Six, SixGains
@@ -28,9 +29,11 @@ class FollowerConfig(HandConfig):
     """
 
     reference_mm_deg: Six = (0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
-    kp_per_s: SixGains = (0.0, 6.0, 8.0, 8.0, 0.0, 0.0)
-    ki_per_s2: SixGains = (0.0, 6.0, 16.0, 8.0, 0.0, 0.0)
-    settle_tolerance_mm: float = 0.5
+    kp_per_s: SixGains = (0.0, 10.0, 10.0, 10.0, 0.0, 0.0)
+    ki_per_s2: SixGains = (0.0, 25.0, 25.0, 25.0, 0.0, 0.0)
+    integral_zone_mm: PositiveFloat = 5.0
+    integral_zone_deg: PositiveFloat = 10.0
+    settle_tolerance_mm: PositiveFloat = 0.5
 
 
 class DualArmPushingConfig(PushConfig, ServoConfig):

@@ -42,8 +42,8 @@ class PushConfig(HandConfig):
     path_mm: tuple[Mm, ...] = ()
     push_speed_mm_s: PositiveFloat = 20.0
     middle_mm: PositiveFloat = 60.0
-    look_ahead_mm: PositiveFloat = 40.0
-    align_kp_mm_s_per_deg: PositiveFloat = 3.0
+    look_ahead_mm: PositiveFloat = 60.0
+    align_kp_mm_s_per_deg: PositiveFloat = 5.0
     align_ki_deg_per_mm_s: NonNegativeFloat = 0.2
     align_kd_mm_per_deg: NonNegativeFloat = 0.0
     align_max_mm_s: PositiveFloat = 10.0

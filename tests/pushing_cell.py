@@ -15,7 +15,7 @@ import yaml
 
 from cell.compose import Cell, compose
 from cell.config import plan_cell
-from cell.loop import RunLoop, RunResult
+from cell.loop import RunLoop, RunResult, StopRequest
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
@@ -62,7 +62,12 @@ class Pushed:
         return [(r.source, r.event, r.target) for r in self.cell.task.transitions]
 
 
-def push(data: dict[str, Any], tmp_path: Path, meanwhile: Callable[[Cell], None] | None = None) -> Pushed:
+def push(
+    data: dict[str, Any],
+    tmp_path: Path,
+    meanwhile: Callable[[Cell], None] | None = None,
+    stop: StopRequest | None = None,
+) -> Pushed:
     """Run the cell; ``meanwhile`` is called after every cycle."""
     file = tmp_path / "cell.yaml"
     file.write_text(yaml.safe_dump(data))
@@ -70,7 +75,7 @@ def push(data: dict[str, Any], tmp_path: Path, meanwhile: Callable[[Cell], None]
     pusher = next(role for role in cell.sensors if not role.startswith("follower"))
     error_mm, at = math.nan, (math.nan, math.nan, math.nan)
     with cell:
-        loop = RunLoop(cell, None)
+        loop = RunLoop(cell, None, stop=stop)
         loop.begin()
         while loop.step():
             if meanwhile is not None:

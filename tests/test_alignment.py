@@ -56,7 +56,7 @@ def test_points_beside_a_path_are_found_again(s, off):
     dx, dy = CORNER.direction(s)
     place = CORNER.place((x - off * dy, y + off * dx), 0.0, 1.0)
     assert abs(place.aside_m) <= abs(off) + 1e-12
-    assert place.along_m == pytest.approx(s, abs=0.011)
+    assert place.along_m == pytest.approx(s, abs=0.015)
 
 
 @pytest.mark.parametrize("points", [[(0.0, 0.0)], [(0.0, 0.0), (0.0, 0.0)]])

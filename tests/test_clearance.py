@@ -14,7 +14,7 @@ from benchmarks.fault_matrix import cells
 from cell.compose import compose
 from cell.config import plan_cell
 from cell.loop import Outcome, RunLoop
-from cell.surroundings import _links
+from cell.surroundings import link_capsules
 from cell.yaml_file import InvalidCell
 from control.clearance import Clearance, ClearanceConfig
 from control.collision import BASE, TOOL, Box, Capsule, Clearances
@@ -145,7 +145,7 @@ def jointed(q: np.ndarray, dq: np.ndarray) -> ArmView:
 
 
 def test_links_are_where_kinematics_put_them_and_move_as_the_command_asks():
-    body = Body(np.eye(4), _links(CHAIN.description), lambda: IK, 6)
+    body = Body(np.eye(4), link_capsules(CHAIN.description), lambda: IK, 6)
     q = np.deg2rad([10.0, 40.0, 90.0, 5.0, 50.0, 20.0])
     dq = np.array([0.1, -0.2, 0.1, 0.0, 0.2, 0.1])
     T = body.frames(jointed(q, dq), 0.01)
@@ -156,7 +156,10 @@ def test_links_are_where_kinematics_put_them_and_move_as_the_command_asks():
 
 
 def test_an_arm_that_folds_onto_itself_is_slowed():
-    parts = [*_links(CHAIN.description), Capsule("gripper", (TOOL, TOOL), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.15)), 0.03)]
+    parts = [
+        *link_capsules(CHAIN.description),
+        Capsule("gripper", (TOOL, TOOL), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.15)), 0.03),
+    ]
     bodies = {"arm": Body(np.eye(4), parts, lambda: IK, 6)}
     (clear,) = build_interlocks(parse_interlocks({"clear": {**ENTRY, "slow_mm": 80}}), {}, Surroundings({}, bodies))
     q = np.deg2rad([0.0, 20.0, 140.0, 0.0, 85.0, 0.0])
@@ -172,7 +175,7 @@ def test_no_shipped_arm_touches_itself_where_it_works(name):
     chain = SerialChain(ChainDescription.shipped(name))
     poses = {"generic_6r": [0, 40, 90, 0, 50, 0], "so101_5r": [0, 10, 90, 80, 0], "fr3": [0, -45, 0, -135, 0, 90, 45]}
     q = np.deg2rad(np.array(poses.get(name, [0, -90, 90, -90, -90, 0]), dtype=float))
-    found = Clearances({"arm": _links(chain.description)}, {"arm": chain.joint_count + 2}, [])
+    found = Clearances({"arm": link_capsules(chain.description)}, {"arm": chain.joint_count + 2}, [])
     frames = np.concatenate([np.eye(4)[None], chain.link_poses(q), chain.forward(q)[None]])
     assert len(found.pairs) >= 3
     assert found.distances(frames).min() > 0.06

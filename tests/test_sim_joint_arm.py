@@ -1,7 +1,13 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
+import yaml
 from pydantic import ValidationError
 
+from cell.compose import compose
+from cell.config import plan_cell
+from cell.loop import Outcome, Progress, RunLoop
 from drivers import registry
 from drivers.clock import VirtualClock
 from drivers.commands import TwistCommand, TwistFrame
@@ -140,6 +146,26 @@ def test_a_snapshot_brings_the_joints_back() -> None:
         ends.append(arm.joints().value.q)
         restore()
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
+
+
+def test_a_panda_tracks_a_moving_plate_in_a_dynamic_scene(tmp_path: Path) -> None:
+    data = yaml.safe_load(Path("configs/object_track_panda_sim.yaml").read_text())
+    data["task"]["duration_s"] = 3
+    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    path = tmp_path / "cell.yaml"
+    path.write_text(yaml.safe_dump(data))
+    depths_mm = []
+
+    def watch(progress: Progress) -> None:
+        if progress.state == "run" and progress.t_s > 2.0:
+            depths_mm.append(1e3 * cell.scene.contact("sensor").value.depth_m)
+
+    cell = compose(plan_cell(path))
+    with cell:
+        result = RunLoop(cell, None, on_cycle=watch).run()
+    assert result.outcome is Outcome.DONE, result.reason
+    assert len(depths_mm) > 100
+    assert np.sqrt(np.mean((np.array(depths_mm[50:]) - 6.0) ** 2)) < 0.5
 
 
 def test_what_it_cannot_reach_is_told() -> None:

@@ -25,6 +25,11 @@ CHANGES: Mapping[str, Mapping[str, Any]] = {
     "camera noise x 2": {f"sensors.{SENSOR}.noise": 4.0},
     "camera noise x 8": {f"sensors.{SENSOR}.noise": 16.0},
     "camera noise x 16": {f"sensors.{SENSOR}.noise": 32.0},
+    "exposure x 0.7": {f"sensors.{SENSOR}.exposure": 0.7},
+    "blur 2 px": {f"sensors.{SENSOR}.blur_px": 2.0},
+    "1 of 10 frames lost": {f"sensors.{SENSOR}.dropped": 0.1},
+    "1 of 3 frames lost": {f"sensors.{SENSOR}.dropped": 1.0 / 3.0},
+    "2 of 3 frames lost": {f"sensors.{SENSOR}.dropped": 2.0 / 3.0},
     "latency + 20 ms": {f"sensors.{SENSOR}.latency_ms": 30.0},
     "latency + 50 ms": {f"sensors.{SENSOR}.latency_ms": 60.0},
     "latency + 90 ms": {f"sensors.{SENSOR}.latency_ms": 100.0},
@@ -38,7 +43,14 @@ CHANGES: Mapping[str, Mapping[str, Any]] = {
     "mass + 30 %": {"scene.objects.prism.mass_g": 1.3 * _PRISM.mass_g},
     "mass x 5": {"scene.objects.prism.mass_g": 5.0 * _PRISM.mass_g},
 }
-_QUICK = ("as it is", "camera noise x 8", "latency + 20 ms", "table friction + 30 %", "mass + 30 %")
+_QUICK = (
+    "as it is",
+    "camera noise x 8",
+    "1 of 3 frames lost",
+    "latency + 20 ms",
+    "table friction + 30 %",
+    "mass + 30 %",
+)
 
 
 def trials(scale: Scale) -> list[Trial]:

@@ -226,8 +226,6 @@ class Chain:
             "rate_hz": group.rate_hz(1.0 / self.period_s),
             "seed": self._seed,
             "scene": group.scene,
-            # Physics that cannot keep up would leave nothing of the processor for anybody else.
-            "realtime": group.scene is None,
             "devices": [
                 {
                     "name": each.name,

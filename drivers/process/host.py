@@ -458,7 +458,7 @@ def main() -> None:
     with ExitStack() as exits:
         for device in host.devices.values():
             exits.callback(device.disconnect)
-        send(control, {"ok": True, "realtime": ask_for_realtime() if spec["realtime"] else "ordinary scheduling"})
+        send(control, {"ok": True, "realtime": ask_for_realtime()})
         host.run()
 
 

@@ -5,10 +5,14 @@ from __future__ import annotations
 import ctypes
 import os
 import resource
-from typing import Final
+import signal
+from typing import Any, Final
 
 PRIORITY: Final = 40
 """Below the kernel's own interrupt threads (50), above everything ordinary."""
+
+LONGEST_US: Final = 200_000
+"""Computing for so long without a pause, a process falls back to ordinary scheduling: nobody else could run."""
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
@@ -20,10 +24,16 @@ def ask_for_realtime() -> str:
 
 def _scheduling() -> str:
     try:
+        signal.signal(signal.SIGXCPU, _give_way)
+        resource.setrlimit(resource.RLIMIT_RTTIME, (LONGEST_US, resource.RLIM_INFINITY))
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except OSError as error:
         return f"ordinary scheduling ({error.strerror})"
     return f"SCHED_FIFO {PRIORITY}"
+
+
+def _give_way(*_: Any) -> None:
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def _memory() -> str:

@@ -23,8 +23,9 @@ from drivers.process.proxies import RemoteArm
 from geometry.types import Array
 
 SPEED_M_S: Final = 1e-3
-MARGIN_S: Final = 0.1
-"""What a stop may take beyond silence, cycles and deceleration."""
+MARGIN_S: Final = 0.2
+"""What a stop may take beyond silence, cycles and deceleration: a vendor's controller rounds its corners, and takes its
+time to say that the arm stands (0.13 s for Franka's)."""
 
 _SEEN_M: Final = 5e-5
 _SEEN_WITHIN_S: Final = 2.0

@@ -28,6 +28,8 @@ from geometry.types import Array
 
 GRAVITY_M_S2: Final = 9.81
 
+_Three = tuple[float, float, float]
+
 _MAX_ITERATIONS: Final = 30
 _TOLERANCE_M: Final = 1e-10
 _TOLERANCE: Final = 1e-7
@@ -87,9 +89,9 @@ class _Slider:
 
         return restore
 
-    def move(self, shift: Array, dt_s: float) -> None:
-        """Move by ``shift`` (3,): x, y and friction radius times yaw, m, within ``dt_s``."""
-        dx, dy, turn = float(shift[0]), float(shift[1]), float(shift[2]) / self.radius_m
+    def move(self, shift: _Three, dt_s: float) -> None:
+        """Move by ``shift``: x, y and friction radius times yaw, m, within ``dt_s``."""
+        dx, dy, turn = shift[0], shift[1], shift[2] / self.radius_m
         self.x, self.y, self.yaw = self.x + dx, self.y + dy, self.yaw + turn
         if dt_s > 0.0:
             self._velocity = np.array([dx, dy, 0.0, 0.0, 0.0, turn]) / dt_s
@@ -162,99 +164,130 @@ class QuasiStaticWorld:
 
 
 class _Tip:
-    """A tip that may press on an object: its centre (3,) in the world, and where its skin holds on to the object."""
+    """A tip that may press on an object: its centre in the world, and where its skin holds on to the object."""
 
     __slots__ = ("centre", "held")
 
     def __init__(self, centre: Array, held: Array | None) -> None:
-        self.centre = centre
-        self.held = held
+        self.centre: _Three = (float(centre[0]), float(centre[1]), float(centre[2]))
+        self.held: _Three | None = None if held is None else (float(held[0]), float(held[1]), float(held[2]))
 
 
-def _settle(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw) -> Array:
-    """How far (3,) the object slides under its tips in one step: x, y and friction radius times yaw, m.
+def _settle(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw) -> _Three:
+    """How far the object slides under its tips in one step: x, y and friction radius times yaw, m.
 
     In these coordinates the limit surface is a sphere: the object rests while the force ``f`` on it is below the limit;
-    otherwise it moves along ``f`` until ``f`` has come down to the limit. Newton's method on both conditions.
+    otherwise it moves along ``f`` until ``f`` has come down to the limit. Newton's method on both conditions,
+    ``shift = way f / limit`` and ``|f| = limit``.
     """
-    shift = np.zeros(3)
     slider.weight_n = slider.own_weight_n
-    if not tips:
-        return shift
+    shift: _Three = (0.0, 0.0, 0.0)
     f, K, down = _force(slider, tips, law, shift)
     slider.weight_n = max(slider.own_weight_n + down, 0.0)
     limit = max(slider.limit_n, 1e-9)
-    size = math.sqrt(float(f @ f))
+    size = math.hypot(*f)
     if size <= limit:
         return shift
     way = 0.0
-    M = np.zeros((4, 4))
-    r = np.empty(4)
-    miss = math.inf
     for _ in range(_MAX_ITERATIONS):
-        r[:3] = shift - way / limit * f
-        r[3] = size / limit - 1.0
-        miss = float(np.abs(r[:3]).max())
-        if miss < _TOLERANCE_M and abs(r[3]) < _TOLERANCE:
+        unmoved = [way / limit * f[i] - shift[i] for i in range(3)]
+        excess = size / limit - 1.0
+        if max(map(abs, unmoved)) < _TOLERANCE_M and abs(excess) < _TOLERANCE:
             break
-        M[:3, :3] = np.eye(3) + way / limit * K
-        M[:3, 3] = -f / limit
-        M[3, :3] = -(f @ K) / (size * limit)
-        change = np.linalg.solve(M, -r)
+        inverse = _inverse(way / limit, K)
+        resting = _times(inverse, unmoved)
+        moving = _times(inverse, [each / limit for each in f])
+        falls = [(f[0] * K[i] + f[1] * K[3 + i] + f[2] * K[6 + i]) / (size * limit) for i in range(3)]
+        further = (excess - _dot(falls, resting)) / _dot(falls, moving)
         part = 1.0
         while True:
-            trial = shift + part * change[:3]
+            goes = [part * (resting[i] + further * moving[i]) for i in range(3)]
+            trial = shift[0] + goes[0], shift[1] + goes[1], shift[2] + goes[2]
             f_trial, K_trial, _ = _force(slider, tips, law, trial)
-            size_trial = math.sqrt(float(f_trial @ f_trial))
+            size_trial = math.hypot(*f_trial)
             # A step that lets go of the object has gone too far: there the force has no direction.
             if size_trial > 0.1 * limit or part < 1e-3:
                 break
             part *= 0.5
-        shift, way = trial, max(way + part * float(change[3]), 0.0)
+        shift, way = trial, max(way + part * further, 0.0)
         f, K, size = f_trial, K_trial, size_trial
         if size == 0.0:
             break
     return shift
 
 
-def _force(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw, shift: Array) -> tuple[Array, Array, float]:
-    """Force (3,) of all tips on the object moved by ``shift``, in its coordinates; how it falls with the shift, (3, 3),
-    to first order; and how hard the tips press down, N."""
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _times(M: Sequence[float], v: Sequence[float]) -> _Three:
+    return _dot(M[0:3], v), _dot(M[3:6], v), _dot(M[6:9], v)
+
+
+def _inverse(scale: float, K: Sequence[float]) -> tuple[float, ...]:
+    """Of the matrix 1 + scale K, by rows."""
+    a, b, c = 1.0 + scale * K[0], scale * K[1], scale * K[2]
+    d, e, f = scale * K[3], 1.0 + scale * K[4], scale * K[5]
+    g, h, i = scale * K[6], scale * K[7], 1.0 + scale * K[8]
+    p, q, r = e * i - f * h, f * g - d * i, d * h - e * g
+    over = 1.0 / (a * p + b * q + c * r)
+    return (
+        over * p,
+        over * (c * h - b * i),
+        over * (b * f - c * e),
+        over * q,
+        over * (a * i - c * g),
+        over * (c * d - a * f),
+        over * r,
+        over * (b * g - a * h),
+        over * (a * e - b * d),
+    )
+
+
+def _force(
+    slider: _Slider, tips: Sequence[_Tip], law: ContactLaw, shift: Sequence[float]
+) -> tuple[_Three, Sequence[float], float]:
+    """Force of all tips on the object moved by ``shift``, in its coordinates; how it falls with the shift to first
+    order, 3 x 3 by rows; and how hard the tips press down, N."""
     radius = slider.radius_m
-    x, y, yaw = slider.x + float(shift[0]), slider.y + float(shift[1]), slider.yaw + float(shift[2]) / radius
+    x, y, yaw = slider.x + shift[0], slider.y + shift[1], slider.yaw + shift[2] / radius
     sin, cos = math.sin(yaw), math.cos(yaw)
-    f = np.zeros(3)
-    K = np.zeros((3, 3))
-    down = 0.0
+    force_x = force_y = force_turn = down = 0.0
+    K = [0.0] * 9
     for tip in tips:
         cx, cy, cz = tip.centre[0] - x, tip.centre[1] - y, tip.centre[2] - slider.z
-        near = slider.surface.shape.nearest(np.array([cos * cx + sin * cy, cos * cy - sin * cx, cz]))
+        # From here on in the object's frame.
+        bx, by = cos * cx + sin * cy, cos * cy - sin * cx
+        near = slider.surface.shape.nearest(np.array([bx, by, cz]))
         depth = law.tip_radius_m - near.distance_m
         if depth <= 0.0:
             continue
-        pull_x = pull_y = 0.0
-        nx, ny, nz = (float(value) for value in near.normal)
+        nx, ny, nz = near.normal.tolist()
+        px, py, pz = near.point.tolist()
         stiff_n, stiff_t = law.stiffness_n_m, 0.0
         push = -stiff_n * depth
+        fx, fy = push * nx, push * ny
+        down -= push * nz
         if tip.held is not None:
-            sx, sy, sz = (float(value) for value in near.point - tip.held)
+            sx, sy, sz = px - tip.held[0], py - tip.held[1], pz - tip.held[2]
             along = sx * nx + sy * ny + sz * nz
             sx, sy, sz = sx - along * nx, sy - along * ny, sz - along * nz
             length, longest = math.sqrt(sx * sx + sy * sy + sz * sz), law.max_shear_m(depth)
             stiff_t = law.shear_stiffness_n_m(depth)
             if length > longest:
                 stiff_t *= longest / length
-            pull_x, pull_y = stiff_t * sx, stiff_t * sy
+            fx, fy = fx + stiff_t * sx, fy + stiff_t * sy
             down -= stiff_t * sz
-        fx, fy = push * nx + pull_x, push * ny + pull_y
-        down -= push * nz
-        px, py = float(near.point[0]), float(near.point[1])
-        f += (cos * fx - sin * fy, sin * fx + cos * fy, (px * fy - py * fx) / radius)
-        # What counts for depth and shear is how the object moves where the tip's centre is.
-        bx, by = cos * cx + sin * cy, cos * cy - sin * cx
+        force_x += cos * fx - sin * fy
+        force_y += sin * fx + cos * fy
+        force_turn += (px * fy - py * fx) / radius
+        # Of a shift of the object's side against the tip, along the normal and along the tangent. What counts for depth
+        # and shear is how the object moves where the tip's centre is.
         for stiff, ux, uy in ((stiff_n, nx, ny), (stiff_t, -ny, nx)):
             wx, wy = cos * ux - sin * uy, sin * ux + cos * uy
-            pushed = np.array([wx, wy, (px * uy - py * ux) / radius])
-            felt = np.array([wx, wy, (bx * uy - by * ux) / radius])
-            K += stiff * np.outer(pushed, felt)
-    return f, K, down
+            felt = (bx * uy - by * ux) / radius
+            for row, pushed in enumerate((stiff * wx, stiff * wy, stiff * (px * uy - py * ux) / radius)):
+                K[3 * row] += pushed * wx
+                K[3 * row + 1] += pushed * wy
+                K[3 * row + 2] += pushed * felt
+    return (force_x, force_y, force_turn), K, down
