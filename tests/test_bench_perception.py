@@ -90,8 +90,8 @@ def test_a_model_of_camera_frames_keeps_its_chain() -> None:
     taught = PUBLIC.model_copy(update={"input_size": FRAME_SIZE})
     assert from_camera(taught) is taught
     assert from_camera(PUBLIC).output_size == PUBLIC.output_size
-    cut = PUBLIC.model_copy(update={"crop": Crop(2, 3, 440, 430)})
-    assert from_camera(cut).crop == (97 + 2, 20 + 3, 97 + 440, 20 + 430)
+    cropped = PUBLIC.model_copy(update={"crop": Crop(0, 2, 444, 440)})
+    assert from_camera(cropped).crop == Crop(97, 22, 97 + 444, 20 + 440)
 
 
 def test_simulated_split_has_the_public_layout(tmp_path: Path) -> None:
