@@ -40,10 +40,11 @@ def from_camera(preprocessing: Preprocessing) -> Preprocessing:
     if preprocessing.input_size == FRAME_SIZE or height > FRAME_SIZE[0] or width > FRAME_SIZE[1]:
         return preprocessing
     top, left = (FRAME_SIZE[0] - height) // 2, (FRAME_SIZE[1] - width) // 2
+    own = preprocessing.crop or Crop(0, 0, width, height)
     return preprocessing.model_copy(
         update={
             "input_size": FRAME_SIZE,
-            "crop": Crop(left, top, left + width, top + height),
+            "crop": Crop(left + own.left, top + own.top, left + own.right, top + own.bottom),
             "median_px": MEDIAN_PX,
             "threshold": THRESHOLD,
         }
