@@ -107,7 +107,7 @@ def test_an_off_centre_push_turns_as_uniform_pressure_says(width_mm: tuple[int, 
     T = hand.object()
     yaw = np.arctan2(T[1, 0], T[0, 0])
     expected = uniform_pressure_yaw(1e-3 * np.array(width_mm), np.array([-0.042, 0.010]), 0.060)
-    assert yaw == pytest.approx(expected, rel=0.05)
+    assert yaw == pytest.approx(expected, rel=0.1)
 
 
 def test_a_tall_prism_pushed_high_falls_and_pushed_low_does_not() -> None:
