@@ -1,8 +1,8 @@
 """Tall objects (paper 5.7.2): four prisms of double height and five bottles, pushed high up, with and without follower.
 
 The paper tells masses and neither sizes nor how high it pushes. Prisms are the short ones doubled; bottles are turned
-bodies of about the size of those that the paper names. Each is pushed a tenth higher than where one sticky tip begins to
-topple it, or just below the top of its straight part.
+bodies of about the size of those that the paper names. Each is pushed a tenth higher than where one sticky tip begins
+to topple it, or just below the top of its straight part.
 """
 
 from __future__ import annotations
