@@ -183,6 +183,17 @@ def test_a_snapshot_brings_back_the_very_same_future(physics: str) -> None:
         restore()
 
 
+def test_numbers_that_are_not_finite_are_told_not_computed_with() -> None:
+    from drivers.simulation.dynamics import PhysicsError
+
+    hand = Hand(FLOOR, ABOVE)
+    hand.move(STILL, 0.01)
+    hand.poses["tip"] = np.full((4, 4), np.nan)
+    with pytest.raises(PhysicsError, match="pose of 'tip' is not finite") as error:
+        hand.move(STILL, 0.002)
+    assert error.value.t_s == pytest.approx(0.010)
+
+
 def test_physics_asks_for_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValidationError, match="no multiple of physics_step_ms"):
         SceneConfig.model_validate({"physics": "dynamic", **FLOOR, "step_ms": 0.5})

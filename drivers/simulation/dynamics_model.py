@@ -126,6 +126,8 @@ def build_model(
     option.impratio = 1000.0
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    # It would hide a state that is not finite by starting anew.
+    option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     if table_height_m is not None:
         spec.worldbody.add_geom(
             name="table",
