@@ -13,7 +13,7 @@ from control.path import Path, Point
 from control.pid import Pid, PidGains
 from geometry.types import Array
 
-MAX_CRAB_RAD: Final = math.radians(15.0)
+MAX_CRAB_RAD: Final = math.radians(25.0)
 """Furthest that an object is headed aside to go straight: it is pushed this far beside its middle."""
 MAX_INTEGRATED_M: Final = 0.015
 """Larger distances from the path are not integrated: on the way back to it the integral would only gather overshoot."""

@@ -55,6 +55,7 @@ def test_figures_are_those_of_evaluate(tmp_path: Path) -> None:
     expected = evaluate(tmp_path / "data", "val", model)
     assert row["all"]["mae"] == pytest.approx(expected.mae)
     assert row["all"]["nll"] == pytest.approx(expected.nll)
+    assert row["camera"]["n"] == 3
     assert row["all"]["coverage"] == expected.coverage
 
 
@@ -116,6 +117,7 @@ def test_table_leaves_out_what_there_is_nothing_of() -> None:
         "all": scored,
         "slip_free": scored,
         "slipping": {"n": 0},
+        "camera": {"n": 0},
     }
     lines = table([row]).splitlines()
     assert sum(line.startswith("  a ") for line in lines) == 2

@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 from benchmarks.process_faults import FAULTS, ProcessCase, ProcessFault, TooBusy, run_fault
-from benchmarks.two_arms import two_arm_plan
+from benchmarks.two_arms import SPEED_M_S, two_arm_plan
 from cell.cli import main
 from cell.compose import Cell, compose
 from cell.config import plan_cell
@@ -228,6 +228,10 @@ def test_both_arms_stand_in_time_whatever_dies(tmp_path: Path, name: str, told_b
     assert list(case.problems) == []
     assert len(case.arms) == 2
     assert case.notes.get("reason") == told_by
+    for arm in case.notes.get("arms", {}).values():
+        assert arm["speed_m_s"] == pytest.approx(SPEED_M_S)
+        assert arm["time_s"] == pytest.approx(SPEED_M_S / 0.5, abs=0.02)
+        assert arm["last_obeyed_ns"] <= arm["stopped_ns"]
     if fault.name != "task killed":
         assert case.outcome["outcome"] == "tripped"
         assert case.outcome["causes"][0][0] == "watchdog"

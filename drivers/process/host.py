@@ -149,8 +149,9 @@ class ArmSeat:
         self._deadline_ns = now_ns + round(1e9 * (braking_s + REST_MARGIN_S))
 
     def clear(self) -> None:
-        """Be ready for the next stop."""
+        """Forget the stop, and be ready for the next."""
         self._deadline_ns = 0
+        self._state.value["stop_ns"] = self._state.value["rest_ns"] = 0
 
     def stands(self) -> bool:
         """Whether it was at rest when it was looked at; what is not connected does not move by us."""
@@ -344,7 +345,7 @@ class Host:
         message = receive(self._control)
         if message is None or message["call"] == "end":
             self.ending = True
-            if message is None and self._cause is None and any(not seat.free() for seat in self._arms.values()):
+            if message is None and self._cause is None:
                 self._latch(Cause(Reason.TASK_GONE, self._clock.now_ns()), self._clock.now_ns())
             return
         try:
