@@ -17,8 +17,11 @@ test: check
 fast: .venv/dev
 	$(BIN)/python -m pytest -m "not slow and not stress"
 
+# Half an hour; `make stress STEPS=100000` takes a few minutes.
+STEPS ?= 10000000
 stress: .venv/dev
-	$(BIN)/python -m pytest -m "stress or not stress" tests/test_stress_*.py
+	OMP_NUM_THREADS=1 STRESS_STEPS=$(STEPS) $(BIN)/python -m pytest -vv --durations=10 -m "stress or not stress" \
+		tests/test_stress_*.py
 
 check: .venv/dev
 	$(BIN)/ruff check .

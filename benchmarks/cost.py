@@ -39,11 +39,11 @@ def run(arguments: Sequence[str], out: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         write_simulated(Path(folder), _REPLAYED)
         rows = {
-            "touchcell check": _measure(base, "check"),
-            "learned estimator": _measure(base, "run"),
-            "learned, never in contact": _measure(far, "run"),
-            "true contact, no images": _measure(true, "run"),
-            "learned, no simulator": _measure(_replaying(Path(folder) / IMAGE_FOLDER), "run"),
+            "touchcell check": measure(base, "check"),
+            "learned estimator": measure(base, "run"),
+            "learned, never in contact": measure(far, "run"),
+            "true contact, no images": measure(true, "run"),
+            "learned, no simulator": measure(replaying(Path(folder) / IMAGE_FOLDER), "run"),
         }
     print(
         f"{'scene':<27}{'ready s':>9}{'CPU s':>7}{'memory MB':>11}{'peak MB':>9}{'cycle us':>10}{'sense us':>10}"
@@ -59,7 +59,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
     (out / "cost.json").write_text(json.dumps({**provenance(), "scenes": rows}, indent=1) + "\n")
 
 
-def _replaying(images: Path) -> dict[str, Any]:
+def replaying(images: Path) -> dict[str, Any]:
     """A cell that only looks at camera frames on file: what a process serves that neither simulates nor moves."""
     estimator = {"kind": "network", "model": "builtin:sim_gdn"}
     return {
@@ -72,13 +72,13 @@ def _replaying(images: Path) -> dict[str, Any]:
     }
 
 
-def _measure(cell: dict[str, Any], what: str) -> dict[str, Any]:
-    """The quickest of three starts: the others waited for a busy machine."""
+def measure(cell: dict[str, Any], what: str, starts: int = 3) -> dict[str, Any]:
+    """The quickest of some starts of ``touchcell run`` or ``check``: the others waited for a busy machine."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cell.yaml"
         path.write_text(yaml.safe_dump(cell))
         rows: list[dict[str, Any]] = []
-        for _ in range(3):
+        for _ in range(starts):
             command = [sys.executable, "-c", _PROGRAM, str(path), what, ",".join(_HEAVY), str(time.monotonic_ns())]
             result = subprocess.run(command, capture_output=True, text=True, check=True, env=as_installed(Path(folder)))
             rows.append(json.loads(result.stdout.splitlines()[-1]))

@@ -1,4 +1,4 @@
-"""Where the processor's time goes, by looking at the running stack every millisecond of it."""
+"""Where the processor's time goes, by looking at the running stack every few milliseconds of it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
 
+# Kernels deliver at their own tick, often 4 ms.
 _PERIOD_S = 0.001
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import dataclasses
 import json
 import subprocess
 import sys
@@ -37,7 +38,12 @@ from perception.model_file import Header, load_model
 from perception.scores import SCORE_NAMES, Scores
 
 SHIPPED = Path(__file__).parent.parent / "perception" / "models" / "sim_gdn.safetensors"
-_PARTS = {"all": "all images", "slip_free": "shear below 0.6 of the depth", "slipping": "the others, which slip"}
+_PARTS = {
+    "all": "all images",
+    "slip_free": "shear below 0.6 of the depth",
+    "slipping": "the others, which slip",
+    "camera": "the timed frames: images put back into camera frames, where they were cut out",
+}
 SHARES = tuple(np.linspace(0.05, 0.95, 19).round(2).tolist())
 # Sensors scatter as little as those that the shipped model was trained on.
 _VARIATION = Variation(parameters=0.01, turn_rad=0.002, shift_px=0.3, marker_px=0.1, disc_radius=0.03, missing=0.002)
@@ -96,7 +102,7 @@ def _measured(options: argparse.Namespace, scratch: Path) -> tuple[list[dict[str
     """One row for each estimator and runtime, and each estimator's scores in the first of its runtimes."""
     labels = read_split(options.data, options.split).contact_mm_deg
     headers = {path: load_model(path).header for path in options.models}
-    served = _frames(options, headers)
+    served, shown = _frames(options, headers)
     frames = scratch / "frames.raw"
     np.concatenate([image.ravel() for image in served]).tofile(frames)
     rows: list[dict[str, Any]] = []
@@ -113,7 +119,10 @@ def _measured(options: argparse.Namespace, scratch: Path) -> tuple[list[dict[str
             subprocess.run([*program, *words, "0", "--start-only"], check=True, env=environment)
             subprocess.run([*program, *words, str(time.monotonic_ns())], check=True, env=environment)
             with np.load(result) as found:
-                each = Scores(labels, found["xi"], found["covariance"], found["in_range"])
+                each, camera = (
+                    Scores(labels[which], found[f"{kind}xi"], found[f"{kind}covariance"], found[f"{kind}in_range"])
+                    for kind, which in (("", slice(None)), ("served_", shown))
+                )
                 figures = json.loads(str(found["figures"]))
                 times = {
                     "latency_ms": _quantiles(found["other_frame_ns"]),
@@ -132,6 +141,7 @@ def _measured(options: argparse.Namespace, scratch: Path) -> tuple[list[dict[str
                     "all": _scored(each),
                     "slip_free": _scored(each.subset(each.slip_free)),
                     "slipping": _scored(each.subset(~each.slip_free)),
+                    "camera": _scored(camera),
                     "in_range": float(each.in_range.mean()),
                     "joint_coverage": {"68": each.joint_coverage(0.68), "95": each.joint_coverage(0.95)},
                     "reliability": each.reliability(SHARES),
@@ -162,16 +172,15 @@ def _quantiles(times_ns: np.ndarray) -> dict[str, dict[str, float]]:
     }
 
 
-def _frames(options: argparse.Namespace, headers: Mapping[Path, Header]) -> list[ImageArray]:
-    """Camera frames of images spread over the split."""
+def _frames(options: argparse.Namespace, headers: Mapping[Path, Header]) -> tuple[list[ImageArray], list[int]]:
+    """Camera frames of images spread over the split, and which images they are."""
     split = read_split(options.data, options.split)
     step = max(1, len(split.images) // options.frames)
     sizes = {from_camera(header.preprocessing).input_size for header in headers.values()}
-    return [
-        camera_frame(image, seed) if sizes == {FRAME_SIZE} else image
-        for seed, image in enumerate(split.read())
-        if seed % step == 0
-    ][: options.frames]
+    shown = list(range(0, len(split.images), step))[: options.frames]
+    chosen = dataclasses.replace(split, images=tuple(split.images[i] for i in shown))
+    frames = [camera_frame(image, i) if sizes == {FRAME_SIZE} else image for i, image in enumerate(chosen.read())]
+    return frames, shown
 
 
 def camera_frame(image: ImageArray, seed: int) -> ImageArray:

@@ -10,6 +10,7 @@ import dataclasses
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import numpy as np
 
 from geometry.types import ImageArray
 from perception.estimators import ContactEstimator, estimator_of
+from perception.inference import Prediction
 from perception.model_file import Model, load_model
 from perception.preprocessing import AdaptiveThreshold, Crop, Preprocessing
 
@@ -40,10 +42,11 @@ def from_camera(preprocessing: Preprocessing) -> Preprocessing:
     if preprocessing.input_size == FRAME_SIZE or height > FRAME_SIZE[0] or width > FRAME_SIZE[1]:
         return preprocessing
     top, left = (FRAME_SIZE[0] - height) // 2, (FRAME_SIZE[1] - width) // 2
+    own = preprocessing.crop or Crop(0, 0, width, height)
     return preprocessing.model_copy(
         update={
             "input_size": FRAME_SIZE,
-            "crop": Crop(left, top, left + width, top + height),
+            "crop": Crop(left + own.left, top + own.top, left + own.right, top + own.bottom),
             "median_px": MEDIAN_PX,
             "threshold": THRESHOLD,
         }
@@ -84,11 +87,17 @@ def main(arguments: list[str]) -> None:
         figures=np.array(json.dumps(figures)),
         other_frame_ns=other,
         same_frame_ns=again,
-        served_xi=np.stack([prediction.xi for prediction in served]),
-        xi=np.stack([prediction.xi for prediction in predictions]),
-        covariance=np.stack([prediction.covariance for prediction in predictions]),
-        in_range=np.array([prediction.in_range for prediction in predictions]),
+        **_arrays("served_", served),
+        **_arrays("", predictions),
     )
+
+
+def _arrays(prefix: str, predictions: Sequence[Prediction]) -> dict[str, Any]:
+    return {
+        f"{prefix}xi": np.stack([prediction.xi for prediction in predictions]),
+        f"{prefix}covariance": np.stack([prediction.covariance for prediction in predictions]),
+        f"{prefix}in_range": np.array([prediction.in_range for prediction in predictions]),
+    }
 
 
 class _Frames:

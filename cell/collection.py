@@ -16,7 +16,7 @@ import cv2
 
 from cell.errors import RecordingError
 from drivers.errors import ConfigError
-from drivers.tactile_data import IMAGE_COLUMN, IMAGE_FOLDER, LABEL_COLUMNS, LABEL_FILES
+from drivers.tactile_data import IMAGE_COLUMN, IMAGE_FOLDER, LABEL_COLUMNS, LABEL_FILES, REST_IMAGE
 from geometry import se3
 from geometry.types import Array, ImageArray
 
@@ -44,6 +44,7 @@ class Collection:
             root.mkdir(parents=True, exist_ok=True)
             self._begin({"shares": dict(shares), **about})
             self.kept = sum(self._whole_rows(split) for split in shares)
+            self._has_rest = (root / REST_IMAGE).exists()
         except OSError as error:
             raise RecordingError(root, f"cannot be written: {error.strerror}") from None
 
@@ -63,6 +64,17 @@ class Collection:
                 self.root, f"cannot be written: {error.strerror}", hint="free some space and run it again: it goes on"
             ) from None
         self.kept += 1
+
+    def keep_rest(self, image: ImageArray) -> None:
+        """Keep what the sensor sees out of contact, if that is not there yet. Raises RecordingError."""
+        if self._has_rest:
+            return
+        path = self.root / REST_IMAGE
+        try:
+            path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+        except OSError as error:
+            raise RecordingError(path, f"cannot be written: {error.strerror}") from None
+        self._has_rest = True
 
     def _begin(self, about: Mapping[str, Any]) -> None:
         file = self.root / _ABOUT

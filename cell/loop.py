@@ -16,6 +16,7 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 
+from cell.collection import Collection
 from cell.compose import Cell, Sensor
 from cell.desk import OperatorDesk
 from cell.errors import RecordingError
@@ -247,6 +248,8 @@ class RunLoop:
     def _begin_waiting(self, desk: OperatorDesk) -> None:
         self._waited_from_ns = self._cell.clock.now_ns()
         stops = self._come_to_rest()
+        # A black box takes longer to write than a watchdog waits. Arms that nobody guards obey no motion.
+        self._cell.watch.end()
         self._waiting = Waiting(self._cell, self._leases, desk)
         desk.open()
         self._due_ns = self._cell.clock.now_ns()
@@ -261,7 +264,6 @@ class RunLoop:
             self._reason = "ended by the operator after a trip"
             return False
         view = None
-        cell.watch.beat()
         try:
             states, contacts, now_ns = self._look()
             view = replace(self._view(now_ns, states, contacts, Action()), at_work=False)
@@ -377,7 +379,8 @@ class RunLoop:
             if verdict.trip is not None:
                 cell.task.trip(now_ns, str(verdict.trip))
         self._sent = sent
-        self._keep(action.labels)
+        if cell.collection is not None:
+            self._keep(cell.collection, contacts, action.labels)
         done = time.perf_counter_ns()
         for sensor in cell.sensors.values():
             self._count_stages(sensor)
@@ -412,11 +415,18 @@ class RunLoop:
         now_ns = cell.clock.now_ns()
         return states, contacts, now_ns
 
-    def _keep(self, labels: Mapping[str, Array]) -> None:
+    def _keep(
+        self, collection: Collection, contacts: Mapping[str, ContactEstimate], labels: Mapping[str, Array]
+    ) -> None:
+        """What a sensor sees while it touches nothing, once, and every frame that the task has labelled."""
+        for role in contacts:
+            frame = self._cell.sensors[role].frame
+            if frame is not None and not contacts[role].in_contact:
+                collection.keep_rest(frame.value.image)
         for role, T_f_s in labels.items():
             frame = self._cell.sensors[role].frame
-            if self._cell.collection is not None and frame is not None:
-                self._cell.collection.keep(frame.value.image, T_f_s)
+            if frame is not None:
+                collection.keep(frame.value.image, T_f_s)
 
     def _stop_arms(self, *, tripped: bool) -> None:
         """Tell all arms to stop: as the cell file says when something is wrong, else holding where they are."""

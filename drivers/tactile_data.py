@@ -25,6 +25,8 @@ from geometry.types import Array, ImageArray
 LABEL_FILES = ("targets_images.csv", "targets.csv")
 IMAGE_FOLDER = "processed_images"
 IMAGE_COLUMN = "sensor_image"
+REST_IMAGE = "rest.png"
+"""Beside the splits, where there is one: what the sensor sees out of contact."""
 LABEL_COLUMNS = ("shear_x", "shear_y", "pose_z", "pose_Rx", "pose_Ry", "shear_Rz")
 """Columns that hold x, y, z, alpha, beta, gamma of ``T_f_s``, mm and degrees."""
 
@@ -112,6 +114,12 @@ def read_split(root: Path, split: str) -> Split:
         contact_mm_deg=np.array(labels, dtype=np.float64),
         unlabelled=len(present - seen),
     )
+
+
+def read_rest(root: Path) -> ImageArray | None:
+    """The image out of contact, uint8 grey (height, width); None where the data set has none. Raises DataError."""
+    path = root / REST_IMAGE
+    return read_image(path) if path.exists() else None
 
 
 def read_image(path: Path) -> ImageArray:

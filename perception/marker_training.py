@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from drivers.tactile_data import Split, read_split
+from drivers.tactile_data import Split, read_rest, read_split
 from geometry.types import Array, ImageArray
 from perception.calibration import calibrate
 from perception.checkpoint import EpochRecord, Progress, delete_checkpoint, load_checkpoint, save_checkpoint
@@ -160,6 +160,7 @@ def train_markers(
         preprocessing=preprocessing,
         size=size,
         settings=settings,
+        reference=None if (rest := read_rest(data)) is None else preprocessing.reduce(rest),
         resume=resume,
         cache=cache,
         observer=observer,

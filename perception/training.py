@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from drivers.tactile_data import read_split
+from drivers.tactile_data import read_rest, read_split
 from geometry.types import Array, ImageArray
 from perception.architecture import Architecture
 from perception.calibration import calibrate
@@ -106,7 +106,7 @@ def train(
     model that it would have ended in.
 
     Args:
-        data: data set, see ``dataset``.
+        data: data set, see ``dataset``; its image out of contact, where it has one, is kept for the contact gate.
         out: ``NAME.safetensors``; figures become ``NAME_predictions.png`` and ``NAME_curves.png``.
         kind: gdn predicts a Gaussian, cnn means alone; markers as ``marker_training``.
         epochs: None for the default of ``Settings`` or ``MarkerSettings``.
@@ -168,6 +168,7 @@ def train(
         preprocessing=preprocessing,
         kind=kind,
         settings=Settings(seed=seed) if epochs is None else Settings(seed=seed, epochs=epochs),
+        reference=None if (rest := read_rest(data)) is None else preprocessing.reduce(rest),
         resume=resume,
         observer=observer,
     )

@@ -21,7 +21,7 @@ from drivers.tactile_data import read_split
 from perception.evaluate import evaluate
 from perception.inference import ContactModel
 from perception.model_file import save_model
-from perception.preprocessing import Preprocessing
+from perception.preprocessing import Crop, Preprocessing
 
 PUBLIC = Preprocessing(input_size=(440, 445), output_size=(440, 445))
 
@@ -55,6 +55,7 @@ def test_figures_are_those_of_evaluate(tmp_path: Path) -> None:
     expected = evaluate(tmp_path / "data", "val", model)
     assert row["all"]["mae"] == pytest.approx(expected.mae)
     assert row["all"]["nll"] == pytest.approx(expected.nll)
+    assert row["camera"]["n"] == 3
     assert row["all"]["coverage"] == expected.coverage
 
 
@@ -90,6 +91,8 @@ def test_a_model_of_camera_frames_keeps_its_chain() -> None:
     taught = PUBLIC.model_copy(update={"input_size": FRAME_SIZE})
     assert from_camera(taught) is taught
     assert from_camera(PUBLIC).output_size == PUBLIC.output_size
+    cropped = PUBLIC.model_copy(update={"crop": Crop(0, 2, 444, 440)})
+    assert from_camera(cropped).crop == Crop(97, 22, 97 + 444, 20 + 440)
 
 
 def test_simulated_split_has_the_public_layout(tmp_path: Path) -> None:
@@ -114,6 +117,7 @@ def test_table_leaves_out_what_there_is_nothing_of() -> None:
         "all": scored,
         "slip_free": scored,
         "slipping": {"n": 0},
+        "camera": {"n": 0},
     }
     lines = table([row]).splitlines()
     assert sum(line.startswith("  a ") for line in lines) == 2

@@ -20,7 +20,7 @@ from cell.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
 from cell.trials import CONFIGS
 from control.reach import Reach, is_there
 from drivers.errors import ConfigError
-from drivers.tactile_data import read_split
+from drivers.tactile_data import read_rest, read_split
 from geometry import se3
 from geometry.gaussian import PoseGaussian
 from perception.estimate import ContactEstimate
@@ -91,6 +91,10 @@ def test_frames_show_what_their_labels_say(tmp_path):
     assert images[0].shape == (440, 445)
     deepest, shallowest = images[int(z.argmax())], images[int(z.argmin())]
     assert np.mean(deepest != shallowest) > 0.02
+    # Out of contact the tip looks more like in the slightest contact than in the deepest.
+    rest = read_rest(tmp_path / "data")
+    assert rest is not None
+    assert np.mean(rest != shallowest) < np.mean(rest != deepest)
 
 
 def test_a_folder_with_other_samples_is_refused(tmp_path):

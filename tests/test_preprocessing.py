@@ -127,3 +127,13 @@ def test_survives_json_and_cannot_be_changed() -> None:
 def test_impossible_steps_are_refused(fields: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         Preprocessing.model_validate({"input_size": (480, 640), **fields})
+
+
+def test_full_resolution_keeps_every_pixel_of_the_crop() -> None:
+    steps = Preprocessing(
+        input_size=(480, 640), crop=Crop(105, 20, 550, 460), threshold=AdaptiveThreshold(block_px=61, offset=-5.0)
+    )
+    full = steps.in_full_resolution()
+    assert full.output_size == (440, 445)
+    assert full.model_copy(update={"output_size": (128, 128)}) == steps
+    assert Preprocessing(input_size=(44, 48)).in_full_resolution().output_size == (44, 48)

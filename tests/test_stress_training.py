@@ -18,6 +18,7 @@ from perception.architecture import Architecture
 from perception.dataset import LabelledImages
 from perception.errors import TrainingError
 from perception.inference import ContactModel
+from perception.labels import contact_from_xi, xi_from_contact
 from perception.model_file import load_model
 from perception.training import Settings, train_on_arrays
 
@@ -94,9 +95,9 @@ def test_any_learning_rate_ends_in_a_model_or_an_error(sets: Sets, tmp_path: Pat
 @pytest.mark.parametrize("component", range(6))
 def test_one_constant_label_is_named(sets: Sets, tmp_path: Path, component: int) -> None:
     def flatten(xi: Array, rng: np.random.Generator) -> Array:
-        flat = xi.copy()
-        flat[:, component] = 0.01
-        return flat
+        flat = contact_from_xi(xi)
+        flat[:, component] = 1.0
+        return xi_from_contact(flat)
 
     with pytest.raises(TrainingError, match="same"):
         trained(relabelled(sets, flatten), tmp_path / "model.safetensors", "gdn")

@@ -12,9 +12,10 @@ from rich.console import Console
 
 torch = pytest.importorskip("torch")
 
-from tactile_samples import labelled, preprocessing, taught, write_split  # noqa: E402
+from tactile_samples import CENTRE, draw, labelled, preprocessing, taught, write_split  # noqa: E402
 
 from drivers.errors import DataError  # noqa: E402
+from drivers.tactile_data import REST_IMAGE  # noqa: E402
 from perception.architecture import Architecture  # noqa: E402
 from perception.checkpoint import EpochRecord, checkpoint_path  # noqa: E402
 from perception.dataset import LabelledImages  # noqa: E402
@@ -210,12 +211,15 @@ def test_trains_from_a_folder(tmp_path: Path) -> None:
     data = tmp_path / "data"
     write_split(data, "train", n=64, seed=1)
     write_split(data, "val", n=32, seed=2)
+    cv2.imwrite(str(data / REST_IMAGE), draw(CENTRE))
     text = io.StringIO()
     recorder = Recorder()
     out = tmp_path / "model.safetensors"
     train(data, out, epochs=2, seed=3, cache=tmp_path / "cache", observer=recorder)
     assert recorder.decoded == {"train": 64, "val": 32}
-    header = load_model(out).header
+    model = load_model(out)
+    header = model.header
+    np.testing.assert_array_equal(model.reference, header.preprocessing.reduce(draw(CENTRE)))
     assert header.preprocessing.input_size == (44, 48)
     assert header.architecture == Architecture(input_size=(44, 48))
     assert header.training["seed"] == 3
