@@ -116,6 +116,13 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument("--reference", type=Path, help="such images of the sensor that taught the model")
     calibrate.set_defaults(run=_calibrate)
 
+    adapt = commands.add_parser("adapt", help="bring a marker estimator to another sensor with a few labelled images")
+    adapt.add_argument("--model", type=Path, required=True)
+    adapt.add_argument("--data", type=Path, required=True, help="data set folder with train/ of the new sensor")
+    adapt.add_argument("--frames", type=int, help="so many of its images, evenly chosen (default: all)")
+    adapt.add_argument("--out", type=Path, required=True, help="model file to write (.safetensors)")
+    adapt.set_defaults(run=_adapt)
+
     evaluate = commands.add_parser("evaluate", help="error, likelihood, calibration and latency on labelled images")
     evaluate.add_argument("--data", type=Path, required=True)
     evaluate.add_argument("--split", default="val", help="train, val or test")
@@ -260,6 +267,18 @@ def _calibrate(options: argparse.Namespace) -> int:
         f"zoom {change.zoom:.4f}, turn {change.turn_deg:.2f} deg, shift {u:.2f} {v:.2f} px, {change.rms_px:.2f} px left"
     )
     print(f"{change.frames} images; wrote {options.out}")
+    return EXIT_OK
+
+
+def _adapt(options: argparse.Namespace) -> int:
+    from perception.adaptation import adapt
+
+    model = adapt(options.model, options.data, options.out, frames=options.frames)
+    told, camera = model.header.training, model.header.camera
+    assert camera is not None
+    print(f"{told['adapted_images_matched']} of {told['adapted_images']} images matched and learned from")
+    print(f"camera: zoom {camera.zoom:.4f}, turn {camera.turn_deg:.1f} deg; labels' axes:", end=" ")
+    print(f"{told['adapted_label_turn_deg']:.1f} deg; wrote {options.out}")
     return EXIT_OK
 
 

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from geometry.types import Array, ImageArray
 from perception.architecture import Architecture
+from perception.camera_change import CameraChange
 from perception.errors import ModelError
 from perception.marker_architecture import MarkerArchitecture
 from perception.preprocessing import Preprocessing
@@ -78,6 +79,8 @@ class Header(BaseModel):
         sigma_scale: (6,) gdn: what the network's standard deviations are multiplied by to be calibrated; cnn: the
             standard deviations themselves, in label half-ranges; markers: the factor for the networks' standard
             deviations after these are raised to the tensor ``sigma_power``. Found on the validation split.
+        camera: from the pixels of this model's sensor to those of the one that taught its networks, where it was
+            adapted (``touchcell adapt``).
         training_data: digest of the training set (``LabelledImages.digest``).
         training: settings and outcome of the training, for people.
     """
@@ -90,6 +93,7 @@ class Header(BaseModel):
     preprocessing: Preprocessing
     labels: Labels
     sigma_scale: SixPositive
+    camera: CameraChange | None = None
     training_data: str
     training: dict[str, str | int | float | list[float] | None] = {}
 

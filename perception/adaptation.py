@@ -1,0 +1,435 @@
+"""Bringing a marker estimator to another sensor of its kind with a few labelled images. Needs the extra ``train``.
+
+What differs between two such sensors is mostly where the camera looks from and how the labels' axes lie: six numbers
+that are found first, so that the old networks see markers and labels as they were taught. The rest - mounts, stiffness,
+skin - is left to a short training that holds on to the old weights.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from drivers.tactile_data import read_image, read_split
+from geometry.types import Array
+from perception.camera_change import CameraChange
+from perception.errors import ModelError, TrainingError
+from perception.labels import xi_from_contact
+from perception.marked_data import evenly
+from perception.marker_architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture
+from perception.marker_estimator import matcher_of, mixed
+from perception.marker_learning import fit_lattice
+from perception.marker_matching import DisplacementModel, MarkerMatcher
+from perception.marker_training import preprocessing_for
+from perception.markers import Discs, MarkerSize, detect_markers, typical_size
+from perception.model_file import Header, Labels, Model, load_model, save_model, touchcell_version
+from perception.preprocessing import Preprocessing
+from perception.zero_frame import lattice_turns, similarity
+
+_DISPLACEMENT_PX = 8.0
+_NARROWEST = 0.02
+_FOLDS = 4
+_SHALLOW = 5
+_TRIED = 60
+_FEWEST = 10
+_MATCHED = 0.5
+
+
+@dataclass(frozen=True)
+class AdaptSettings:
+    """How the networks are brought near.
+
+    Attributes:
+        steps: of the training.
+        batch_size: contacts per step and network.
+        learning_rate: at its peak; it falls as a half cosine.
+        hold: how strongly weights are held to the old ones: the loss of one weight that is off by its layer's usual
+            size, times the number of weights.
+        dropout: after each hidden layer.
+        shift_px, turn_rad, zoom: standard deviations of the jitter.
+        seed: of everything random.
+    """
+
+    steps: int = 400
+    batch_size: int = 32
+    learning_rate: float = 1e-3
+    hold: float = 0.3
+    dropout: float = 0.1
+    shift_px: float = 0.3
+    turn_rad: float = 0.001
+    zoom: float = 0.0006
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class FewContacts:
+    """Discs of labelled images of the new sensor.
+
+    Attributes:
+        frames: of each image, in its preprocessed pixels.
+        xi: (n, 6) log(T_s_f), m and rad.
+    """
+
+    frames: list[Discs]
+    xi: Array
+
+
+@dataclass(frozen=True)
+class Brought:
+    """How a new sensor's images and labels are brought to those of the old.
+
+    Attributes:
+        camera: from its pixels to the old sensor's.
+        turn_rad: of its label axes about the sensor's axis, to the old sensor's.
+        displacements: (n, 2 m) px, as the old sensor would have seen them.
+        matched: (n,) contacts whose markers could be matched.
+    """
+
+    camera: CameraChange
+    turn_rad: float
+    displacements: NDArray[np.float32]
+    matched: NDArray[np.bool_]
+
+
+def adapt(
+    model: Path, data: Path, out: Path, *, frames: int | None = None, settings: AdaptSettings | None = None
+) -> Model:
+    """Write ``out``, a model for the sensor that took ``data/train``.
+
+    Args:
+        model: model file of kind markers.
+        data: data set; ``train`` is learned from.
+        out: ``NAME.safetensors``.
+        frames: so many images, evenly chosen; None for all.
+        settings: None for the defaults.
+
+    Raises:
+        ModelError: the model is of another kind, or was adapted already.
+        DataError: the data set is damaged.
+        TrainingError: fewer than ten images can be matched to the old sensor's markers.
+    """
+
+    old = load_model(model)
+    if not isinstance(old.header.architecture, MarkerArchitecture):
+        raise ModelError(
+            model,
+            f"is {old.header.architecture.kind}; only marker estimators can be adapted",
+            key="architecture.kind",
+            hint="train one with `touchcell train --kind markers`, or this kind anew on the new sensor's images",
+        )
+    if old.header.camera is not None:
+        raise ModelError(model, "was adapted already", key="camera", hint="adapt the model that it came from")
+    split = read_split(data, "train")
+    chosen = evenly(len(split.images), len(split.images) if frames is None else frames)
+    images = [read_image(split.images[i]) for i in chosen]
+    preprocessing = preprocessing_for(images[0])
+    size = typical_size(preprocessing.reduce(images[0]))
+    few = FewContacts(
+        [detect_markers(preprocessing.reduce(image), size) for image in images],
+        xi_from_contact(split.contact_mm_deg[chosen]),
+    )
+    adapted = adapt_to(old, few, preprocessing=preprocessing, size=size, settings=settings)
+    save_model(adapted, out)
+    return adapted
+
+
+def adapt_to(
+    old: Model,
+    few: FewContacts,
+    *,
+    preprocessing: Preprocessing,
+    size: MarkerSize,
+    settings: AdaptSettings | None = None,
+) -> Model:
+    """The model for another sensor, from discs in memory. Arguments as of the model; raises as ``adapt``."""
+    settings = settings or AdaptSettings()
+    architecture = old.header.architecture
+    assert isinstance(architecture, MarkerArchitecture)
+    brought = bring(old, few)
+    xi, displacements = few.xi[brought.matched], brought.displacements[brought.matched]
+    layers = turned_layers(old, -brought.turn_rad)
+    labels = _widened(old.header.labels, xi)
+    layers = _relabelled(layers, old.header.labels, labels)
+    target = (xi - labels.centre) / labels.half_range
+    # Residuals of contacts that were left out tell how far to believe the sigmas; those that were learned would not.
+    power = old.tensors["sigma_power"].astype(np.float64)
+    standardised = []
+    for fold in range(_FOLDS):
+        left_out = np.arange(len(xi)) % _FOLDS == fold
+        trained = tune(old, layers, displacements[~left_out], target[~left_out], settings)
+        mean, sigma = outputs_of(trained, displacements[left_out])
+        standardised.append((target[left_out] - mean) / sigma**power)
+    scale = np.sqrt(np.mean(np.concatenate(standardised) ** 2, axis=0))
+    tuned = tune(old, layers, displacements, target, settings)
+    tensors = dict(old.tensors)
+    for i, (weight, bias) in enumerate(tuned):
+        tensors[f"layer{i}.weight"] = np.ascontiguousarray(weight, dtype=np.float32)
+        tensors[f"layer{i}.bias"] = np.ascontiguousarray(bias, dtype=np.float32)
+    header = old.header
+    return Model(
+        Header(
+            touchcell_version=touchcell_version(),
+            architecture=architecture.model_copy(update={"input_size": preprocessing.output_size, "size": size}),
+            preprocessing=preprocessing,
+            labels=labels,
+            sigma_scale=tuple(scale.tolist()),
+            camera=brought.camera,
+            training_data=header.training_data,
+            training={
+                **header.training,
+                "adapted_images": len(few.frames),
+                "adapted_images_matched": int(brought.matched.sum()),
+                "adapted_label_turn_deg": math.degrees(brought.turn_rad),
+                **{f"adapted_{key}": value for key, value in asdict(settings).items()},
+            },
+        ),
+        tensors,
+    )
+
+
+def bring(old: Model, few: FewContacts) -> Brought:
+    """Find camera and label axes.
+
+    A lattice looks the same after a sixth of a turn: of the six cameras that are possible, that one is right, together
+    with its turn of the label axes, with which the old networks err least.
+    """
+    architecture = old.header.architecture
+    assert isinstance(architecture, MarkerArchitecture)
+    matcher = matcher_of(old, architecture)
+    there = matcher.model.reference
+    # By how far |log| is, for want of a depth: the least deformed are the shallowest.
+    depth = np.abs(few.xi[:, 2])
+    fits = [fit_lattice(few.frames[i], architecture.rings) for i in np.argsort(depth)[:_SHALLOW]]
+    here, rms = min(fits, key=lambda each: each[1])
+    if not np.isfinite(rms):
+        raise TrainingError(
+            f"the shallowest images show no lattice of {architecture.rings} rings",
+            hint="only a sensor of the same kind can be adapted to; give an image of hardly any contact",
+        )
+    layers = layers_of(old)
+    some = np.linspace(0, len(few.frames) - 1, min(_TRIED, len(few.frames))).round().astype(int)
+    best: tuple[float, CameraChange, float] | None = None
+    for order in lattice_turns(architecture.rings):
+        linear, off = similarity(here[order], there)
+        centre = here.mean(axis=0)
+        du, dv = there.mean(axis=0) - centre
+        camera = CameraChange(
+            zoom=abs(linear),
+            turn_deg=float(np.degrees(np.angle(linear))),
+            centre_px=(float(centre[0]), float(centre[1])),
+            shift_px=(float(du), float(dv)),
+            frames=1,
+            rms_px=off,
+        )
+        displacements, matched = _seen_by(camera, matcher, [few.frames[i] for i in some])
+        if matched.mean() < _MATCHED or matched.sum() < min(_FEWEST, len(some)):
+            continue
+        mean, _ = outputs_of(layers, displacements[matched])
+        predicted = old.header.labels.centre + old.header.labels.half_range * mean
+        turn, error = _label_turn(few.xi[some][matched], predicted)
+        if best is None or error < best[0]:
+            best = (error, camera, turn)
+    if best is None:
+        raise TrainingError(
+            "the markers of too few images can be matched to the old sensor's",
+            hint="only a sensor of the same kind can be adapted to; check threshold and crop",
+        )
+    displacements, matched = _seen_by(best[1], matcher, few.frames)
+    if matched.sum() < _FEWEST:
+        raise TrainingError(f"{int(matched.sum())} images could be matched, {_FEWEST} are needed", hint="give more")
+    return Brought(best[1], best[2], displacements, matched)
+
+
+def _seen_by(
+    camera: CameraChange, matcher: MarkerMatcher, frames: list[Discs]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    fields = [matcher.match(Discs(camera.points(discs.centres), discs.areas)) for discs in frames]
+    displacements = np.stack([each.displacements.ravel() for each in fields]).astype(np.float32)
+    return displacements, np.array([each.valid for each in fields])
+
+
+def _label_turn(xi: Array, predicted: Array) -> tuple[float, float]:
+    """Angle about z that brings labels xi (n, 6) to predictions, and the mean error that is left, mm or degrees."""
+    a, b = (np.concatenate([_plane(each, 0) / 1e-3, _plane(each, 3) / np.radians(1.0)]) for each in (xi, predicted))
+    turn = float(np.angle(np.vdot(a, b)))
+    return turn, float(np.abs(a * np.exp(1j * turn) - b).mean())
+
+
+def _plane(xi: Array, first: int) -> NDArray[np.complex128]:
+    return (xi[:, first] + 1j * xi[:, first + 1]).astype(np.complex128)
+
+
+Layers = list[tuple[Array, Array]]
+"""Weights (networks, before, units) and biases (networks, 1, units) of a model's networks, in order."""
+
+
+def layers_of(model: Model) -> Layers:
+    """The networks of a marker model."""
+    architecture = model.header.architecture
+    assert isinstance(architecture, MarkerArchitecture)
+    return [
+        (model.tensors[f"layer{i}.weight"].astype(np.float64), model.tensors[f"layer{i}.bias"].astype(np.float64))
+        for i in range(len(architecture.hidden) + 1)
+    ]
+
+
+def turned_layers(model: Model, turn_rad: float) -> Layers:
+    """The networks with their predictions turned about the sensor's z axis."""
+    labels = model.header.labels
+    layers = layers_of(model)
+    cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+    turn = np.eye(6)
+    for first in (0, 3):
+        turn[first : first + 2, first : first + 2] = [[cos, -sin], [sin, cos]]
+    scaled = turn * labels.half_range[None, :] / labels.half_range[:, None]
+    # Precisions have no direction of their own: those of the two axes are mixed by their shares.
+    mixed_precision = turn**2
+    whole = np.zeros((12, 12))
+    whole[:6, :6], whole[6:, 6:] = scaled, mixed_precision
+    shift = (turn @ labels.centre - labels.centre) / labels.half_range
+    weight, bias = layers[-1]
+    layers[-1] = (weight @ whole.T, bias @ whole.T + np.concatenate([shift, np.zeros(6)]))
+    return layers
+
+
+def _widened(labels: Labels, xi: Array) -> Labels:
+    low, high = np.minimum(labels.low, xi.min(axis=0)), np.maximum(labels.high, xi.max(axis=0))
+    return labels.model_copy(update={"low": tuple(low.tolist()), "high": tuple(high.tolist())})
+
+
+def _relabelled(layers: Layers, old: Labels, new: Labels) -> Layers:
+    """The networks with outputs in another range of labels."""
+    share = old.half_range / new.half_range
+    scale = np.concatenate([share, np.ones(6)])
+    shift = np.concatenate([(old.centre - new.centre) / new.half_range, -np.log(share)])
+    weight, bias = layers[-1]
+    return [*layers[:-1], (weight * scale, bias * scale + shift)]
+
+
+def outputs_of(layers: Layers, displacements: NDArray[np.float32]) -> tuple[Array, Array]:
+    """Mean and uncalibrated sigma (n, 6) of the mixture, in label half-ranges, of displacements (n, 2 m) px."""
+    x: Array = np.broadcast_to(displacements.astype(np.float64), (len(layers[0][0]), *displacements.shape))
+    for i, (weight, bias) in enumerate(layers):
+        x = x @ weight + bias
+        if i + 1 < len(layers):
+            x = x / (1.0 + np.exp(-np.maximum(x, -80.0)))
+    return mixed(x[..., :6], np.clip(x[..., 6:], *LOG_PRECISION_BOUNDS))
+
+
+def tune(
+    old: Model, layers: Layers, displacements: NDArray[np.float32], target: Array, settings: AdaptSettings
+) -> Layers:
+    """Layers that fit labelled displacements better and stay near those given.
+
+    Args:
+        old: whose displacement model scales the inputs.
+        layers: to begin with.
+        displacements: (n, 2 m) px.
+        target: (n, 6) in label half-ranges.
+        settings: of the training.
+
+    Raises:
+        TrainingError: the loss is no number.
+    """
+    tensors = {name: old.tensors[f"displacement.{name}"].astype(np.float64) for name in ("mean", "basis", "sd")}
+    reference = old.tensors["lattice"].astype(np.float64)
+    model = DisplacementModel(reference, tensors["mean"], tensors["basis"], tensors["sd"])
+    features = _features(model)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        tuner = _Tuner(layers, features, model, settings)
+        tuner.fit(torch.from_numpy(displacements), torch.from_numpy(target.astype(np.float32)))
+    return tuner.layers()
+
+
+def _features(model: DisplacementModel) -> Array:
+    """(2 m, f) what first layers learn from: markers alone, and together the ways in which they move."""
+    scaled = model.basis.T / np.maximum(model.sd, _NARROWEST * model.sd[0])
+    return np.concatenate([np.eye(len(model.mean)) / _DISPLACEMENT_PX, scaled], axis=1)
+
+
+class _Tuner:
+    """Changes of weights, that begin at zero."""
+
+    def __init__(self, layers: Layers, features: Array, model: DisplacementModel, settings: AdaptSettings) -> None:
+        self.settings = settings
+        self.old = [(torch.from_numpy(w).float(), torch.from_numpy(b).float()) for w, b in layers]
+        self.features = torch.from_numpy(features).float()
+        self.mean = torch.from_numpy(model.mean).float()
+        around = model.reference - model.reference.mean(axis=0)
+        self.around_middle = torch.from_numpy(around.astype(np.float32))
+        networks, _, units = layers[0][0].shape
+        shapes = [(networks, features.shape[1], units), *(w.shape for w, _ in layers[1:])]
+        self.weights = [torch.zeros(shape, requires_grad=True) for shape in shapes]
+        self.biases = [torch.zeros(b.shape, requires_grad=True) for _, b in layers]
+        # The usual size of a layer's weights, from which a change is large or small.
+        self.usual = [1.0 / math.sqrt(shape[1]) for shape in shapes]
+
+    def fit(self, inputs: Tensor, targets: Tensor) -> None:
+        settings = self.settings
+        optimizer = torch.optim.Adam([*self.weights, *self.biases], lr=settings.learning_rate)
+        networks = len(self.old[0][0])
+        for step in range(settings.steps):
+            for group in optimizer.param_groups:
+                rise = min(1.0, (step + 1) / (0.1 * settings.steps))
+                group["lr"] = settings.learning_rate * rise * 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
+            chosen = torch.randint(len(inputs), (networks, min(settings.batch_size, len(inputs))))
+            outputs = self._outputs(self._jittered(inputs[chosen]))
+            aim = targets[chosen]
+            mean, log_precision = outputs[..., :6], outputs[..., 6:].clamp(*LOG_PRECISION_BOUNDS)
+            # Errors count by the root of the precision: exactly as far as half of the likelihood would have it.
+            weight = (0.5 * log_precision.detach()).exp()
+            loss = (functional.smooth_l1_loss(mean, aim, beta=0.02, reduction="none") * weight).sum(-1).mean()
+            off = (aim - mean).detach()
+            loss = loss + 0.05 * (0.5 * (off * log_precision.exp()).square() - log_precision).sum(-1).mean()
+            held = sum(((w / usual) ** 2).mean() for w, usual in zip(self.weights, self.usual, strict=True))
+            loss = loss + settings.hold * held
+            if not torch.isfinite(loss):
+                raise TrainingError("the loss is no number", hint="check the labels of the new images")
+            optimizer.zero_grad(set_to_none=True)
+            (loss * networks).backward()  # type: ignore[no-untyped-call]
+            optimizer.step()
+
+    def layers(self) -> Layers:
+        """Old weights and changes together, as a model file has them."""
+        found: Layers = []
+        for i, ((weight, bias), change, shift) in enumerate(zip(self.old, self.weights, self.biases, strict=True)):
+            moved = self.features @ change if i == 0 else change
+            found.append(
+                (
+                    (weight + moved).detach().numpy().astype(np.float64),
+                    (bias + shift).detach().numpy().astype(np.float64),
+                )
+            )
+        return found
+
+    def _outputs(self, displacements: Tensor) -> Tensor:
+        x = torch.baddbmm(self.old[0][1] + self.biases[0], displacements, self.old[0][0])
+        x = x + torch.bmm((displacements - self.mean) @ self.features, self.weights[0])
+        rest = zip(self.old[1:], self.weights[1:], self.biases[1:], strict=True)
+        for (weight, bias), change, shift in rest:
+            x = functional.dropout(functional.silu(x), self.settings.dropout)
+            x = torch.baddbmm(bias + shift, x, weight + change)
+        return x
+
+    def _jittered(self, displacements: Tensor) -> Tensor:
+        settings = self.settings
+        networks, n, _ = displacements.shape
+        place = self.around_middle + displacements.view(networks, n, -1, 2)
+        across = torch.stack([-place[..., 1], place[..., 0]], dim=-1)
+        moved = settings.shift_px * torch.randn(networks, n, 1, 2)
+        moved = moved + settings.turn_rad * torch.randn(networks, n, 1, 1) * across
+        moved = moved + settings.zoom * torch.randn(networks, n, 1, 1) * place
+        return displacements + moved.flatten(2)
+
+
+def _doubles(tensor: Tensor) -> Array:
+    doubles: Array = tensor.detach().numpy().astype(np.float64)
+    return doubles
