@@ -35,7 +35,7 @@ from perception.model_file import Model, load_model
 COUNTS = (20, 50, 100, 200)
 _ORDER = (2, 3, 4, 0, 1, 5)
 
-_SCRATCH = AdaptSettings(steps=1500, learning_rate=2e-3, hold=0.0, batch_size=64)
+_SCRATCH = AdaptSettings(steps=600, learning_rate=2e-3, hold=0.0, batch_size=64)
 _TURN_DEG, _ZOOM, _SHIFT_PX, _AXES_DEG = 70.0, 0.95, 6.0, 25.0
 
 
@@ -86,6 +86,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
         for name, mae, matched in _rows(case):
             row = [name, *(f"{mae[i]:.3f}" for i in _ORDER), "" if matched is None else f"{100 * matched:.1f} %"]
             table.add_row(*row)
+            print("  ".join(row), flush=True)
             lines.append("| " + " | ".join(row) + " |")
         Console(width=130).print(table)
     (out / "adapt.md").write_text("\n".join(lines).lstrip() + "\n", encoding="utf-8")
@@ -94,9 +95,11 @@ def run(arguments: Sequence[str], out: Path) -> None:
 def _rows(case: Case) -> Iterator[tuple[str, Array, float | None]]:
     old = case.model
     yield "before", *_errors(old, case.held_out)
+    adapted = old
     for count in COUNTS:
-        yield f"after {count} images", *_errors(_adapted(case, count), case.held_out)
-    yield "networks from scratch on 200", *_errors(_scratch(case, COUNTS[-1]), case.held_out)
+        adapted = _adapted(case, count)
+        yield f"after {count} images", *_errors(adapted, case.held_out)
+    yield f"networks from scratch on {COUNTS[-1]}", *_errors(_scratch(case, adapted), case.held_out)
     if case.best is not None:
         yield case.best[0], case.best[1], None
 
@@ -107,10 +110,9 @@ def _adapted(case: Case, count: int) -> Model:
     return adapt_to(case.model, few, preprocessing=case.model.header.preprocessing, size=case.size)
 
 
-def _scratch(case: Case, count: int) -> Model:
+def _scratch(case: Case, adapted: Model) -> Model:
     """Networks that begin anew; camera and matching are given to them."""
-    adapted = _adapted(case, count)
-    chosen = evenly(len(case.few.frames), count)
+    chosen = evenly(len(case.few.frames), COUNTS[-1])
     few = FewContacts([case.few.frames[i] for i in chosen], case.few.xi[chosen])
     brought = bring(case.model, few)
     rng = np.random.default_rng(0)

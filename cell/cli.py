@@ -128,6 +128,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--split", default="val", help="train, val or test")
     evaluate.add_argument("--model", type=Path, required=True)
     evaluate.add_argument("--calibration", type=Path, help="file of `touchcell calibrate`")
+    evaluate.add_argument("--deeper-than", type=float, metavar="MM", help="leave out shallower contacts")
     evaluate.add_argument("--json", type=Path, help="also write the figures there")
     evaluate.set_defaults(run=_evaluate)
 
@@ -294,6 +295,7 @@ def _evaluate(options: argparse.Namespace) -> int:
             options.split,
             options.model,
             calibration=options.calibration,
+            deeper_than_mm=options.deeper_than,
             progress=lambda done, total: bar.update(images, completed=done, total=total),
         )
     print_table(result)

@@ -35,7 +35,7 @@ from perception.zero_frame import lattice_turns, similarity
 
 _DISPLACEMENT_PX = 8.0
 _NARROWEST = 0.02
-_FOLDS = 4
+_FOLDS = 2
 _SHALLOW = 5
 _TRIED = 60
 _FEWEST = 10
@@ -57,7 +57,7 @@ class AdaptSettings:
         seed: of everything random.
     """
 
-    steps: int = 400
+    steps: int = 200
     batch_size: int = 32
     learning_rate: float = 1e-3
     hold: float = 0.3
