@@ -22,6 +22,7 @@ from geometry.types import Array
 from perception.camera_change import CameraChange
 from perception.errors import ModelError, TrainingError
 from perception.labels import xi_from_contact
+from perception.least_squares import robust_fit
 from perception.marked_data import evenly
 from perception.marker_architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture
 from perception.marker_estimator import matcher_of, mixed
@@ -35,7 +36,9 @@ from perception.zero_frame import lattice_turns, similarity
 
 _DISPLACEMENT_PX = 8.0
 _NARROWEST = 0.02
-_FOLDS = 2
+_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+_REFINED_WITH = 100
+_TYPICAL_ERROR = 0.05
 _SHALLOW = 5
 _TRIED = 60
 _FEWEST = 10
@@ -88,12 +91,16 @@ class Brought:
     Attributes:
         camera: from its pixels to the old sensor's.
         turn_rad: of its label axes about the sensor's axis, to the old sensor's.
+        gain: of its displacements.
+        offset: (6,) of the old networks' outputs, in label half-ranges.
         displacements: (n, 2 m) px, as the old sensor would have seen them.
         matched: (n,) contacts whose markers could be matched.
     """
 
     camera: CameraChange
     turn_rad: float
+    gain: float
+    offset: Array
     displacements: NDArray[np.float32]
     matched: NDArray[np.bool_]
 
@@ -154,20 +161,26 @@ def adapt_to(
     assert isinstance(architecture, MarkerArchitecture)
     brought = bring(old, few)
     xi, displacements = few.xi[brought.matched], brought.displacements[brought.matched]
-    layers = turned_layers(old, -brought.turn_rad)
+    layers = turned_layers(_regained(layers_of(old), brought), old.header.labels, -brought.turn_rad)
     labels = _widened(old.header.labels, xi)
     layers = _relabelled(layers, old.header.labels, labels)
     target = (xi - labels.centre) / labels.half_range
-    # Residuals of contacts that were left out tell how far to believe the sigmas; those that were learned would not.
+    # How far to go from the old weights, and how far to believe the sigmas, contacts tell that were left out.
     power = old.tensors["sigma_power"].astype(np.float64)
-    standardised = []
-    for fold in range(_FOLDS):
-        left_out = np.arange(len(xi)) % _FOLDS == fold
-        trained = tune(old, layers, displacements[~left_out], target[~left_out], settings)
-        mean, sigma = outputs_of(trained, displacements[left_out])
-        standardised.append((target[left_out] - mean) / sigma**power)
-    scale = np.sqrt(np.mean(np.concatenate(standardised) ** 2, axis=0))
-    tuned = tune(old, layers, displacements, target, settings)
+    left_out = np.arange(len(xi)) % 2 == 0
+    halves = [tune(old, layers, displacements[half], target[half], settings) for half in (left_out, ~left_out)]
+    errors, standardised = [], []
+    for share in _SHARES:
+        off, by_sigma = [], []
+        for half, trained in zip((~left_out, left_out), halves, strict=True):
+            mean, sigma = outputs_of(_between(layers, trained, share), displacements[half])
+            off.append(np.abs(target[half] - mean))
+            by_sigma.append((target[half] - mean) / sigma**power)
+        errors.append(float(np.concatenate(off).mean()))
+        standardised.append(np.concatenate(by_sigma))
+    best = int(np.argmin(errors))
+    scale = np.sqrt(np.mean(standardised[best] ** 2, axis=0))
+    tuned = _between(layers, tune(old, layers, displacements, target, settings), _SHARES[best]) if best else layers
     tensors = dict(old.tensors)
     for i, (weight, bias) in enumerate(tuned):
         tensors[f"layer{i}.weight"] = np.ascontiguousarray(weight, dtype=np.float32)
@@ -187,6 +200,7 @@ def adapt_to(
                 "adapted_images": len(few.frames),
                 "adapted_images_matched": int(brought.matched.sum()),
                 "adapted_label_turn_deg": math.degrees(brought.turn_rad),
+                "adapted_share": _SHARES[best],
                 **{f"adapted_{key}": value for key, value in asdict(settings).items()},
             },
         ),
@@ -241,10 +255,61 @@ def bring(old: Model, few: FewContacts) -> Brought:
             "the markers of too few images can be matched to the old sensor's",
             hint="only a sensor of the same kind can be adapted to; check threshold and crop",
         )
-    displacements, matched = _seen_by(best[1], matcher, few.frames)
+    _, camera, turn = best
+    displacements, matched = _seen_by(camera, matcher, few.frames)
     if matched.sum() < _FEWEST:
         raise TrainingError(f"{int(matched.sum())} images could be matched, {_FEWEST} are needed", hint="give more")
-    return Brought(best[1], best[2], displacements, matched)
+    refined = _refined(old, layers, there, displacements[matched], few.xi[matched], turn)
+    camera, turn = _composed(camera, refined), turn + float(refined[4])
+    displacements, matched = _seen_by(camera, matcher, few.frames)
+    return Brought(camera, turn, float(refined[5]), refined[6:], displacements, matched)
+
+
+def _refined(
+    old: Model, layers: Layers, there: Array, displacements: NDArray[np.float32], xi: Array, turn: float
+) -> Array:
+    """(12,) what makes the old networks err least: log zoom, turn, shift (2) px of the camera, turn of the label axes,
+    gain of the displacements, offset (6) of the outputs in label half-ranges.
+
+    One image of hardly any contact gives the camera to 0.3 %, which depth would feel.
+    """
+    some = np.linspace(0, len(xi) - 1, min(_REFINED_WITH, len(xi))).round().astype(int)
+    middle = there.mean(axis=0)
+    labels = old.header.labels
+    moved = displacements[some].astype(np.float64).reshape(len(some), -1, 2)
+
+    def residuals(x: Array) -> Array:
+        linear = np.exp(x[0]) * np.array([[np.cos(x[1]), -np.sin(x[1])], [np.sin(x[1]), np.cos(x[1])]])
+        seen = (there + moved - middle) @ linear.T + middle + x[2:4] - there
+        mean, _ = outputs_of(layers, (x[5] * seen).reshape(len(some), -1).astype(np.float32))
+        aim = (_about_z(turn + x[4], xi[some]) - labels.centre) / labels.half_range
+        flat: Array = (mean + x[6:] - aim).ravel() / _TYPICAL_ERROR
+        return flat
+
+    start = np.concatenate([np.zeros(5), [1.0], np.zeros(6)])
+    scale = np.array([0.003, 0.005, 1.0, 1.0, 0.05, 0.05, *[0.05] * 6])
+    return robust_fit(
+        residuals, start, scale, low=start - 20 * scale, high=start + 20 * scale, prior=3.0, soft=1.0, turns=6
+    )
+
+
+def _composed(camera: CameraChange, refined: Array) -> CameraChange:
+    return camera.model_copy(
+        update={
+            "zoom": camera.zoom * float(np.exp(refined[0])),
+            "turn_deg": camera.turn_deg + float(np.degrees(refined[1])),
+            "shift_px": (camera.shift_px[0] + float(refined[2]), camera.shift_px[1] + float(refined[3])),
+        }
+    )
+
+
+def _about_z(turn_rad: float, xi: Array) -> Array:
+    """Labels (n, 6) about axes that are turned about the sensor's."""
+    turned = xi.copy()
+    for first in (0, 3):
+        plane = _plane(xi, first) * np.exp(1j * turn_rad)
+        turned[:, first], turned[:, first + 1] = plane.real, plane.imag
+    return turned
 
 
 def _seen_by(
@@ -280,10 +345,15 @@ def layers_of(model: Model) -> Layers:
     ]
 
 
-def turned_layers(model: Model, turn_rad: float) -> Layers:
+def _regained(layers: Layers, brought: Brought) -> Layers:
+    first, last = layers[0], layers[-1]
+    shifted = (last[0], last[1] + np.concatenate([brought.offset, np.zeros(6)]))
+    return [(brought.gain * first[0], first[1]), *layers[1:-1], shifted]
+
+
+def turned_layers(layers: Layers, labels: Labels, turn_rad: float) -> Layers:
     """The networks with their predictions turned about the sensor's z axis."""
-    labels = model.header.labels
-    layers = layers_of(model)
+    layers = list(layers)
     cos, sin = math.cos(turn_rad), math.sin(turn_rad)
     turn = np.eye(6)
     for first in (0, 3):
@@ -297,6 +367,14 @@ def turned_layers(model: Model, turn_rad: float) -> Layers:
     weight, bias = layers[-1]
     layers[-1] = (weight @ whole.T, bias @ whole.T + np.concatenate([shift, np.zeros(6)]))
     return layers
+
+
+def _between(one: Layers, other: Layers, share: float) -> Layers:
+    """Weights a share of the way from one to the other."""
+    return [
+        (weight + share * (to - weight), bias + share * (shift - bias))
+        for (weight, bias), (to, shift) in zip(one, other, strict=True)
+    ]
 
 
 def _widened(labels: Labels, xi: Array) -> Labels:

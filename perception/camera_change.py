@@ -28,7 +28,7 @@ class CameraChange(BaseModel):
         rms_px: of the undeformed markers from the taught ones, after the change.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
     schema_: Literal[1] = Field(default=1, alias="schema")
     zoom: float = Field(gt=0.2, lt=5.0, allow_inf_nan=False)
