@@ -67,6 +67,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
     parser.add_argument("--model", type=Path, help="marker model that was trained on them")
     parser.add_argument("--sim-model", type=Path, help="of `train-sim --kind markers --processed --tip TIP`")
     parser.add_argument("--tip", default="franka_tactip_1", help="that TIP")
+    parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="images to adapt with, ascending")
     parser.add_argument("--held-out", type=int, default=400, help="images to measure on")
     options = parser.parse_args(arguments)
     cases: list[Case] = []
@@ -83,7 +84,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
         for name in columns:
             table.add_column(name, justify="right" if name else "left")
         lines += ["", case.title, "", "| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
-        for name, mae, matched in _rows(case):
+        for name, mae, matched in _rows(case, options.counts):
             row = [name, *(f"{mae[i]:.3f}" for i in _ORDER), "" if matched is None else f"{100 * matched:.1f} %"]
             table.add_row(*row)
             print("  ".join(row), flush=True)
@@ -92,14 +93,14 @@ def run(arguments: Sequence[str], out: Path) -> None:
     (out / "adapt.md").write_text("\n".join(lines).lstrip() + "\n", encoding="utf-8")
 
 
-def _rows(case: Case) -> Iterator[tuple[str, Array, float | None]]:
+def _rows(case: Case, counts: Sequence[int]) -> Iterator[tuple[str, Array, float | None]]:
     old = case.model
     yield "before", *_errors(old, case.held_out)
     adapted = old
-    for count in COUNTS:
+    for count in counts:
         adapted = _adapted(case, count)
         yield f"after {count} images", *_errors(adapted, case.held_out)
-    yield f"networks from scratch on {COUNTS[-1]}", *_errors(_scratch(case, adapted), case.held_out)
+    yield f"networks from scratch on {counts[-1]}", *_errors(_scratch(case, adapted, counts[-1]), case.held_out)
     if case.best is not None:
         yield case.best[0], case.best[1], None
 
@@ -110,9 +111,9 @@ def _adapted(case: Case, count: int) -> Model:
     return adapt_to(case.model, few, preprocessing=case.model.header.preprocessing, size=case.size)
 
 
-def _scratch(case: Case, adapted: Model) -> Model:
+def _scratch(case: Case, adapted: Model, count: int) -> Model:
     """Networks that begin anew; camera and matching are given to them."""
-    chosen = evenly(len(case.few.frames), COUNTS[-1])
+    chosen = evenly(len(case.few.frames), count)
     few = FewContacts([case.few.frames[i] for i in chosen], case.few.xi[chosen])
     brought = bring(case.model, few)
     rng = np.random.default_rng(0)

@@ -37,10 +37,10 @@ from perception.zero_frame import lattice_turns, similarity
 _DISPLACEMENT_PX = 8.0
 _NARROWEST = 0.02
 _SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-_REFINED_WITH = 100
+_REFINED_WITH = 60
 _TYPICAL_ERROR = 0.05
 _SHALLOW = 5
-_TRIED = 60
+_TRIED = 30
 _FEWEST = 10
 _MATCHED = 0.5
 
@@ -60,7 +60,7 @@ class AdaptSettings:
         seed: of everything random.
     """
 
-    steps: int = 200
+    steps: int = 150
     batch_size: int = 32
     learning_rate: float = 1e-3
     hold: float = 0.3

@@ -5,12 +5,15 @@ import pytest
 from marker_samples import REST, SIZE
 from test_model_file import make_model
 
-from drivers.errors import ConfigError
+from cell.calibrate import calibrate
+from cell.compose import MODELS
+from drivers.errors import ConfigError, DataError
 from drivers.simulation.render import FrameRenderer
 from geometry.types import Array, ImageArray
 from perception.calibrated_estimator import CalibratedEstimator
 from perception.camera_change import CameraChange, load_change
 from perception.errors import TrainingError
+from perception.estimators import load_estimator
 from perception.inference import ContactModel
 from perception.model_file import Model
 from perception.preprocessing import Preprocessing
@@ -110,3 +113,17 @@ def test_calibration_files(tmp_path: Path) -> None:
             load_change(path)
     with pytest.raises(ConfigError, match="touchcell calibrate"):
         load_change(tmp_path / "none.yaml")
+
+
+def test_a_cell_s_own_sensor_takes_the_images(tmp_path: Path) -> None:
+    model = MODELS / "sim_gdn.safetensors"
+    out = tmp_path / "sensor.yaml"
+    change = calibrate(model, out, cell=Path("configs/surface_follow_sim.yaml"), count=2)
+    assert change.zoom == pytest.approx(1.0, abs=1e-3)
+    np.testing.assert_allclose(change.shift_px, 0.0, atol=0.2)
+    assert load_change(out) == change
+    assert isinstance(load_estimator(model, out), CalibratedEstimator)
+    with pytest.raises(ConfigError, match="no sensor 'nobody'"):
+        calibrate(model, out, cell=Path("configs/surface_follow_sim.yaml"), sensor="nobody")
+    with pytest.raises(DataError, match="no PNG"):
+        calibrate(model, out, frames=tmp_path)
