@@ -7,7 +7,7 @@ SOURCES := pyproject.toml setup.py $(wildcard geometry/*.c geometry/*.h)
 .PHONY: demo test check fast stress clean
 
 demo: .venv/core
-	$(BIN)/touchcell run configs/surface_follow_sim.yaml
+	$(BIN)/touchcell run configs/dual_push_sim.yaml --animate
 
 # Tests beside emulators one after another, since they have deadlines; the others on all cores.
 test: check

@@ -24,7 +24,7 @@ from drivers.simulation.tip_file import load_tip
 from drivers.tactile_data import read_image, read_split
 from geometry import se3
 from geometry.types import Array
-from perception.adaptation import AdaptSettings, FewContacts, adapt_to, bring, layers_of, outputs_of, tune
+from perception.adaptation import AdaptSettings, FewContacts, about_z, adapt_to, bring, layers_of, outputs_of, tune
 from perception.labels import contact_from_xi, xi_from_contact
 from perception.marked_data import evenly
 from perception.marker_architecture import MarkerArchitecture
@@ -122,7 +122,7 @@ def _scratch(case: Case, adapted: Model, count: int) -> Model:
         # First weights are per pixel: displacements are of eight.
         scale = 1.0 / np.sqrt(weight.shape[1]) / (8.0 if i == 0 else 1.0)
         layers.append((rng.uniform(-scale, scale, weight.shape), np.zeros_like(bias)))
-    target = (few.xi[brought.matched] - adapted.header.labels.centre) / adapted.header.labels.half_range
+    target = adapted.header.labels.targets(about_z(brought.turn_rad, few.xi[brought.matched]))
     trained = tune(case.model, layers, brought.displacements[brought.matched], target, _SCRATCH)
     tensors = dict(adapted.tensors)
     for i, (weight, bias) in enumerate(trained):
@@ -139,10 +139,11 @@ def _errors(model: Model, contacts: FewContacts) -> tuple[Array, float]:
     if camera is not None:
         frames = [Discs(camera.points(discs.centres), discs.areas) for discs in frames]
     fields = [matcher.match(discs) for discs in frames]
-    mean, _ = outputs_of(layers_of(model), np.stack([each.displacements.ravel() for each in fields]).astype(np.float32))
+    displacements = np.stack([each.displacements.ravel() for each in fields]).astype(np.float32)
+    mean, _ = outputs_of(layers_of(model), displacements, model.header.labels)
     mean[[not each.seen.any() for each in fields]] = 0.0
-    labels = model.header.labels
-    found = contact_from_xi(labels.centre + labels.half_range * mean)
+    xi = xi_from_contact(model.header.labels.contacts(mean))
+    found = contact_from_xi(about_z(-np.radians(model.header.label_turn_deg), xi))
     mae: Array = np.abs(found - contact_from_xi(contacts.xi)).mean(axis=0)
     return mae, float(np.mean([each.valid for each in fields]))
 
@@ -161,20 +162,13 @@ def _real(data: Path, path: Path, held_out: int) -> Case:
         if name == "val":
             unchanged = FewContacts([detect_markers(image, architecture.size) for image in images], xi)
         other = [changed(image, _ZOOM, _TURN_DEG, _SHIFT_PX) for image in images]
-        sets[name] = FewContacts([detect_markers(image, architecture.size) for image in other], turned(xi, _AXES_DEG))
+        sets[name] = FewContacts(
+            [detect_markers(image, architecture.size) for image in other], about_z(np.radians(_AXES_DEG), xi)
+        )
     assert unchanged is not None
     title = f"real images, turned by {_TURN_DEG:g} deg, zoomed {_ZOOM:g}, shifted {_SHIFT_PX:g} px; labels' axes turned"
     best = ("trained on all, unchanged images", _errors(model, unchanged)[0])
     return Case(title, model, sets["train"], sets["val"], architecture.size, best)
-
-
-def turned(xi: Array, angle_deg: float) -> Array:
-    """Labels (n, 6) about axes that are turned about the sensor's."""
-    cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
-    other = xi.copy()
-    for first in (0, 3):
-        other[:, first : first + 2] = xi[:, first : first + 2] @ np.array([[cos, sin], [-sin, cos]])
-    return other
 
 
 def _simulated(path: Path, tip: str, held_out: int) -> Case:

@@ -40,12 +40,15 @@ def run(arguments: Sequence[str], out: Path) -> None:
         "p99_us": sum(rows[stage]["p99_us"] for stage in _STAGES if stage in rows),
         "times": rows.get("infer", rows["supervisor"])["times"],
     }
+    from cell.plots import plot_budget
+
     print(f"{'stage':<22}{'median us':>11}{'p99 us':>11}{'times':>8}")
     for stage, row in rows.items():
         print(f"{stage:<22}{row['median_us']:11.1f}{row['p99_us']:11.1f}{row['times']:8.0f}")
     report = {**provenance(), "cell": path.name, "outcome": result.outcome.value, "stages": rows}
     (out / "cycle.json").write_text(json.dumps(report, indent=1) + "\n")
-    _plot(rows, out / "cycle.png")
+    stages_ms = {stage: 1e-3 * times_us[stage] for stage in _STAGES if stage in times_us}
+    plot_budget(stages_ms, out / "cycle.png", "one control cycle with a new frame, by stage")
 
 
 def _row(times_us: np.ndarray) -> dict[str, float]:
@@ -54,24 +57,3 @@ def _row(times_us: np.ndarray) -> dict[str, float]:
         "p99_us": float(np.percentile(times_us, 99)),
         "times": float(len(times_us)),
     }
-
-
-def _plot(rows: dict[str, dict[str, float]], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    names = [name for name in _STAGES if name in rows]
-    figure, axis = plt.subplots(figsize=(9, 0.5 * len(names) + 1.5), layout="constrained")
-    position = np.arange(len(names))
-    axis.barh(position, [1e-3 * rows[name]["p99_us"] for name in names], color="#c6d3ea", label="p99")
-    axis.barh(position, [1e-3 * rows[name]["median_us"] for name in names], color="#4c72b0", label="median")
-    axis.set_yticks(position, names)
-    axis.invert_yaxis()
-    axis.set_xlabel("ms")
-    axis.set_title("one control cycle with a new frame, by stage")
-    axis.legend()
-    axis.grid(axis="x", alpha=0.3)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)

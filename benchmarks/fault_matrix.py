@@ -102,13 +102,13 @@ FAULTS: Final = (
     Fault("arm: runs_on", "arm", _and_stop(_arm(runs_on=True)), frozenset({"stop"}), _STANDS, obeys=False),
     Fault("camera: frozen", "camera", _camera(frozen=True), frozenset({"frame_frozen"}), {}),
     Fault("camera: last_seq", "camera", _camera(last_seq=0), frozenset({"frame_age"}), {}),
-    # Where the loop waits for the first frame, its command has expired when it is sent; a task without commands sees
-    # the same picture for too long.
+    # Where the loop waits for the first frame, the arm's state is too old when it comes; a task without an arm sees the
+    # same picture for too long.
     Fault(
         "camera: extra_latency_s",
         "camera",
         _camera(extra_latency_s=0.3),
-        frozenset({"frame_age", "CommandRejected", "frame_frozen"}),
+        frozenset({"frame_age", "arm_state_age", "frame_frozen"}),
         {},
     ),
     Fault("camera: gain", "camera", _camera(gain=0.6), frozenset({"exposure"}), _NO_BASELINE),

@@ -33,6 +33,7 @@ LEVELS = (1.0, 0.3, 0.1, 0.03)
 """Standard deviations of the dynamics noise per contact, mm and degrees alike."""
 
 SYNTHETIC_DRIFT = 0.1
+TORN_EVERY = 10
 PARTS = ("sequences", "steps", "tracking")
 _ORDER = ("z_mm", "alpha_deg", "beta_deg", "x_mm", "y_mm", "gamma_deg")
 _CORRECTIONS = {"plain": PoseFilter, "Student-t": StudentFilter, "slip inflation": SlipFilter}
@@ -95,9 +96,11 @@ def _sequences(options: argparse.Namespace, out: Path) -> dict[str, Any]:
         }
     else:
         whole = labelled(options.data, options.split, options.model, _show_progress)
+        torn = labelled(options.data, options.split, options.model, _show_progress, torn_every=TORN_EVERY)
         kinds = {
             "order of the data set": [whole],
             "shuffled": [whole.shuffled(seed) for seed in range(options.orders)],
+            f"one frame in {TORN_EVERY} torn": [torn],
         }
     result: dict[str, Any] = {}
     for kind, sequences in kinds.items():
@@ -114,6 +117,10 @@ def _sequences(options: argparse.Namespace, out: Path) -> dict[str, Any]:
                 rows.append(_row(level, name, sequences, tracks))
                 if name == "plain" and kind == next(iter(kinds)):
                     _plot_predictions(sequences, tracks, out / f"filter_noise_{level:g}.png")
+        if not all(sequence.in_range.all() for sequence in sequences):
+            for level in LEVELS:
+                tracks = [filtered(sequence, level, out_of_range_too=True) for sequence in sequences]
+                rows.append(_row(level, "all frames", sequences, tracks))
         if kind == next(iter(kinds)):
             _plot_predictions(
                 sequences, [single_frames(sequence) for sequence in sequences], out / "filter_single_frames.png"

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.simulation.samples import random_poses
 from drivers.tactile_data import natural_order, read_split
 from geometry import gaussian, se3
 from geometry.gaussian import PoseGaussian, mahalanobis_squared
 from geometry.types import Array
+from perception.estimators import load_estimator
 from perception.filter import FilterState, PoseFilter
-from perception.inference import ContactModel
+from perception.inference import Prediction
 from perception.labels import CONTACT_NAMES, XI_UNITS, contact_from_xi
 
 STEP_NS = 1_000_000_000
@@ -35,6 +37,7 @@ class ContactSequence:
         observed: Gaussians of the single frames.
         xi: (n, 6) and
         sigma: (n, 6), the means and standard deviations of xi that they came from, m and rad.
+        in_range: (n,) what the estimator said of itself.
     """
 
     T_base_s: Array
@@ -42,6 +45,7 @@ class ContactSequence:
     observed: tuple[PoseGaussian, ...]
     xi: Array
     sigma: Array
+    in_range: NDArray[np.bool_]
 
     def shuffled(self, seed: int) -> ContactSequence:
         """The same contacts in another order. A labelled surface stands still, so any order is a possible motion."""
@@ -52,6 +56,7 @@ class ContactSequence:
             tuple(self.observed[i] for i in order),
             self.xi[order],
             self.sigma[order],
+            self.in_range[order],
         )
 
 
@@ -72,27 +77,30 @@ class Track:
     nis: Array
 
 
-def labelled(data: Path, split: str, model: Path, progress: Callable[[int, int], None]) -> ContactSequence:
+def labelled(
+    data: Path, split: str, model: Path, progress: Callable[[int, int], None], *, torn_every: int = 0
+) -> ContactSequence:
     """A labelled split as a sequence in the order of its images' names; the sensor moves as the labels say.
+
+    Args:
+        torn_every: of so many images, one arrives with its lower half black; 0 for none.
 
     Raises:
         DataError, ModelError, ImageError: as ``perception.evaluate.evaluate``.
     """
     split_data = read_split(data, split)
-    network = ContactModel.load(model)
+    estimator = load_estimator(model)
     predictions = []
-    for image in split_data.read():
-        predictions.append(network.predict(image))
+    for i, image in enumerate(split_data.read()):
+        if torn_every and i % torn_every == torn_every - 1:
+            image = image.copy()
+            image[len(image) // 2 :] = 0
+        predictions.append(estimator.predict(image))
         progress(len(predictions), len(split_data.images))
     order = sorted(range(len(predictions)), key=lambda i: natural_order(split_data.images[i]))
     # The base is the surface frame, as in drivers.replay_arm.
     T_f_s = se3.from_euler_mm_deg(split_data.contact_mm_deg[order])
-    return _sequence(
-        T_f_s,
-        se3.inverse(T_f_s),
-        np.stack([predictions[i].xi for i in order]),
-        np.stack([predictions[i].sigma for i in order]),
-    )
+    return _sequence(T_f_s, se3.inverse(T_f_s), [predictions[i] for i in order])
 
 
 def synthetic(
@@ -121,7 +129,8 @@ def synthetic(
     sigma = np.broadcast_to(SYNTHETIC_SIGMA, (n, 6))
     scale = np.where(rng.random(n) < outlier_share, 6.0, 1.0)
     xi = se3.log(T_s_f) + sigma * scale[:, None] * rng.normal(size=(n, 6))
-    return _sequence(T_base_s, T_s_f, xi, np.array(sigma))
+    predictions = [Prediction(mean, np.diag(each**2), in_range=True) for mean, each in zip(xi, sigma, strict=True)]
+    return _sequence(T_base_s, T_s_f, predictions)
 
 
 def single_frames(sequence: ContactSequence) -> Track:
@@ -130,18 +139,27 @@ def single_frames(sequence: ContactSequence) -> Track:
     return Track(contact_from_xi(sequence.xi), sequence.sigma, np.array(nees), np.empty(0))
 
 
-def filtered(sequence: ContactSequence, level: float, make: Callable[[Array], PoseFilter] = PoseFilter) -> Track:
+def filtered(
+    sequence: ContactSequence,
+    level: float,
+    make: Callable[[Array], PoseFilter] = PoseFilter,
+    *,
+    out_of_range_too: bool = False,
+) -> Track:
     """A filter over the sequence.
 
     Args:
         level: standard deviation of the dynamics noise per contact, in mm and degrees.
         make: builds the filter from its noise density.
+        out_of_range_too: fuse even what the estimator says it was not taught, which ``perception.pipeline`` does not.
     """
     pose_filter = make(np.diag((level * XI_UNITS) ** 2))
-    states: list[FilterState] = [
-        pose_filter.update(observation, T, k * STEP_NS)
-        for k, (observation, T) in enumerate(zip(sequence.observed, sequence.T_base_s, strict=True))
-    ]
+    states: list[FilterState] = []
+    for k, (observation, T) in enumerate(zip(sequence.observed, sequence.T_base_s, strict=True)):
+        if sequence.in_range[k] or out_of_range_too or not states:
+            states.append(pose_filter.update(observation, T, k * STEP_NS))
+        else:
+            states.append(FilterState(pose_filter.predict(T, k * STEP_NS), T, k * STEP_NS))
     means = np.stack([state.belief.mean for state in states])
     inverses = se3.left_jacobian_inverse(se3.log(means))
     covariances = inverses @ np.stack([state.belief.covariance for state in states]) @ np.swapaxes(inverses, 1, 2)
@@ -197,6 +215,12 @@ def _correlation_length(series: list[Array]) -> float:
     return length
 
 
-def _sequence(T_base_s: Array, T_s_f: Array, xi: Array, sigma: Array) -> ContactSequence:
-    observed = tuple(gaussian.from_exponential(x, np.diag(s**2)) for x, s in zip(xi, sigma, strict=True))
-    return ContactSequence(T_base_s, T_s_f, observed, xi, sigma)
+def _sequence(T_base_s: Array, T_s_f: Array, predictions: Sequence[Prediction]) -> ContactSequence:
+    return ContactSequence(
+        T_base_s,
+        T_s_f,
+        tuple(gaussian.from_exponential(one.xi, one.covariance) for one in predictions),
+        np.stack([one.xi for one in predictions]),
+        np.stack([one.sigma for one in predictions]),
+        np.array([one.in_range for one in predictions]),
+    )

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.provenance import provenance
-from drivers.gate import TwistLimits
+from drivers.arm import LimitsConfig
 from drivers.joint_setpoint import JointSetpoint
 from drivers.kinematics import ChainDescription, DifferentialIk, SerialChain, Tool
 from geometry.types import Array
@@ -23,7 +23,7 @@ _CALLS = 5000
 _RATE_HZ = 250.0
 _DIAMETER_M = 0.15
 _LAP_S = 8.0
-_LIMITS = TwistLimits(0.10, 0.5, 0.5, 2.5)
+_LIMITS = LimitsConfig().build()
 
 
 def run(arguments: Sequence[str], out: Path) -> None:

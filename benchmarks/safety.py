@@ -1,43 +1,47 @@
 """``touchcell bench safety``: the fault matrix of ``benchmarks.fault_matrix``, and what the interlocks cost per cycle.
 
 For each fault the time from its beginning to the trip, and the arm's time and way to rest, over all tasks and states;
-the worst stop of each fault in each state; then the time of a supervisor's review by number of interlocks, and of the
-gate.
+the worst stop of each fault in each state; then what gate and interlocks cost (``benchmarks.safety_cost``).
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from benchmarks.fault_matrix import FAULTS, Case, matrix
 from benchmarks.provenance import provenance
-from cell.cli import find_cell
-from control.interlocks import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, build_interlocks, parse_interlocks
-from control.latch import Latch
-from control.supervisor import Supervisor
-from control.view import ArmView, CellView, SensorView
-from drivers.clock import VirtualClock
-from drivers.commands import Sent, TwistCommand, TwistFrame
-from drivers.device import Lifecycle
-from drivers.gate import TwistGate, TwistLimits
-from drivers.lease import LeaseDesk
-from drivers.samples import Stamped, TcpState
-from geometry import se3
+from benchmarks.safety_cost import costs
 
 _REPEATS = 2000
 _PERIOD_NS = 10_000_000
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Print both tables; writes ``safety.json`` into ``out``."""
+    """Print both tables; writes ``safety.json`` into ``out``.
+
+    ``--processes``: see ``benchmarks.process_bench``. ``--cost``: only what a cycle costs, into ``safety_cost.json``.
+    """
+    parser = argparse.ArgumentParser("touchcell bench safety --")
+    parser.add_argument("--processes", action="store_true", help="faults of whole processes, with two arms")
+    parser.add_argument("--repeats", type=int, default=3, help="how often each fault of a process is tried")
+    parser.add_argument("--cost", action="store_true", help="only what gate and interlocks cost in a cycle")
+    options = parser.parse_args(arguments)
+    if options.processes:
+        from benchmarks import process_bench
+
+        process_bench.run(options.repeats, out)
+        return
+    if options.cost:
+        (out / "safety_cost.json").write_text(json.dumps({**provenance(), "cost_us": _print_costs()}, indent=1) + "\n")
+        return
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         cases = list(matrix(Path(folder)))
@@ -55,12 +59,18 @@ def run(arguments: Sequence[str], out: Path) -> None:
     print(f"\nas it has to be: {len(cases) - len(bad)} of {len(cases)} places of the matrix, in {seconds:.0f} s")
     for case in bad:
         print(f"  {case.task}, {case.state}, {case.fault}: {case.problem}")
-    costs = _costs()
-    print(f"\n{'cost per cycle':<40}{'median us':>11}")
-    for name, cost_us in costs.items():
-        print(f"{name:<40}{cost_us:11.1f}")
-    report = {**provenance(), "cases": [asdict(case) for case in cases], "cost_us": costs}
+    print()
+    cost_us = _print_costs()
+    report = {**provenance(), "cases": [asdict(case) for case in cases], "cost_us": cost_us}
     (out / "safety.json").write_text(json.dumps(report, indent=1) + "\n")
+
+
+def _print_costs() -> dict[str, float]:
+    found = costs()
+    print(f"{'cost per cycle':<64}{'median us':>11}")
+    for name, cost_us in found.items():
+        print(f"{name:<64}{cost_us:11.1f}")
+    return found
 
 
 def _row(name: str, cases: Sequence[Case]) -> str:
@@ -82,67 +92,3 @@ def _quantiles(values: Sequence[float], first: int, second: int, digits: int) ->
     if not values:
         return f"{'-':>{first}}{'-':>{second}}"
     return f"{np.median(values):{first}.{digits}f}{max(values):{second}.{digits}f}"
-
-
-def _costs() -> dict[str, float]:
-    """Microseconds of a review by number of interlocks in the shipped cell, and of the gate."""
-    shipped = yaml.safe_load(find_cell(Path("configs/object_track_sim.yaml")).read_text())["interlocks"]
-    names = list(shipped)
-    views = _quiet_views()
-    costs = {}
-
-    def cost_us(chosen: Sequence[str]) -> float:
-        section = {name: shipped[name] for name in chosen}
-        supervisor = Supervisor(build_interlocks(parse_interlocks(section), {"sensor": np.eye(4)}), Latch())
-        median_us = _median_us(lambda k: supervisor.review(views[k]))
-        assert supervisor.latch.first_cause is None
-        return median_us
-
-    required = [n for n in names if shipped[n]["kind"] in REQUIRED_TO_MOVE | REQUIRED_TO_TOUCH]
-    for chosen in ([], required, names):
-        costs[f"review, {len(chosen)} interlocks and finite"] = cost_us(chosen)
-    bare = costs["review, 0 interlocks and finite"]
-    for name in names:
-        costs[f"  of it {shipped[name]['kind']}"] = round(max(0.0, cost_us([name]) - bare), 2)
-    costs["gate"] = _median_us(_Gate())
-    return costs
-
-
-def _median_us(call: Callable[[int], object]) -> float:
-    times = []
-    for k in range(_REPEATS):
-        started = time.perf_counter_ns()
-        call(k)
-        times.append(time.perf_counter_ns() - started)
-    return round(1e-3 * float(np.median(times)), 2)
-
-
-def _quiet_views() -> list[CellView]:
-    """A cell with one moving arm and one sensor in contact, cycle after cycle."""
-    T = se3.from_euler_mm_deg(np.array([0.0, 0.0, 25.0, 180.0, 0.0, 0.0]))
-    twist = np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0])
-    views = []
-    for k in range(_REPEATS):
-        now_ns = k * _PERIOD_NS
-        command = TwistCommand(twist, TwistFrame.BASE, now_ns, 0.03)
-        arm = ArmView(Stamped(TcpState(T, twist), now_ns, k), command, Sent(command, now_ns))
-        sensor = SensorView(now_ns, k, True, 3e-3, True, 6.0, 3e-4, 1e-3, 0.0, k, 70.0)
-        views.append(CellView(now_ns, {"arm": arm}, {"sensor": sensor}, "run"))
-    return views
-
-
-class _Gate:
-    """A gate that turns a twist along tool axes and limits nothing."""
-
-    def __init__(self) -> None:
-        self._clock = VirtualClock()
-        desk = LeaseDesk("arm")
-        self._gate = TwistGate("arm", TwistLimits(0.1, 10.0, 1.0, 100.0), desk, self._clock)
-        self._lease = desk.acquire("bench")
-        self._T = np.eye(4)
-
-    def __call__(self, k: int) -> None:
-        self._clock.advance_s(0.01)
-        twist = np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0])
-        command = TwistCommand(twist, TwistFrame.TCP, self._clock.now_ns(), 0.03)
-        self._gate.admit(command, self._lease, Lifecycle.ACTIVE, self._T)

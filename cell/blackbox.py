@@ -5,6 +5,7 @@ It holds what the recording holds, and is there also when nothing is recorded or
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections import deque
 from collections.abc import Mapping
@@ -70,6 +71,16 @@ class BlackBox:
             (folder / ABOUT).write_text(json.dumps(record, indent=1) + "\n")
         except OSError as error:
             raise RecordingError(folder / ABOUT, f"cannot be written: {error.strerror}") from None
+
+
+def keep_earlier(folder: Path) -> None:
+    """Put the black box of an earlier trip of the same run aside, as ``blackbox-1`` and so on."""
+    if (folder / ABOUT).exists():
+        number = 1 + len(list(folder.glob("blackbox-*.json")))
+        for name in (MESSAGES, ABOUT):
+            file = folder / name
+            with contextlib.suppress(OSError):
+                file.rename(file.with_stem(f"{file.stem}-{number}"))
 
 
 def cause_record(cause: Violation) -> dict[str, Any]:

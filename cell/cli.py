@@ -54,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--data", type=Path, help="data set folder for drivers that replay one")
     run.add_argument("--model", help="model file in place of the one that the cell names")
     run.add_argument("--out", type=Path, help="run folder (default: runs/NAME-TIME)")
+    run.add_argument("--animate", action="store_true", help="also write animation.gif, of a simulated run")
     run.add_argument("--quiet", action="store_true", help="no live progress line")
     run.set_defaults(run=_run)
 
@@ -69,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     probe.add_argument("cell", type=Path)
     probe.set_defaults(run=_probe)
 
-    listing = commands.add_parser("list", help="known drivers, tasks, interlocks, emulators, benchmarks and cells")
+    listing = commands.add_parser("list", help="known drivers, tasks, interlocks, experiments, cells")
     listing.set_defaults(run=_list)
 
     train = commands.add_parser("train", help="train an estimator on labelled images")
@@ -82,6 +83,7 @@ def _parser() -> argparse.ArgumentParser:
         help="Gaussian-density network, regression or marker estimator",
     )
     train.add_argument("--epochs", type=int)
+    train.add_argument("--networks", type=int, help="of a marker estimator, whose mixture it gives (default: 4)")
     train.add_argument("--seed", type=int, default=0)
     train.add_argument("--fresh", action="store_true", help="start again instead of resuming")
     train.set_defaults(run=_train)
@@ -134,7 +136,13 @@ def _parser() -> argparse.ArgumentParser:
 
     report = commands.add_parser("report", help="make a run's summary and plots again from its recording")
     report.add_argument("folder", type=Path)
+    report.add_argument("--animate", action="store_true", help="also write animation.gif")
     report.set_defaults(run=_report)
+
+    view = commands.add_parser("view", help="show in a browser what a run's sensors feel, live or from its recording")
+    view.add_argument("folder", type=Path, help="run folder")
+    view.add_argument("--port", type=int, default=8177, help="of the page on this machine")
+    view.set_defaults(run=_view)
 
     why = commands.add_parser("why", help="explain why a run tripped, from its black box")
     why.add_argument("folder", type=Path)
@@ -145,11 +153,27 @@ def _parser() -> argparse.ArgumentParser:
     stop.add_argument("--now", action="store_true", help="at once, without withdrawing first")
     stop.set_defaults(run=_stop)
 
+    for word, text in (
+        ("reset", "reset a run that has tripped and waits, once the cause has gone; nothing moves by it"),
+        ("resume", "let a run that has been reset start its task again"),
+    ):
+        asking = commands.add_parser(word, help=text)
+        asking.add_argument("folder", type=Path, nargs="?", help="run folder (default: the one run below runs/)")
+        asking.set_defaults(run=_ask, ask=word)
+
     bench = commands.add_parser("bench", help="run time against error")
     bench.add_argument("name", nargs="?", help="which; `touchcell list` names them")
     bench.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for tables and plots")
     bench.add_argument("rest", nargs="*", help="arguments of the benchmark; its options follow after --")
     bench.set_defaults(run=_bench)
+
+    experiment = commands.add_parser("experiment", help="the paper's experiments: trials, table and plots")
+    experiment.add_argument("name", help="which, or `all`; `touchcell list` names them")
+    experiment.add_argument("--out", type=Path, default=Path("runs/experiments"), help="folder with one for each")
+    experiment.add_argument("--jobs", type=int, help="trials at a time (default: one for each core)")
+    experiment.add_argument("--trials", type=int, help="repetitions of each row (default: the experiment's own number)")
+    experiment.add_argument("--quick", action="store_true", help="the least that still shows every kind of row")
+    experiment.set_defaults(run=_experiment)
 
     commands.add_parser("emulate", help="emulate a device on the wire", add_help=False)
     return parser
@@ -164,6 +188,7 @@ def _run(options: argparse.Namespace) -> int:
         model=options.model,
         out=options.out,
         live=not options.quiet and sys.stdout.isatty(),
+        moving=options.animate,
     )
 
 
@@ -177,7 +202,12 @@ def _check(options: argparse.Namespace) -> int:
         print(f"  {device.spec.capabilities.kind:<8} {device.name}: {device.spec.name}, {device.spec.summary}")
     for name, interlock in plan.cell.interlocks.items():
         way = plan.overshoots.get(name)
-        print(f"  interlock {name}: {interlock.kind}" + (f"; beyond the box, {way}" if way else ""))
+        print(f"  interlock {name}: {interlock.kind}" + (f"; beyond its limit, {way}" if way else ""))
+    if plan.cell.processes == "separate":
+        from cell.processes import process_lines
+
+        for line in process_lines(plan):
+            print(f"  process  {line}")
     if plan.skipped:
         print(f"  not needed by this task and not built: {', '.join(plan.skipped)}")
     return EXIT_OK
@@ -216,6 +246,7 @@ def _train(options: argparse.Namespace) -> int:
         options.out,
         kind=options.kind,
         epochs=options.epochs,
+        networks=options.networks,
         seed=options.seed,
         resume=not options.fresh,
     )
@@ -279,7 +310,7 @@ def _adapt(options: argparse.Namespace) -> int:
     assert camera is not None
     print(f"{told['adapted_images_matched']} of {told['adapted_images']} images matched and learned from")
     print(f"camera: zoom {camera.zoom:.4f}, turn {camera.turn_deg:.1f} deg; labels' axes:", end=" ")
-    print(f"{told['adapted_label_turn_deg']:.1f} deg; wrote {options.out}")
+    print(f"{model.header.label_turn_deg:.1f} deg; wrote {options.out}")
     return EXIT_OK
 
 
@@ -308,6 +339,17 @@ def _report(options: argparse.Namespace) -> int:
     from cell.report import write_report
 
     print(write_report(options.folder))
+    if options.animate:
+        from cell.animation import animate
+
+        print(animate(options.folder))
+    return EXIT_OK
+
+
+def _view(options: argparse.Namespace) -> int:
+    from cell.view import view_run
+
+    view_run(options.folder, options.port)
     return EXIT_OK
 
 
@@ -332,6 +374,21 @@ def _stop(options: argparse.Namespace) -> int:
     return EXIT_OK if all(ended.values()) else EXIT_TASK_FAILED
 
 
+def _ask(options: argparse.Namespace) -> int:
+    import getpass
+
+    from cell.desk import Ask, ask_run, is_waiting
+    from cell.operator import NoSuchRun, running
+
+    folders = [options.folder] if options.folder else [run for run in running(Path("runs")) if is_waiting(run)]
+    if len(folders) != 1 or not is_waiting(folders[0]):
+        where = folders[0] if len(folders) == 1 else Path("runs")
+        raise NoSuchRun(where, "several runs wait: name one" if len(folders) > 1 else "no run waits for a reset here")
+    done, words = ask_run(folders[0], Ask(options.ask), getpass.getuser())
+    print(f"{folders[0]}: {words}")
+    return EXIT_OK if done else EXIT_TASK_FAILED
+
+
 def _bench(options: argparse.Namespace) -> int:
     from drivers import entry_points
 
@@ -341,6 +398,28 @@ def _bench(options: argparse.Namespace) -> int:
         return EXIT_BAD_INPUT
     options.out.mkdir(parents=True, exist_ok=True)
     known[options.name].load()([*options.rest, *options.passed_on], options.out)
+    return EXIT_OK
+
+
+def _experiment(options: argparse.Namespace) -> int:
+    # Each trial has a core; libraries that start a thread for every core would only be in each other's way.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from cell.experiment import Scale, installed, run_experiment, spec
+
+    experiments = [spec(name) for name in (installed() if options.name == "all" else [options.name])]
+    scale = Scale(options.trials, options.quick)
+    jobs = options.jobs or os.cpu_count() or 1
+    tables = []
+    for experiment in experiments:
+        folder = options.out / experiment.name
+        try:
+            tables.append(run_experiment(experiment, folder, scale, jobs=jobs, live=sys.stdout.isatty()))
+        except KeyboardInterrupt:
+            print(f"touchcell: what has finished is kept in {folder}; the same command goes on", file=sys.stderr)
+            raise
+        print(tables[-1], flush=True)
+    if len(tables) > 1:
+        (options.out / "summary.txt").write_text("\n\n".join(tables) + "\n")
     return EXIT_OK
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,15 +12,20 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
 import numpy as np
 
+from cell.collection import Collection
 from cell.config import (
     CellPlan,
     DevicePlan,
+    KnownSurface,
     MovingSurfaceSection,
     NetworkEstimator,
     SensorSection,
     StillSurfaceSection,
 )
+from cell.known_surface import KnownSurfaceSource
 from cell.messages import belief_message, pose_message
+from cell.surroundings import build_surroundings
+from cell.watch import OneProcess, Watch
 from control.interlocks import build_interlocks
 from control.latch import Latch
 from control.supervisor import Supervisor
@@ -30,12 +35,14 @@ from drivers.clock import Clock, MonotonicClock, VirtualClock
 from drivers.device import Device
 from drivers.errors import ConfigError
 from drivers.registry import DriverContext
+from drivers.samples import Frame, Stamped
 from geometry import se3
 from geometry.types import Array
 from perception.pipeline import ContactPipeline, ContactSource
 from tasks.interface import Task, TaskContext
 
 if TYPE_CHECKING:
+    from drivers.process.chain import Chain
     from drivers.simulation.scene import Scene
     from perception.filter import ContactFilter
 
@@ -70,9 +77,19 @@ class Sensor:
     _picture: tuple[int | None, float | None] = field(default=(None, None), init=False)
     _picture_seq: int = field(default=-1, init=False)
 
+    @property
+    def frame(self) -> Stamped[Frame] | None:
+        """The newest frame that was looked at; None from a source that looks at none."""
+        return self.source.frame if isinstance(self.source, ContactPipeline | KnownSurfaceSource) else None
+
+    def await_frame(self) -> None:
+        """Wait for the first frame, so that no control cycle has to. Raises DeviceError."""
+        if isinstance(self.source, ContactPipeline | KnownSurfaceSource):
+            self.source.await_frame()
+
     def picture(self) -> tuple[int | None, float | None]:
         """A checksum and the mean grey level of every third pixel of the newest frame; (None, None) if not watched."""
-        frame = self.source.frame if self.watched and isinstance(self.source, ContactPipeline) else None
+        frame = self.frame if self.watched else None
         if frame is not None and frame.seq != self._picture_seq:
             sample = np.ascontiguousarray(frame.value.image[::3, ::3])
             self._picture = zlib.crc32(sample.data), float(sample.mean())
@@ -91,16 +108,22 @@ class Sensor:
             "filter": times.filter_ns,
         }
 
+    def about(self) -> dict[str, Any] | None:
+        """What recorded images need to be understood: the preprocessing; None when none are recorded."""
+        if self.frames == "none" or not isinstance(self.source, ContactPipeline):
+            return None
+        return self.source.preprocessing.model_dump(mode="json")
+
     def extra_messages(self, now_ns: int) -> Iterator[tuple[str, int, dict[str, Any]]]:
         """What else is recorded of this sensor in this cycle: the frame's own measurement, its image, the truth."""
         if isinstance(self.source, ContactPipeline):
             measured = self.source.measurement
             if measured is not None and measured.belief is not None:
                 yield "measurement", measured.t_ns, {"seq": measured.seq, **belief_message(measured.belief)}
-            frame = self.source.frame
-            if self.frames != "none" and frame is not None and frame.seq != self._recorded_seq:
-                self._recorded_seq = frame.seq
-                yield "image", frame.t_ns, _image_message(frame.value.image, self.frames, frame.seq, frame.t_ns)
+        frame = self.frame
+        if self.frames != "none" and frame is not None and frame.seq != self._recorded_seq:
+            self._recorded_seq = frame.seq
+            yield "image", frame.t_ns, _image_message(frame.value.image, self.frames, frame.seq, frame.t_ns)
         if self.truth is not None:
             true = self.truth.update(now_ns)
             if true is not None:
@@ -119,8 +142,14 @@ class Cell:
         clock: its time.
         arms: by role in the task, and those that only carry a sensor by their own name.
         sensors: by role.
+        task: what the cell does.
+        new_task: makes it anew, in its first state, after a trip.
         stop_categories: by which each arm stops when something is wrong, by role.
-        scene: what is simulated around the arms, None in a cell of real devices.
+        holding: roles of arms that keep their power when another's fault stops them.
+        watched_joints: roles of arms whose joint angles an interlock looks at.
+        scene: what is simulated around the arms, None in a cell of real devices, or where it is in another process.
+        collection: where labelled frames go, None where the task labels none.
+        watch: who looks after the loop.
     """
 
     plan: CellPlan
@@ -130,8 +159,13 @@ class Cell:
     sensors: Mapping[str, Sensor]
     supervisor: Supervisor
     task: Task
+    new_task: Callable[[], Task]
     stop_categories: Mapping[str, StopCategory] = field(default_factory=dict)
+    holding: frozenset[str] = frozenset()
+    watched_joints: frozenset[str] = frozenset()
     scene: Scene | None = None
+    collection: Collection | None = None
+    watch: Watch = field(default_factory=OneProcess)
     start_ns: int = 0
     _exit: ExitStack = field(default_factory=ExitStack, init=False)
 
@@ -152,6 +186,7 @@ class Cell:
 
     def __enter__(self) -> Self:
         with self._exit:
+            self._exit.enter_context(self.watch)
             for device in self._devices():
                 self._exit.enter_context(device)
                 device.configure()
@@ -159,6 +194,7 @@ class Cell:
             for device in self._devices():
                 device.activate()
                 self._exit.callback(self._deactivate, device)
+            self.watch.prove()
             self.start_ns = self.clock.now_ns()
             self._exit = self._exit.pop_all()
         return self
@@ -188,26 +224,45 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
     Raises:
         ConfigError: an interlock names what is not there.
         ModelError: a model file cannot be used.
+        RecordingError: the folder for labelled frames cannot be written.
     """
     cell_clock = clock or _clock(plan)
-    scene = _scene(plan, cell_clock)
-    devices = build_devices(plan, {**plan.arms, **plan.sensors}, cell_clock, scene)
+    chain = _chain(plan, cell_clock)
+    hosted = {} if chain is None else chain.devices
+    # A scene that lives in a host is not here too.
+    scene = _scene(plan, cell_clock) if chain is None else None
+    wanted = {name: device for name, device in {**plan.arms, **plan.sensors}.items() if name not in hosted}
+    devices = {**build_devices(plan, wanted, cell_clock, scene), **hosted}
     arm_of = {name: role for role, name in plan.arm_roles.items()}
     arm_of |= {name: name for name in plan.arms if name not in arm_of}
     sensors = {role: _sensor(plan, name, devices, scene, arm_of) for role, name in plan.sensor_roles.items()}
     poses = {role: sensor.T_tcp_sensor for role, sensor in sensors.items()}
-    supervisor = Supervisor(build_interlocks(plan.cell.interlocks, poses), Latch())
-    task = plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses))
+    arms = {role: cast(Arm, devices[name]) for name, role in arm_of.items()}
+    surroundings = build_surroundings(plan, arms, {role: name for name, role in arm_of.items()})
+    supervisor = Supervisor(build_interlocks(plan.cell.interlocks, poses, surroundings), Latch())
+    collection = _collection(plan)
+    kept = 0 if collection is None else collection.kept
+
+    def new_task() -> Task:
+        return plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses, kept))
+
     return Cell(
         plan=plan,
         clock=cell_clock,
-        arms={role: cast(Arm, devices[name]) for name, role in arm_of.items()},
+        arms=arms,
         cameras={name: devices[name] for name in plan.sensors},
         sensors=sensors,
         supervisor=supervisor,
-        task=task,
+        task=new_task(),
+        new_task=new_task,
         stop_categories={role: StopCategory(plan.cell.arms[name].stop_category) for name, role in arm_of.items()},
+        holding=frozenset(
+            arm_of[pair.follower] for pair in plan.cell.pairs if pair.on_stop == "hold" and pair.follower in arm_of
+        ),
+        watched_joints=frozenset(role for role, body in surroundings.bodies.items() if body.link_count),
         scene=scene,
+        collection=collection,
+        watch=OneProcess() if chain is None else _process_watch(chain, arm_of),
     )
 
 
@@ -224,7 +279,9 @@ def build_devices(
     """
     clock = clock or _clock(plan)
     devices: dict[str, Device] = {}
-    context = DriverContext(clock, devices, scene or _scene(plan, clock), plan.cell.seed)
+    if scene is None and wanted:
+        scene = _scene(plan, clock)
+    context = DriverContext(clock, devices, scene, plan.cell.seed)
     for name, device in wanted.items():
         devices[name] = device.spec.build(name, device.config, context)
     return devices
@@ -233,6 +290,20 @@ def build_devices(
 def model_path(name: str) -> Path:
     """The file behind a cell file's ``model:``: a path, or ``builtin:NAME`` for one that ships with touchcell."""
     return MODELS / f"{name.removeprefix(BUILTIN)}.safetensors" if name.startswith(BUILTIN) else Path(name)
+
+
+def _chain(plan: CellPlan, clock: Clock) -> Chain | None:
+    if plan.cell.processes == "one":
+        return None
+    from cell.processes import build_chain
+
+    return build_chain(plan, clock)
+
+
+def _process_watch(chain: Chain, role_of: Mapping[str, str]) -> Watch:
+    from cell.processes import ProcessWatch
+
+    return ProcessWatch(chain, role_of)
 
 
 def _clock(plan: CellPlan) -> Clock:
@@ -247,6 +318,15 @@ def _scene(plan: CellPlan, clock: Clock) -> Scene | None:
     return SceneConfig.model_validate(plan.cell.scene).build(clock)
 
 
+def _collection(plan: CellPlan) -> Collection | None:
+    section = plan.cell.collect
+    if section is None:
+        return None
+    # More samples of the same kind may be asked for later.
+    about = {"cell": plan.cell.name, **plan.task_config.model_dump(exclude={"samples"})}
+    return Collection(section.data, dict(section.shares.items()), about)
+
+
 def _sensor(
     plan: CellPlan, name: str, devices: Mapping[str, Device], scene: Scene | None, arm_of: Mapping[str, str]
 ) -> Sensor:
@@ -256,6 +336,9 @@ def _sensor(
     source: ContactSource
     if isinstance(section.estimator, NetworkEstimator):
         source = _pipeline(section, section.estimator, devices[name])
+    elif isinstance(section.estimator, KnownSurface):
+        T_base_f = se3.from_euler_mm_deg(np.array(section.estimator.surface_mm_deg))
+        source = KnownSurfaceSource(cast(FrameSource, devices[name]), T_base_f)
     else:
         assert truth is not None
         source = truth
@@ -279,9 +362,13 @@ def _truth(name: str, mount: Device | None, scene: Scene | None, T_tcp_sensor: A
 
 
 def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Device) -> ContactPipeline:
+    import cv2
+
     from perception.contact_gate import ContactGate
     from perception.estimators import load_estimator
 
+    # A second thread gains nothing on images of this size (PERCEPTION part 5), and takes a core from other sensors.
+    cv2.setNumThreads(1)
     calibration = None if estimator.calibration is None else Path(estimator.calibration)
     model = load_estimator(model_path(estimator.model), calibration)
     pose_filter = None if estimator.filter is None else build_filter(estimator.filter)

@@ -10,13 +10,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag, model_validator
 
-from cell.margins import Overshoot, overshoot
+from cell.margins import Overshoot, overshoot, together
 from cell.yaml_file import InvalidCell, KeyPath, YamlFile, load
+from control.clearance import ClearanceConfig
 from control.interlocks import (
     INTERLOCKS,
     REQUIRED_TO_MOVE,
@@ -33,6 +34,7 @@ from tasks import registry as task_registry
 from tasks.interface import TaskConfig, TaskSpec
 
 M = TypeVar("M", bound=BaseModel)
+Three = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]
 
 
@@ -110,18 +112,58 @@ class TrueContact(_Section):
     kind: Literal["true_contact"]
 
 
-EstimatorSection = Annotated[NetworkEstimator | TrueContact, Field(discriminator="kind")]
+class KnownSurface(_Section):
+    """The contact from the arm's pose over a surface that stands where the file says, for collecting labels.
+
+    ``surface_mm_deg`` is where the sensor frame is, in the arm's base, when it just touches the surface, upright.
+    """
+
+    kind: Literal["known_surface"]
+    surface_mm_deg: Six
+
+
+EstimatorSection = Annotated[NetworkEstimator | TrueContact | KnownSurface, Field(discriminator="kind")]
+
+
+class CapsuleSection(_Section):
+    """A part of an arm: all within ``radius_mm`` of a segment from ``from_mm`` to ``to_mm`` in the tool's frame.
+
+    ``from_base_mm`` in place of ``from_mm`` is a place in the base's frame: for the forearm of an arm that tells only
+    where its tool is.
+    """
+
+    from_mm: Three | None = None
+    from_base_mm: Three | None = None
+    to_mm: Three
+    radius_mm: PositiveFloat
+
+    @model_validator(mode="after")
+    def _one_start(self) -> Self:
+        if (self.from_mm is None) == (self.from_base_mm is None):
+            raise ValueError("say either from_mm or from_base_mm")
+        return self
+
+
+class BoxSection(_Section):
+    """Something that stands still: the pose of its centre in the world, and the lengths of its sides."""
+
+    pose_mm_deg: Six
+    size_mm: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
 
 
 class ArmSection(_OpenSection):
-    """An arm: its driver, what happens when it is deactivated or has to stop, and the driver's own keys.
+    """An arm: its driver, where it stands, what it looks like, what happens when it is deactivated or has to stop, and
+    the driver's own keys.
 
-    ``stop_category`` is by IEC 60204-1: 2 stops and holds with power, 1 stops and then removes it.
+    ``stop_category`` is by IEC 60204-1: 2 stops and holds with power, 1 stops and then removes it. ``base_pose_mm_deg``
+    is in the world; ``body`` adds capsules to those of the arm's chain, for ``clearance``.
     """
 
     driver: str
     deactivate: DeactivatePolicy
     stop_category: Literal[1, 2] = 2
+    base_pose_mm_deg: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    body: tuple[CapsuleSection, ...] = ()
 
 
 class SensorSection(_OpenSection):
@@ -147,21 +189,51 @@ class RecordingSection(_Section):
     frames: Literal["none", "jpeg", "png"] = "none"
 
 
+class PairSection(_Section):
+    """Two arms with something between them.
+
+    All arms of a cell stop together. With ``on_stop: hold`` the follower then keeps its power, and so what it holds,
+    whatever its ``stop_category`` says, unless it is itself what is wrong; with ``same`` it stops as that says.
+    """
+
+    leader: str
+    follower: str
+    on_stop: Literal["hold", "same"] = "hold"
+
+
+class CollectSection(_Section):
+    """Where labelled frames go, and in which proportion to which split."""
+
+    data: Path
+    shares: dict[Literal["train", "val", "test"], Annotated[int, Field(ge=1)]] = Field(
+        default={"train": 3, "val": 1}, min_length=1
+    )
+
+
 class CellFile(_Section):
-    """A whole cell file."""
+    """A whole cell file.
+
+    ``on_trip: end`` ends a run that has tripped; ``wait_for_reset`` keeps it up, with the arms stopped and watched,
+    until a person has reset it and lets the task start again.
+    """
 
     schema_: Literal[1] = Field(alias="schema")
     name: str
     time: Literal["simulated", "real"]
     rate_hz: Annotated[float, Field(gt=0, le=1000)]
+    processes: Literal["one", "separate"] = "one"
     seed: int = 0
     max_duration_s: PositiveFloat = 3600.0
     scene: dict[str, Any] | None = None
+    obstacles: dict[str, BoxSection] = {}
     arms: dict[str, ArmSection] = {}
     sensors: dict[str, SensorSection] = {}
+    pairs: tuple[PairSection, ...] = ()
     interlocks: InterlocksConfig = {}
+    on_trip: Literal["end", "wait_for_reset"] = "end"
     task: TaskSection
     recording: RecordingSection = RecordingSection()
+    collect: CollectSection | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +258,8 @@ class CellPlan:
         task_config: its validated parameters.
         skipped: devices of the file that this task does not need and that are not built.
         devices: every device of the file, whether the task needs it or not.
-        overshoots: how far beyond each workspace, by the interlock's name, its arm may get before it stands.
+        overshoots: by the name of a workspace or clearance, how far its arm gets beyond it, or the two fastest arms
+            towards each other, before they stand.
     """
 
     file: Path
@@ -229,6 +302,8 @@ class _Planner:
 
     def plan(self) -> CellPlan:
         file = self._file
+        if "data" in self._overrides and isinstance(collect := file.data.get("collect"), dict):
+            collect["data"] = self._overrides["data"]
         cell = file.validate(CellFile, file.data)
         self._require_scene_fits(cell)
         task, task_config = self._task(cell)
@@ -242,9 +317,12 @@ class _Planner:
         arms = {name: plan for name, plan in devices.items() if name in needed_arms}
         sensors = {name: plan for name, plan in devices.items() if name in needed_sensors}
         if task:
+            self._require_collection(cell, task)
             self._require_abilities(task, arm_roles, arms)
             self._require_interlocks(cell, task)
+            self._require_processes(cell, task, arm_roles)
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
+        self._require_pairs(cell)
         overshoots = self._require_margins(cell, arm_roles, sensor_roles, arms)
         if self._problems:
             raise InvalidCell(self._problems)
@@ -306,7 +384,8 @@ class _Planner:
 
     def _arm(self, cell: CellFile, name: str) -> DevicePlan | None:
         section = cell.arms[name]
-        plan = self._device(cell, ("arms", name), section, {"deactivate": section.deactivate}, "arm")
+        shared = {"deactivate": section.deactivate, "base_pose_mm_deg": section.base_pose_mm_deg}
+        plan = self._device(cell, ("arms", name), section, shared, "arm")
         offered = plan.spec.capabilities.stop_categories if plan else ()
         if plan and offered and section.stop_category not in offered:
             self._add(
@@ -374,6 +453,31 @@ class _Planner:
                 hint=f"add one: {INTERLOCKS[kind].summary}",
             )
 
+    def _require_processes(self, cell: CellFile, task: TaskSpec, arm_roles: Mapping[str, str]) -> None:
+        """What devices in other processes cannot do is not asked of them."""
+        if cell.processes == "one":
+            return
+        from drivers.process.groups import REMOTE_ABILITIES
+
+        if cell.time == "simulated":
+            self._add(
+                ("processes",), "several processes share real time only", value=cell.processes, hint="`time: real`"
+            )
+        for name, section in cell.sensors.items():
+            if section.estimator.kind == "true_contact":
+                self._add(
+                    ("sensors", name, "estimator"),
+                    "true_contact needs the scene in the task's own process",
+                    hint="use kind: network, or leave out `processes:`",
+                )
+        for role, abilities in task.arms.items():
+            if missing := abilities - REMOTE_ABILITIES:
+                self._add(
+                    ("processes",),
+                    f"{task.name} needs {', '.join(sorted(missing))} of {role!r}, which no other process passes on",
+                    hint="leave out `processes:`",
+                )
+
     def _require_guarded_arms(self, cell: CellFile, roles: set[str]) -> None:
         for name, entry in cell.interlocks.items():
             role = getattr(entry, "arm", None)
@@ -385,6 +489,19 @@ class _Planner:
                     hint=suggest(role, sorted(roles)),
                 )
 
+    def _require_pairs(self, cell: CellFile) -> None:
+        for k, pair in enumerate(cell.pairs):
+            for key, name in (("leader", pair.leader), ("follower", pair.follower)):
+                if name not in cell.arms:
+                    self._add(
+                        ("pairs", str(k), key),
+                        f"there is no arm {name!r}",
+                        value=name,
+                        hint=suggest(name, sorted(cell.arms)),
+                    )
+            if pair.leader == pair.follower:
+                self._add(("pairs", str(k)), "one arm is no pair", value=pair.leader, hint="name two")
+
     def _require_margins(
         self,
         cell: CellFile,
@@ -395,17 +512,17 @@ class _Planner:
         """What an arm may get beyond its workspace before it stands has to fit the margin that there is."""
         found = {}
         for name, entry in cell.interlocks.items():
+            if isinstance(entry, ClearanceConfig):
+                found[name] = self._require_clearance(cell, name, entry, arms)
             if not isinstance(entry, WorkspaceConfig):
                 continue
             arm = arms.get(arm_roles.get(entry.arm, entry.arm))
-            limits = getattr(arm.config, "limits", None) if arm else None
-            if arm is None or not isinstance(limits, LimitsConfig):
-                continue
             section = cell.sensors.get(sensor_roles.get(entry.sensor or "", ""))
             lever_m = 0.0 if section is None else 1e-3 * float(np.linalg.norm(section.tcp_to_sensor_mm_deg[:3]))
-            able = arm.spec.capabilities
-            latency_s = able.command_latency_s + (1.0 / able.state_rate_hz if able.state_rate_hz else 0.0)
-            found[name] = overshoot(limits.build(), lever_m, cell.rate_hz, latency_s)
+            way = None if arm is None else _overshoot(arm, lever_m, cell.rate_hz)
+            if arm is None or way is None:
+                continue
+            found[name] = way
             if entry.margin_mm is not None and found[name].total_m > 1e-3 * entry.margin_mm:
                 self._add(
                     ("interlocks", name, "margin_mm"),
@@ -414,6 +531,40 @@ class _Planner:
                     hint=f"lower arms.{arm.name}.limits.tcp_speed_m_s, or make the box smaller and the margin larger",
                 )
         return found
+
+    def _require_collection(self, cell: CellFile, task: TaskSpec) -> None:
+        if task.labels_frames and cell.collect is None:
+            self._add(("collect",), f"{task.name} labels frames, and nothing says where they go", hint="add `collect:`")
+        if cell.collect is not None and not task.labels_frames:
+            self._add(("collect",), f"{task.name} labels no frames", hint="leave out `collect:`")
+
+    def _require_clearance(
+        self, cell: CellFile, name: str, entry: ClearanceConfig, arms: Mapping[str, DevicePlan]
+    ) -> Overshoot:
+        """Two arms that come near each other must stand before they touch, whatever way they go meanwhile."""
+        ways = []
+        for arm in arms.values():
+            body = cell.arms[arm.name].body
+            if not body and "JointSource" not in arm.spec.capabilities.abilities:
+                self._add(
+                    ("arms", arm.name, "body"),
+                    f"{arm.spec.name} tells only where its tool is; interlocks.{name} has to know its shape",
+                    hint="name capsules: body: [{from_mm: [0, 0, 0], to_mm: [0, 0, -100], radius_mm: 40}]",
+                )
+            ends = [end for part in body for end in (part.from_mm, part.to_mm) if end is not None]
+            lever_m = 1e-3 * max((float(np.linalg.norm(end)) for end in ends), default=0.0)
+            if (way := _overshoot(arm, lever_m, cell.rate_hz)) is not None:
+                ways.append(way)
+        both = together(sorted(ways, key=lambda way: way.total_m)[-2:])
+        if both.total_m > 1e-3 * entry.limit_mm:
+            self._add(
+                ("interlocks", name, "limit_mm"),
+                f"the arms may touch before they stand: {both}, more than the limit of {entry.limit_mm:g} mm",
+                value=entry.limit_mm,
+                hint=f"raise it above {1e3 * both.total_m:.0f}, or lower limits.tcp_speed_m_s of "
+                f"{', '.join(sorted(arms))}",
+            )
+        return both
 
     def _require_abilities(self, task: TaskSpec, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]) -> None:
         for role, abilities in task.arms.items():
@@ -438,3 +589,13 @@ class _Planner:
 
     def _add(self, path: tuple[str, ...], reason: str, *, value: Any = None, hint: str = "") -> None:
         self._problems.append(self._file.problem(path, reason, value=value, hint=hint))
+
+
+def _overshoot(arm: DevicePlan, lever_m: float, rate_hz: float) -> Overshoot | None:
+    """Of a point ``lever_m`` from the tool centre point; None for what has no limits, as a replay."""
+    limits = getattr(arm.config, "limits", None)
+    if not isinstance(limits, LimitsConfig):
+        return None
+    able = arm.spec.capabilities
+    latency_s = able.command_latency_s + (1.0 / able.state_rate_hz if able.state_rate_hz else 0.0)
+    return overshoot(limits.build(), lever_m, rate_hz, latency_s)

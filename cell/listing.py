@@ -18,6 +18,9 @@ def listing() -> dict[str, list[tuple[str, str]]]:
         "tasks": [(name, _summary(point)) for name, point in sorted(tasks_registry.installed().items())],
         "interlocks": [(spec.kind, spec.summary) for spec in INTERLOCKS.values()],
         "emulators": [(name, "") for name in sorted(entry_points.installed("touchcell.emulators"))],
+        "experiments": [
+            (name, _summary(point)) for name, point in sorted(entry_points.installed("touchcell.experiments").items())
+        ],
         "benchmarks": [(name, "") for name in sorted(entry_points.installed("touchcell.benchmarks"))],
         "cells that ship": [(f"configs/{path.name}", _first_comment(path)) for path in _shipped()],
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from drivers.gate import TwistLimits
@@ -43,3 +44,13 @@ def overshoot(limits: TwistLimits, lever_m: float, rate_hz: float, latency_s: fl
     braking_m = 0.5 * limits.speed_m_s**2 / limits.accel_m_s2
     braking_m += 0.5 * turning_m_s * limits.rot_speed_rad_s / limits.rot_accel_rad_s2
     return Overshoot(speed_m_s, speed_m_s / rate_hz, speed_m_s * latency_s, braking_m)
+
+
+def together(ways: Sequence[Overshoot]) -> Overshoot:
+    """The overshoot of two points that come towards each other: the sum of theirs."""
+    return Overshoot(
+        sum(way.speed_m_s for way in ways),
+        sum(way.cycle_m for way in ways),
+        sum(way.latency_m for way in ways),
+        sum(way.braking_m for way in ways),
+    )

@@ -1,4 +1,4 @@
-"""How a person stops a running cell: a key, a signal, a lost terminal, or ``touchcell stop`` from another shell.
+"""How a person stops a running cell, and lets one that has tripped go on: keys, signals, a lost terminal, other shells.
 
 All of them only ask; the loop looks once a cycle. This is no emergency stop: that one is wired.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import getpass
 import os
 import select
 import signal
@@ -16,6 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Final
 
+from cell.desk import Ask, OperatorDesk
 from cell.loop import StopRequest
 from geometry.errors import TouchcellError
 
@@ -23,19 +25,20 @@ PID_FILE: Final = "pid"
 AT_ONCE_KEYS: Final = b" \x1b"
 """Space and Esc; so does every arrow or function key, which begins with Esc."""
 ORDERLY_KEYS: Final = b"sSqQ"
+ASK_KEYS: Final = {ord("r"): Ask.RESET, ord("g"): Ask.RESUME}
 _WAIT_S = 20.0
 _POLL_S = 0.05
 
 
 class NoSuchRun(TouchcellError):
-    """There is no run to stop.
+    """There is no run to ask.
 
     Attributes:
         folder: where it was looked for.
     """
 
     def __init__(self, folder: Path, reason: str) -> None:
-        super().__init__(f"{folder}: {reason}", hint="`touchcell stop RUN` takes the folder of a run that goes on")
+        super().__init__(f"{folder}: {reason}", hint="name the folder of a run that goes on")
         self.folder = folder
 
 
@@ -64,8 +67,11 @@ def stop_on_signals(stop: StopRequest) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def stop_on_keys(stop: StopRequest, stream: IO[str] | None = None) -> Iterator[Callable[[], None]]:
-    """Yields what the loop calls once a cycle: space or Esc stop at once, s or q end in an orderly way.
+def stop_on_keys(
+    stop: StopRequest, stream: IO[str] | None = None, desk: OperatorDesk | None = None
+) -> Iterator[Callable[[], None]]:
+    """Yields what the loop calls once a cycle: space or Esc stop at once, s or q end in an orderly way; r asks ``desk``
+    for a reset, and g to go on.
 
     A terminal that is gone stops at once too. Where ``stream`` (standard input) is no terminal, or belongs to another
     job of the shell, it does nothing. The terminal is left as it was found.
@@ -80,7 +86,7 @@ def stop_on_keys(stop: StopRequest, stream: IO[str] | None = None) -> Iterator[C
     before = termios.tcgetattr(fd)
     tty.setcbreak(fd)
     try:
-        yield lambda: _look(fd, stop)
+        yield lambda: _look(fd, stop, desk)
     finally:
         # A terminal that is gone needs no repair.
         with contextlib.suppress(termios.error):
@@ -95,7 +101,7 @@ def _terminal(stream: IO[str]) -> int | None:
         return None
 
 
-def _look(fd: int, stop: StopRequest) -> None:
+def _look(fd: int, stop: StopRequest, desk: OperatorDesk | None) -> None:
     if not select.select([fd], [], [], 0.0)[0]:
         return
     try:
@@ -106,6 +112,10 @@ def _look(fd: int, stop: StopRequest) -> None:
         stop.ask_at_once()
     elif any(key in ORDERLY_KEYS for key in keys):
         stop.ask()
+    elif desk is not None:
+        for key in dict.fromkeys(keys.lower()):
+            if key in ASK_KEYS:
+                desk.ask(ASK_KEYS[key], getpass.getuser())
 
 
 @contextlib.contextmanager

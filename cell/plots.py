@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import matplotlib
@@ -116,6 +117,24 @@ def plot_trajectory(run: Run, path: Path) -> Path:
     handles = [plt.Line2D([], [], color=colour, lw=2, label=state) for state, colour in colours.items()]
     axes[0].legend(handles=handles, fontsize=9, loc="best")
     figure.savefig(path, dpi=100)
+    plt.close(figure)
+    return path
+
+
+def plot_budget(stages_ms: Mapping[str, Array], path: Path, title: str) -> Path:
+    """Median and 99th percentile of the time that each stage takes, as bars in the order given."""
+    figure, axis = plt.subplots(figsize=(9, 0.5 * len(stages_ms) + 1.5), layout="constrained")
+    position = np.arange(len(stages_ms))
+    for percentile, colour in ((99, "#c6d3ea"), (50, "#4c72b0")):
+        widths = [float(np.percentile(times, percentile)) for times in stages_ms.values()]
+        axis.barh(position, widths, color=colour, label="median" if percentile == 50 else "p99")
+    axis.set_yticks(position, list(stages_ms))
+    axis.invert_yaxis()
+    axis.set_xlabel("ms")
+    axis.set_title(title)
+    axis.legend()
+    axis.grid(axis="x", alpha=0.3)
+    figure.savefig(path, dpi=110)
     plt.close(figure)
     return path
 

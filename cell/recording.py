@@ -8,21 +8,33 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
 
 import numpy as np
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader
+from mcap.records import Channel, Chunk
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from cell.errors import RecordingError
 
 # A kill loses the open chunk at most: 16 KiB is a fraction of a second of a cell's usual 100 kB/s.
 CHUNK_BYTES = 16 * 1024
+RECORDING = "run.mcap"
+"""Name of the recording in a run folder."""
+
+_BLOCK_BYTES = 1 << 20
+_MAGIC = b"\x89MCAP0\r\n"
+_RECORD_HEAD = 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +128,7 @@ def read(path: Path) -> Iterator[Message]:
     except OSError as error:
         raise RecordingError(path, f"cannot be read: {error.strerror}") from None
     with stream:
-        if stream.read(8) != b"\x89MCAP0\r\n":
+        if stream.read(len(_MAGIC)) != _MAGIC:
             raise RecordingError(path, "is no MCAP file")
         stream.seek(0)
         messages = NonSeekingReader(stream, validate_crcs=False).iter_messages(log_time_order=False)
@@ -127,6 +139,50 @@ def read(path: Path) -> Iterator[Message]:
                 # A truncated last chunk ends the file; everything before it has been delivered.
                 return
             yield Message(channel.topic, message.log_time, json.loads(message.data))
+
+
+def follow(path: Path, wait: Callable[[], bool]) -> Iterator[Message]:
+    """All messages of a recording that may still be written, and those that are added to it, until it is finished.
+
+    Args:
+        path: the recording.
+        wait: called when there is nothing new; False gives up.
+
+    Raises:
+        RecordingError: ``path`` is missing or no MCAP file at all.
+    """
+    try:
+        stream = path.open("rb")
+    except OSError as error:
+        raise RecordingError(path, f"cannot be read: {error.strerror}") from None
+    topics: dict[int, str] = {}
+    with stream:
+        held = b""
+        while len(held) < len(_MAGIC):
+            held += stream.read(len(_MAGIC) - len(held))
+            if len(held) < len(_MAGIC) and not wait():
+                return
+        if held != _MAGIC:
+            raise RecordingError(path, "is no MCAP file")
+        held = b""
+        while True:
+            held += stream.read(_BLOCK_BYTES)
+            length = int.from_bytes(held[1:9], "little") if len(held) >= _RECORD_HEAD else 0
+            if len(held) < _RECORD_HEAD + length or len(held) < _RECORD_HEAD:
+                if stream.tell() == path.stat().st_size and not wait():
+                    return
+                continue
+            kind, content = held[0], held[_RECORD_HEAD : _RECORD_HEAD + length]
+            held = held[_RECORD_HEAD + length :]
+            if kind == Opcode.FOOTER:
+                return
+            if kind != Opcode.CHUNK:
+                continue
+            for record in breakup_chunk(Chunk.read(ReadDataStream(BytesIO(content)))):
+                if isinstance(record, Channel):
+                    topics[record.id] = record.topic
+                elif isinstance(record, McapMessage):
+                    yield Message(topics[record.channel_id], record.log_time, json.loads(record.data))
 
 
 def _encode(data: Mapping[str, Any]) -> bytes:

@@ -12,11 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.messages import COMPONENTS
-from cell.recording import Message, read
+from cell.recording import RECORDING, Message, read
 from geometry import se3
 from geometry.types import Array
 
 Times = NDArray[np.int64]
+STAGES = (
+    "read_arms",
+    "read_frame",
+    "preprocess",
+    "infer",
+    "filter",
+    "task_and_control",
+    "supervisor",
+    "gate_and_send",
+    "cycle",
+)
+"""Stages of a control cycle as recorded under /timing, in the order in which they run, and the whole."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +99,7 @@ def write_report(folder: Path) -> str:
     Raises:
         RecordingError: the folder holds no recording.
     """
-    run = load_run(folder / "run.mcap")
+    run = load_run(folder / RECORDING)
     result_file = folder / "result.json"
     result = json.loads(result_file.read_text()) if result_file.exists() else {}
     summary = summarise(run)
@@ -98,7 +110,8 @@ def write_report(folder: Path) -> str:
 
 
 def _pictures(run: Run, folder: Path) -> list[Path]:
-    from cell.plots import plot_agreement, plot_contact, plot_trajectory
+    from cell.contact_pictures import write_strip
+    from cell.plots import plot_agreement, plot_budget, plot_contact, plot_trajectory
 
     moved = bool(run.roles("arms", "command"))
     pictures = []
@@ -108,7 +121,23 @@ def _pictures(run: Run, folder: Path) -> list[Path]:
             pictures.append(plot_agreement(run, sensor, folder / f"agreement_{sensor}.png"))
     if moved:
         pictures.append(plot_trajectory(run, folder / "trajectory.png"))
+    for sensor in run.roles("sensors", "preprocessing"):
+        strip = write_strip(folder / RECORDING, run, sensor, folder / f"markers_{sensor}.png")
+        pictures += [strip] if strip is not None else []
+    if stages_ms := _stages_ms(run):
+        title = "time that each stage of a control cycle took, in the cycles in which it ran"
+        pictures.append(plot_budget(stages_ms, folder / "budget.png", title))
     return pictures
+
+
+def _stages_ms(run: Run) -> dict[str, Array]:
+    """Durations of each stage in the cycles in which it ran, in the order in which they run."""
+    timing = run.series("/timing")
+    if timing is None:
+        return {}
+    columns = {stage: timing.column(f"{stage}_us") for stage in STAGES}
+    ran = {stage: us[np.isfinite(us)] for stage, us in columns.items()}
+    return {stage.replace("_", " "): 1e-3 * us for stage, us in ran.items() if len(us)}
 
 
 def summarise(run: Run) -> dict[str, Any]:

@@ -7,15 +7,14 @@ that its deceleration takes, and a margin, is stopped once more by the strongest
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from drivers.abilities import StopCategory
-from drivers.arm import Arm
+from drivers.abilities import ServoArm, StopCategory
 from drivers.clock import Clock
 from drivers.errors import DeviceError
 from drivers.samples import Stamped, TcpState
@@ -65,7 +64,7 @@ def declared_stop(speed_m_s: float, accel_m_s2: float, margin_s: float = STOP_MA
 class _Stopping:
     """One arm on its way to rest."""
 
-    arm: Arm
+    arm: ServoArm
     category: StopCategory
     told_ns: int
     start: Array | None
@@ -98,34 +97,42 @@ class Stopper:
     Args:
         arms: by role.
         categories: the one for each role when motion has to end.
+        holding: roles of arms that hold something against another: they keep their power unless they are themselves
+            what is wrong.
         clock: injected time.
         period_s: how often the arms are looked at until they stand.
     """
 
     def __init__(
-        self, arms: Mapping[str, Arm], categories: Mapping[str, StopCategory], clock: Clock, period_s: float
+        self,
+        arms: Mapping[str, ServoArm],
+        categories: Mapping[str, StopCategory],
+        clock: Clock,
+        period_s: float,
+        holding: Collection[str] = (),
     ) -> None:
         self._arms = arms
+        self._holding = frozenset(holding)
         self._categories = categories
         self._clock = clock
         self._period_ns = round(1e9 * period_s)
         self._stopping: dict[str, _Stopping] = {}
 
-    def stop(self, *, tripped: bool, strongest: str | None = None) -> Mapping[str, DeviceError]:
+    def stop(self, *, tripped: bool, distrusted: Collection[str] = ()) -> Mapping[str, DeviceError]:
         """Tell every arm to stop, whatever becomes of the others; returns what the arms answered that could not.
 
         Args:
             tripped: whether something is wrong; an arm whose work is merely done stops and holds.
-            strongest: role of an arm that can no longer be trusted and gets the strongest category that it offers.
+            distrusted: roles of arms that can no longer be trusted and get the strongest category that they offer.
         """
         failed: dict[str, DeviceError] = {}
         told: dict[str, StopCategory] = {}
         for role, arm in self._arms.items():
-            told[role] = (
-                self._categories.get(role, StopCategory.STOP_AND_HOLD) if tripped else StopCategory.STOP_AND_HOLD
-            )
-            if role == strongest:
+            told[role] = StopCategory.STOP_AND_HOLD
+            if role in distrusted:
                 told[role] = min(arm.stop_categories)
+            elif tripped and role not in self._holding:
+                told[role] = self._categories.get(role, StopCategory.STOP_AND_HOLD)
             try:
                 arm.stop(told[role])
             except DeviceError as error:
@@ -157,7 +164,7 @@ class Stopper:
         self._stopping.clear()
         return reports
 
-    def _begin(self, arm: Arm, category: StopCategory) -> _Stopping:
+    def _begin(self, arm: ServoArm, category: StopCategory) -> _Stopping:
         now_ns, limits = self._clock.now_ns(), arm.limits
         start = speed_m_s = None
         turn_s = limits.rot_speed_rad_s / limits.rot_accel_rad_s2

@@ -11,6 +11,7 @@ import numpy as np
 from cell.blackbox import ABOUT, MESSAGES
 from cell.errors import RecordingError
 from cell.report import Run, Series, load_run
+from cell.watch import NOTES
 from geometry.types import Array
 
 BEFORE_S: Final = 1.0
@@ -20,11 +21,13 @@ BEFORE_S: Final = 1.0
 def explain(folder: Path) -> str:
     """What tripped the run in ``folder``, what happened in the second before, and how the arms came to rest.
 
-    Also draws ``why.png`` beside it.
+    Also draws ``why.png`` beside it. A run whose process died has the watchdog's note only.
 
     Raises:
         RecordingError: the folder holds no black box.
     """
+    if not (folder / ABOUT).exists() and (folder / NOTES).exists():
+        return _from_watchdog(folder / NOTES)
     about = _about(folder)
     run = load_run(folder / MESSAGES)
     lines = [f"{about['cell']}: {about['outcome']}, cell file sha256 {about['cell_sha256'][:12]}"]
@@ -55,6 +58,23 @@ def _about(folder: Path) -> dict[str, Any]:
     except ValueError:
         raise RecordingError(folder / ABOUT, "is damaged") from None
     return about
+
+
+def _from_watchdog(file: Path) -> str:
+    try:
+        note = json.loads(file.read_text())
+    except (OSError, ValueError):
+        raise RecordingError(file, "is damaged") from None
+    lines = ["the run's own process left no black box; the watchdog noted:", f"  {note['words']}"]
+    if note["limit_s"]:
+        lines[-1] += f"  [value {note['value_s']:.4g}, limit {note['limit_s']:.4g} s]"
+    for name, arm in note["arms"].items():
+        rest = "never seen at rest" if arm["time_s"] is None else f"at rest after {arm['time_s']:.3f} s"
+        lines.append(
+            f"  {name}: told to stop at {1e3 * arm['speed_m_s']:.1f} mm/s; {rest} and {1e3 * arm['distance_m']:.2f} mm"
+            + (", by the strongest category it offers" if arm["escalated"] else "")
+        )
+    return "\n".join(lines)
 
 
 def _cause(cause: dict[str, Any]) -> str:

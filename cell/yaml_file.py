@@ -111,7 +111,8 @@ def load(path: Path) -> YamlFile:
             f"cannot be read: {error.strerror}", file=str(path), hint="`touchcell list` names the cells that ship"
         ) from None
     try:
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        # The loader in C, where it was built, is ten times as fast: 40 ms of a cell's start.
+        node = yaml.compose(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         loader = yaml.SafeLoader("")
         lines: dict[KeyPath, int] = {(): 1}
         if not isinstance(node, yaml.MappingNode):

@@ -16,15 +16,20 @@ from typing import Annotated, Any, Final, Literal, Protocol
 import numpy as np
 from pydantic import BaseModel, Field, PositiveFloat, TypeAdapter, ValidationError, model_validator
 
+from control.clearance import ClearanceConfig
 from control.motion_interlocks import LimitedConfig, StandstillConfig, TrackingConfig
+from control.pair_interlocks import ObjectLostConfig, OutOfStepConfig, TopplingConfig
 from control.settings import GradedSettings, InterlockSettings
+from control.surroundings import PlacedSettings, Surroundings
 from control.tactile_interlocks import (
     ContactLostConfig,
     ExposureConfig,
     FrameFrozenConfig,
     InconsistentConfig,
+    MarkersLostConfig,
     OutOfRangeConfig,
     ShearConfig,
+    SlipConfig,
     TorsionConfig,
     UncertainConfig,
 )
@@ -62,7 +67,8 @@ class Finite:
 
     def check(self, view: CellView) -> Violation | None:
         for role, frame_seq, what, value in self._numbers(view):
-            if not np.isfinite(value).all():
+            # NumPy takes several times as long for one number.
+            if not (math.isfinite(value) if isinstance(value, float) else np.isfinite(value).all()):
                 reason = f"{what} is not finite"
                 return Violation(self.name, self.severity, role, reason, view.now_ns, frame_seq=frame_seq)
         return None
@@ -74,6 +80,8 @@ class Finite:
                 yield role, None, "commanded time-to-live", arm.command.ttl_s
             yield role, None, "measured pose", arm.state.value.T_base_tcp
             yield role, None, "measured twist", arm.state.value.twist
+            if arm.joints is not None:
+                yield role, None, "measured joint angles", arm.joints.value.q
         for role, sensor in view.sensors.items():
             for what, value in (
                 ("depth", sensor.depth_m),
@@ -82,6 +90,8 @@ class Finite:
                 ("shear", sensor.shear_m),
                 ("torsion", sensor.torsion_rad),
                 ("brightness", sensor.brightness),
+                ("contact pose", sensor.T_s_f),
+                ("share of markers", sensor.markers),
             ):
                 if value is not None:
                     yield role, sensor.seq, what, value
@@ -382,7 +392,13 @@ InterlockConfig = Annotated[
     | TorsionConfig
     | TrackingConfig
     | StandstillConfig
-    | LimitedConfig,
+    | LimitedConfig
+    | SlipConfig
+    | MarkersLostConfig
+    | OutOfStepConfig
+    | ObjectLostConfig
+    | TopplingConfig
+    | ClearanceConfig,
     Field(discriminator="kind"),
 ]
 """One entry of the ``interlocks:`` section; ``kind`` says which."""
@@ -430,8 +446,14 @@ INTERLOCKS: Final[Mapping[str, InterlockSpec]] = MappingProxyType(
             InterlockSpec("contact_lost", "a contact that was made is not missing for long", ContactLostConfig),
             InterlockSpec("shear", "no contact is sheared until it saturates or slips", ShearConfig),
             InterlockSpec("torsion", "no contact is twisted too far", TorsionConfig),
+            InterlockSpec("slip", "no contact is sheared further than its depth can hold", SlipConfig),
+            InterlockSpec("markers_lost", "most of the markers expected in view are seen", MarkersLostConfig),
+            InterlockSpec("out_of_step", "leader and follower keep their distance and share the load", OutOfStepConfig),
+            InterlockSpec("object_lost", "what two sensors hold stays between them", ObjectLostConfig),
+            InterlockSpec("toppling", "what is pushed or held does not begin to lean", TopplingConfig),
             InterlockSpec("tracking", "an arm moves as it was sent", TrackingConfig),
             InterlockSpec("standstill", "an arm that is told to stand does", StandstillConfig),
+            InterlockSpec("clearance", "arms keep away from each other, obstacles and themselves", ClearanceConfig),
             InterlockSpec("limited", "no gate holds an arm back for long", LimitedConfig),
         )
     }
@@ -459,7 +481,23 @@ def parse_interlocks(section: Mapping[str, Any]) -> dict[str, InterlockConfig]:
 
 
 def build_interlocks(
-    settings: Mapping[str, InterlockConfig], T_tcp_sensor: Mapping[str, Array]
+    settings: Mapping[str, InterlockConfig],
+    T_tcp_sensor: Mapping[str, Array],
+    surroundings: Surroundings | None = None,
 ) -> tuple[Interlock | TimedInterlock, ...]:
-    """The rules of a cell whose sensors sit at ``T_tcp_sensor``, (4, 4) by role. Raises ConfigError."""
-    return tuple(config.build(name, T_tcp_sensor) for name, config in settings.items())
+    """The rules of a cell.
+
+    Args:
+        settings: by name.
+        T_tcp_sensor: (4, 4) where each sensor sits, by role.
+        surroundings: where arms stand and what they look like.
+
+    Raises:
+        ConfigError: a rule is about something that is not there.
+    """
+    return tuple(
+        config.build_placed(name, T_tcp_sensor, surroundings or Surroundings())
+        if isinstance(config, PlacedSettings)
+        else config.build(name, T_tcp_sensor)
+        for name, config in settings.items()
+    )

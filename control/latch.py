@@ -1,6 +1,6 @@
 """The latch: what has tripped stays tripped until a person resets it, and a reset never moves anything.
 
-    CLEAR -trip-> TRIPPED -fault-> FAULTED      TRIPPED | FAULTED -reset (cause gone, at rest, idle)-> CLEAR
+    CLEAR -trip-> TRIPPED -fault-> FAULTED      TRIPPED | FAULTED <-> CAUSE_GONE -reset (at rest, idle)-> CLEAR
 
 Manual reset after IEC 60204-1 (9.2) and ISO 13849-1 (5.2.2): deliberate, refused while the cause is present, and not
 itself a start. It is not safety-rated: the hard-wired emergency stop and the arm's own controller are the protection.
@@ -22,6 +22,8 @@ class LatchState(Enum):
     CLEAR = "clear"
     TRIPPED = "tripped"
     FAULTED = "faulted"
+    CAUSE_GONE = "cause gone"
+    """Still latched: a person may reset it now."""
 
 
 class Refusal(Enum):
@@ -71,7 +73,13 @@ class Latch:
     @property
     def state(self) -> LatchState:
         """Present state."""
-        return self._state
+        gone = self._state is not LatchState.CLEAR and not self._present
+        return LatchState.CAUSE_GONE if gone else self._state
+
+    @property
+    def faulted(self) -> bool:
+        """Whether any of the causes is a fault, after which a device needs recovery."""
+        return self._state is LatchState.FAULTED
 
     @property
     def first_cause(self) -> Violation | None:
@@ -82,11 +90,6 @@ class Latch:
     def causes(self) -> tuple[Violation, ...]:
         """The first cause, then the first violation of every other interlock and subject since, in order of time."""
         return tuple(self._causes.values())
-
-    @property
-    def cause_present(self) -> bool:
-        """Whether the latest cycle still showed a violation."""
-        return self._present
 
     def update(self, violations: Sequence[Violation]) -> None:
         """Take in one cycle's violations; an empty sequence says that no cause is present any more."""

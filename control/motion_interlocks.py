@@ -18,7 +18,7 @@ from geometry.types import Array
 
 @dataclass(frozen=True, slots=True)
 class Standstill:
-    """An arm that was told to stand stays where it stood ``settle_s`` after."""
+    """An arm that was told to stand stays where it stood ``settle_s`` after, and ``settle_s`` after each violation."""
 
     name: str
     severity: Severity
@@ -36,8 +36,9 @@ class Standstill:
             mark = past.get(role, Mark(view.now_ns))
             if not mark.values and view.now_ns - mark.since_ns >= round(1e9 * self.settle_s):
                 mark = Mark(mark.since_ns, values=tuple(position.tolist()))
-            marks[role] = mark
             drift_m = math.dist(position, mark.values) if mark.values else 0.0
+            # Told once: where it stands from now on is what counts, or nobody could ever reset this.
+            marks[role] = Mark(view.now_ns) if drift_m > self.limit_m else mark
             if found is None and drift_m > self.limit_m:
                 reason = f"has drifted by {1e3 * drift_m:.2f} mm while told to stand, limit {1e3 * self.limit_m:g} mm"
                 found = Violation(

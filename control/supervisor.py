@@ -88,9 +88,14 @@ class Supervisor:
         """The latch, to be read."""
         return self._latch
 
-    def review(self, view: CellView) -> Verdict:
-        """Check ``view``, latch what it shows, and say whether its commands may be sent. Never raises."""
-        violations = self._violations(view)
+    def review(self, view: CellView, alarms: Sequence[Violation] = ()) -> Verdict:
+        """Check ``view``, latch what it shows, and say whether its commands may be sent. Never raises.
+
+        Args:
+            view: what is known in this cycle.
+            alarms: what others have found, the watchdog for one; taken as it is.
+        """
+        violations = (*alarms, *self._violations(view))
         self._latch.update(violations)
         first = self._latch.first_cause
         return Verdict(
@@ -100,9 +105,9 @@ class Supervisor:
             trip=None if first is None else first.as_error(),
         )
 
-    def reset(self, token: OperatorToken, view: CellView) -> ResetDone | ResetRefused:
-        """Clear the latch on a person's request, judged on ``view`` as it is now; nothing moves by it."""
-        self._latch.update(self._violations(view))
+    def reset(self, token: OperatorToken, view: CellView, alarms: Sequence[Violation] = ()) -> ResetDone | ResetRefused:
+        """Clear the latch on a person's request, judged on ``view`` and ``alarms`` as they are; nothing moves by it."""
+        self._latch.update((*alarms, *self._violations(view)))
         return self._latch.reset(
             token,
             at_rest=all(self._at_rest(arm.state.value.twist) for arm in view.arms.values()),
@@ -117,7 +122,7 @@ class Supervisor:
 
     def _escalated(self, found: Sequence[Violation], now_ns: int) -> tuple[Violation, ...]:
         """``found``, with a trip in place of each limit that has lasted for too long."""
-        limiting = {(v.interlock, v.subject) for v in found if v.severity is Severity.LIMIT}
+        limiting = {(v.interlock, v.subject) for v in found if v.severity is Severity.LIMIT and not v.may_last}
         self._limited_since_ns = {key: self._limited_since_ns.get(key, now_ns) for key in limiting}
         lasting = {key for key, since_ns in self._limited_since_ns.items() if now_ns - since_ns > LIMIT_FOR_NS}
         return tuple(

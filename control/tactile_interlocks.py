@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
@@ -123,6 +123,27 @@ def _torsions(view: CellView) -> Iterator[Reading]:
             yield Reading(role, math.degrees(abs(sensor.torsion_rad)), sensor.seq)
 
 
+def _markers_missing(view: CellView) -> Iterator[Reading]:
+    for role, sensor in view.sensors.items():
+        if sensor.markers is not None:
+            yield Reading(role, 100.0 * (1.0 - sensor.markers), sensor.seq)
+
+
+@dataclass(frozen=True, slots=True)
+class _ShearPerDepth:
+    """How far contacts are sheared for their depth, where they are deep enough for that to be known."""
+
+    min_depth_m: float
+    states: frozenset[str]
+
+    def __call__(self, view: CellView) -> Iterator[Reading]:
+        if not view.works_in(self.states):
+            return
+        for role, sensor in view.sensors.items():
+            if sensor.shear_m is not None and sensor.depth_m is not None and sensor.depth_m >= self.min_depth_m:
+                yield Reading(role, sensor.shear_m / sensor.depth_m, sensor.seq)
+
+
 def _out_of_range(view: CellView) -> Mapping[str, str]:
     return {role: "outside the training range" for role, sensor in view.sensors.items() if not sensor.in_range}
 
@@ -231,3 +252,42 @@ class TorsionConfig(GradedSettings):
         """The rule."""
         leave, hold_s = self.leave_deg or LEAVE * self.limit_deg, 1e-3 * self.hold_ms
         return Sustained(name, self.level, _torsions, "twisted by", self.limit_deg, leave, "deg", hold_s)
+
+
+class SlipConfig(GradedSettings):
+    """Largest tangential shear of a contact for its depth, while the task is at work in ``states``, or in any state.
+
+    On the real images estimates of shear fall behind the motion once shear exceeds depth: there the skin begins to
+    slide. Contacts more shallow than ``min_depth_mm`` are not judged.
+    """
+
+    kind: Literal["slip"]
+    limit_ratio: PositiveFloat
+    leave_ratio: PositiveFloat | None = None
+    hold_ms: NonNegativeFloat = 0.0
+    min_depth_mm: PositiveFloat = 1.0
+    states: tuple[str, ...] = ()
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        leave, hold_s = self.leave_ratio or LEAVE * self.limit_ratio, 1e-3 * self.hold_ms
+        measure = _ShearPerDepth(1e-3 * self.min_depth_mm, frozenset(self.states))
+        return Sustained(name, self.level, measure, "shear per depth", self.limit_ratio, leave, "", hold_s)
+
+
+class MarkersLostConfig(InterlockSettings):
+    """Largest share of the markers expected in view that may be missing, and in how many frames on end.
+
+    Only estimators that look at markers tell; for others it never trips.
+    """
+
+    kind: Literal["markers_lost"]
+    limit_percent: Annotated[float, Field(gt=0.0, lt=100.0)]
+    leave_percent: PositiveFloat | None = None
+    frames: PositiveInt = 1
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        leave = self.leave_percent or LEAVE * self.limit_percent
+        what = "markers missing:"
+        return Sustained(name, self.level, _markers_missing, what, self.limit_percent, leave, "%", frames=self.frames)

@@ -92,9 +92,13 @@ class Sustained:
 
     def judge(self, view: CellView, past: Past) -> Judgement:
         """The first subject that is above for too long."""
+        return self.over(view, self.measure(view), past)
+
+    def over(self, view: CellView, readings: Iterable[Reading], past: Past) -> Judgement:
+        """The same for readings that somebody else has taken."""
         marks: dict[str, Mark] = {}
         found: Violation | None = None
-        for reading in self.measure(view):
+        for reading in readings:
             mark = past.get(reading.subject)
             if not reading.value > (self.limit if mark is None else self.leave):
                 continue
@@ -124,6 +128,36 @@ class Sustained:
             unit=self.unit,
             frame_seq=reading.seq,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class AnyOf:
+    """Several rules under one name: the first that is broken counts."""
+
+    name: str
+    severity: Severity
+    rules: tuple[TimedInterlock, ...]
+
+    def judge(self, view: CellView, past: Past) -> Judgement:
+        """The violation of the first rule that has one."""
+        marks: dict[str, Mark] = {}
+        found: Violation | None = None
+        for k, rule in enumerate(self.rules):
+            violation, left = rule.judge(view, share(past, k))
+            marks.update(shared(left, k))
+            found = found or violation
+        return found, marks
+
+
+def share(past: Past, number: int) -> Past:
+    """The marks of the rule with that number, of several under one name."""
+    prefix = f"{number}:"
+    return {key.removeprefix(prefix): mark for key, mark in past.items() if key.startswith(prefix)}
+
+
+def shared(marks: Past, number: int) -> Past:
+    """``marks`` of the rule with that number, to be kept with those of others."""
+    return {f"{number}:{key}": mark for key, mark in marks.items()}
 
 
 @dataclass(frozen=True, slots=True)

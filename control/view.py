@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivers.commands import Sent, TwistCommand, in_base_axes
-from drivers.samples import Stamped, TcpState
+from drivers.samples import JointState, Stamped, TcpState
 from geometry.types import Array
 
 
@@ -20,11 +20,13 @@ class ArmView:
         state: newest measured state.
         command: what is about to be sent; None when it is told to stop.
         sent: what its gate let through in the cycle before, and why it differs; None when it was told to stop.
+        joints: newest joint angles, where an interlock looks at them.
     """
 
     state: Stamped[TcpState]
     command: TwistCommand | None = None
     sent: Sent[TwistCommand] | None = None
+    joints: Stamped[JointState] | None = None
 
     def commanded_twist(self) -> Array | None:
         """(6,) the command's twist of the tool centre point along base axes; None without a command."""
@@ -55,6 +57,9 @@ class SensorView:
         torsion_rad: estimated rotation about the surface normal; None without contact.
         content: number that changes with the frame's picture, noise included; None where nobody looks at it.
         brightness: the frame's mean grey level; None likewise.
+        T_s_f: (4, 4) estimated pose of the surface in the sensor's frame; None without contact.
+        markers: share of the markers expected in view that are seen; None where the estimator looks at none.
+        arm: role of the arm that carries it; None where nothing moves it.
     """
 
     t_frame_ns: int
@@ -68,13 +73,24 @@ class SensorView:
     torsion_rad: float | None = None
     content: int | None = None
     brightness: float | None = None
+    T_s_f: Array | None = None
+    markers: float | None = None
+    arm: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class CellView:
-    """The cell at ``now_ns``, arms and sensors by their role in the task, and the state that the task is in."""
+    """The cell at ``now_ns``: arms and sensors by their role in the task, and the state that the task is in.
+
+    ``at_work`` is False while a run that has tripped waits for a person: then nothing is being pushed or held.
+    """
 
     now_ns: int
     arms: Mapping[str, ArmView] = field(default_factory=dict)
     sensors: Mapping[str, SensorView] = field(default_factory=dict)
     task_state: str = ""
+    at_work: bool = True
+
+    def works_in(self, states: frozenset[str]) -> bool:
+        """Whether the task is at work, and in one of ``states`` if any are named."""
+        return self.at_work and (not states or self.task_state in states)

@@ -33,6 +33,7 @@ class Violation:
         limit: what is allowed, in ``unit``; None likewise.
         unit: of both.
         frame_seq: number of the tactile frame that showed it, where it was one.
+        may_last: whether motion may stay slowed for as long as it likes; else a limit that lasts becomes a trip.
     """
 
     interlock: str
@@ -44,6 +45,7 @@ class Violation:
     limit: float | None = None
     unit: str = ""
     frame_seq: int | None = None
+    may_last: bool = False
 
     def as_error(self) -> SafetyTrip:
         """The same as an exception, for those who must not go on."""

@@ -6,6 +6,8 @@ from enum import IntEnum
 from typing import Protocol, runtime_checkable
 
 from drivers.commands import Sent, TwistCommand
+from drivers.gate import TwistLimits
+from drivers.kinematics import DifferentialIk
 from drivers.lease import Lease
 from drivers.samples import Frame, JointState, Stamped, TcpState
 from geometry.types import Array
@@ -73,6 +75,26 @@ class Stoppable(Protocol):
 
     def at_rest(self) -> bool:
         """Whether it stands still now."""
+        ...
+
+
+class ServoArm(TcpSource, TwistSink, Stoppable, Protocol):
+    """What a run loop needs of an arm that it moves, in this process or in another."""
+
+    name: str
+
+    @property
+    def limits(self) -> TwistLimits:
+        """What its gate allows."""
+        ...
+
+    @property
+    def stop_categories(self) -> frozenset[StopCategory]:
+        """Stop categories that it offers in software."""
+        ...
+
+    def kinematics(self) -> DifferentialIk | None:
+        """Of its joints, for an arm that tells them and whose chain is known; None for others."""
         ...
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import replace
 from typing import final
 
 import numpy as np
@@ -22,6 +21,7 @@ from drivers.commands import Adjustment, Sent, TwistCommand, TwistFrame
 from drivers.device import DeactivatePolicy, Device, Lifecycle
 from drivers.errors import CommandRejected, DeviceError, DeviceFault, FaultClass, LifecycleError, Rejection
 from drivers.gate import TwistGate, TwistLimits
+from drivers.kinematics import DifferentialIk, LocalIk
 from drivers.lease import Lease, LeaseDesk
 from drivers.registry import DriverConfig
 from drivers.samples import Stamped, TcpState
@@ -33,16 +33,25 @@ _SHORTEST_TTL_S = 1e-3
 
 
 class LimitsConfig(DriverConfig):
-    """The ``limits:`` of an arm in the cell file: speeds and accelerations of the tool centre point."""
+    """The ``limits:`` of an arm in the cell file: speeds, accelerations and jerks of the tool centre point."""
 
     tcp_speed_m_s: float = Field(default=0.10, gt=0.0, le=1.0)
     tcp_accel_m_s2: float = Field(default=0.5, gt=0.0, le=10.0)
     tcp_rot_speed_rad_s: float = Field(default=0.5, gt=0.0, le=4.0)
     tcp_rot_accel_rad_s2: float = Field(default=2.5, gt=0.0, le=20.0)
+    tcp_jerk_m_s3: float = Field(default=50.0, gt=0.0, le=5000.0)
+    tcp_rot_jerk_rad_s3: float = Field(default=250.0, gt=0.0, le=20000.0)
 
     def build(self) -> TwistLimits:
         """The gate's limits."""
-        return TwistLimits(self.tcp_speed_m_s, self.tcp_accel_m_s2, self.tcp_rot_speed_rad_s, self.tcp_rot_accel_rad_s2)
+        return TwistLimits(
+            self.tcp_speed_m_s,
+            self.tcp_accel_m_s2,
+            self.tcp_rot_speed_rad_s,
+            self.tcp_rot_accel_rad_s2,
+            self.tcp_jerk_m_s3,
+            self.tcp_rot_jerk_rad_s3,
+        )
 
 
 class Arm(Device):
@@ -112,12 +121,9 @@ class Arm(Device):
 
         Raises:
             CommandRejected: nothing was sent; ``reason`` tells why.
-            StaleData: the pose is too old to turn a twist along tool axes.
+            StaleData: the pose is too old to turn a twist along tool axes, or the joints to be kept within limits.
         """
-        sent = self._gate.admit(command, lease, self.state, self._tool_pose(command))
-        twist, lost = self._followable(sent.command.twist)
-        if lost:
-            sent = replace(sent, command=replace(sent.command, twist=twist), adjustments=sent.adjustments + lost)
+        sent = self._gate.admit(command, lease, self.state, self._tool_pose(command), self._followable, self._local_ik)
         left_s = command.ttl_s - (sent.t_ns - command.t_ns) * 1e-9
         self._stream_twist(sent.command.twist, max(left_s, _SHORTEST_TTL_S), sent.t_ns)
         return sent
@@ -169,8 +175,16 @@ class Arm(Device):
         """Begin to stop at once and return; called in ACTIVE and FAULTED, with an offered category only."""
 
     def _followable(self, twist_base: Array) -> tuple[Array, tuple[Adjustment, ...]]:
-        """What the arm can follow of an admitted twist, and why it differs: all of it, unless a driver knows better."""
+        """What the arm can follow of a twist, and why it differs: all of it, unless a driver knows better."""
         return twist_base, ()
+
+    def kinematics(self) -> DifferentialIk | None:
+        """Of its joints, for an arm that tells them and whose chain is known; None for others."""
+        return None
+
+    def _local_ik(self) -> LocalIk | None:
+        """The same where the joints are now, for the gate to keep them within limits. Raises StaleData."""
+        return None
 
     def _after_rest(self, policy: DeactivatePolicy) -> None:
         """Obey ``policy``; called when the arm stands still."""

@@ -13,7 +13,6 @@ from __future__ import annotations
 import threading
 from collections import deque
 from functools import partial
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -40,6 +39,7 @@ from drivers.errors import (
     TransportTimeout,
 )
 from drivers.joint_arm import JointArm
+from drivers.joint_limits import JointLimitsConfig
 from drivers.joint_setpoint import JointSetpoint
 from drivers.kinematics import GRAVITY_M_S2, ChainDescription, DifferentialIk, SerialChain, Tool, Vector3
 from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
@@ -101,6 +101,7 @@ class DamiaoCanConfig(DriverConfig):
     tracking_error_deg: Positive = 8.0
 
     limits: LimitsConfig = LimitsConfig()
+    joint_limits: JointLimitsConfig = JointLimitsConfig()
 
     park_deg: tuple[float, ...] | None = None
     park_tolerance_deg: Positive = 5.0
@@ -132,8 +133,7 @@ class DamiaoCanConfig(DriverConfig):
 
     def describe(self) -> ChainDescription:
         """The arm. Raises ConfigError if there is none or it has another number of joints."""
-        is_file = Path(self.chain).suffix in (".yaml", ".yml")
-        found = ChainDescription.read(Path(self.chain)) if is_file else ChainDescription.shipped(self.chain)
+        found = ChainDescription.named(self.chain)
         if len(found.joints) != len(self.motors):
             raise ConfigError(
                 f"chain {found.name!r} has {len(found.joints)} joints", key="motors", value=len(self.motors)
@@ -154,10 +154,11 @@ class DamiaoCanArm(JointArm):
     """
 
     def __init__(self, name: str, config: DamiaoCanConfig, clock: Clock) -> None:
-        super().__init__(name, clock, config.limits.build())
+        super().__init__(name, clock, config.limits.build(), max_state_age_s=config.max_silence_s)
         self._config = config
         self._chain = SerialChain(config.describe(), config.tool, config.gravity_m_s2)
-        self._setpoint = JointSetpoint(self._chain, DifferentialIk(self._chain), self.limits)
+        self._ik = DifferentialIk(self._chain, config.joint_limits.settings())
+        self._setpoint = JointSetpoint(self._chain, self._ik, self.limits)
         motors = config.motors
         self._direction = np.array([motor.direction for motor in motors], dtype=np.float64)
         self._offset = np.deg2rad([motor.offset_deg for motor in motors])

@@ -20,7 +20,6 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -49,6 +48,7 @@ from drivers.errors import (
 from drivers.feetech_bus import Answer, ServoBus
 from drivers.feetech_codec import FaultBit, Register, ServoState
 from drivers.joint_arm import JointArm
+from drivers.joint_limits import JointLimitsConfig
 from drivers.joint_setpoint import JointSetpoint
 from drivers.kinematics import ChainDescription, DifferentialIk, SerialChain, Tool
 from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
@@ -128,6 +128,7 @@ class FeetechSerialConfig(DriverConfig):
     torque_limit_percent: Annotated[float, Field(ge=5.0, le=100.0)] = 60.0
 
     limits: LimitsConfig = LimitsConfig()
+    joint_limits: JointLimitsConfig = JointLimitsConfig()
 
     park_deg: tuple[float, ...] | None = None
     park_tolerance_deg: Positive = 5.0
@@ -164,8 +165,7 @@ class FeetechSerialConfig(DriverConfig):
             ConfigError: there is no such arm, it has another number of joints, a joint has no range left, or the park
                 pose is outside it.
         """
-        is_file = Path(self.chain).suffix in (".yaml", ".yml")
-        found = ChainDescription.read(Path(self.chain)) if is_file else ChainDescription.shipped(self.chain)
+        found = ChainDescription.named(self.chain)
         if len(found.joints) != len(self.servos):
             raise ConfigError(
                 f"chain {found.name!r} has {len(found.joints)} joints", key="servos", value=len(self.servos)
@@ -202,7 +202,8 @@ class FeetechSerialArm(JointArm):
         super().__init__(name, clock, config.limits.build(), max_state_age_s=config.max_silence_s)
         self._config = config
         self._chain = SerialChain(config.describe(), config.tool)
-        self._setpoint = JointSetpoint(self._chain, DifferentialIk(self._chain), self.limits)
+        self._ik = DifferentialIk(self._chain, config.joint_limits.settings())
+        self._setpoint = JointSetpoint(self._chain, self._ik, self.limits)
         self._ids = [servo.id for servo in config.servos]
         self._bus = ServoBus(name, self._ids, partial(_open_port, name, config), clock, echo=config.echo)
         self._thread: threading.Thread | None = None
@@ -351,9 +352,6 @@ class FeetechSerialArm(JointArm):
 
     def _followable(self, twist_base: Array) -> tuple[Array, tuple[Adjustment, ...]]:
         twist, self._lost = followable(self._chain.jacobian(self._setpoint.q), twist_base)
-        turning, most = float(np.linalg.norm(twist[3:])), self.limits.rot_speed_rad_s
-        if turning > most:
-            return twist * (most / turning), (*self._lost, Adjustment("tcp angular speed", turning, most))
         return twist, self._lost
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:

@@ -42,6 +42,8 @@ from drivers.errors import (
 )
 from drivers.franka_errors import BY_NAME, ERRORS, MODES, VendorError
 from drivers.franka_reader import PERIOD_S, Reading, StateReader
+from drivers.joint_limits import JointLimitsConfig
+from drivers.kinematics import ChainDescription, DifferentialIk, LocalIk, SerialChain, Tool, require_same_arm
 from drivers.lease import Lease
 from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
 from drivers.samples import JointState, Stamped, TcpState
@@ -93,6 +95,7 @@ class FrankaConfig(DriverConfig):
     Attributes:
         host: address of the controller.
         limits: of the tool centre point.
+        joint_limits: margins to the joint limits, which the controller tells, and to singularities.
         enforce_realtime: refuse to run without a PREEMPT_RT kernel; without one expect communication reflexes.
         dynamics_factor: share of the arm's largest acceleration and jerk (and speed, for goals) that motions may use.
         stop_dynamics_factor: the same for stopping, at the end of a time-to-live as well.
@@ -104,6 +107,7 @@ class FrankaConfig(DriverConfig):
 
     host: str = Field(min_length=1)
     limits: LimitsConfig = LimitsConfig()
+    joint_limits: JointLimitsConfig = JointLimitsConfig()
     enforce_realtime: bool = True
     dynamics_factor: float = Field(default=0.05, gt=0.0, le=1.0)
     stop_dynamics_factor: float = Field(default=0.2, gt=0.0, le=1.0)
@@ -144,6 +148,7 @@ class FrankaArm(Arm):
         self._contact = threading.Event()
         self._moved_ns = clock.now_ns()
         self._joint_limits = np.zeros((7, 2))
+        self._ik = self._kinematics_of(SerialChain(ChainDescription.shipped("fr3")))
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
         """Newest state. Raises StaleData if it is older than ``max_age_s``, and the fault that makes it FAULTED."""
@@ -225,6 +230,10 @@ class FrankaArm(Arm):
             "external_force_n": float(np.linalg.norm(reading.wrench[:3])),
         }
 
+    def kinematics(self) -> DifferentialIk:
+        """Of its joints, with the tool that the controller has since ``configure``."""
+        return self._ik
+
     def watchdog_s(self) -> float:
         """Silence after which the controller stops the arm: 20 command packets at 1 kHz, fixed by Franka."""
         return _WATCHDOG_S
@@ -273,6 +282,7 @@ class FrankaArm(Arm):
         try:
             self._robot.set_collision_behavior([_JOINT_TORQUE_NM] * 7, [force] * 3 + [torque] * 3)
             self._set_frames()
+            self._ik = self._modelled()
             # A reading from before would have another tool centre point.
             self._await_reading(_FIRST_STATE_S, "state", after_ms=self._robot.state.time.to_msec())
         except (self._franky.Exception, RuntimeError) as error:
@@ -295,6 +305,20 @@ class FrankaArm(Arm):
         if np.abs(state.EE_T_K.matrix - np.eye(4)).max() > _FRAME_TOLERANCE:
             self._robot.set_k(np.eye(4).ravel())
             self._verify_frame("EE_T_K", np.eye(4))
+
+    def _modelled(self) -> DifferentialIk:
+        """Kinematics with the joint limits that the controller tells and the tool that it has now."""
+        state = self._robot.state
+        tool = se3.to_euler_mm_deg(np.asarray(state.F_T_EE.matrix)).tolist()
+        chain = SerialChain(
+            ChainDescription.shipped("fr3").narrowed(np.rad2deg(self._joint_limits)),
+            Tool(origin_mm=tuple(tool[:3]), rotation_deg=tuple(tool[3:])),
+        )
+        require_same_arm(self.name, chain, np.asarray(state.q), np.asarray(state.O_T_EE.matrix))
+        return self._kinematics_of(chain)
+
+    def _kinematics_of(self, chain: SerialChain) -> DifferentialIk:
+        return DifferentialIk(chain, self._config.joint_limits.settings(own_controller=True))
 
     def _verify_frame(self, name: str, wanted: Array) -> None:
         actual = np.asarray(getattr(self._robot.state, name).matrix)
@@ -363,6 +387,9 @@ class FrankaArm(Arm):
             ]
         )
         self._start(motion, franky.CartesianVelocityStopMotion, franky.ControlSignalType.CartesianVelocities)
+
+    def _local_ik(self) -> LocalIk:
+        return self._ik.at(self.joints(self._max_state_age_s).value.q)
 
     def _begin_stop(self, category: StopCategory) -> None:
         # While a silent arm rests, franky would wait for it.

@@ -1,12 +1,14 @@
 """The last check before an arm: finite, shape, frame, lease, mode, freshness, limits, in that order.
 
 ``min``, ``max`` and ``np.clip`` turn NaN into full speed or let it pass, so whatever is not finite is refused before
-any limit is applied. Speed and acceleration limits are relative to the last command sent, never to the measured state.
+any limit is applied. Acceleration and jerk are those of one command after another, never of the measured state; where
+the joints are is measured.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,18 +17,33 @@ from drivers.clock import Clock
 from drivers.commands import Adjustment, Sent, TwistCommand, TwistFrame, in_base_axes
 from drivers.device import Lifecycle
 from drivers.errors import CommandRejected, Rejection
+from drivers.kinematics import LocalIk
 from drivers.lease import Lease, LeaseDesk
 from geometry.types import Array
 
 
 @dataclass(frozen=True, slots=True)
 class TwistLimits:
-    """Largest speeds and accelerations of the tool centre point (norms of the linear and the angular part)."""
+    """Largest speeds, accelerations and jerks of the tool centre point (norms of the linear and the angular part)."""
 
     speed_m_s: float
     accel_m_s2: float
     rot_speed_rad_s: float
     rot_accel_rad_s2: float
+    jerk_m_s3: float
+    rot_jerk_rad_s3: float
+
+
+Follow = Callable[[Array], tuple[Array, tuple[Adjustment, ...]]]
+"""What an arm can follow of a twist (6,) along base axes, and why that differs."""
+
+
+def _follow_all(twist: Array) -> tuple[Array, tuple[Adjustment, ...]]:
+    return twist, ()
+
+
+def _no_joints() -> LocalIk | None:
+    return None
 
 
 class TwistGate:
@@ -53,36 +70,91 @@ class TwistGate:
     def reset(self) -> None:
         """Forget the last command: the next one is limited as if from rest."""
         self._last = np.zeros(6)
+        self._last_accel = np.zeros(6)
         self._last_ns = self._clock.now_ns() - round(self._max_ttl_s * 1e9)
         self._expires_ns = self._last_ns
 
-    def admit(self, command: TwistCommand, lease: Lease, state: Lifecycle, T_base_tcp: Array) -> Sent[TwistCommand]:
+    def admit(
+        self,
+        command: TwistCommand,
+        lease: Lease,
+        state: Lifecycle,
+        T_base_tcp: Array,
+        follow: Follow = _follow_all,
+        joints: Callable[[], LocalIk | None] = _no_joints,
+    ) -> Sent[TwistCommand]:
         """Refuse the command or return what may be sent, along base axes, with every adjustment named.
+
+        Args:
+            command: what is asked for.
+            lease: of whoever asks.
+            state: of the arm.
+            T_base_tcp: (4, 4) for commands along tool axes.
+            follow: asked first what the arm can follow at all.
+            joints: tells where the joints are, asked once the command is found fit; None: they are not limited here.
 
         Raises:
             CommandRejected: with the first reason that applies; nothing may be sent.
         """
         now_ns = self._clock.now_ns()
         self._check(command, lease, state, now_ns)
-        wanted = in_base_axes(command, T_base_tcp)
-        adjustments: list[Adjustment] = []
-        # After a silence longer than the time-to-live the arm stands: limit from zero.
-        previous = self._last if now_ns <= self._expires_ns else np.zeros(6)
-        dt_s = min(command.ttl_s, (now_ns - self._last_ns) * 1e-9)
-        limits = self._limits
-        allowed = _limited(wanted, limits.speed_m_s, limits.rot_speed_rad_s, "speed", adjustments)
-        step = _limited(
-            allowed - previous,
-            limits.accel_m_s2 * dt_s,
-            limits.rot_accel_rad_s2 * dt_s,
-            "acceleration",
-            adjustments,
-        )
-        allowed = previous + step
+        wanted, lost = follow(in_base_axes(command, T_base_tcp))
+        adjustments = list(lost)
+        if now_ns > self._expires_ns:
+            # After a silence longer than the time-to-live the arm stands: limit from rest.
+            self._last, self._last_accel = np.zeros(6), np.zeros(6)
+        dt_s = max(min(command.ttl_s, (now_ns - self._last_ns) * 1e-9), _SHORTEST_STEP_S)
+        limits, local = self._limits, joints()
+        wanted = _limited(wanted, limits.speed_m_s, limits.rot_speed_rad_s, adjustments)
+        if local is not None:
+            wanted = _within(local, wanted, adjustments)
+        step = self._step(wanted - self._last, dt_s, adjustments)
+        if local is not None:
+            share, why = local.acceleration_scale(step, dt_s)
+            step = share * step
+            adjustments.extend(why)
+        # Nothing that smoothes a motion may carry it over the limits that end it.
+        allowed = _limited(self._last + step, limits.speed_m_s, limits.rot_speed_rad_s, adjustments)
+        if local is not None:
+            allowed = _within(local, allowed, adjustments)
+        self._last_accel = (allowed - self._last) / dt_s
         self._last = allowed
         self._last_ns = now_ns
         self._expires_ns = now_ns + round(command.ttl_s * 1e9)
         return Sent(replace(command, twist=allowed, frame=TwistFrame.BASE), now_ns, tuple(adjustments))
+
+    def _step(self, way: Array, dt_s: float, adjustments: list[Adjustment]) -> Array:
+        """Change of the twist within ``dt_s`` on the ``way`` (6,) to the wanted one.
+
+        The acceleration points along the way, as large as allowed and as can still be taken off before the way ends; it
+        changes by no more than the jerk allows.
+        """
+        limits = self._limits
+        parts = (
+            ("linear", slice(0, 3), limits.accel_m_s2, limits.jerk_m_s3),
+            ("angular", slice(3, 6), limits.rot_accel_rad_s2, limits.rot_jerk_rad_s3),
+        )
+        rate = smooth = 1.0 / dt_s
+        for name, part, most, jerk in parts:
+            left = _norm(way[part])
+            if left > most * dt_s:
+                adjustments.append(Adjustment(f"tcp {name} acceleration", left / dt_s, most))
+                rate = min(rate, most / left)
+            if left > 0.0:
+                # The largest acceleration that the jerk can take off again before the way ends.
+                braked = math.sqrt(2.0 * jerk / left) - 0.5 * jerk * dt_s / left
+                smooth = min(smooth, max(braked, min(1.0 / dt_s, jerk * dt_s / left)))
+        change = min(rate, smooth) * way - self._last_accel
+        share = 1.0
+        for name, part, _, jerk in parts:
+            asked = max(_norm(change[part]), rate * _norm(way[part]) if smooth < rate else 0.0) / dt_s
+            if asked > jerk * _ROUNDING:
+                adjustments.append(Adjustment(f"tcp {name} jerk", asked, jerk))
+            if _norm(change[part]) > jerk * dt_s:
+                share = min(share, jerk * dt_s / _norm(change[part]))
+        if share == 1.0 and min(rate, smooth) * dt_s == 1.0:
+            return way
+        return (self._last_accel + share * change) * dt_s
 
     def _check(self, command: TwistCommand, lease: Lease, state: Lifecycle, now_ns: int) -> None:
         twist = np.asarray(command.twist, dtype=np.float64)
@@ -115,16 +187,34 @@ class TwistGate:
         return CommandRejected(self._device, reason, message, value=value, limit=limit)
 
 
-def _limited(twist: Array, max_linear: float, max_angular: float, what: str, adjustments: list[Adjustment]) -> Array:
-    """``twist`` scaled by one factor so that neither part exceeds its limit.
+def _limited(twist: Array, max_linear: float, max_angular: float, adjustments: list[Adjustment]) -> Array:
+    """``twist`` scaled by one factor so that neither part exceeds its speed.
 
     One factor for both parts: scaling them apart would bend the motion of whatever sits on a lever, and a tactile
     sensor that turns about its contact would be torn off it.
     """
     scale = 1.0
     for part, vector, limit in (("linear", twist[:3], max_linear), ("angular", twist[3:], max_angular)):
-        size = math.sqrt(float(vector @ vector))
+        size = _norm(vector)
+        if size > limit * _ROUNDING:
+            adjustments.append(Adjustment(f"tcp {part} speed", size, limit))
         if size > limit:
-            adjustments.append(Adjustment(f"tcp {part} {what}", size, limit))
             scale = min(scale, limit / size)
     return twist if scale == 1.0 else twist * scale
+
+
+def _within(local: LocalIk, twist: Array, adjustments: list[Adjustment]) -> Array:
+    """``twist`` scaled so that no joint exceeds its limits; each joint is named once."""
+    _, scale, why = local.limited(twist)
+    if why:
+        named = {adjustment.limit for adjustment in adjustments}
+        adjustments.extend(adjustment for adjustment in why if adjustment.limit not in named)
+    return twist if scale == 1.0 else scale * twist
+
+
+def _norm(vector: Array) -> float:
+    return math.sqrt(float(vector @ vector))
+
+
+_SHORTEST_STEP_S = 1e-6
+_ROUNDING = 1.0 + 1e-6

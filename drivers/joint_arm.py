@@ -8,7 +8,7 @@ from drivers.arm import Arm
 from drivers.device import Lifecycle
 from drivers.errors import CommandRejected, DeviceError, Rejection, StaleData
 from drivers.joint_setpoint import JointSetpoint
-from drivers.kinematics import SerialChain
+from drivers.kinematics import DifferentialIk, LocalIk, SerialChain
 from drivers.lease import Lease
 from drivers.samples import JointState, Stamped, TcpState
 from geometry.types import Array
@@ -21,6 +21,7 @@ class JointArm(Arm):
     """
 
     _chain: SerialChain
+    _ik: DifferentialIk
     _setpoint: JointSetpoint
     _joints: Stamped[JointState] | None
     _trouble: DeviceError | None
@@ -54,6 +55,13 @@ class JointArm(Arm):
         if self._trouble is not None:
             raise CommandRejected(self.name, Rejection.MODE, f"in trouble: {self._trouble}")
         self._setpoint.go_to(q, speed_fraction)
+
+    def kinematics(self) -> DifferentialIk:
+        """Of its joints."""
+        return self._ik
+
+    def _local_ik(self) -> LocalIk:
+        return self._ik.at(self.joints(self._max_state_age_s).value.q)
 
     def _is_at(self, park_deg: tuple[float, ...] | None, tolerance_deg: float) -> bool:
         """Whether every joint is within ``tolerance_deg`` of the park pose; never where there is none."""

@@ -6,7 +6,8 @@ ends a motion (a stop, an expired twist, another goal), the setpoint first slows
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,6 +78,16 @@ class JointSetpoint:
     def stop(self) -> None:
         """Slow down and hold."""
         self._task = None
+
+    def snapshot(self) -> Callable[[int], None]:
+        """What brings setpoint and task back, given how many nanoseconds later it is then."""
+        kept = self._task, self.q, self.dq, self.adjustments, self.twist, self._line, self._line_speed
+
+        def restore(later_ns: int) -> None:
+            task, self.q, self.dq, self.adjustments, self.twist, self._line, self._line_speed = kept
+            self._task = replace(task, expires_ns=task.expires_ns + later_ns) if isinstance(task, _Twist) else task
+
+        return restore
 
     def step(self, now_ns: int, dt_s: float) -> tuple[Array, Array]:
         """Move on by ``dt_s``; returns setpoint (n,) rad and its velocity (n,) rad/s."""

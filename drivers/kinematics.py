@@ -16,7 +16,9 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from drivers.commands import Adjustment
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, DeviceFault, FaultClass, Remedy
+from drivers.joint_limits import IkSettings, off_singularity, speed_bounds, within_acceleration, within_bounds
+from geometry import se3
 from geometry.errors import GeometryError
 from geometry.types import Array
 
@@ -47,11 +49,19 @@ class Placement(_Description):
         return T
 
 
+class CapsuleShape(_Description):
+    """A part of a link as a capsule: all that lies within a radius of a segment, in the frame that it is fixed to."""
+
+    from_mm: Vector3
+    to_mm: Vector3
+    radius_mm: Positive
+
+
 class Joint(Placement):
     """A revolute joint and the link that it moves.
 
     The joint frame sits at ``origin_mm`` and ``rotation_deg`` in the link before it when the joint is at zero;
-    ``axis`` and ``com_mm`` are given in the joint frame.
+    ``axis``, ``com_mm`` and ``capsules`` are given in the joint frame.
     """
 
     name: str
@@ -59,9 +69,11 @@ class Joint(Placement):
     lower_deg: float
     upper_deg: float
     speed_deg_s: Positive
+    accel_deg_s2: Positive = 400.0
     torque_n_m: Positive
     mass_kg: NotNegative = 0.0
     com_mm: Vector3 = (0.0, 0.0, 0.0)
+    capsules: tuple[CapsuleShape, ...] = ()
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -80,9 +92,10 @@ class Tool(Placement):
 
 
 class ChainDescription(_Description):
-    """A serial arm, base to flange."""
+    """A serial arm, base to flange; ``base_capsules`` are in the base frame."""
 
     name: str
+    base_capsules: tuple[CapsuleShape, ...] = ()
     joints: tuple[Joint, ...] = Field(min_length=1)
     flange: Placement = Placement()
 
@@ -103,6 +116,24 @@ class ChainDescription(_Description):
             raise ConfigError(f"unknown chain {name!r}", key="chain", value=name, hint=f"known: {', '.join(known)}")
         return cls.read(folder / f"{name}.yaml")
 
+    @classmethod
+    def named(cls, chain: str) -> ChainDescription:
+        """A YAML file, or one that ships, as a cell file says it. Raises ConfigError."""
+        return cls.read(Path(chain)) if Path(chain).suffix in (".yaml", ".yml") else cls.shipped(chain)
+
+    def narrowed(self, ranges_deg: Array) -> ChainDescription:
+        """The same arm with each joint's range narrowed to ``ranges_deg`` (n, 2), lower and upper."""
+        joints = [
+            joint.model_copy(
+                update={
+                    "lower_deg": max(joint.lower_deg, float(lower)),
+                    "upper_deg": min(joint.upper_deg, float(upper)),
+                }
+            )
+            for joint, (lower, upper) in zip(self.joints, ranges_deg, strict=True)
+        ]
+        return self.model_copy(update={"joints": tuple(joints)})
+
 
 class SerialChain:
     """Kinematics of one described arm with one tool.
@@ -113,18 +144,21 @@ class SerialChain:
         gravity_m_s2: (3,) along base axes, for arms that hang or stand on a wall.
 
     Attributes:
-        joint_names, lower, upper, speed, torque: (n,) per joint, rad, rad, rad/s, N m.
+        description, tool: the arm, and what its flange carries.
+        joint_names, lower, upper, speed, accel, torque: (n,) per joint, rad, rad, rad/s, rad/s2, N m.
     """
 
     def __init__(
         self, description: ChainDescription, tool: Tool | None = None, gravity_m_s2: Vector3 = GRAVITY_M_S2
     ) -> None:
+        self.description = description
         joints = description.joints
-        tool = tool or Tool()
+        self.tool = tool = tool or Tool()
         self.joint_names = tuple(joint.name for joint in joints)
         self.lower = np.deg2rad([joint.lower_deg for joint in joints])
         self.upper = np.deg2rad([joint.upper_deg for joint in joints])
         self.speed = np.deg2rad([joint.speed_deg_s for joint in joints])
+        self.accel = np.deg2rad([joint.accel_deg_s2 for joint in joints])
         self.torque = np.array([joint.torque_n_m for joint in joints])
         self._axes = np.array([np.array(joint.axis) / np.linalg.norm(joint.axis) for joint in joints])
         # Rodrigues' formula, split to place all joints at once: T(q) = fixed + sin q * sine + (1 - cos q) * cosine.
@@ -146,6 +180,10 @@ class SerialChain:
     def forward(self, q: Array) -> Array:
         """Pose ``T_base_tcp`` (4, 4) at joint angles ``q`` (n,) rad. Raises GeometryError for a wrong shape or NaN."""
         return self._place(q)[1]
+
+    def link_poses(self, q: Array) -> Array:
+        """Poses (n, 4, 4) of the joint frames along base axes, each turned by its joint. Raises GeometryError."""
+        return self._place(q)[0]
 
     def jacobian(self, q: Array) -> Array:
         """Geometric Jacobian (6, n): [v, w] of the tool centre point along base axes per joint velocity."""
@@ -190,6 +228,30 @@ class SerialChain:
         return T_base_joint, T_base_joint[-1] @ self._T_joint_tcp
 
 
+def require_same_arm(device: str, chain: SerialChain, q: Array, T_base_tcp: Array) -> None:
+    """Hold a chain against what a controller says of its own arm.
+
+    Args:
+        device: name for the error.
+        chain: how we describe it.
+        q: (n,) rad, told together with ...
+        T_base_tcp: ... this pose (4, 4).
+
+    Raises:
+        DeviceFault: the poses lie further apart than two arms of one model.
+    """
+    apart = se3.compose(se3.inverse(chain.forward(q)), T_base_tcp)
+    away_m, turned_rad = float(np.linalg.norm(apart[:3, 3])), float(np.linalg.norm(se3.log(apart)[3:]))
+    if away_m > _SAME_ARM_M or turned_rad > _SAME_ARM_RAD:
+        raise DeviceFault(
+            device,
+            f"its tool is {1e3 * away_m:.0f} mm and {np.rad2deg(turned_rad):.1f} deg from where the chain puts it",
+            fault_class=FaultClass.CONFIGURATION,
+            needs=Remedy.OPERATOR,
+            hint="name the chain of this arm's model, and the tool that it carries",
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class JointMotion:
     """Joint velocities for a twist, and how well they follow it.
@@ -197,36 +259,16 @@ class JointMotion:
     Attributes:
         dq: (n,) rad/s, within every limit.
         twist: (6,) what the tool centre point will really do, along base axes.
+        scale: share of the motion that the limits left.
         smallest_singular_value: of the Jacobian with its angular rows times the characteristic length, m.
         adjustments: which limits made ``twist`` differ from what was asked for.
     """
 
     dq: Array
     twist: Array
+    scale: float
     smallest_singular_value: float
     adjustments: tuple[Adjustment, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class IkSettings:
-    """How ``DifferentialIk`` treats limits.
-
-    Attributes:
-        characteristic_length_m: one radian weighs as much as this many metres; about half the arm's reach makes the
-            singular values comparable.
-        singular_value_m: directions with a smaller singular value are damped, and approached slowly.
-        singular_floor_m: motion that would bring the smallest singular value below this is refused; leaving is free.
-        damping_m: largest damping, reached at a singular value of zero; it bounds the joint speed per tool speed.
-        singular_gain_hz: the distance to the floor shrinks by at most this fraction per second.
-        limit_margin_rad: over this last stretch a joint's outward speed falls linearly to zero; inward it is free.
-    """
-
-    characteristic_length_m: float = 0.25
-    singular_value_m: float = 0.04
-    singular_floor_m: float = 0.02
-    damping_m: float = 0.04
-    singular_gain_hz: float = 10.0
-    limit_margin_rad: float = np.deg2rad(5.0)
 
 
 class DifferentialIk:
@@ -243,9 +285,9 @@ class DifferentialIk:
     """
 
     def __init__(self, chain: SerialChain, settings: IkSettings | None = None) -> None:
-        self._chain = chain
-        self._settings = settings or IkSettings()
-        self._weights = np.array([1.0, 1.0, 1.0, *[self._settings.characteristic_length_m] * 3])
+        self.chain = chain
+        self.settings = settings or IkSettings()
+        self._weights = np.array([1.0, 1.0, 1.0, *[self.settings.characteristic_length_m] * 3])
 
     def solve(self, q: Array, twist: Array) -> JointMotion:
         """Joint velocities at ``q`` (n,) rad for ``twist`` (6,) [v, w] along base axes.
@@ -256,30 +298,71 @@ class DifferentialIk:
         twist = np.asarray(twist, dtype=np.float64)
         if twist.shape != (6,) or not np.isfinite(twist).all():
             raise GeometryError("DifferentialIk.solve", "twist", "is not six finite numbers")
-        J = self._weighted_jacobian(q)
-        lowest, highest = self._speed_bounds(q)
-        dq, smallest = self._saturated(J, self._weights * twist, lowest, highest)
-        adjustments: list[Adjustment] = []
-        dq = self._slow_to_bounds(dq, lowest, highest, adjustments)
-        if smallest < self._settings.singular_value_m:
-            dq = self._slow_to_singularity(q, dq, smallest, adjustments)
-        return JointMotion(dq, (J @ dq) / self._weights, smallest, tuple(adjustments))
+        return self.at(q).motion(twist)
+
+    def at(self, q: Array) -> LocalIk:
+        """The same for several twists at one ``q`` (n,) rad. Raises GeometryError for a wrong shape or NaN."""
+        return LocalIk(self, q, self._weights)
+
+
+class LocalIk:
+    """Differential inverse kinematics at one place.
+
+    Args:
+        ik: arm and settings.
+        q: (n,) rad.
+        weights: (6,) of a twist's components.
+    """
+
+    def __init__(self, ik: DifferentialIk, q: Array, weights: Array) -> None:
+        self._chain = ik.chain
+        self._settings = ik.settings
+        self._q = q
+        self._weights = weights
+        self._J = self._weighted_jacobian(q)
+        self._inverse, self._smallest = self._inverted(self._J)
+        chain, margin_rad = ik.chain, ik.settings.limit_margin_rad
+        self._bounds = speed_bounds(q, chain.lower, chain.upper, chain.speed, margin_rad)
+
+    def acceleration_scale(self, step: Array, dt_s: float) -> tuple[float, tuple[Adjustment, ...]]:
+        """Share of the change of twist ``step`` (6,) within ``dt_s`` that no joint is too slow for, and why."""
+        ddq = self._inverse @ (self._weights * step) / dt_s
+        return within_acceleration(ddq, self._chain.accel, self._chain.joint_names)
+
+    def motion(self, twist: Array) -> JointMotion:
+        """Joint velocities for ``twist`` (6,), within every limit."""
+        dq, scale, adjustments = self.limited(twist)
+        return JointMotion(dq, (self._J @ dq) / self._weights, scale, self._smallest, adjustments)
+
+    def limited(self, twist: Array) -> tuple[Array, float, tuple[Adjustment, ...]]:
+        """Joint velocities (n,) for ``twist`` (6,), within every limit, what share of it that is, and why."""
+        chain, settings = self._chain, self._settings
+        lowest, highest = self._bounds
+        dq = self._inverse @ (self._weights * twist)
+        if settings.goes_round and len(dq) > 6:
+            dq = self._saturated(dq, self._weights * twist, lowest, highest)
+        scale, adjustments = within_bounds(dq, lowest, highest, chain.joint_names)
+        # Rounding must not lead beyond a limit either.
+        dq = np.clip(dq * scale, lowest, highest)
+        if self._smallest < settings.singular_value_m and dq.any():
+            left, why = self._off_singularity(dq)
+            scale, dq, adjustments = scale * left, dq * left, adjustments + why
+        return dq, scale, adjustments
 
     def _weighted_jacobian(self, q: Array) -> Array:
         J = self._chain.jacobian(q)
         J *= self._weights[:, None]
         return J
 
-    def _speed_bounds(self, q: Array) -> tuple[Array, Array]:
-        """Slowest and fastest joint speeds allowed at ``q``; standing still always is."""
-        chain = self._chain
-        rate = chain.speed / self._settings.limit_margin_rad
-        highest = np.minimum(np.maximum(rate * (chain.upper - q), 0.0), chain.speed)
-        lowest = np.maximum(np.minimum(rate * (chain.lower - q), 0.0), -chain.speed)
-        return lowest, highest
+    def _inverted(self, J: Array) -> tuple[Array, float]:
+        """Damped inverse (n, 6) of ``J`` (6, n), and its smallest singular value."""
+        settings = self._settings
+        U, s, Vt = np.linalg.svd(J, full_matrices=False)
+        short = np.maximum(1.0 - (s / settings.singular_value_m) ** 2, 0.0)
+        gain = s / np.maximum(s**2 + settings.damping_m**2 * short, np.finfo(np.float64).tiny)
+        return (Vt.T * gain) @ U.T, float(s[-1])
 
-    def _saturated(self, J: Array, wanted: Array, lowest: Array, highest: Array) -> tuple[Array, float]:
-        dq, smallest = self._damped(J, wanted)
+    def _saturated(self, dq: Array, wanted: Array, lowest: Array, highest: Array) -> Array:
         free = np.ones(len(dq), dtype=bool)
         while np.count_nonzero(free) > 6:
             excess = np.where(free, np.maximum(dq - highest, lowest - dq), 0.0)
@@ -288,42 +371,15 @@ class DifferentialIk:
                 break
             dq[worst] = np.clip(dq[worst], lowest[worst], highest[worst])
             free[worst] = False
-            dq[free] = self._damped(J[:, free], wanted - J[:, ~free] @ dq[~free])[0]
-        return dq, smallest
+            dq[free] = self._inverted(self._J[:, free])[0] @ (wanted - self._J[:, ~free] @ dq[~free])
+        return dq
 
-    def _damped(self, J: Array, wanted: Array) -> tuple[Array, float]:
-        settings = self._settings
-        U, s, Vt = np.linalg.svd(J, full_matrices=False)
-        short = np.maximum(1.0 - (s / settings.singular_value_m) ** 2, 0.0)
-        gain = s / np.maximum(s**2 + settings.damping_m**2 * short, np.finfo(np.float64).tiny)
-        return Vt.T @ (gain * (U.T @ wanted)), float(s[-1])
-
-    def _slow_to_bounds(self, dq: Array, lowest: Array, highest: Array, adjustments: list[Adjustment]) -> Array:
-        allowed = np.clip(dq, lowest, highest)
-        # Rounding that points outwards at a limit must not stop the whole arm; the last clip takes care of it.
-        over = np.abs(allowed - dq) > _NEGLIGIBLE
-        if not over.any():
-            return allowed
-        scale = np.where(over, allowed / np.where(over, dq, 1.0), 1.0)
-        worst = int(np.argmin(scale))
-        name = self._chain.joint_names[worst]
-        adjustments.append(Adjustment(f"joint {name}", float(dq[worst]), float(allowed[worst])))
-        slowed: Array = np.clip(dq * scale[worst], lowest, highest)
-        return slowed
-
-    def _slow_to_singularity(self, q: Array, dq: Array, smallest: float, adjustments: list[Adjustment]) -> Array:
-        settings = self._settings
-        fastest = float(np.abs(dq).max())
-        if fastest == 0.0:
-            return dq
-        step_s = 1e-5 / fastest
-        ahead = np.linalg.svd(self._weighted_jacobian(q + step_s * dq), compute_uv=False)[-1]
-        closing = (smallest - float(ahead)) / step_s
-        allowed = settings.singular_gain_hz * max(smallest - settings.singular_floor_m, 0.0)
-        if closing <= allowed + _NEGLIGIBLE:
-            return dq
-        adjustments.append(Adjustment("singularity", closing, allowed))
-        return dq * (allowed / closing)
+    def _off_singularity(self, dq: Array) -> tuple[float, tuple[Adjustment, ...]]:
+        step_s = 1e-5 / float(np.abs(dq).max())
+        ahead = np.linalg.svd(self._weighted_jacobian(self._q + step_s * dq), compute_uv=False)[-1]
+        closing_m_s = (self._smallest - float(ahead)) / step_s
+        fastest = float(np.max(np.abs(dq) / self._chain.speed))
+        return off_singularity(self._smallest, closing_m_s, fastest, self._settings)
 
 
 def _links(joints: tuple[Joint, ...], T_joint_flange: Array, tool: Tool) -> tuple[Array, Array]:
@@ -353,6 +409,7 @@ def _cross(a: Array, b: Array) -> Array:
     return product
 
 
+_SAME_ARM_M = 0.02
+_SAME_ARM_RAD = np.deg2rad(2.0)
 _YZX = np.array([1, 2, 0])
 _ZXY = np.array([2, 0, 1])
-_NEGLIGIBLE = 1e-6

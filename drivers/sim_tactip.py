@@ -17,7 +17,7 @@ from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSp
 from drivers.samples import Frame, Stamped
 from drivers.simulation.faults import FrameFaults
 from drivers.simulation.render import FrameRenderer, Lighting
-from drivers.simulation.scene import Carrier, MeasuredCarrier, Scene
+from drivers.simulation.scene import Carrier, LoadBearer, MeasuredCarrier, Scene
 from drivers.simulation.tip import Tip
 from drivers.simulation.tip_file import load_tip
 from geometry import se3
@@ -181,7 +181,8 @@ class SimTactip(Device):
 
     def _touch(self) -> None:
         mount, T_tcp_s = self._mount, self._T_tcp_s
-        self._scene.mount(self.name, lambda: mount.T_world_tcp() @ T_tcp_s)
+        bear = mount.bear if isinstance(mount, LoadBearer) else None
+        self._scene.mount(self.name, lambda: mount.T_world_tcp() @ T_tcp_s, bear)
         self._first = math.ceil(self._scene.timeline.t_ns / self._period_ns)
 
     def _close(self) -> None:

@@ -36,6 +36,8 @@ from drivers.errors import (
     TransportError,
     TransportTimeout,
 )
+from drivers.joint_limits import JointLimitsConfig
+from drivers.kinematics import ChainDescription, DifferentialIk, LocalIk, SerialChain, Tool, require_same_arm
 from drivers.lease import Lease
 from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
 from drivers.samples import JointState, Stamped, TcpState
@@ -72,8 +74,10 @@ class UrConfig(DriverConfig):
 
     Attributes:
         host: address of the controller.
+        chain: the model: ``ur3e``, ``ur5e``, ``ur10e`` or a YAML file; checked against the arm when it is activated.
         flange_to_tcp_mm_deg: [x y z alpha beta gamma] of the tool centre point in the flange's frame, extrinsic xyz.
         limits: of the tool centre point.
+        joint_limits: margins to the chain's joint limits and to singularities.
         stop_accel_m_s2: how hard it brakes, m/s2 and rad/s2; no gentler than the accelerations above.
         joint_speed_deg_s, joint_accel_deg_s2: of a joint goal at ``speed_fraction`` 1.
         watchdog_hz: the controller stops the program after silence of ``1 / watchdog_hz``.
@@ -83,7 +87,9 @@ class UrConfig(DriverConfig):
 
     host: str = Field(min_length=1)
     flange_to_tcp_mm_deg: tuple[float, float, float, float, float, float]
+    chain: str = "ur5e"
     limits: LimitsConfig = LimitsConfig()
+    joint_limits: JointLimitsConfig = JointLimitsConfig()
     stop_accel_m_s2: Annotated[float, Field(gt=0.0, le=10.0)] = 3.0
     joint_speed_deg_s: Annotated[float, Field(gt=0.0, le=180.0)] = 30.0
     joint_accel_deg_s2: Annotated[float, Field(gt=0.0, le=800.0)] = 60.0
@@ -125,6 +131,12 @@ class UrArm(Arm):
         super().__init__(name, clock, config.limits.build(), stop_categories=_STOPS)
         self._config = config
         self._flange_to_tcp = _pose_vector(se3.from_euler_mm_deg(np.array(config.flange_to_tcp_mm_deg)))
+        tool = Tool(
+            origin_mm=config.flange_to_tcp_mm_deg[:3],
+            rotation_deg=config.flange_to_tcp_mm_deg[3:],
+        )
+        self._chain = SerialChain(ChainDescription.named(config.chain), tool)
+        self._ik = DifferentialIk(self._chain, config.joint_limits.settings(own_controller=True))
         self._receive: Any = None
         self._reader: StateReader | None = None
         self._link: ControlLink | None = None
@@ -185,6 +197,10 @@ class UrArm(Arm):
         speed = math.radians(self._config.joint_speed_deg_s) * speed_fraction
         accel = math.radians(self._config.joint_accel_deg_s2)
         self._attempt(lambda: link.move_joints(target, speed, accel, self._config.stop_accel_m_s2))
+
+    def kinematics(self) -> DifferentialIk:
+        """Of its joints."""
+        return self._ik
 
     def watchdog_s(self) -> float:
         """Silence after which the controller stops the arm, proven at activation. Raises LifecycleError before it."""
@@ -269,6 +285,7 @@ class UrArm(Arm):
             snapshot = self._await(
                 lambda state: state.runtime_state is RuntimeState.PLAYING, _FIRST_STATE_S, "state of the program"
             )
+            require_same_arm(self.name, self._chain, snapshot.q, _pose(snapshot.tcp_pose))
         except BaseException:
             self._drop_program()
             raise
@@ -313,6 +330,9 @@ class UrArm(Arm):
             raise
         except DeviceError as error:
             raise self._to_faulted(self._explained(error)) from None
+
+    def _local_ik(self) -> LocalIk:
+        return self._ik.at(self.joints(self._max_state_age_s).value.q)
 
     def _begin_stop(self, category: StopCategory) -> None:
         link = self._link

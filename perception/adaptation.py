@@ -161,21 +161,18 @@ def adapt_to(
     assert isinstance(architecture, MarkerArchitecture)
     brought = bring(old, few)
     xi, displacements = few.xi[brought.matched], brought.displacements[brought.matched]
-    layers = turned_layers(_regained(layers_of(old), brought), old.header.labels, -brought.turn_rad)
-    labels = _widened(old.header.labels, xi)
-    layers = _relabelled(layers, old.header.labels, labels)
-    target = (xi - labels.centre) / labels.half_range
+    layers, labels = _regained(layers_of(old), brought), old.header.labels
+    target = labels.targets(about_z(brought.turn_rad, xi))
     # How far to go from the old weights, and how far to believe the sigmas, contacts tell that were left out.
-    power = old.tensors["sigma_power"].astype(np.float64)
-    left_out = np.arange(len(xi)) % 2 == 0
-    halves = [tune(old, layers, displacements[half], target[half], settings) for half in (left_out, ~left_out)]
+    even = np.arange(len(xi)) % 2 == 0
+    halves = [tune(old, layers, displacements[half], target[half], settings) for half in (even, ~even)]
     errors, standardised = [], []
     for share in _SHARES:
         off, by_sigma = [], []
-        for half, trained in zip((~left_out, left_out), halves, strict=True):
-            mean, sigma = outputs_of(_between(layers, trained, share), displacements[half])
+        for half, trained in zip((~even, even), halves, strict=True):
+            mean, sigma = outputs_of(_between(layers, trained, share), displacements[half], labels)
             off.append(np.abs(target[half] - mean))
-            by_sigma.append((target[half] - mean) / sigma**power)
+            by_sigma.append(labels.aligned(target[half] - mean, mean) / sigma ** np.array(old.header.sigma_power))
         errors.append(float(np.concatenate(off).mean()))
         standardised.append(np.concatenate(by_sigma))
     best = int(np.argmin(errors))
@@ -193,13 +190,14 @@ def adapt_to(
             preprocessing=preprocessing,
             labels=labels,
             sigma_scale=tuple(scale.tolist()),
+            sigma_power=header.sigma_power,
             camera=brought.camera,
+            label_turn_deg=math.degrees(brought.turn_rad),
             training_data=header.training_data,
             training={
                 **header.training,
                 "adapted_images": len(few.frames),
                 "adapted_images_matched": int(brought.matched.sum()),
-                "adapted_label_turn_deg": math.degrees(brought.turn_rad),
                 "adapted_share": _SHARES[best],
                 **{f"adapted_{key}": value for key, value in asdict(settings).items()},
             },
@@ -245,8 +243,8 @@ def bring(old: Model, few: FewContacts) -> Brought:
         displacements, matched = _seen_by(camera, matcher, [few.frames[i] for i in some])
         if matched.mean() < _MATCHED or matched.sum() < min(_FEWEST, len(some)):
             continue
-        mean, _ = outputs_of(layers, displacements[matched])
-        predicted = old.header.labels.centre + old.header.labels.half_range * mean
+        mean, _ = outputs_of(layers, displacements[matched], old.header.labels)
+        predicted = xi_from_contact(old.header.labels.contacts(mean))
         turn, error = _label_turn(few.xi[some][matched], predicted)
         if best is None or error < best[0]:
             best = (error, camera, turn)
@@ -281,8 +279,8 @@ def _refined(
     def residuals(x: Array) -> Array:
         linear = np.exp(x[0]) * np.array([[np.cos(x[1]), -np.sin(x[1])], [np.sin(x[1]), np.cos(x[1])]])
         seen = (there + moved - middle) @ linear.T + middle + x[2:4] - there
-        mean, _ = outputs_of(layers, (x[5] * seen).reshape(len(some), -1).astype(np.float32))
-        aim = (_about_z(turn + x[4], xi[some]) - labels.centre) / labels.half_range
+        mean, _ = outputs_of(layers, (x[5] * seen).reshape(len(some), -1).astype(np.float32), labels)
+        aim = labels.targets(about_z(turn + x[4], xi[some]))
         flat: Array = (mean + x[6:] - aim).ravel() / _TYPICAL_ERROR
         return flat
 
@@ -303,7 +301,7 @@ def _composed(camera: CameraChange, refined: Array) -> CameraChange:
     )
 
 
-def _about_z(turn_rad: float, xi: Array) -> Array:
+def about_z(turn_rad: float, xi: Array) -> Array:
     """Labels (n, 6) about axes that are turned about the sensor's."""
     turned = xi.copy()
     for first in (0, 3):
@@ -351,24 +349,6 @@ def _regained(layers: Layers, brought: Brought) -> Layers:
     return [(brought.gain * first[0], first[1]), *layers[1:-1], shifted]
 
 
-def turned_layers(layers: Layers, labels: Labels, turn_rad: float) -> Layers:
-    """The networks with their predictions turned about the sensor's z axis."""
-    layers = list(layers)
-    cos, sin = math.cos(turn_rad), math.sin(turn_rad)
-    turn = np.eye(6)
-    for first in (0, 3):
-        turn[first : first + 2, first : first + 2] = [[cos, -sin], [sin, cos]]
-    scaled = turn * labels.half_range[None, :] / labels.half_range[:, None]
-    # Precisions have no direction of their own: those of the two axes are mixed by their shares.
-    mixed_precision = turn**2
-    whole = np.zeros((12, 12))
-    whole[:6, :6], whole[6:, 6:] = scaled, mixed_precision
-    shift = (turn @ labels.centre - labels.centre) / labels.half_range
-    weight, bias = layers[-1]
-    layers[-1] = (weight @ whole.T, bias @ whole.T + np.concatenate([shift, np.zeros(6)]))
-    return layers
-
-
 def _between(one: Layers, other: Layers, share: float) -> Layers:
     """Weights a share of the way from one to the other."""
     return [
@@ -377,34 +357,20 @@ def _between(one: Layers, other: Layers, share: float) -> Layers:
     ]
 
 
-def _widened(labels: Labels, xi: Array) -> Labels:
-    low, high = np.minimum(labels.low, xi.min(axis=0)), np.maximum(labels.high, xi.max(axis=0))
-    return labels.model_copy(update={"low": tuple(low.tolist()), "high": tuple(high.tolist())})
-
-
-def _relabelled(layers: Layers, old: Labels, new: Labels) -> Layers:
-    """The networks with outputs in another range of labels."""
-    share = old.half_range / new.half_range
-    scale = np.concatenate([share, np.ones(6)])
-    shift = np.concatenate([(old.centre - new.centre) / new.half_range, -np.log(share)])
-    weight, bias = layers[-1]
-    return [*layers[:-1], (weight * scale, bias * scale + shift)]
-
-
-def outputs_of(layers: Layers, displacements: NDArray[np.float32]) -> tuple[Array, Array]:
-    """Mean and uncalibrated sigma (n, 6) of the mixture, in label half-ranges, of displacements (n, 2 m) px."""
+def outputs_of(layers: Layers, displacements: NDArray[np.float32], labels: Labels) -> tuple[Array, Array]:
+    """Means (n, 6) in label half-ranges and uncalibrated sigmas of the mixture, of displacements (n, 2 m) px."""
     x: Array = np.broadcast_to(displacements.astype(np.float64), (len(layers[0][0]), *displacements.shape))
     for i, (weight, bias) in enumerate(layers):
         x = x @ weight + bias
         if i + 1 < len(layers):
             x = x / (1.0 + np.exp(-np.maximum(x, -80.0)))
-    return mixed(x[..., :6], np.clip(x[..., 6:], *LOG_PRECISION_BOUNDS))
+    return mixed(x[..., :6], np.clip(x[..., 6:], *LOG_PRECISION_BOUNDS), labels)
 
 
 def tune(
     old: Model, layers: Layers, displacements: NDArray[np.float32], target: Array, settings: AdaptSettings
 ) -> Layers:
-    """Layers that fit labelled displacements better and stay near those given.
+    """Layers whose means fit labelled displacements better and that stay near those given.
 
     Args:
         old: whose displacement model scales the inputs.
@@ -460,15 +426,9 @@ class _Tuner:
                 group["lr"] = settings.learning_rate * rise * 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
             chosen = torch.randint(len(inputs), (networks, min(settings.batch_size, len(inputs))))
             outputs = self._outputs(self._jittered(inputs[chosen]))
-            aim = targets[chosen]
-            mean, log_precision = outputs[..., :6], outputs[..., 6:].clamp(*LOG_PRECISION_BOUNDS)
-            # Errors count by the root of the precision: exactly as far as half of the likelihood would have it.
-            weight = (0.5 * log_precision.detach()).exp()
-            loss = (functional.smooth_l1_loss(mean, aim, beta=0.02, reduction="none") * weight).sum(-1).mean()
-            off = (aim - mean).detach()
-            loss = loss + 0.05 * (0.5 * (off * log_precision.exp()).square() - log_precision).sum(-1).mean()
+            off = functional.smooth_l1_loss(outputs[..., :6], targets[chosen], beta=0.02, reduction="none")
             held = sum(((w / usual) ** 2).mean() for w, usual in zip(self.weights, self.usual, strict=True))
-            loss = loss + settings.hold * held
+            loss = off.sum(-1).mean() + settings.hold * held
             if not torch.isfinite(loss):
                 raise TrainingError("the loss is no number", hint="check the labels of the new images")
             optimizer.zero_grad(set_to_none=True)

@@ -39,11 +39,11 @@ class Architecture(BaseModel):
 
     kind: Literal["gdn", "cnn"] = "gdn"
     input_size: tuple[int, int] = (128, 128)
-    channels: Annotated[tuple[Annotated[int, Field(gt=0)], ...], Field(min_length=1)] = (16, 32, 64, 128, 256)
+    channels: Annotated[tuple[Annotated[int, Field(gt=0)], ...], Field(min_length=1)] = (8, 16, 32, 64, 128)
     hidden: int = Field(default=256, gt=0)
-    feature_dropout: Rate = 0.05
-    mean_dropout: SixRates = (0.05,) * 6
-    precision_dropout: SixRates = (0.05,) * 6
+    feature_dropout: Rate = 0.0
+    mean_dropout: SixRates = (0.0,) * 6
+    precision_dropout: SixRates = (0.0,) * 6
 
     @model_validator(mode="after")
     def _something_is_left(self) -> Architecture:

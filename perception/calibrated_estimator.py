@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from geometry.types import ImageArray
 from perception.camera_change import CameraChange
@@ -50,7 +53,18 @@ class CalibratedEstimator:
 
     def predict_reduced(self, reduced: ImageArray) -> Prediction:
         """Contact in an image that ``reduce`` made."""
-        return self._estimator.predict_reduced(reduced)
+        prediction = self._estimator.predict_reduced(reduced)
+        turn_deg = self.header.label_turn_deg
+        return prediction if turn_deg == 0.0 else turned(prediction, -turn_deg)
+
+
+def turned(prediction: Prediction, angle_deg: float) -> Prediction:
+    """A prediction about axes of sensor and surface that are turned about the sensor's z axis."""
+    turn = np.deg2rad(angle_deg)
+    G = np.eye(6)
+    for first in (0, 3):
+        G[first : first + 2, first : first + 2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    return replace(prediction, xi=G @ prediction.xi, covariance=G @ prediction.covariance @ G.T)
 
 
 def in_crop(change: CameraChange, preprocessing: Preprocessing) -> CameraChange:

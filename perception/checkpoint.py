@@ -26,12 +26,14 @@ class EpochRecord:
         train_loss: mean over its batches, with dropout and jitter.
         validation_loss: afterwards, without.
         mae: mean absolute error on the validation set, by ``labels.CONTACT_NAMES``.
+        cpu_s: CPU time of the process, validation included.
     """
 
     epoch: int
     train_loss: float
     validation_loss: float
     mae: dict[str, float]
+    cpu_s: float = field(default=0.0, compare=False)
 
 
 @dataclass
@@ -42,6 +44,11 @@ class Progress:
     best_epoch: int = 0
     best_loss: float = float("inf")
     best_state: dict[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def cpu_s(self) -> float:
+        """CPU seconds of all epochs, those before an interruption included."""
+        return sum(record.cpu_s for record in self.history)
 
     def add(self, record: EpochRecord, network: nn.Module) -> None:
         """Take note of an epoch, and of the network if it is the best so far."""

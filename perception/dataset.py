@@ -15,7 +15,12 @@ import numpy as np
 
 from drivers.tactile_data import Split
 from geometry.types import Array, ImageArray
+from perception.errors import TrainingError
+from perception.labels import CONTACT_NAMES, contact_from_xi
+from perception.model_file import Labels
 from perception.preprocessing import Preprocessing
+
+_SAME_MM_DEG = 1e-6
 
 Progress = Callable[[int, int], None]
 """Told (images done, images in all)."""
@@ -94,3 +99,20 @@ def cache_key(split: Split, preprocessing: Preprocessing) -> str:
         status = path.stat()
         key.update(f"{path.name}\0{status.st_size}\0{status.st_mtime_ns}\n".encode())
     return key.hexdigest()[:32]
+
+
+def label_range(training: Array, validation: Array) -> Labels:
+    """Contacts between the least and the greatest of the training set's, given as xi (n, 6), m and rad.
+
+    Raises:
+        TrainingError: there are fewer than two labels in either set, they are not finite, or a component never varies.
+    """
+    for name, xi in (("training", training), ("validation", validation)):
+        if xi.ndim != 2 or len(xi) < 2 or xi.shape[1] != 6 or not np.isfinite(xi).all():
+            raise TrainingError(f"the {name} set needs two or more labels of six finite components")
+    contacts = contact_from_xi(training)
+    low, high = contacts.min(axis=0), contacts.max(axis=0)
+    for name, width in zip(CONTACT_NAMES, high - low, strict=True):
+        if width < _SAME_MM_DEG:
+            raise TrainingError(f"all training labels have the same {name}", hint="collect contacts that vary in it")
+    return Labels.of_contacts(tuple(low.tolist()), tuple(high.tolist()))

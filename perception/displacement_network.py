@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from perception.marker_architecture import LOG_PRECISION_BOUNDS
 from perception.marker_matching import DisplacementModel
+from perception.networks import Alignment
 
 _DISPLACEMENT_PX = 8.0
 _NARROWEST = 0.02
@@ -28,22 +29,19 @@ class DisplacementNetwork(nn.Module):
         model: of the displacements.
         hidden: units of each layer.
         networks: how many, trained side by side and independently.
-        dropout: after every hidden layer.
     """
 
-    features: Tensor
-    offset: Tensor
+    mean: Tensor
+    scaled: Tensor
 
-    def __init__(self, model: DisplacementModel, hidden: tuple[int, ...], networks: int, dropout: float) -> None:
+    def __init__(self, model: DisplacementModel, hidden: tuple[int, ...], networks: int) -> None:
         super().__init__()
         scaled = model.basis.T / np.maximum(model.sd, _NARROWEST * model.sd[0])
-        features = np.concatenate([np.eye(len(model.mean)) / _DISPLACEMENT_PX, scaled], axis=1)
-        self.register_buffer("features", torch.from_numpy(features.astype(np.float32)), persistent=False)
-        self.register_buffer("offset", torch.from_numpy((model.mean @ features).astype(np.float32)), persistent=False)
-        self.dropout = dropout
+        self.register_buffer("mean", torch.from_numpy(model.mean.astype(np.float32)), persistent=False)
+        self.register_buffer("scaled", torch.from_numpy(scaled.astype(np.float32)), persistent=False)
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
-        before = features.shape[1]
+        before = sum(scaled.shape)
         for units in (*hidden, 18):
             bound = 1.0 / math.sqrt(before)
             self.weights.append(nn.Parameter(torch.empty(networks, before, units).uniform_(-bound, bound)))
@@ -53,12 +51,12 @@ class DisplacementNetwork(nn.Module):
             self.weights[-1][:, :, 6:] *= 0.1
 
     def forward(self, displacements: Tensor, noise: float = 0.0) -> Tensor:
-        x = displacements @ self.features - self.offset
+        moved = displacements - self.mean
+        x = torch.cat([moved / _DISPLACEMENT_PX, moved @ self.scaled], dim=-1)
         if noise:
             x = x + noise * torch.randn_like(x)
         for weight, bias in zip(list(self.weights)[:-1], list(self.biases)[:-1], strict=True):
             x = functional.silu(torch.baddbmm(bias, x, weight))
-            x = functional.dropout(x, self.dropout, self.training)
         # The standard deviations are read off what the means have taught, and change nothing about it.
         weight, bias = self.weights[-1], self.biases[-1]
         outputs = torch.baddbmm(bias[:, :, :12], x, weight[:, :, :12])
@@ -70,8 +68,9 @@ class DisplacementNetwork(nn.Module):
         """Tensors of a model file: the first layer takes pixels, the last gives means and standard deviations."""
         weights = [weight.detach().double() for weight in self.weights]
         biases = [bias.detach().double() for bias in self.biases]
-        biases[0] = biases[0] - (self.offset.double() @ weights[0])[:, None]
-        weights[0] = self.features.double() @ weights[0]
+        m = len(self.mean)
+        weights[0] = weights[0][:, :m] / _DISPLACEMENT_PX + self.scaled.double() @ weights[0][:, m:]
+        biases[0] = biases[0] - (self.mean.double() @ weights[0])[:, None]
         kept = [*range(6), *range(12, 18)]
         weights[-1], biases[-1] = weights[-1][:, :, kept], biases[-1][:, :, kept]
         tensors: dict[str, NDArray[np.float32]] = {}
@@ -81,7 +80,7 @@ class DisplacementNetwork(nn.Module):
         return tensors
 
 
-def displacement_loss(outputs: Tensor, labels: Tensor) -> Tensor:
+def displacement_loss(outputs: Tensor, labels: Tensor, alignment: Alignment) -> Tensor:
     """Laplace likelihood of the means, each term weighted by the root of its own scale, and Gaussian likelihood of the
     standard deviations about those means.
 
@@ -91,10 +90,12 @@ def displacement_loss(outputs: Tensor, labels: Tensor) -> Tensor:
     Args:
         outputs: (networks, n, 18).
         labels: (networks, n, 6).
+        alignment: of the standard deviations.
     """
     mean, log_inverse_scale, log_precision = outputs[..., :6], outputs[..., 6:12], outputs[..., 12:]
-    off = (labels - mean).abs()
+    residual = labels - mean
+    off = residual.abs()
     laplace = (off * log_inverse_scale.exp() - log_inverse_scale) * (-0.5 * log_inverse_scale.detach()).exp()
-    gaussian = 0.5 * (off.detach() * log_precision.exp()).square() - log_precision
+    gaussian = 0.5 * (alignment(residual.detach(), mean) * log_precision.exp()).square() - log_precision
     loss: Tensor = (laplace.sum(-1) + 0.2 * gaussian.sum(-1)).mean()
     return loss

@@ -20,6 +20,7 @@ class ContactEstimate:
         t_ns: time that the belief is for: the frame's, or later where the sensor's motion since has been replayed.
         in_range: False when the network left the range that it was trained on.
         nis: normalised innovation squared of the last correction (6 degrees of freedom), None before the second frame.
+        markers: share of the markers expected in view that the estimator has seen, where it looks for markers.
     """
 
     in_contact: bool
@@ -29,3 +30,4 @@ class ContactEstimate:
     t_ns: int
     in_range: bool = True
     nis: float | None = None
+    markers: float | None = None

@@ -54,7 +54,7 @@ def load_estimator(path: Path, calibration: Path | None = None) -> ContactEstima
 
         found = load_change(calibration)
         change = found if change is None else change.after(found)
-    estimator = _estimator(model)
+    estimator = estimator_of(model)
     if change is None:
         return estimator
     from perception.calibrated_estimator import CalibratedEstimator
@@ -62,7 +62,8 @@ def load_estimator(path: Path, calibration: Path | None = None) -> ContactEstima
     return CalibratedEstimator(estimator, change)
 
 
-def _estimator(model: Model) -> ContactEstimator:
+def estimator_of(model: Model) -> ContactEstimator:
+    """The estimator that a model of any kind describes."""
     if model.header.architecture.kind == "markers":
         from perception.marker_estimator import MarkerEstimator
 

@@ -18,13 +18,13 @@ from drivers.clock import Clock, MonotonicClock
 from drivers.tactile_data import read_split
 from perception.dataset import Progress
 from perception.estimators import load_estimator
-from perception.labels import CONTACT_NAMES, XI_UNITS, contact_from_xi, xi_from_contact
+from perception.inference import Prediction
+from perception.scores import Scores
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-_MAE_ORDER = ("z_mm", "alpha_deg", "beta_deg", "x_mm", "y_mm", "gamma_deg")
-_NORMAL_QUANTILES = {"68": 0.9944579, "95": 1.9599640}
+_COVERAGE = {"68": 0.68, "95": 0.95}
 
 
 @dataclass(frozen=True)
@@ -92,36 +92,27 @@ def evaluate(
         labelled = labelled.deeper_than(deeper_than_mm)
     contact_model = load_estimator(model, calibration)
     n = len(labelled.images)
-    means, sigmas, latencies_ns = np.empty((n, 6)), np.empty((n, 6)), np.empty(n)
-    with _one_opencv_thread():
+    predictions: list[Prediction] = []
+    latencies_ns = np.empty(n)
+    with one_opencv_thread():
         for i, image in enumerate(labelled.read()):
             if i == 0:
                 contact_model.predict(image)  # The first run also plans the memory.
             start_ns = clock.now_ns()
-            prediction = contact_model.predict(image)
+            predictions.append(contact_model.predict(image))
             latencies_ns[i] = clock.now_ns() - start_ns
-            means[i], sigmas[i] = prediction.xi, prediction.sigma
             if progress is not None:
                 progress(i + 1, n)
-    errors = np.abs(contact_from_xi(means) - labelled.contact_mm_deg).mean(axis=0)
-    mae = dict(zip(CONTACT_NAMES, errors.tolist(), strict=True))
-    standardised = (xi_from_contact(labelled.contact_mm_deg) - means) / sigmas
-    nll = (0.5 * standardised**2 + np.log(sigmas / XI_UNITS) + 0.5 * np.log(2.0 * np.pi)).sum(axis=1).mean()
+    scores = Scores.of(labelled.contact_mm_deg, predictions)
     return Evaluation(
         n=n,
-        mae={name: mae[name] for name in _MAE_ORDER},
-        nll=float(nll),
+        mae=scores.mae(),
+        nll=float(scores.nll.mean()),
         latency_ms={
             "median": float(np.median(latencies_ns)) * 1e-6,
             "p99": float(np.percentile(latencies_ns, 99)) * 1e-6,
         },
-        coverage={
-            percent: {
-                name: float((np.abs(standardised[:, CONTACT_NAMES.index(name)]) <= quantile).mean())
-                for name in _MAE_ORDER
-            }
-            for percent, quantile in _NORMAL_QUANTILES.items()
-        },
+        coverage={percent: scores.coverage(share) for percent, share in _COVERAGE.items()},
     )
 
 
@@ -148,7 +139,8 @@ def print_table(evaluation: Evaluation, console: Console | None = None) -> None:
 
 
 @contextmanager
-def _one_opencv_thread() -> Iterator[None]:
+def one_opencv_thread() -> Iterator[None]:
+    """Within it OpenCV uses one thread, as a running cell does."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

@@ -1,18 +1,18 @@
-"""The ONNX graph of a model, built from its header and tensors. Needs no PyTorch."""
+"""The ONNX graph of a model, built from its header and tensors. Needs neither PyTorch nor the ``onnx`` package."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from perception import onnx_wire
 from perception.architecture import Architecture
 from perception.model_file import Model
 
 IMAGES = "images"
 OUTPUTS = "outputs"
-
-_OPSET = 17
-_IR_VERSION = 9
 
 
 def onnx_model(model: Model) -> bytes:
@@ -23,19 +23,18 @@ def onnx_model(model: Model) -> bytes:
     Raises:
         TypeError: the model is no image network.
     """
-    from onnx import NodeProto, TensorProto, helper, numpy_helper
-
     architecture = model.header.architecture
     if not isinstance(architecture, Architecture):
         raise TypeError(f"a model of kind {architecture.kind} has no graph")
-    constants: dict[str, NDArray[np.generic]] = dict(model.tensors)
-    nodes: list[NodeProto] = []
+    constants: dict[str, NDArray[np.float32]] = dict(model.tensors)
+    nodes: list[bytes] = []
     last = IMAGES
 
-    def add(operator: str, *others: str, output: str = "", **attributes: object) -> None:
+    def add(operator: str, *others: str, output: str = "", before: str = "", **attributes: int | Sequence[int]) -> None:
         nonlocal last
         result = output or f"value{len(nodes)}"
-        nodes.append(helper.make_node(operator, [last, *others], [result], **attributes))
+        first = (before, last) if before else (last,)
+        nodes.append(onnx_wire.node(operator, [*first, *others], result, attributes))
         last = result
 
     for i in range(len(architecture.channels)):
@@ -53,27 +52,14 @@ def onnx_model(model: Model) -> bytes:
         constants |= {"floor": low - np.float32(40), "ceiling": high + np.float32(40)}
         add("Max", "floor")
         add("Min", "ceiling")
-        nodes.append(helper.make_node("Sub", ["low", last], ["below"]))
-        last = "below"
+        add("Sub", before="low")
         add("Exp")
         add("Add", "c")
-        nodes.append(helper.make_node("Div", ["rest", last], ["share"]))
-        last = "share"
+        add("Div", before="rest")
         add("Add", "one")
         add("Log")
         add("Add", "low")
         add("Max", "low")
         add("Min", "high", output=OUTPUTS)
-
     height, width = architecture.input_size
-    graph = helper.make_graph(
-        nodes,
-        "touchcell",
-        [helper.make_tensor_value_info(IMAGES, TensorProto.FLOAT, ["n", 1, height, width])],
-        [helper.make_tensor_value_info(OUTPUTS, TensorProto.FLOAT, ["n", architecture.outputs])],
-        [numpy_helper.from_array(np.asarray(array), name) for name, array in constants.items()],
-    )
-    serialised: bytes = helper.make_model(
-        graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR_VERSION
-    ).SerializeToString()
-    return serialised
+    return onnx_wire.model(nodes, constants, {IMAGES: ("n", 1, height, width)}, {OUTPUTS: ("n", architecture.outputs)})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,9 @@ from perception.graph import IMAGES, OUTPUTS, onnx_model
 from perception.model_file import Header, Model, load_model
 from perception.preprocessing import scale
 
+Runner = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+"""Computes a network: float32 (n, 1, height, width) in [0, 1] to its outputs (n, outputs)."""
+
 RANGE_TOLERANCE = 0.05
 """How far, in label half-ranges, a prediction may lie outside the taught range and still count as inside."""
 
@@ -25,37 +28,62 @@ class Prediction:
 
     Attributes:
         xi: (6,) mean [v, w], m and rad.
-        sigma: (6,) standard deviation of each component, m and rad; the components are independent.
+        covariance: (6, 6) of xi, m and rad.
         in_range: the mean lies in the range of labels that the model was taught. Outside it, and out of contact, a
             prediction means little.
+        markers: share of the markers expected in view that were seen, where the model looks for markers.
     """
 
     xi: Array
-    sigma: Array
+    covariance: Array
     in_range: bool
+    markers: float | None = None
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) standard deviation of each component of xi, m and rad."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+
+def onnx_runtime(model: Model) -> Runner:
+    """A model's network in ONNX Runtime, on the thread that calls it and no other."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # On batches of one neither of these is faster: a memory plan for each input shape (1 MB), and a second, packed copy
+    # of the weights (3 MB).
+    options.enable_mem_pattern = False
+    options.add_session_config_entry("session.disable_prepacking", "1")
+    session = onnxruntime.InferenceSession(onnx_model(model), options, providers=["CPUExecutionProvider"])
+    # It keeps the whole model for another provider that it might fall back to: 2 to 6 MB, and there is no other.
+    session._model_bytes = None
+
+    def run(inputs: NDArray[np.float32]) -> NDArray[np.float32]:
+        outputs: NDArray[np.float32] = session.run([OUTPUTS], {IMAGES: inputs})[0]
+        return outputs
+
+    return run
 
 
 class ContactModel:
     """A trained model, ready to predict.
 
     Memory does not grow with the number of predictions. Not safe for use from two threads at once.
+
+    Args:
+        model: what was trained.
+        runner: computes its network; None for ``onnx_runtime``.
     """
 
-    def __init__(self, model: Model) -> None:
-        import onnxruntime
-
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 3
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        self._session = onnxruntime.InferenceSession(onnx_model(model), options, providers=["CPUExecutionProvider"])
+    def __init__(self, model: Model, runner: Runner | None = None) -> None:
+        self._run = runner or onnx_runtime(model)
         self.header: Header = model.header
         self.reference: ImageArray | None = model.reference
         self._preprocessing = model.header.preprocessing
-        self._centre = model.header.labels.centre
-        self._half_range = model.header.labels.half_range
-        self._sigma_scale = np.array(model.header.sigma_scale) * self._half_range
 
     @classmethod
     def load(cls, path: Path) -> ContactModel:
@@ -94,17 +122,8 @@ class ContactModel:
             self.predict(sample.value.image), sample.t_ns, sample.seq, sample.t_device_ns, quality=sample.quality
         )
 
-    def _run(self, inputs: NDArray[np.float32]) -> NDArray[np.float32]:
-        outputs: NDArray[np.float32] = self._session.run([OUTPUTS], {IMAGES: inputs})[0]
-        return outputs
-
     def _decode(self, output: NDArray[np.float32]) -> Prediction:
         mean = output[:6].astype(np.float64)
-        sigma = (
-            self._sigma_scale * np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else self._sigma_scale.copy()
-        )
-        return Prediction(
-            xi=self._centre + self._half_range * mean,
-            sigma=sigma,
-            in_range=bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE)),
-        )
+        sigma = np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else np.ones(6)
+        xi, covariance = self.header.labels.xi_gaussian(mean, self.header.calibrated(sigma))
+        return Prediction(xi, covariance, in_range=bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE)))

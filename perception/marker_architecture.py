@@ -72,7 +72,6 @@ class MarkerArchitecture(BaseModel):
             "guess.output.weight": (k, self.guess_hidden),
             "guess.output.bias": (k,),
             "guess.sd": (k,),
-            "sigma_power": (6,),
         }
         before = 2 * m
         for i, units in enumerate((*self.hidden, 12)):

@@ -14,7 +14,7 @@ from perception.inference import RANGE_TOLERANCE, Prediction
 from perception.marker_architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture
 from perception.marker_matching import DisplacementModel, FirstGuess, MarkerField, MarkerMatcher
 from perception.markers import Discs, detect_markers
-from perception.model_file import Header, Model, load_model
+from perception.model_file import Header, Labels, Model, load_model
 
 if TYPE_CHECKING:
     from perception.camera_change import CameraChange
@@ -60,10 +60,6 @@ class MarkerEstimator:
         self._first = first.reshape(-1, first.shape[2])
         self._first_bias = bias.reshape(-1)
         self._networks = architecture.networks
-        self._centre = model.header.labels.centre
-        self._half_range = model.header.labels.half_range
-        self._power = model.tensors["sigma_power"].astype(np.float64)
-        self._sigma_scale = np.array(model.header.sigma_scale) * self._half_range
 
     @classmethod
     def load(cls, path: Path) -> MarkerEstimator:
@@ -100,13 +96,13 @@ class MarkerEstimator:
             discs = Discs(self.change.points(discs.centres), discs.areas)
         field = self._matcher.match(discs, self.field)
         self.field = field
+        labels = self.header.labels
         if not field.seen.any():
-            return Prediction(self._centre.copy(), self._half_range.copy(), in_range=False)
+            return Prediction(*labels.xi_gaussian(np.zeros(6), np.ones(6)), in_range=False, markers=0.0)
         mean, sigma = self._infer(field.displacements)
         in_range = field.valid and bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
-        return Prediction(
-            xi=self._centre + self._half_range * mean, sigma=self._sigma_scale * sigma**self._power, in_range=in_range
-        )
+        xi, covariance = labels.xi_gaussian(mean, self.header.calibrated(sigma))
+        return Prediction(xi, covariance, in_range, markers=field.score)
 
     def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:
         """``predict`` of a camera's sample; the prediction keeps the stamp, number and quality of the frame."""
@@ -115,7 +111,8 @@ class MarkerEstimator:
         )
 
     def _infer(self, displacements: Array) -> tuple[Array, Array]:
-        """Mean and standard deviation (6,), in label half-ranges, of the mixture of all networks' Gaussians."""
+        """Mean (6,) in label half-ranges, and standard deviations (6,) in label units, of the mixture of all networks'
+        Gaussians."""
         x = np.einsum("ij,j->i", self._first, displacements.ravel().astype(np.float32)) + self._first_bias
         x = x.reshape(self._networks, -1)
         for weight, bias in self._layers:
@@ -124,21 +121,23 @@ class MarkerEstimator:
             x = np.einsum("noi,ni->no", weight, x) + bias
         outputs = x.astype(np.float64)
         log_precision = np.clip(outputs[:, 6:], *LOG_PRECISION_BOUNDS)
-        return mixed(outputs[:, :6], log_precision)
+        return mixed(outputs[:, :6], log_precision, self.header.labels)
 
 
-def mixed(means: Array, log_precisions: Array) -> tuple[Array, Array]:
-    """Mean and standard deviation of an even mixture of Gaussians.
+def mixed(means: Array, log_precisions: Array, labels: Labels) -> tuple[Array, Array]:
+    """Mean and standard deviations of an even mixture of Gaussians.
 
     Args:
-        means: (networks, ..., 6).
-        log_precisions: (networks, ..., 6) logarithms of inverse standard deviations.
+        means: (networks, ..., 6) in label half-ranges.
+        log_precisions: (networks, ..., 6) logarithms of inverse standard deviations, along ``labels.aligned``.
+        labels: of the model.
 
     Returns:
         (..., 6) and (..., 6).
     """
     mean = means.mean(axis=0)
-    variance = np.exp(-2.0 * log_precisions).mean(axis=0) + means.var(axis=0)
+    apart = labels.aligned(means - mean, mean)
+    variance = np.exp(-2.0 * log_precisions).mean(axis=0) + np.square(apart).mean(axis=0)
     return mean, np.sqrt(variance)
 
 

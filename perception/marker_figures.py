@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from geometry.types import Array
+from geometry.types import Array, ImageArray
 
 _CELL_PX = 4
 _BANDWIDTH_SPACINGS = 0.8
@@ -79,3 +79,32 @@ def write_markers(
         )
     figure.colorbar(drawn, ax=list(panels[1]), label="change of marker density")
     figure.savefig(path, dpi=90)
+
+
+def draw_contact(
+    image: ImageArray, reference: Array, positions: Array, spacing_px: float, *, arrows: bool
+) -> ImageArray:
+    """A contact as people see it live: the image with displacement arrows, and beside it the change of density.
+
+    Args:
+        image: uint8 (height, width), as markers were looked for in it.
+        reference: (m, 2) px, undeformed.
+        positions: (m, 2) px now.
+        spacing_px: of neighbouring markers.
+        arrows: whether the positions are those of the same markers; their density is right in any order.
+
+    Returns:
+        uint8 (height, 2 width, 3) BGR; red where markers crowd, blue where they left.
+    """
+    height, width = image.shape
+    left = np.asarray(cv2.cvtColor(image // 2, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    if arrows:
+        whole = [(int(u), int(v)) for u, v in np.round(reference * 16)]
+        ends = [(int(u), int(v)) for u, v in np.round(positions * 16)]
+        for start, end in zip(whole, ends, strict=True):
+            cv2.arrowedLine(left, start, end, (80, 220, 255), 1, cv2.LINE_AA, shift=4, tipLength=0.3)
+    change = np.clip(density_change(positions, reference, image.shape, spacing_px), -1.0, 1.0)[..., None]
+    colour = np.where(change > 0.0, [40.0, 24.0, 178.0], [172.0, 102.0, 33.0])
+    drawn = 247.0 + np.abs(change) * (colour - 247.0)
+    right = cv2.resize(drawn.astype(np.uint8), (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.concatenate([left, np.asarray(right, dtype=np.uint8)], axis=1)

@@ -13,7 +13,7 @@ this size over all cores, and wait for a busy core far longer than the product t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,8 +28,10 @@ _SETTLED_PX = 0.1
 _CONVINCING = 0.965
 _COMPLETE = 0.985
 _STILL_THERE = 0.6
-_MOST_STARTS = 6
-_MOST_STARTS_DOUBTFUL = 2
+_BANKED_AT_ONCE = 32
+_NEAR = 0.2  # Spacings that a first guess may be off; where it fails, it is off by 0.3 and more.
+_ALIKE = 6
+_MOST_STARTS = 2
 _RINGS_GROWN = 6
 _NEIGHBOURS = 7
 _ONWARD = 1.2
@@ -187,7 +189,8 @@ class MarkerMatcher:
         model: how the markers move.
         guess: a start for frames without a near frame before them.
         image_size: (height, width) px.
-        bank: (b, k) learned coefficients, of which those like the guess are tried when the guess leads nowhere.
+        bank: (b, k) learned coefficients, one or more. Those whose discs lie alike are tried where the guess leads
+            nowhere.
         least_score: below this a match is not believed.
         most_rms_px: above this a match is not believed.
     """
@@ -198,14 +201,14 @@ class MarkerMatcher:
         guess: FirstGuess,
         image_size: tuple[int, int],
         *,
-        bank: Array | None = None,
+        bank: Array,
         least_score: float = 0.9,
         most_rms_px: float = 2.0,
     ) -> None:
         self.model = model
         self._guess = guess
         self._size = np.array(image_size[::-1], dtype=np.float64)
-        self._bank = np.empty((0, len(model.sd))) if bank is None else bank
+        self._bank = bank
         self._least_score = least_score
         self._most_rms_px = most_rms_px
         self._base = model.base
@@ -220,7 +223,11 @@ class MarkerMatcher:
         self._neighbours = np.where(is_near, nearest, len(apart))
         # Where a contact is far from those that taught it, a guess is off by more than its own standard deviation.
         self._guess_sd = np.hypot(3.0 * guess.sd, 0.1 * model.sd)
-        self._bank_density = guess.density(model.positions(self._bank))
+        self._bank_density = np.empty((len(self._bank), guess.hidden_weight.shape[1]), np.float32)
+        # All at once would take 100 MB for a moment, which a process does not give back.
+        for i in range(0, len(self._bank), _BANKED_AT_ONCE):
+            part = slice(i, i + _BANKED_AT_ONCE)
+            self._bank_density[part] = guess.density(model.positions(self._bank[part]))
         self._bank_squares = (self._bank_density**2).sum(axis=1)
 
     def match(self, discs: Discs, previous: MarkerField | None = None) -> MarkerField:
@@ -238,14 +245,9 @@ class MarkerMatcher:
             field = self._refine(previous.coefficients, centres, search, self.model.sd, near=True)
             if _convincing(field):
                 return field
-        density = self._guess.density(centres)
-        field = self._refine(self._guess(density) * self.model.sd, centres, search, self._guess_sd)
-        if _convincing(field):
-            return field
-        tried = [field]
-        starts = self._alike(density)[: _MOST_STARTS_DOUBTFUL if field.valid else _MOST_STARTS]
-        for start in starts:
-            tried.append(self._refine(start, centres, search, 0.4 * self.model.sd))
+        tried: list[MarkerField] = []
+        for start, prior_sd in self._starts(centres, search):
+            tried.append(self._refine(start, centres, search, prior_sd))
             if _convincing(tried[-1]):
                 break
         return max(tried, key=quality)
@@ -261,13 +263,33 @@ class MarkerMatcher:
         prior_sd = 0.4 * self.model.sd
         return max((self._refine(start, discs.centres, search, prior_sd) for start in starts), key=quality)
 
+    def _starts(self, centres: Array, search: _Nearest) -> Iterator[tuple[Array, Array]]:
+        """Coefficients (k,) to start a match from, the most promising first, with their uncertainties (k,).
+
+        A start is looked at once before it is followed: one that leads nowhere costs ten times as much.
+        """
+        density = self._guess.density(centres)
+        guess = self._guess(density) * self.model.sd
+        off = self._off(guess, search)
+        if off < _NEAR * self._spacing_px:
+            yield guess, self._guess_sd
+        alike = self._alike(density)
+        offs = [self._off(start, search) for start in alike]
+        order = np.argsort(offs)[:_MOST_STARTS]
+        if _NEAR * self._spacing_px <= off <= offs[order[0]]:
+            yield guess, self._guess_sd
+        for i in order:
+            yield alike[i], 0.4 * self.model.sd
+
+    def _off(self, coefficients: Array, search: _Nearest) -> float:
+        """Median distance px of the predicted markers from their nearest discs."""
+        return math.sqrt(float(np.median(search(self.model.positions(coefficients))[1])))
+
     def _alike(self, density: NDArray[np.float32]) -> Array:
         """(s, k) coefficients of the learned contacts whose discs are dense where this image's are."""
-        if not len(self._bank):
-            return self._bank
         # The distance less what is the same for all.
         apart = self._bank_squares - 2.0 * np.einsum("ij,j->i", self._bank_density, density)
-        return self._bank[np.argsort(apart)[:_MOST_STARTS]]
+        return self._bank[np.argsort(apart)[:_ALIKE]]
 
     def _refine(
         self, start: Array, centres: Array, search: _Nearest, prior_sd: Array, *, near: bool = False

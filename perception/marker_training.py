@@ -8,6 +8,7 @@ import json
 import math
 import os
 import tempfile
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -22,8 +23,9 @@ from torch import Tensor
 
 from drivers.tactile_data import Split, read_split
 from geometry.types import Array, ImageArray
+from perception.calibration import calibrate
 from perception.checkpoint import EpochRecord, Progress, delete_checkpoint, load_checkpoint, save_checkpoint
-from perception.dataset import cache_key, default_cache
+from perception.dataset import cache_key, default_cache, label_range
 from perception.displacement_network import DisplacementNetwork, displacement_loss
 from perception.errors import TrainingError
 from perception.figures import write_curves, write_predictions
@@ -35,11 +37,12 @@ from perception.marker_learning import GRID, GUESS_HIDDEN, Learned, learn_marker
 from perception.marker_matching import DisplacementModel
 from perception.markers import Discs, MarkerSize, detect_markers, typical_size
 from perception.model_file import Header, Labels, Model, save_model, touchcell_version
+from perception.networks import Alignment
 from perception.preprocessing import AdaptiveThreshold, Preprocessing
 from perception.training_display import Display, Observer
 
 _LEAST_SCORE_TAUGHT = 0.9
-_POWERS = np.arange(0.4, 1.6, 0.02)
+_MATCHING = 2  # Counts the ways of matching there have been, so that no other way's result is taken from the cache.
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,6 @@ class MarkerSettings:
         batch_size: contacts per step and network.
         learning_rate: its peak, after a rise over 5 % of the steps; then it falls as a half cosine.
         weight_decay: of AdamW.
-        dropout: after each hidden layer.
         memory: of the running average of the networks, as the share that stays in a step.
         noise: standard deviation added to scaled inputs.
         shift_px, turn_rad, zoom: standard deviations of the jitter, as of a camera taken off and put on again.
@@ -71,9 +73,8 @@ class MarkerSettings:
     hidden: tuple[int, ...] = (384, 384, 192)
     networks: int = 4
     batch_size: int = 64
-    learning_rate: float = 2e-3
+    learning_rate: float = 1e-3
     weight_decay: float = 0.01
-    dropout: float = 0.1
     memory: float = 0.998
     noise: float = 0.02
     shift_px: float = 0.5
@@ -196,7 +197,7 @@ def train_on_discs(
         TrainingError: as ``train_markers``.
     """
     settings = settings or MarkerSettings()
-    labels = _label_range(training.xi, validation.xi)
+    labels = label_range(training.xi, validation.xi)
     training_data = training.digest()
     matched = _matched(training, validation, preprocessing.output_size, training_data, settings, cache, observer)
     architecture = MarkerArchitecture(
@@ -225,8 +226,7 @@ def train_on_discs(
         run = _Run(settings, labels, matched, training.xi, validation.xi, observer)
         run.fit(out, recipe, resume=resume)
     mean, sigma = run.predict()
-    target = (validation.xi - labels.centre) / labels.half_range
-    scale, power = calibrate(target - mean, sigma)
+    scale, power = calibrate(labels.aligned(labels.targets(validation.xi) - mean, mean), sigma)
     best = run.progress.history[run.progress.best_epoch - 1]
     model = Model(
         Header(
@@ -235,6 +235,7 @@ def train_on_discs(
             preprocessing=preprocessing,
             labels=labels,
             sigma_scale=tuple(scale.tolist()),
+            sigma_power=tuple(power.tolist()),
             training_data=training_data,
             training={
                 **{key: list(value) if isinstance(value, tuple) else value for key, value in asdict(settings).items()},
@@ -242,48 +243,26 @@ def train_on_discs(
                 "images_matched": int(matched.taught.sum()),
                 "epochs_run": len(run.progress.history),
                 "best_epoch": run.progress.best_epoch,
+                "epochs_cpu_s": round(run.progress.cpu_s, 1),
                 "validation_loss": run.progress.best_loss,
                 "validation_mae": list(best.mae.values()),
             },
         ),
-        {**matched.tensors, **run.average.folded(), "sigma_power": power.astype(np.float32)},
+        {**matched.tensors, **run.average.folded()},
         reference,
     )
     save_model(model, out)
+    xi, covariance = labels.xi_gaussian(mean, model.header.calibrated(sigma))
     write_predictions(
         out.with_name(f"{out.stem}_predictions.png"),
         truth=contact_from_xi(validation.xi),
-        predicted=contact_from_xi(labels.centre + labels.half_range * mean),
-        sigma=scale * sigma**power * labels.half_range,
+        predicted=contact_from_xi(xi),
+        sigma=np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)),
     )
     write_curves(out.with_name(f"{out.stem}_curves.png"), run.progress.history)
     _write_examples(out.with_name(f"{out.stem}_markers.png"), run.model, matched.validation, preprocessing.output_size)
     delete_checkpoint(out)
     return model
-
-
-def calibrate(residual: Array, sigma: Array) -> tuple[Array, Array]:
-    """Scale and power that make ``scale * sigma ** power`` the likeliest standard deviations of Gaussian residuals.
-
-    A network is surer of what it is sure of, and less sure of the rest, than other data bear out: a power below one
-    takes some of both back.
-
-    Args:
-        residual: (n, 6).
-        sigma: (n, 6) predicted, uncalibrated.
-
-    Returns:
-        (6,) and (6,).
-    """
-    scales, powers = np.empty(6), np.empty(6)
-    for i in range(6):
-        # Given the power, the likeliest scale is the root mean square of the standardised residuals.
-        candidates = sigma[:, i, None] ** _POWERS
-        scale = np.sqrt(((residual[:, i, None] / candidates) ** 2).mean(axis=0))
-        cost = np.log(candidates).mean(axis=0) + np.log(scale)
-        best = int(np.argmin(cost))
-        scales[i], powers[i] = scale[best], _POWERS[best]
-    return scales, powers
 
 
 @dataclass(frozen=True)
@@ -313,7 +292,7 @@ def _matched(
     cache: Path | None,
     observer: Observer | None,
 ) -> _Matched:
-    matching = [settings.rings, settings.modes, settings.guess_steps, settings.seed]
+    matching = [_MATCHING, settings.rings, settings.modes, settings.guess_steps, settings.seed]
     key = json.dumps([training_data, validation.digest(), *matching])
     name = f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.markers.npz"
     stored = _load(cache / name) if cache is not None else None
@@ -406,8 +385,9 @@ class _Run:
             tensors["displacement.sd"],
         )
         settings = self.settings
-        self.network = DisplacementNetwork(model, settings.hidden, settings.networks, settings.dropout)
+        self.network = DisplacementNetwork(model, settings.hidden, settings.networks)
         self.average = copy.deepcopy(self.network).eval()
+        self.alignment = Alignment(self.labels)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
         )
@@ -439,17 +419,19 @@ class _Run:
         """Mean and uncalibrated sigma (n, 6) of the validation set, in label half-ranges."""
         networks = self.settings.networks
         outputs = self.average(self.validation_inputs.expand(networks, -1, -1)).numpy().astype(np.float64)
-        return mixed(outputs[..., :6], outputs[..., 12:])
+        return mixed(outputs[..., :6], outputs[..., 12:], self.labels)
 
     def _epoch_and_its_validation(self, epoch: int) -> None:
+        started_s = time.process_time()
         train_loss = self._epoch(epoch)
         mean, _ = self.predict()
         loss = float(np.abs(mean - self.validation_targets.numpy()).mean(axis=0).sum())
         if not math.isfinite(loss):
             raise TrainingError("the validation loss is no number", epoch=epoch, hint="lower the learning rate")
-        contacts = contact_from_xi(self.labels.centre + self.labels.half_range * mean)
+        contacts = self.labels.contacts(mean)
         mae = np.abs(contacts - contact_from_xi(self.validation_xi)).mean(axis=0)
-        record = EpochRecord(epoch, train_loss, loss, dict(zip(CONTACT_NAMES, mae.tolist(), strict=True)))
+        errors = dict(zip(CONTACT_NAMES, mae.tolist(), strict=True))
+        record = EpochRecord(epoch, train_loss, loss, errors, time.process_time() - started_s)
         self.progress.add(record, self.average)
         if self.observer is not None:
             self.observer.epoch(record, best=self.progress.best_epoch == epoch)
@@ -468,7 +450,7 @@ class _Run:
                 group["lr"] = _cosine(step, batches * settings.epochs, settings.learning_rate)
             chosen = order[:, i * settings.batch_size : (i + 1) * settings.batch_size]
             outputs = self.network(self._jittered(self.inputs[chosen]), settings.noise)
-            loss = displacement_loss(outputs, self.targets[chosen])
+            loss = displacement_loss(outputs, self.targets[chosen], self.alignment)
             if not torch.isfinite(loss):
                 raise TrainingError("the loss is no number", epoch=epoch, hint="lower the learning rate")
             self.optimizer.zero_grad(set_to_none=True)
@@ -499,23 +481,12 @@ class _Run:
         return displacements + moved.flatten(2)
 
     def _normalised(self, xi: Array) -> Tensor:
-        return torch.from_numpy(((xi - self.labels.centre) / self.labels.half_range).astype(np.float32))
+        return torch.from_numpy(self.labels.targets(xi).astype(np.float32))
 
 
 def _cosine(step: int, steps: int, peak: float) -> float:
     """Learning rate: up in a straight line over 5 % of the steps, down as a half cosine over all of them."""
     return peak * min(1.0, (step + 1) / (0.05 * steps)) * 0.5 * (1.0 + math.cos(math.pi * step / steps))
-
-
-def _label_range(training: Array, validation: Array) -> Labels:
-    for name, xi in (("training", training), ("validation", validation)):
-        if xi.ndim != 2 or len(xi) < 2 or xi.shape[1] != 6 or not np.isfinite(xi).all():
-            raise TrainingError(f"the {name} set needs two or more labels of six finite components")
-    low, high = training.min(axis=0), training.max(axis=0)
-    for name, width in zip(CONTACT_NAMES, high - low, strict=True):
-        if width < 1e-9:
-            raise TrainingError(f"all training labels have the same {name}", hint="collect contacts that vary in it")
-    return Labels(low=tuple(low.tolist()), high=tuple(high.tolist()))
 
 
 def _discs(

@@ -18,6 +18,7 @@ from geometry.types import Array, ImageArray
 from perception.architecture import Architecture
 from perception.camera_change import CameraChange
 from perception.errors import ModelError
+from perception.labels import CONTACT_NAMES, contact_from_xi, shear_direction, xi_gaussian
 from perception.marker_architecture import MarkerArchitecture
 from perception.preprocessing import Preprocessing
 
@@ -32,9 +33,14 @@ SixPositive = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
 
 
 class Labels(BaseModel):
-    """What the outputs mean: exponential coordinates log(T_s_f), and the range of them that was taught.
+    """What the outputs mean, and the range that was taught.
 
-    A network's output o stands for ``centre + o * half_range``.
+    A network's mean o stands for ``centre + o * half_range``: contacts in mm and degrees (``of_contacts``), or
+    exponential coordinates log(T_s_f) in m and rad. Slip blurs x, y and gamma. In the coordinates of a contact it stays
+    there, in exponential coordinates it also blurs depth and tilt.
+
+    The standard deviations that go with a contact are those of its shear along and across the shear's own direction,
+    then of z, alpha, beta and gamma, as slip errs along the shear (``xi_gaussian``).
 
     Attributes:
         names: of the six components.
@@ -56,6 +62,16 @@ class Labels(BaseModel):
             raise ValueError("every high must exceed its low")
         return self
 
+    @classmethod
+    def of_contacts(cls, low: Six, high: Six) -> Labels:
+        """Contacts between ``low`` and ``high``, mm and degrees, in the order of ``labels.CONTACT_NAMES``."""
+        return cls(names=CONTACT_NAMES, units=("mm", "mm", "mm", "deg", "deg", "deg"), low=low, high=high)
+
+    @property
+    def are_contacts(self) -> bool:
+        """Whether they are contacts rather than exponential coordinates."""
+        return self.names == CONTACT_NAMES
+
     @property
     def centre(self) -> Array:
         """(6,) middle of the range."""
@@ -65,6 +81,50 @@ class Labels(BaseModel):
     def half_range(self) -> Array:
         """(6,) half of the range."""
         return 0.5 * np.subtract(self.high, self.low, dtype=np.float64)
+
+    @property
+    def sigma_unit(self) -> Array:
+        """(6,) what a standard deviation of one stands for: the half range, one for both directions of shear."""
+        unit = self.half_range
+        if self.are_contacts:
+            unit[:2] = unit[:2].mean()
+        return unit
+
+    def targets(self, xi: Array) -> Array:
+        """(n, 6) what a network should answer for contacts with exponential coordinates (n, 6), m and rad."""
+        values = contact_from_xi(xi) if self.are_contacts else xi
+        return np.divide(values - self.centre, self.half_range)
+
+    def contacts(self, mean: Array) -> Array:
+        """(..., 6) contacts, mm and degrees, that outputs (..., 6) stand for."""
+        values = self.centre + self.half_range * mean
+        contacts: Array = values if self.are_contacts else contact_from_xi(values)
+        return contacts
+
+    def aligned(self, residual: Array, mean: Array) -> Array:
+        """Residuals (..., 6) of outputs about ``mean`` (..., 6), in the directions and units of the sigmas."""
+        if not self.are_contacts:
+            return residual
+        along = shear_direction(self.centre + self.half_range * mean)
+        values = residual * self.half_range / self.sigma_unit
+        x, y = values[..., 0], values[..., 1]
+        shear = np.stack([along[..., 0] * x + along[..., 1] * y, along[..., 0] * y - along[..., 1] * x], axis=-1)
+        return np.concatenate([shear, values[..., 2:]], axis=-1)
+
+    def xi_gaussian(self, mean: Array, sigma: Array) -> tuple[Array, Array]:
+        """Means (..., 6) and covariances (..., 6, 6) of xi = log(T_s_f), m and rad, that outputs and sigmas say."""
+        values = self.centre + self.half_range * mean
+        variance = (sigma * self.sigma_unit) ** 2
+        covariance = variance[..., None] * np.eye(6)
+        if not self.are_contacts:
+            return values, covariance
+        direction = shear_direction(values)
+        u, v = direction[..., 0], direction[..., 1]
+        along, across = variance[..., 0], variance[..., 1]
+        covariance[..., 0, 0] = u**2 * along + v**2 * across
+        covariance[..., 1, 1] = v**2 * along + u**2 * across
+        covariance[..., 0, 1] = covariance[..., 1, 0] = u * v * (along - across)
+        return xi_gaussian(values, covariance)
 
 
 class Header(BaseModel):
@@ -76,11 +136,13 @@ class Header(BaseModel):
         architecture: which tensors there are and how they are joined.
         preprocessing: from camera image to network input.
         labels: what the outputs mean.
-        sigma_scale: (6,) gdn: what the network's standard deviations are multiplied by to be calibrated; cnn: the
-            standard deviations themselves, in label half-ranges; markers: the factor for the networks' standard
-            deviations after these are raised to the tensor ``sigma_power``. Found on the validation split.
+        sigma_scale: (6,) what a network's standard deviations, raised to ``sigma_power``, are multiplied by to be
+            calibrated; cnn: the standard deviations themselves. In ``labels.sigma_unit``, along ``labels.aligned``.
+            Found on the validation split.
+        sigma_power: (6,) see ``calibration.calibrate``.
         camera: from the pixels of this model's sensor to those of the one that taught its networks, where it was
             adapted (``touchcell adapt``).
+        label_turn_deg: of its contacts' axes about the sensor's z axis, to those that its networks were taught with.
         training_data: digest of the training set (``LabelledImages.digest``).
         training: settings and outcome of the training, for people.
     """
@@ -93,9 +155,16 @@ class Header(BaseModel):
     preprocessing: Preprocessing
     labels: Labels
     sigma_scale: SixPositive
+    sigma_power: SixPositive = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
     camera: CameraChange | None = None
+    label_turn_deg: Finite = 0.0
     training_data: str
     training: dict[str, str | int | float | list[float] | None] = {}
+
+    def calibrated(self, sigma: Array) -> Array:
+        """(..., 6) standard deviations of the network (..., 6) after calibration."""
+        calibrated: Array = np.array(self.sigma_scale) * sigma ** np.array(self.sigma_power)
+        return calibrated
 
     @model_validator(mode="after")
     def _preprocessing_feeds_network(self) -> Header:

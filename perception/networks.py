@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from perception.architecture import Architecture
+from perception.model_file import Labels
 
 
 def softbound(x: Tensor, low: Tensor | float, high: Tensor | float) -> Tensor:
@@ -71,7 +72,7 @@ class ContactNetwork(nn.Module):
             x = functional.relu(normalisation(functional.max_pool2d(convolution(x), 2)))
         x = functional.dropout(x.flatten(1), self.architecture.feature_dropout, self.training)
         x = functional.relu(self.hidden(x))
-        x = self._each_output_behind_its_own_dropout(x) if self.training else self.output(x)
+        x = self._each_output_behind_its_own_dropout(x) if self.training and self.rates.any() else self.output(x)
         return softbound(x, self.low, self.high) if self.architecture.kind == "gdn" else x
 
     def folded(self) -> dict[str, NDArray[np.float32]]:
@@ -98,10 +99,34 @@ class ContactNetwork(nn.Module):
         return torch.einsum("noh,oh->no", features[:, None, :] * mask, self.output.weight) + self.output.bias
 
 
-def gaussian_loss(outputs: Tensor, labels: Tensor) -> Tensor:
+class Alignment:
+    """``Labels.aligned`` in PyTorch: residuals along and across the predicted shear, instead of in x and y.
+
+    The gradient does not turn the direction, which would let a network reduce its loss by turning the shear of contacts
+    that it cannot place.
+    """
+
+    def __init__(self, labels: Labels) -> None:
+        self._are_contacts = labels.are_contacts
+        self._centre, self._half_range, self._scale = (
+            torch.from_numpy(array.astype(np.float32))
+            for array in (labels.centre[:2], labels.half_range[:2], labels.half_range[:2] / labels.sigma_unit[:2])
+        )
+
+    def __call__(self, residual: Tensor, mean: Tensor) -> Tensor:
+        """Residuals (..., 6) about outputs ``mean`` (..., 6)."""
+        if not self._are_contacts:
+            return residual
+        along = functional.normalize((self._centre + self._half_range * mean[..., :2]).detach(), dim=-1)
+        shear = residual[..., :2] * self._scale
+        across = shear[..., 1] * along[..., 0] - shear[..., 0] * along[..., 1]
+        return torch.cat([(shear * along).sum(-1, keepdim=True), across[..., None], residual[..., 2:]], dim=-1)
+
+
+def gaussian_loss(outputs: Tensor, labels: Tensor, alignment: Alignment) -> Tensor:
     """Mean negative log-likelihood of labels (n, 6) under gdn outputs (n, 12), summed over components, nats."""
     mean, log_precision = outputs[:, :6], outputs[:, 6:]
-    residual = (labels - mean) * torch.exp(log_precision)
+    residual = alignment(labels - mean, mean) * torch.exp(log_precision)
     return (0.5 * residual.square() - log_precision).sum(1).mean() + 3.0 * float(np.log(2.0 * np.pi))
 
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -24,6 +25,7 @@ from perception.estimate import ContactEstimate
 from perception.estimators import ContactEstimator
 from perception.filter import ContactFilter
 from perception.motion import PoseHistory
+from perception.preprocessing import Preprocessing
 
 Timer = Callable[[], int]
 
@@ -67,6 +69,9 @@ class Measurement:
 class ContactPipeline:
     """Camera, network, contact gate and filter of one sensor.
 
+    What an estimator says of an image outside the range that it was taught is told as such, and not fused: its sigma
+    means nothing there, and the filter carries the contact on by the sensor's own motion.
+
     Args:
         camera: an opened frame source.
         model: any estimator, with its preprocessing.
@@ -92,6 +97,7 @@ class ContactPipeline:
         self._poses = PoseHistory()
         self._newest: ContactEstimate | None = None
         self._ended = False
+        self._filtering = False
         self.measurement: Measurement | None = None
         self.frame: Stamped[Frame] | None = None
         self.times = StageTimes()
@@ -100,6 +106,16 @@ class ContactPipeline:
     def ended(self) -> bool:
         """Whether the camera has come to its end."""
         return self._ended
+
+    @property
+    def preprocessing(self) -> Preprocessing:
+        """Of the model, from camera images."""
+        return self._model.header.preprocessing
+
+    def await_frame(self) -> None:
+        """Wait for the camera's first frame, which is processed by the next update. Raises DeviceError."""
+        with suppress(EndOfStream):
+            self._camera.latest()
 
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
         """Tell where the sensor was at ``t_ns``."""
@@ -137,28 +153,41 @@ class ContactPipeline:
             self.measurement = Measurement(frame.seq, frame.t_ns, None)
             if self._filter is not None:
                 self._filter.reset()
+                self._filtering = False
             return ContactEstimate(False, None, frame.t_ns, frame.seq, frame.t_ns)
         start = self._timer()
         prediction = self._model.predict_reduced(reduced)
         infer_ns = self._timer() - start
         start = self._timer()
-        observed = gaussian.from_exponential(prediction.xi, np.diag(prediction.sigma**2))
+        observed = gaussian.from_exponential(prediction.xi, prediction.covariance)
         self.measurement = Measurement(frame.seq, frame.t_ns, observed)
         belief, nis = observed, None
         if self._filter is not None:
-            state = self._filter.update(observed, self._sensor_pose(frame.t_ns), frame.t_ns)
-            belief, nis = state.belief, state.nis
+            T_base_sensor = self._sensor_pose(frame.t_ns)
+            if prediction.in_range:
+                state = self._filter.update(observed, T_base_sensor, frame.t_ns)
+                self._filtering = True
+                belief, nis = state.belief, state.nis
+            elif self._filtering:
+                belief = self._filter.predict(T_base_sensor, frame.t_ns)
         self.times = StageTimes(read_ns, preprocess_ns, infer_ns, self._timer() - start)
-        return ContactEstimate(True, belief, frame.t_ns, frame.seq, frame.t_ns, in_range=prediction.in_range, nis=nis)
+        return ContactEstimate(
+            True,
+            belief,
+            frame.t_ns,
+            frame.seq,
+            frame.t_ns,
+            in_range=prediction.in_range,
+            nis=nis,
+            markers=prediction.markers,
+        )
 
     def _replayed(self, estimate: ContactEstimate, now_ns: int) -> ContactEstimate:
         """The estimate carried from its frame to now by the sensor's own motion since."""
-        if self._filter is None or estimate.belief is None or now_ns <= estimate.t_frame_ns:
+        if self._filter is None or not self._filtering or estimate.belief is None or now_ns <= estimate.t_frame_ns:
             return estimate
         belief = self._filter.predict(self._sensor_pose(now_ns), now_ns)
-        return ContactEstimate(
-            True, belief, estimate.t_frame_ns, estimate.seq, now_ns, in_range=estimate.in_range, nis=estimate.nis
-        )
+        return replace(estimate, belief=belief, t_ns=now_ns)
 
     def _sensor_pose(self, t_ns: int) -> Array:
         return self._poses.at(t_ns) if len(self._poses) else np.eye(4)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import copy
 import math
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -19,17 +20,19 @@ from torch.nn import functional
 from drivers.tactile_data import read_split
 from geometry.types import Array, ImageArray
 from perception.architecture import Architecture
+from perception.calibration import calibrate
 from perception.checkpoint import EpochRecord, Progress, delete_checkpoint, load_checkpoint, save_checkpoint
-from perception.dataset import LabelledImages, default_cache, load_reduced
+from perception.dataset import LabelledImages, default_cache, label_range, load_reduced
 from perception.errors import TrainingError
 from perception.figures import write_curves, write_predictions
 from perception.labels import CONTACT_NAMES, contact_from_xi, xi_from_contact
 from perception.model_file import Header, Labels, Model, save_model, touchcell_version
-from perception.networks import ContactNetwork, gaussian_loss, weighted_absolute_loss, weighted_square_loss
-from perception.preprocessing import Preprocessing, scale
+from perception.networks import Alignment, ContactNetwork, gaussian_loss, weighted_absolute_loss, weighted_square_loss
+from perception.preprocessing import Crop, Preprocessing, scale
 from perception.training_display import Display, Observer
 
 _EVALUATION_BATCH = 100
+_SHORT_SIDE_PX = 100
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ def train(
     *,
     kind: Literal["gdn", "cnn", "markers"] = "gdn",
     epochs: int | None = None,
+    networks: int | None = None,
     seed: int = 0,
     resume: bool = True,
     cache: Path | None = None,
@@ -105,8 +109,9 @@ def train(
         data: data set, see ``dataset``.
         out: ``NAME.safetensors``; figures become ``NAME_predictions.png`` and ``NAME_curves.png``.
         kind: gdn predicts a Gaussian, cnn means alone; markers as ``marker_training``.
-        epochs: None for the default of ``Settings``.
-        seed: of everything random; the same seed on the same machine gives the same file.
+        epochs: None for the default of ``Settings`` or ``MarkerSettings``.
+        networks: of a marker estimator; None for the default of ``MarkerSettings``.
+        seed: of everything random; the same seed on the same machine gives the same file, but for the time it took.
         resume: go on with an interrupted training; False begins anew.
         cache: folder for preprocessed images; None for ``dataset.default_cache()``.
         observer: is told of the progress; None shows it on the terminal.
@@ -118,17 +123,32 @@ def train(
     """
     if observer is None:
         with Display() as display:
-            train(data, out, kind=kind, epochs=epochs, seed=seed, resume=resume, cache=cache, observer=display)
+            train(
+                data,
+                out,
+                kind=kind,
+                epochs=epochs,
+                networks=networks,
+                seed=seed,
+                resume=resume,
+                cache=cache,
+                observer=display,
+            )
         return
     if kind == "markers":
         from perception.marker_training import MarkerSettings, train_markers
 
-        marker_settings = MarkerSettings(seed=seed) if epochs is None else MarkerSettings(seed=seed, epochs=epochs)
+        marker_settings = MarkerSettings(seed=seed)
+        if epochs is not None:
+            marker_settings = replace(marker_settings, epochs=epochs)
+        if networks is not None:
+            marker_settings = replace(marker_settings, networks=networks)
         train_markers(data, out, settings=marker_settings, resume=resume, cache=cache, observer=observer)
         return
+    if networks is not None:
+        raise TrainingError(f"a {kind} is one network", hint="the number of networks is for --kind markers")
     splits = {name: read_split(data, name) for name in ("train", "val")}
-    first = next(splits["train"].read())
-    preprocessing = Preprocessing(input_size=(first.shape[0], first.shape[1]))
+    preprocessing = preprocessing_for(next(splits["train"].read()))
     sets = {
         name: LabelledImages(
             load_reduced(
@@ -150,6 +170,24 @@ def train(
         settings=Settings(seed=seed) if epochs is None else Settings(seed=seed, epochs=epochs),
         resume=resume,
         observer=observer,
+    )
+
+
+def preprocessing_for(image: ImageArray) -> Preprocessing:
+    """Whole pixels averaged into one, to a short side of 100 to 199.
+
+    OpenCV shrinks by whole numbers three times as fast as to the paper's 128x128. What is left over at the border is
+    cut off.
+    """
+    height, width = image.shape[:2]
+    factor = max(1, min(height, width) // _SHORT_SIDE_PX)
+    rows, columns = height // factor, width // factor
+    left, top = (width - columns * factor) // 2, (height - rows * factor) // 2
+    crop = Crop(left, top, left + columns * factor, top + rows * factor)
+    return Preprocessing(
+        input_size=(height, width),
+        crop=None if crop == (0, 0, width, height) else crop,
+        output_size=(rows, columns),
     )
 
 
@@ -185,7 +223,9 @@ def train_on_arrays(
     """
     settings = settings or Settings()
     architecture = architecture or Architecture(kind=kind, input_size=preprocessing.output_size)
-    labels = _label_range(training, validation)
+    if len(training.images) != len(training.xi) or len(validation.images) != len(validation.xi):
+        raise TrainingError("every image needs one label")
+    labels = label_range(training.xi, validation.xi)
     training_data = training.digest()
     recipe: dict[str, object] = {
         "data": training_data,
@@ -198,20 +238,23 @@ def train_on_arrays(
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         run = _Run(network, settings, labels, training, validation, observer)
         run.fit(out, recipe, resume=resume)
-    outputs = run.outputs(validation.images)
+    mean, sigma = run.predict()
+    scale, power = calibrate(labels.aligned(labels.targets(validation.xi) - mean, mean), sigma)
     model = Model(
         Header(
             touchcell_version=touchcell_version(),
             architecture=architecture,
             preprocessing=preprocessing,
             labels=labels,
-            sigma_scale=_calibrate(outputs, run.validation_labels.numpy()),
+            sigma_scale=tuple(scale.tolist()),
+            sigma_power=tuple(power.tolist()),
             training_data=training_data,
             training={
                 **{key: list(value) if isinstance(value, tuple) else value for key, value in asdict(settings).items()},
                 "images": len(training),
                 "epochs_run": len(run.progress.history),
                 "best_epoch": run.progress.best_epoch,
+                "epochs_cpu_s": round(run.progress.cpu_s, 1),
                 "validation_loss": run.progress.best_loss,
                 "validation_mae": list(run.progress.history[run.progress.best_epoch - 1].mae.values()),
             },
@@ -220,15 +263,12 @@ def train_on_arrays(
         reference,
     )
     save_model(model, out)
-    sigma = np.broadcast_to(
-        np.array(model.header.sigma_scale) * (np.exp(-outputs[:, 6:]) if architecture.kind == "gdn" else 1.0),
-        (len(outputs), 6),
-    )
+    xi, covariance = labels.xi_gaussian(mean, model.header.calibrated(sigma))
     write_predictions(
         out.with_name(f"{out.stem}_predictions.png"),
         truth=contact_from_xi(validation.xi),
-        predicted=run.contacts(outputs),
-        sigma=sigma * labels.half_range,
+        predicted=contact_from_xi(xi),
+        sigma=np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)),
     )
     write_curves(out.with_name(f"{out.stem}_curves.png"), run.progress.history)
     delete_checkpoint(out)
@@ -257,6 +297,7 @@ class _Run:
             learned, lr=self.settings.learning_rate, weight_decay=self.settings.weight_decay
         )
         self.average = copy.deepcopy(self.network).eval()
+        self.alignment = Alignment(self.labels)
         self.training_labels = self._normalised(self.training.xi)
         self.validation_labels = self._normalised(self.validation.xi)
         self.weights = torch.tensor(
@@ -285,21 +326,27 @@ class _Run:
                 ]
             )
 
-    def contacts(self, outputs: NDArray[np.float32]) -> Array:
-        """(n, 6) contacts, mm and degrees, that network outputs stand for."""
-        return contact_from_xi(self.labels.centre + self.labels.half_range * outputs[:, :6].astype(np.float64))
+    def predict(self) -> tuple[Array, Array]:
+        """Mean and uncalibrated sigma (n, 6) of the validation set, in label half-ranges; sigma is 1 for cnn."""
+        outputs = self.outputs(self.validation.images).astype(np.float64)
+        sigma = np.exp(-outputs[:, 6:]) if outputs.shape[1] > 6 else np.ones_like(outputs)
+        return outputs[:, :6], sigma
 
     def _remaining_epochs(self, out: Path, recipe: dict[str, object]) -> None:
         for epoch in range(len(self.progress.history) + 1, self.settings.epochs + 1):
             if epoch - self.progress.best_epoch > self.settings.patience:
                 break
+            started_s = time.process_time()
             train_loss = self._epoch(epoch)
             outputs = self.outputs(self.validation.images)
             loss = self._loss(torch.from_numpy(outputs), self.validation_labels).item()
             if not math.isfinite(loss):
                 raise TrainingError("the validation loss is no number", epoch=epoch, hint="lower the learning rate")
-            mae = np.abs(self.contacts(outputs) - contact_from_xi(self.validation.xi)).mean(axis=0)
-            record = EpochRecord(epoch, train_loss, loss, dict(zip(CONTACT_NAMES, mae.tolist(), strict=True)))
+            mae = np.abs(
+                self.labels.contacts(outputs[:, :6].astype(np.float64)) - contact_from_xi(self.validation.xi)
+            ).mean(axis=0)
+            errors = dict(zip(CONTACT_NAMES, mae.tolist(), strict=True))
+            record = EpochRecord(epoch, train_loss, loss, errors, time.process_time() - started_s)
             self.progress.add(record, self.average)
             save_checkpoint(out, recipe, self.network, self.average, self.optimizer, self.progress)
             if self.observer is not None:
@@ -349,23 +396,10 @@ class _Run:
     def _loss(self, outputs: Tensor, labels: Tensor) -> Tensor:
         if self.network.architecture.kind == "cnn":
             return weighted_square_loss(outputs, labels, self.weights)
-        return gaussian_loss(outputs, labels) + weighted_absolute_loss(outputs, labels, self.weights)
+        return gaussian_loss(outputs, labels, self.alignment) + weighted_absolute_loss(outputs, labels, self.weights)
 
     def _normalised(self, xi: Array) -> Tensor:
-        return torch.from_numpy(((xi - self.labels.centre) / self.labels.half_range).astype(np.float32))
-
-
-def _label_range(training: LabelledImages, validation: LabelledImages) -> Labels:
-    for name, images in (("training", training), ("validation", validation)):
-        if len(images) < 2 or images.xi.shape != (len(images), 6):
-            raise TrainingError(f"the {name} set needs at least two images and as many labels of six components")
-        if not np.isfinite(images.xi).all():
-            raise TrainingError(f"the {name} set has labels that are not finite")
-    low, high = training.xi.min(axis=0), training.xi.max(axis=0)
-    for i, name in enumerate(CONTACT_NAMES):
-        if high[i] - low[i] < 1e-9:
-            raise TrainingError(f"all training labels have the same {name}", hint="collect contacts that vary in it")
-    return Labels(low=tuple(low.tolist()), high=tuple(high.tolist()))
+        return torch.from_numpy(self.labels.targets(xi).astype(np.float32))
 
 
 def _as_input(images: ImageArray) -> Tensor:
@@ -385,17 +419,6 @@ def _jittered(images: Tensor, settings: Settings) -> Tensor:
     grid = functional.affine_grid(motion, list(images.shape), align_corners=False)
     moved = functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
     return moved.contiguous(memory_format=torch.channels_last)
-
-
-def _calibrate(
-    outputs: NDArray[np.float32], labels: NDArray[np.float32]
-) -> tuple[float, float, float, float, float, float]:
-    """Scales that give squared errors, in units of the predicted variance, a mean of one."""
-    residual = (labels - outputs[:, :6]).astype(np.float64)
-    if outputs.shape[1] > 6:
-        residual *= np.exp(outputs[:, 6:].astype(np.float64))
-    x, y, z, alpha, beta, gamma = np.sqrt((residual**2).mean(axis=0)).tolist()
-    return x, y, z, alpha, beta, gamma
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+from tasks.data_collection import DataCollectionConfig, collect_table
 from tasks.machine import Table, mermaid
 from tasks.observe import ObserveConfig, observe_table
 from tasks.servoing import servo_table
@@ -22,6 +23,7 @@ def tables() -> Mapping[str, Table]:
     """The tables that are drawn, by the word in their markers."""
     return {
         "servoing": servo_table("servoing", SurfaceFollowingConfig(), run_timeout_s=1.0),
+        "data_collection": collect_table(DataCollectionConfig()),
         "observe": observe_table(ObserveConfig()),
     }
 

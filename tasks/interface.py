@@ -51,10 +51,12 @@ class Action:
     Attributes:
         twists: a command for each arm that shall move; an arm without one is told to stop.
         telemetry: named numbers for recording and plots, units in the names.
+        labels: contact T_f_s (4, 4) that the newest frame of a sensor shows, by role: the frame is kept with it.
     """
 
     twists: Mapping[str, TwistCommand] = field(default_factory=dict)
     telemetry: Mapping[str, float] = field(default_factory=dict)
+    labels: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,10 +109,12 @@ class TaskContext:
     Attributes:
         rate_hz: control cycles per second.
         T_tcp_sensor: pose (4, 4) of each sensor role in the tool frame of the arm that carries it.
+        kept: how many labelled frames earlier runs of this cell have left.
     """
 
     rate_hz: float
     T_tcp_sensor: Mapping[str, Array]
+    kept: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +128,7 @@ class TaskSpec:
         arms: roles of arms and the abilities (names in ``drivers.abilities``) each must have.
         sensors: roles of tactile sensors it needs.
         build: makes the task from its parameters and the context.
+        labels_frames: whether it labels frames, which the cell has to put somewhere.
     """
 
     name: str
@@ -132,3 +137,4 @@ class TaskSpec:
     arms: Mapping[str, frozenset[str]]
     sensors: frozenset[str]
     build: Callable[[Any, TaskContext], Task]
+    labels_frames: bool = False

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from pydantic import PositiveFloat
 
 from geometry.types import Array
+from tasks.hand import Hand, SixGains
 from tasks.interface import TaskContext, TaskSpec
-from tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask, SixGains
+from tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
 
 
 class ObjectTrackingConfig(ServoConfig):
     """Parameters of object tracking. All six components are controlled.
 
     Attributes:
+        depth_mm: indentation to hold, normal to the surface and without shear.
         duration_s: how long to track.
     """
 
@@ -42,15 +46,21 @@ class Track:
         """A second more than the run takes."""
         return self._timeout_s
 
-    def advance(self, dt_s: float, displacement: Array) -> bool:
+    def advance(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
         """Count the time."""
         self._left_s -= dt_s
         return self._left_s <= 0.0
 
+    def telemetry(self) -> Mapping[str, float]:
+        """Nothing more."""
+        return {}
+
 
 def build(config: ObjectTrackingConfig, context: TaskContext) -> ServoTask:
     """The task in a cell that has ``arm`` and ``sensor``."""
-    return ServoTask("object_tracking", config, context, Track(config))
+    reference = (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0)
+    hand = Hand(ARM, SENSOR, config, reference, Track(config), context)
+    return ServoTask("object_tracking", config, context, hand)
 
 
 SPEC = TaskSpec(

@@ -1,23 +1,19 @@
-"""The machine of every task that holds a contact with one arm: find the surface, settle, do the work, withdraw."""
+"""The machine of every task that holds contacts: find the surface, settle, do the work, withdraw."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Annotated, Final, Protocol
+from typing import Final
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
-from control.pid import PidGains
-from control.servo import TactileServo
 from drivers.commands import TwistCommand, TwistFrame
-from geometry import se3
 from geometry.errors import TouchcellError
 from geometry.types import Array
-from perception.estimate import ContactEstimate
-from tasks.interface import Action, Observation, TaskConfig, TaskContext, TransitionRecord
+from tasks.hand import Hand, HandConfig
+from tasks.interface import Action, Observation, TaskContext, TransitionRecord
 from tasks.machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
 from tasks.machine_task import MachineTask
 
@@ -26,79 +22,31 @@ ARM: Final = "arm"
 SENSOR: Final = "sensor"
 """Role of the tactile sensor that it carries."""
 
-Six = tuple[float, float, float, float, float, float]
-"""One number for each of x, y, z, alpha, beta, gamma."""
 
-SixGains = Annotated[Six, Field(description="x, y, z, alpha, beta, gamma of the sensor's twist; zeros: not controlled")]
-
-
-class ServoConfig(TaskConfig):
-    """Parameters of every task that holds a contact.
+class ServoConfig(HandConfig):
+    """Parameters of every task that holds contacts; what is said of one hand holds for the one that leads.
 
     Attributes:
-        depth_mm: indentation to hold, normal to the surface and without shear.
         approach_speed_mm_s: speed towards the surface, along the sensor's z axis.
         approach_distance_mm: give up when no contact was made within it.
-        settle_tolerance_mm: the contact has settled when the controlled errors are below these ...
-        settle_tolerance_deg: ... for ...
-        settle_time_s: ... this long.
+        settle_time_s: the contact has settled when errors were below the tolerances for this long.
         settle_timeout_s: give up when it has not settled by then.
         retract_mm: distance to withdraw at the end.
         retract_speed_mm_s: speed of that.
         max_reapproach: how often a lost contact is searched for again.
-        kp_per_s: proportional gain of each axis.
-        ki_per_s2: integral gain of each axis.
-        kd: derivative gain of each axis.
-        max_integral_speed_mm_s: largest speed that integral action may ask for.
-        max_integral_turn_deg_s: largest turning rate that integral action may ask for.
-        integral_zone_mm: larger errors are not integrated, so that pressing in does not overshoot ...
-        integral_zone_deg: ... nor does turning.
-        max_speed_mm_s: largest speed of the sensor along each axis.
-        max_turn_deg_s: largest turning rate of the sensor about each axis.
-        max_frame_age_ms: the arm stops when the newest frame is older.
-        max_state_age_ms: the arm stops when its newest state is older.
         stale_timeout_s: the task trips when the arm has been stopped for lack of a valid estimate for this long.
         prepare_timeout_s: give up when there is no first frame and arm state by then.
     """
 
-    depth_mm: PositiveFloat
     approach_speed_mm_s: PositiveFloat = 10.0
     approach_distance_mm: PositiveFloat = 50.0
-    settle_tolerance_mm: PositiveFloat = 0.3
-    settle_tolerance_deg: PositiveFloat = 2.0
     settle_time_s: NonNegativeFloat = 0.3
     settle_timeout_s: PositiveFloat = 10.0
     retract_mm: PositiveFloat = 20.0
     retract_speed_mm_s: PositiveFloat = 20.0
     max_reapproach: NonNegativeInt = 2
-    kp_per_s: SixGains
-    ki_per_s2: SixGains
-    kd: SixGains = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    max_integral_speed_mm_s: NonNegativeFloat = 40.0
-    max_integral_turn_deg_s: NonNegativeFloat = 20.0
-    integral_zone_mm: PositiveFloat = 1.5
-    integral_zone_deg: PositiveFloat = 5.0
-    max_speed_mm_s: PositiveFloat = 60.0
-    max_turn_deg_s: PositiveFloat = 20.0
-    max_frame_age_ms: PositiveFloat = 150.0
-    max_state_age_ms: PositiveFloat = 50.0
     stale_timeout_s: PositiveFloat = 0.5
     prepare_timeout_s: PositiveFloat = 5.0
-
-    def gains(self) -> PidGains:
-        """Gains and clips in SI units."""
-        return PidGains(
-            np.array(self.kp_per_s),
-            np.array(self.ki_per_s2),
-            np.array(self.kd),
-            _six(self.max_integral_speed_mm_s, self.max_integral_turn_deg_s),
-            _six(self.integral_zone_mm, self.integral_zone_deg),
-            _six(self.max_speed_mm_s, self.max_turn_deg_s),
-        )
-
-
-def _six(linear_mm: float, angular_deg: float) -> Array:
-    return np.repeat([1e-3 * linear_mm, np.radians(angular_deg)], 3)
 
 
 class ServoState(Enum):
@@ -159,73 +107,29 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float) -> Table:
     )
 
 
-class RunPhase(Protocol):
-    """What a servoing task does once the contact has settled."""
-
-    @property
-    def feedforward(self) -> Array:
-        """Twist (6,) in the desired sensor frame."""
-        ...
-
-    @property
-    def timeout_s(self) -> float:
-        """Longest time that it may take."""
-        ...
-
-    def advance(self, dt_s: float, displacement: Array) -> bool:
-        """Take in one cycle and tell whether the work is done.
-
-        Args:
-            dt_s: how long the cycle was.
-            displacement: (3,) m, how far the sensor has moved in it, along its axes.
-        """
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class _Sight:
-    """What can be relied on in one cycle: None where it is missing or too old."""
-
-    now_ns: int
-    T_base_sensor: Array | None
-    contact: ContactEstimate | None
-
-    @property
-    def T_s_f(self) -> Array | None:  # noqa: N802  the field's own name
-        """Valid contact pose (4, 4), or None."""
-        if self.contact is None or not (self.contact.in_contact and self.contact.in_range):
-            return None
-        return None if self.contact.belief is None else self.contact.belief.mean
-
-
 class ServoTask(MachineTask):
     """A task in execution; see ``tasks.interface.Task`` for what its members mean.
 
-    While it looks for the surface or holds it, it moves only on a fresh frame, a fresh arm state and a valid belief.
-    When it withdraws, which is away from the surface, a fresh arm state is enough.
+    While hands look for the surface or hold it, they move only on fresh frames, fresh arm states and valid beliefs, all
+    of them or none. When they withdraw, which is away from the surface, a fresh arm state is enough. A hand that has
+    made its contact holds it until the others have made theirs.
 
     Args:
         name: the task's name.
-        config: its parameters.
+        config: parameters of its machine.
         context: of the cell.
-        run: what to do once settled.
+        hands: what holds the contacts. A task with several tells the sensor's role in the names of its telemetry.
 
     Raises:
         TaskDefinitionError: the table is wrong.
-        KeyError: the context has no sensor in the role "sensor".
     """
 
-    def __init__(self, name: str, config: ServoConfig, context: TaskContext, run: RunPhase) -> None:
+    def __init__(self, name: str, config: ServoConfig, context: TaskContext, *hands: Hand) -> None:
         self._config = config
-        self._run = run
         self._period_s = 1.0 / context.rate_hz
-        self._T_tcp_sensor = context.T_tcp_sensor[SENSOR]
-        self._Ad_tcp_sensor = se3.adjoint(self._T_tcp_sensor)
-        T_f_sref = se3.from_euler_mm_deg(np.array([0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0]))
-        self._servo = TactileServo(se3.inverse(T_f_sref), self._T_tcp_sensor, config.gains(), self._period_s)
-        self._machine = TaskMachine(servo_table(name, config, run.timeout_s), self)
-        self._sight = _Sight(0, None, None)
-        self._start: Array | None = None
+        self._hands = hands
+        self._machine = TaskMachine(servo_table(name, config, min(hand.run.timeout_s for hand in hands)), self)
+        self._now_ns = 0
         self._steady_s = 0.0
         self._blind_s = 0.0
         self._reapproaches = 0
@@ -236,16 +140,18 @@ class ServoTask(MachineTask):
         """Advance by one cycle."""
         if self.finished:
             return Action()
-        previous = self._sight
+        dt_s = (observation.now_ns - self._now_ns) * 1e-9
+        self._now_ns = observation.now_ns
         try:
-            self._sight = self._look(observation)
-            self._watch(observation, previous)
+            for hand in self._hands:
+                hand.look(observation)
+            self._watch(observation, dt_s)
             self._machine.tick(observation.now_ns)
-            V_tcp = self._twist()
+            twists = self._twists()
         except TouchcellError as error:
             self._machine.fire(FAULT, str(error), now_ns=observation.now_ns)
             return Action()
-        return Action(self._commands(V_tcp), self._telemetry(observation))
+        return Action({hand.arm: self._command(hand, V) for hand, V in twists}, self._telemetry(observation))
 
     def may_reapproach(self) -> bool:
         """Guard: a lost contact may be searched for again."""
@@ -262,12 +168,14 @@ class ServoTask(MachineTask):
     def start_approach(self, record: TransitionRecord) -> None:
         """On entry: measure the way from here."""
         self._reapproaches += record.event == "lost"
-        self._start = self._sight.T_base_sensor
+        for hand in self._hands:
+            hand.start_way()
         self._blind_s = 0.0
 
     def start_settle(self, record: TransitionRecord) -> None:
         """On entry: begin to servo, without a past."""
-        self._servo.reset()
+        for hand in self._hands:
+            hand.servo.reset()
         self._steady_s = 0.0
         self._blind_s = 0.0
 
@@ -278,58 +186,49 @@ class ServoTask(MachineTask):
     def start_retract(self, record: TransitionRecord) -> None:
         """On entry: measure the way from here, or go on measuring if a stop only confirms it."""
         if record.source != state_name(ServoState.RETRACT):
-            self._start = self._sight.T_base_sensor
+            for hand in self._hands:
+                hand.start_way()
         self._finished_run = self._finished_run or record.event == "finished"
 
-    def _look(self, observation: Observation) -> _Sight:
-        now_ns, limits = observation.now_ns, self._config
-        arm = observation.arms.get(ARM)
-        T_base_sensor = None
-        if arm is not None and 0.0 <= arm.age_s(now_ns) <= 1e-3 * limits.max_state_age_ms:
-            T_base_sensor = se3.compose(arm.value.T_base_tcp, self._T_tcp_sensor)
-        contact = observation.contacts.get(SENSOR)
-        if contact is not None and not 0.0 <= now_ns - contact.t_frame_ns <= 1e6 * limits.max_frame_age_ms:
-            contact = None
-        return _Sight(now_ns, T_base_sensor, contact)
-
-    def _watch(self, observation: Observation, previous: _Sight) -> None:
+    def _watch(self, observation: Observation, dt_s: float) -> None:
         """Post what this cycle's observation means for the present state."""
         if observation.operator_stop and not self._stop_seen:
             self._stop_seen = True
             self._machine.post(STOP, "operator")
-        sight = self._sight
-        dt_s = (sight.now_ns - previous.now_ns) * 1e-9
+        hands = self._hands
         match self._machine.state:
             case ServoState.PREPARE:
-                if sight.T_base_sensor is not None and sight.contact is not None:
+                if all(hand.sees for hand in hands):
                     self._post("ready")
             case ServoState.APPROACH:
-                self._watch_sight(dt_s, blind=sight.T_base_sensor is None or sight.contact is None)
-                if sight.contact is not None and sight.contact.in_contact:
+                self._watch_sight(dt_s, blind=not all(hand.sees for hand in hands))
+                searching = [hand for hand in hands if not hand.touches]
+                if not searching:
                     self._post("contact")
-                elif self._travelled_m() >= 1e-3 * self._config.approach_distance_mm:
+                elif max(hand.way_m() for hand in searching) >= 1e-3 * self._config.approach_distance_mm:
                     self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
             case ServoState.SETTLE:
                 self._watch_contact(dt_s)
-                steady = self._steady()
+                steady = all(hand.steady() for hand in hands)
                 self._steady_s = self._steady_s + dt_s if steady else 0.0
                 if steady and self._steady_s >= self._config.settle_time_s:
                     self._post("settled")
             case ServoState.RUN:
                 self._watch_contact(dt_s)
-                if sight.T_base_sensor is not None and previous.T_base_sensor is not None:
-                    moved = sight.T_base_sensor[:3, 3] - previous.T_base_sensor[:3, 3]
-                    if self._run.advance(dt_s, sight.T_base_sensor[:3, :3].T @ moved):
-                        self._post("finished")
+                # Every hand takes the cycle in, whether another one has finished already or not.
+                finished = [hand.advance(dt_s) for hand in hands]
+                if any(finished):
+                    self._post("finished")
             case ServoState.RETRACT:
-                if self._travelled_m() >= 1e-3 * self._config.retract_mm:
+                if all(hand.way_m() >= 1e-3 * self._config.retract_mm for hand in hands):
                     self._post("retracted")
 
     def _watch_contact(self, dt_s: float) -> None:
-        contact = self._sight.contact
-        if contact is not None and not contact.in_contact:
-            self._post("lost", f"frame {contact.seq}")
-        self._watch_sight(dt_s, blind=self._sight.T_base_sensor is None or self._sight.T_s_f is None)
+        for hand in self._hands:
+            if hand.contact is not None and not hand.contact.in_contact:
+                self._post("lost", f"{hand.sensor}, frame {hand.contact.seq}")
+                break
+        self._watch_sight(dt_s, blind=any(hand.T_base_sensor is None or hand.T_s_f is None for hand in self._hands))
 
     def _watch_sight(self, dt_s: float, *, blind: bool) -> None:
         self._blind_s = self._blind_s + dt_s if blind else 0.0
@@ -339,75 +238,44 @@ class ServoTask(MachineTask):
     def _post(self, event: str, reason: str = "") -> None:
         self._machine.post(event, reason, epoch=self._machine.epoch)
 
-    def _steady(self) -> bool:
-        """Whether the errors of the latest servo step are small and it was not held back."""
-        if self._sight.T_s_f is None or not self._servo.active:
-            return False
-        e = self._servo.latest_error
-        small = np.linalg.norm(e[:3]) <= 1e-3 * self._config.settle_tolerance_mm
-        return bool(small and np.linalg.norm(e[3:]) <= np.radians(self._config.settle_tolerance_deg))
+    def _twists(self) -> list[tuple[Hand, Array]]:
+        """Twist (6,) of each tool that moves in the present state."""
+        state = self._machine.state
+        if state is ServoState.RETRACT:
+            speed_m_s = -1e-3 * self._config.retract_speed_mm_s
+            return [(hand, hand.along_z(speed_m_s)) for hand in self._hands if hand.T_base_sensor is not None]
+        if state not in (ServoState.APPROACH, ServoState.SETTLE, ServoState.RUN):
+            return []
+        searching = state is ServoState.APPROACH
+        if not all(hand.sees and (searching or hand.T_s_f is not None) for hand in self._hands):
+            for hand in self._hands:
+                hand.servo.reset()
+            return []
+        twists = []
+        for hand in self._hands:
+            V_tcp: Array | None
+            if searching and not hand.touches:
+                V_tcp = hand.along_z(1e-3 * self._config.approach_speed_mm_s)
+            else:
+                V_tcp = hand.servo_step(hand.run.feedforward if state is ServoState.RUN else np.zeros(6))
+            if V_tcp is not None:
+                twists.append((hand, V_tcp))
+        return twists
 
-    def _travelled_m(self) -> float:
-        """Way of the sensor since the present state was entered; 0 while it cannot be told."""
-        if self._sight.T_base_sensor is None:
-            return 0.0
-        if self._start is None:
-            self._start = self._sight.T_base_sensor
-        return float(np.linalg.norm(self._sight.T_base_sensor[:3, 3] - self._start[:3, 3]))
-
-    def _twist(self) -> Array | None:
-        """Twist (6,) of the tool in the present state; None where it has to stand still."""
-        sight = self._sight
-        if sight.T_base_sensor is None:
-            self._servo.reset()
-            return None
-        match self._machine.state:
-            case ServoState.APPROACH:
-                return None if sight.contact is None else self._along_z(1e-3 * self._config.approach_speed_mm_s)
-            case ServoState.SETTLE:
-                return self._servo_step(np.zeros(6))
-            case ServoState.RUN:
-                return self._servo_step(self._run.feedforward)
-            case ServoState.RETRACT:
-                return self._along_z(-1e-3 * self._config.retract_speed_mm_s)
-        return None
-
-    def _along_z(self, speed_m_s: float) -> Array:
-        V_tcp: Array = self._Ad_tcp_sensor @ np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0])
-        return V_tcp
-
-    def _servo_step(self, V_ff: Array) -> Array | None:
-        contact, T_s_f = self._sight.contact, self._sight.T_s_f
-        V_tcp = self._servo.step(T_s_f, 0 if contact is None else contact.t_ns, V_ff)
-        return None if T_s_f is None else V_tcp
-
-    def _commands(self, V_tcp: Array | None) -> Mapping[str, TwistCommand]:
-        if V_tcp is None:
-            return {}
-        contact = self._sight.contact
-        return {
-            ARM: TwistCommand(
-                V_tcp,
-                TwistFrame.TCP,
-                t_ns=self._sight.now_ns,
-                ttl_s=3.0 * self._period_s,
-                t_cause_ns=None if contact is None else contact.t_frame_ns,
-            )
-        }
+    def _command(self, hand: Hand, V_tcp: Array) -> TwistCommand:
+        return TwistCommand(
+            V_tcp,
+            TwistFrame.TCP,
+            t_ns=self._now_ns,
+            ttl_s=3.0 * self._period_s,
+            t_cause_ns=None if hand.contact is None else hand.contact.t_frame_ns,
+        )
 
     def _telemetry(self, observation: Observation) -> Mapping[str, float]:
+        servoing = self._machine.state in (ServoState.SETTLE, ServoState.RUN)
         telemetry: dict[str, float] = {}
-        contact = observation.contacts.get(SENSOR)
-        if contact is not None:
-            telemetry["frame_age_ms"] = 1e-6 * (observation.now_ns - contact.t_frame_ns)
-        if self._machine.state in (ServoState.SETTLE, ServoState.RUN) and self._servo.active:
-            errors, references = _UNITS * self._servo.latest_error, self._servo.reference_mm_deg
-            for name, error, reference in zip(_COMPONENTS, errors, references, strict=True):
-                if np.isfinite(reference):
-                    telemetry[f"error_{name}"] = float(error)
-                    telemetry[f"reference_{name}"] = float(reference)
+        for hand in self._hands:
+            prefix = f"{hand.sensor}_" if len(self._hands) > 1 else ""
+            told = hand.telemetry(observation, servoing=servoing)
+            telemetry |= {f"{prefix}{name}": value for name, value in told.items()}
         return telemetry
-
-
-_COMPONENTS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
-_UNITS = np.repeat([1e3, np.degrees(1.0)], 3)

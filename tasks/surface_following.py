@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from pydantic import PositiveFloat
 
 from geometry.types import Array
+from tasks.hand import Hand, SixGains
 from tasks.interface import TaskContext, TaskSpec
-from tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask, SixGains
+from tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
 
 
 class SurfaceFollowingConfig(ServoConfig):
     """Parameters of surface following. Shear is left alone: its gains are zero.
 
     Attributes:
+        depth_mm: indentation to hold, normal to the surface.
         speed_mm_s: tangential speed of the sensor.
         direction_deg: direction of travel, from the sensor's x axis towards its y axis.
         distance_mm: way of the sensor until the task is done.
@@ -47,15 +51,21 @@ class Follow:
         """Twice the time that the way takes, and a second."""
         return self._timeout_s
 
-    def advance(self, dt_s: float, displacement: Array) -> bool:
+    def advance(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
         """Count the way along the direction of travel, so that noise and corrections do not add to it."""
-        self._left_m -= float(self._direction @ displacement)
+        self._left_m -= float(self._direction @ now[:3, :3].T @ (now[:3, 3] - before[:3, 3]))
         return self._left_m <= 0.0
+
+    def telemetry(self) -> Mapping[str, float]:
+        """Nothing more."""
+        return {}
 
 
 def build(config: SurfaceFollowingConfig, context: TaskContext) -> ServoTask:
     """The task in a cell that has ``arm`` and ``sensor``."""
-    return ServoTask("surface_following", config, context, Follow(config))
+    reference = (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0)
+    hand = Hand(ARM, SENSOR, config, reference, Follow(config), context)
+    return ServoTask("surface_following", config, context, hand)
 
 
 SPEC = TaskSpec(

@@ -18,6 +18,7 @@ _BESIDE_EMULATORS = (
     "test_feetech",
     "test_franka",
     "test_opencv_camera",
+    "test_process_cell",
     "test_ur",
     "test_v4l2",
 )

@@ -12,6 +12,7 @@ from drivers.tactile_data import IMAGE_COLUMN, LABEL_COLUMNS
 from geometry.types import Array, ImageArray
 from perception.dataset import LabelledImages
 from perception.labels import xi_from_contact
+from perception.model_file import load_model
 from perception.preprocessing import Preprocessing
 
 SIZE = (44, 48)
@@ -66,3 +67,11 @@ def write_split(root: Path, split: str, n: int, seed: int) -> Path:
             values = dict(zip(LABEL_COLUMNS, contact.tolist(), strict=True))
             table.writerow({IMAGE_COLUMN: name, "pose_x": 0, "shear_z": 0, **values})
     return folder
+
+
+def taught(path: Path) -> tuple[dict[str, object], dict[str, bytes]]:
+    """What is in a model file, but for the time that it took to train."""
+    model = load_model(path)
+    header = model.header.model_dump()
+    assert header["training"].pop("epochs_cpu_s") >= 0.0
+    return header, {name: tensor.tobytes() for name, tensor in model.tensors.items()}

@@ -11,7 +11,7 @@ pytest.importorskip("torch")
 
 from marker_samples import SIZE, write_split
 
-from benchmarks.adapt import _drawn, _errors, second_sensor, turned
+from benchmarks.adapt import _drawn, _errors, second_sensor
 from cell.calibrate_sim import calibrate_sim
 from cell.train_sim import Imagined, _discs
 from drivers.simulation.render import PUBLIC_CROP
@@ -22,16 +22,18 @@ from geometry import se3
 from perception.adaptation import (
     AdaptSettings,
     FewContacts,
+    about_z,
     adapt,
     adapt_to,
     bring,
     layers_of,
     outputs_of,
     tune,
-    turned_layers,
 )
+from perception.calibrated_estimator import turned
 from perception.errors import ModelError, TrainingError
 from perception.estimators import load_estimator
+from perception.inference import Prediction
 from perception.marker_architecture import MarkerArchitecture
 from perception.marker_estimator import matcher_of
 from perception.marker_learning import train_guess
@@ -59,7 +61,7 @@ def model() -> Model:
     displacements += rng.normal(0.0, 0.15, displacements.shape)
     moves = DisplacementModel.fit(reference, displacements, np.ones((500, 331), bool), 16)
     coefficients = (displacements.reshape(500, -1) - moves.mean) @ moves.basis.T
-    guess = train_guess(moves, coefficients, noise_px=1.0, scatter=0.1, steps=30, seed=0)
+    guess = train_guess(moves, coefficients, np.ones((500, 331), bool), noise_px=1.0, scatter=0.1, steps=30, seed=0)
     architecture = MarkerArchitecture(
         input_size=SIZE,
         size=SIZE_OF_MARKERS,
@@ -85,7 +87,6 @@ def model() -> Model:
         "guess.output.weight": guess.weight,
         "guess.output.bias": guess.bias,
         "guess.sd": guess.sd,
-        "sigma_power": np.ones(6),
     }
     for name, shape in architecture.tensor_shapes().items():
         if name.startswith("layer"):
@@ -115,9 +116,9 @@ def test_another_camera_and_other_axes_cost_next_to_nothing(model: Model) -> Non
     spin = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     middle = np.array([222.0, 219.0])
     frames = [Discs((each.centres - middle) @ spin.T * 1.05 + middle + 4.0, each.areas) for each in own.frames]
-    other = FewContacts(frames, turned(own.xi, 35.0))
+    other = FewContacts(frames, about_z(np.radians(35.0), own.xi))
     brought = bring(model, other)
-    assert brought.camera.zoom == pytest.approx(1 / 1.05, abs=0.015)
+    assert brought.camera.zoom == pytest.approx(1 / 1.05, abs=0.03)
     assert brought.matched.mean() > 0.9
     # The lattice leaves a sixth of a turn open, which camera and labels have to share.
     off = (brought.camera.turn_deg - 130.0 + 180) % 360 - 180
@@ -144,15 +145,14 @@ def test_thirty_images_bring_it_to_another_sensor(model: Model, tmp_path: Path) 
         adapt(tmp_path / "adapted.safetensors", tmp_path, tmp_path / "again.safetensors")
 
 
-def test_turned_predictions_are_predictions_turned(model: Model) -> None:
-    displacements = np.random.default_rng(0).normal(0.0, 5.0, (4, 662)).astype(np.float32)
-    labels = model.header.labels
-    plain = labels.centre + labels.half_range * outputs_of(layers_of(model), displacements)[0]
-    layers = turned_layers(layers_of(model), labels, np.radians(40.0))
-    other = labels.centre + labels.half_range * outputs_of(layers, displacements)[0]
-    np.testing.assert_allclose(other, turned(plain, 40.0), atol=1e-9)
-    T, Z = se3.exp(plain), se3.from_euler_mm_deg([0, 0, 0, 0, 0, 40.0])
-    np.testing.assert_allclose(se3.exp(other), Z @ T @ se3.inverse(Z), atol=1e-9)
+def test_turned_predictions_are_about_turned_axes() -> None:
+    xi = np.array([1e-3, -2e-3, -4e-3, 0.2, -0.3, 0.05])
+    root = np.random.default_rng(0).normal(size=(6, 6))
+    found = turned(Prediction(xi, root @ root.T, in_range=True), 40.0)
+    Z = se3.from_euler_mm_deg([0, 0, 0, 0, 0, 40.0])
+    np.testing.assert_allclose(se3.exp(found.xi), Z @ se3.exp(xi) @ se3.inverse(Z), atol=1e-12)
+    np.testing.assert_allclose(found.xi, about_z(np.radians(40.0), xi[None])[0])
+    np.testing.assert_allclose(turned(found, -40.0).covariance, root @ root.T)
 
 
 def test_folded_layers_do_what_the_model_file_does(model: Model) -> None:
@@ -160,7 +160,11 @@ def test_folded_layers_do_what_the_model_file_does(model: Model) -> None:
     assert isinstance(architecture, MarkerArchitecture)
     frames = _drawn(TIP, RIG, 5, 9, model).frames
     fields = [matcher_of(model, architecture).match(each) for each in frames]
-    mean, _ = outputs_of(layers_of(model), np.stack([each.displacements.ravel() for each in fields]).astype(np.float32))
+    mean, _ = outputs_of(
+        layers_of(model),
+        np.stack([each.displacements.ravel() for each in fields]).astype(np.float32),
+        model.header.labels,
+    )
     from perception.marker_estimator import MarkerEstimator
 
     estimator = MarkerEstimator(model)
@@ -194,11 +198,12 @@ def test_samples_of_a_real_sensor_are_labelled_with_the_command() -> None:
     assert Imagined().preprocessing("markers").threshold is not None
 
 
+@pytest.mark.timeout(400)
 def test_calibrate_sim_fits_simulated_images_and_says_how_well(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_split(tmp_path / "data", "train", 130, seed=1)
-    calibrate_sim(tmp_path / "data", tmp_path / "sensor.yaml", frames=24, images=130, guess_steps=30)
+    write_split(tmp_path / "data", "train", 100, seed=1)
+    calibrate_sim(tmp_path / "data", tmp_path / "sensor.yaml", frames=20, images=100, guess_steps=30)
     fitted = load_tip(str(tmp_path / "sensor.yaml"))
     assert fitted.measured["train, held out px"] < 1.5
     assert fitted.tip.disc_radius_px == pytest.approx(6.2, abs=0.3)

@@ -70,7 +70,8 @@ def test_two_runs_are_identical(tmp_path: Path) -> None:
     for name in ("a.mcap", "b.mcap"):
         with Recorder(tmp_path / name) as recorder:
             run(path, recorder=recorder)
-        recordings.append([(m.topic, m.t_ns, m.data) for m in read(tmp_path / name)])
+        # How long a cycle takes is the machine's affair.
+        recordings.append([(m.topic, m.t_ns, m.data) for m in read(tmp_path / name) if m.topic != "/timing"])
     assert recordings[0] == recordings[1]
     assert len(recordings[0]) > 1000
 

@@ -21,6 +21,8 @@ from geometry import se3
 
 NOW = 1_000_000_000
 SENSOR_MOUNT = {"sensor": se3.from_euler_mm_deg(np.array([0, 0, 100.0, 0, 0, 0]))}
+PAIR = {"leader_sensor": "sensor", "follower_sensor": "sensor"}
+ONE = {"sensors": ["sensor"], "arms": ["arm"]}
 GOOD = {
     "box": {
         "kind": "workspace",
@@ -45,6 +47,11 @@ GOOD = {
     "tracking": {"kind": "tracking", "limit_mm_s": 20, "hold_ms": 100},
     "stand": {"kind": "standstill", "limit_mm": 1, "settle_ms": 500},
     "limited": {"kind": "limited", "limit_ms": 300},
+    "slip": {"kind": "slip", "limit_ratio": 1.0},
+    "markers": {"kind": "markers_lost", "limit_percent": 10},
+    "step": {"kind": "out_of_step", **PAIR, "limit_mm_s": 5, "limit_mm": 2, "hold_ms": 100},
+    "object": {"kind": "object_lost", **PAIR, "limit_ms": 100},
+    "topple": {"kind": "toppling", **ONE, "limit_deg": 5, "limit_deg_s": 10, "limit_mm": 3, "hold_ms": 100},
 }
 
 
@@ -172,6 +179,8 @@ def test_anything_not_finite_is_found(bad, place):
         view(shear_m=bad),
         view(torsion_rad=bad),
         view(brightness=bad),
+        view(T_s_f=pose),
+        view(markers=bad),
         CellView(NOW, {"arm": ArmView(Stamped(TcpState(pose, np.zeros(6)), NOW, 1))}),
         CellView(
             NOW,
@@ -227,7 +236,8 @@ def test_an_unknown_sensor_is_a_config_error():
 
 
 def test_every_kind_is_listed_with_one_line():
-    assert set(INTERLOCKS) == {"finite"} | {entry["kind"] for entry in GOOD.values()}
+    # What a clearance does is in test_clearance.py.
+    assert set(INTERLOCKS) == {"finite", "clearance"} | {entry["kind"] for entry in GOOD.values()}
     for kind, spec in INTERLOCKS.items():
         assert spec.kind == kind
         assert spec.summary

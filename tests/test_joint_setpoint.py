@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.gate import TwistLimits
+from drivers.arm import LimitsConfig
 from drivers.joint_setpoint import JointSetpoint
 from drivers.kinematics import ChainDescription, DifferentialIk, SerialChain
 
 CHAIN = SerialChain(ChainDescription.shipped("generic_6r"))
-LIMITS = TwistLimits(0.10, 0.5, 0.5, 2.5)
+LIMITS = LimitsConfig().build()
 WORKING = np.deg2rad([0.0, 40.0, 90.0, 0.0, 50.0, 0.0])
 DT_S = 0.004
 DT_NS = 4_000_000

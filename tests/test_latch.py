@@ -37,9 +37,12 @@ def test_first_cause_is_kept_and_later_ones_are_listed_once():
 def test_stays_latched_when_the_cause_goes():
     latch = Latch()
     latch.update([violation()])
-    latch.update([])
     assert latch.state is LatchState.TRIPPED
-    assert not latch.cause_present
+    latch.update([])
+    assert latch.state is LatchState.CAUSE_GONE
+    latch.update([violation("frame_age", t_ns=200)])
+    assert latch.state is LatchState.TRIPPED
+    assert latch.causes == (violation(), violation("frame_age", t_ns=200))
 
 
 def test_a_fault_raises_a_trip_and_a_trip_never_lowers_a_fault():
@@ -70,7 +73,7 @@ def test_reset_is_refused_with_the_reason(how, reason):
     latch.update([violation(t_ns=100)])
     latch.update([])
     assert reset(latch, **how) == ResetRefused(reason)
-    assert latch.state is LatchState.TRIPPED
+    assert latch.state is LatchState.CAUSE_GONE
     assert latch.first_cause == violation(t_ns=100)
 
 
@@ -140,7 +143,10 @@ class LatchAgainstModel(RuleBasedStateMachine):
 
     @invariant()
     def agrees(self):
-        assert self.latch.state is self.expected
+        latched = self.expected is not LatchState.CLEAR
+        gone = latched and not self.present
+        assert self.latch.state is (LatchState.CAUSE_GONE if gone else self.expected)
+        assert self.latch.faulted == (self.expected is LatchState.FAULTED)
         assert self.latch.first_cause == self.first
 
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from marker_samples import REST, SIZE, Simulated, simulated
@@ -9,7 +11,7 @@ pytest.importorskip("torch")
 
 from perception.errors import TrainingError
 from perception.marker_learning import Learned, fit_lattice, learn_markers
-from perception.marker_matching import DisplacementModel, MarkerField
+from perception.marker_matching import DisplacementModel, MarkerField, MarkerMatcher
 from perception.markers import Discs, detect_markers
 
 
@@ -90,6 +92,26 @@ def test_tracking_gives_what_a_cold_start_gives(learned: Learned) -> None:
         np.testing.assert_allclose(tracked.positions[tracked.seen], places[identity][tracked.seen], atol=1e-9)
         assert tracked.valid
         previous = tracked
+
+
+def test_a_guess_that_leads_nowhere_is_not_followed(learned: Learned, sample: Simulated) -> None:
+    """With a blind first guess, the learned contact whose discs lie alike is where the match starts."""
+    model = learned.matcher.model
+    nothing = np.zeros_like(learned.guess.bias)
+    nothing[:2] = 3.0
+    blind = dataclasses.replace(learned.guess, weight=np.zeros_like(learned.guess.weight), bias=nothing)
+    identity = identity_of(learned)
+    truth = sample.pixels[:20][:, identity]
+    bank = ((truth - model.reference).reshape(20, -1) - model.mean) @ model.basis.T
+    helped = MarkerMatcher(model, blind, SIZE, bank=bank)
+    alone = MarkerMatcher(model, blind, SIZE, bank=np.tile(nothing, (3, 1)) * model.sd)
+    for places in truth:
+        discs = Discs(places, np.full(331, 120.0))
+        field = helped.match(discs)
+        assert field.valid
+        np.testing.assert_allclose(field.positions[field.seen], places[field.seen], atol=1e-9)
+        lost = alone.match(discs)
+        assert share_right(lost, places) > 0.97 or not lost.valid
 
 
 def test_a_jump_between_frames_is_survived(learned: Learned, sample: Simulated) -> None:

@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 torch = pytest.importorskip("torch")
 
 from perception.architecture import LOG_PRECISION_BOUNDS, MEAN_BOUNDS, Architecture  # noqa: E402
+from perception.model_file import Labels  # noqa: E402
 from perception.networks import (  # noqa: E402
+    Alignment,
     ContactNetwork,
     gaussian_loss,
     softbound,
@@ -138,7 +140,8 @@ def test_losses_are_their_formulas() -> None:
     outputs, labels = rng.normal(size=(7, 12)), rng.normal(size=(7, 6))
     sigma = np.exp(-outputs[:, 6:])
     density = np.exp(-0.5 * ((labels - outputs[:, :6]) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
-    likelihood = gaussian_loss(torch.tensor(outputs), torch.tensor(labels)).item()
+    plain = Alignment(Labels(low=(-1.0,) * 6, high=(1.0,) * 6))
+    likelihood = gaussian_loss(torch.tensor(outputs), torch.tensor(labels), plain).item()
     assert likelihood == pytest.approx(-np.log(density).sum(axis=1).mean(), rel=1e-12)
     weights = np.arange(1.0, 7.0)
     error = outputs[:, :6] - labels
@@ -146,6 +149,20 @@ def test_losses_are_their_formulas() -> None:
     assert square == pytest.approx((weights * error**2).sum(axis=1).mean(), rel=1e-12)
     absolute = weighted_absolute_loss(torch.tensor(outputs), torch.tensor(labels), torch.tensor(weights)).item()
     assert absolute == pytest.approx((weights * np.abs(error)).sum(axis=1).mean(), rel=1e-12)
+
+
+def test_alignment_is_that_of_the_labels_and_keeps_the_direction_out_of_the_gradient() -> None:
+    rng = np.random.default_rng(1)
+    labels = Labels.of_contacts((-5.0, -4.0, 0.0, -1.0, -1.0, -1.0), (5.0, 4.4, 1.0, 1.0, 1.0, 1.0))
+    residual, mean = rng.normal(size=(2, 9, 6))
+    inputs = [torch.tensor(array, dtype=torch.float32, requires_grad=True) for array in (residual, mean)]
+    aligned = Alignment(labels)(*inputs)
+    np.testing.assert_allclose(aligned.detach().numpy(), labels.aligned(residual, mean), atol=1e-5)
+    aligned.sum().backward()
+    assert inputs[0].grad is not None
+    assert inputs[1].grad is None
+    nothing = Alignment(labels)(inputs[0], torch.tensor(-labels.centre / labels.half_range, dtype=torch.float32))
+    assert torch.isfinite(nothing).all()
 
 
 def test_architecture_that_leaves_no_pixel_is_refused() -> None:

@@ -14,6 +14,7 @@ from drivers.samples import Frame, Stamped
 from geometry import se3
 from geometry.types import Array, ImageArray
 from perception.contact_gate import ContactGate
+from perception.estimate import ContactEstimate
 from perception.filter import PoseFilter, isotropic_noise
 from perception.inference import Prediction
 from perception.pipeline import ContactPipeline
@@ -37,7 +38,7 @@ class StubModel:
 
     def predict_reduced(self, reduced: ImageArray) -> Prediction:
         self.inferences += 1
-        return Prediction(XI, SIGMA, in_range=True)
+        return Prediction(XI, np.diag(SIGMA**2), in_range=True, markers=0.75)
 
 
 class StubCamera:
@@ -67,6 +68,14 @@ def pipeline(images: list[ImageArray], **parts: object) -> tuple[ContactPipeline
     clock, model = VirtualClock(), StubModel()
     made = ContactPipeline(StubCamera(clock, images), model, **parts)  # type: ignore[arg-type]
     return made, model, clock
+
+
+def test_what_the_estimator_tells_of_its_markers_comes_with_the_estimate() -> None:
+    made, _, clock = pipeline([np.zeros((8, 8), np.uint8)] * 2)
+    for now_ns in ticks(clock, 5):
+        estimate = made.update(now_ns)
+        assert estimate is not None
+        assert estimate.markers == 0.75
 
 
 def pose(x_mm: float) -> Array:
@@ -125,6 +134,43 @@ def test_a_new_contact_starts_afresh() -> None:
     assert estimate.belief is not None
     J = se3.left_jacobian(XI)
     np.testing.assert_allclose(estimate.belief.covariance, J @ np.diag(SIGMA**2) @ J.T, rtol=1e-9, atol=1e-18)
+
+
+def test_what_lies_outside_the_range_is_told_and_not_fused() -> None:
+    strange = np.full_like(PRESSED, 7)
+
+    class Doubtful(StubModel):
+        def predict_reduced(self, reduced: ImageArray) -> Prediction:
+            good = super().predict_reduced(reduced)
+            return good if reduced is not strange else Prediction(XI + 0.01, good.covariance, in_range=False)
+
+    def estimates(images: list[ImageArray]) -> list[ContactEstimate]:
+        clock, model = VirtualClock(), Doubtful()
+        source = ContactPipeline(StubCamera(clock, images), model, pose_filter=PoseFilter(isotropic_noise(1e-3, 0.01)))
+        found = []
+        for i, now_ns in enumerate(ticks(clock, 3 * len(images))):
+            source.record_pose(now_ns, pose(0.1 * i))
+            found.append(source.update(now_ns))
+        assert None not in found
+        return found  # type: ignore[return-value]
+
+    with_strange = estimates([PRESSED, strange, PRESSED])
+    assert [estimate.in_range for estimate in with_strange] == [True] * 3 + [False] * 3 + [True] * 3
+    # The contact of the frame before, moved by the arm and less certain, in place of the doubtful one.
+    for i, estimate in enumerate(with_strange[:6]):
+        assert estimate.belief is not None
+        np.testing.assert_allclose(estimate.belief.mean, pose(-0.1 * i) @ se3.exp(XI), atol=1e-9)
+    spreads = [np.trace(estimate.belief.covariance) for estimate in with_strange if estimate.belief is not None]
+    assert spreads[5] > spreads[3] > spreads[2]
+    assert with_strange[3].nis is None
+    assert with_strange[6].nis is not None
+    # With nothing to carry on, the doubtful contact itself is told.
+    first = estimates([strange, PRESSED])
+    assert not first[2].in_range
+    assert first[2].belief is not None
+    np.testing.assert_allclose(first[2].belief.mean, se3.exp(XI + 0.01), atol=1e-12)
+    assert first[3].belief is not None
+    np.testing.assert_allclose(first[3].belief.mean, se3.exp(XI), atol=1e-12)
 
 
 def test_end_of_the_recording_is_told() -> None:

@@ -89,7 +89,7 @@ def test_an_arm_whose_work_is_done_keeps_its_power() -> None:
 
 def test_an_arm_that_is_not_trusted_gets_the_strongest_stop_and_the_other_its_own() -> None:
     pair = Pair()
-    _, reports = pair.stop(strongest="right")
+    _, reports = pair.stop(distrusted={"right"})
     assert {role: report.category for role, report in reports.items()} == {"left": HOLD, "right": POWER_OFF}
 
 

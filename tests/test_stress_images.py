@@ -170,7 +170,7 @@ def test_a_density_network_cannot_claim_what_no_filter_bears() -> None:
     for log_precision in (-1e6, 0.0, 1e6):
         prediction = ContactModel(constant_model("gdn", [0.0] * 6 + [log_precision] * 6)).predict(image)
         assert (prediction.sigma > 0.0).all()
-        beliefs.append(gaussian.from_exponential(prediction.xi, np.diag(prediction.sigma**2)))
+        beliefs.append(gaussian.from_exponential(prediction.xi, prediction.covariance))
     for prior in beliefs:
         for observation in beliefs:
             fused, record = gaussian.fuse(prior, observation)

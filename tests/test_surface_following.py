@@ -259,12 +259,18 @@ def test_walks(walk):
         assert task.state == "tripped"
 
 
-def test_the_way_is_counted_along_the_direction_only():
+def test_the_way_is_counted_along_the_sensors_direction_only():
     follow = Follow(QUICK.model_copy(update={"direction_deg": 90.0}))
-    assert not follow.advance(DT, np.array([1.0, 0.0, 1.0]))
-    assert not follow.advance(DT, np.array([0.0, -0.010, 0.0]))
-    assert not follow.advance(DT, np.array([0.0, 0.029, 0.0]))
-    assert follow.advance(DT, np.array([0.0, 0.002, 0.0]))
+    T = se3.from_euler_mm_deg(np.array([10.0, 20.0, 30.0, 0.0, 0.0, 90.0]))
+
+    def go_on(*displacement_mm: float) -> bool:
+        moved = T @ se3.from_euler_mm_deg(np.array([*displacement_mm, 0.0, 0.0, 0.0]))
+        return follow.advance(DT, T, moved, None)
+
+    assert not go_on(1000.0, 0.0, 1000.0)
+    assert not go_on(0.0, -10.0, 0.0)
+    assert not go_on(0.0, 29.0, 0.0)
+    assert go_on(0.0, 2.0, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from tasks import diagrams, registry
 from tasks.interface import TaskContext, TaskSpec
 
 
-@pytest.mark.parametrize("name", ["object_tracking", "observe", "surface_following"])
+@pytest.mark.parametrize("name", ["data_collection", "object_tracking", "observe", "surface_following"])
 def test_specs(name):
     assert name in registry.installed()
     spec = registry.spec(name)

@@ -12,15 +12,16 @@ from rich.console import Console
 
 torch = pytest.importorskip("torch")
 
-from tactile_samples import labelled, preprocessing, write_split  # noqa: E402
+from tactile_samples import labelled, preprocessing, taught, write_split  # noqa: E402
 
 from drivers.errors import DataError  # noqa: E402
 from perception.architecture import Architecture  # noqa: E402
 from perception.checkpoint import EpochRecord, checkpoint_path  # noqa: E402
 from perception.dataset import LabelledImages  # noqa: E402
 from perception.errors import ModelError, TrainingError  # noqa: E402
+from perception.labels import contact_from_xi, xi_from_contact  # noqa: E402
 from perception.model_file import Model, load_model  # noqa: E402
-from perception.training import Settings, learning_rate, train, train_on_arrays  # noqa: E402
+from perception.training import Settings, learning_rate, preprocessing_for, train, train_on_arrays  # noqa: E402
 from perception.training_display import Display  # noqa: E402
 
 ARCHITECTURE = Architecture(input_size=(32, 32), channels=(8, 16), hidden=32)
@@ -81,7 +82,8 @@ def test_learns_and_writes_model_and_figures(
     header = load_model(out).header
     assert header == model.header
     assert header.training["images"] == 240
-    np.testing.assert_allclose(header.labels.low, sets[0].xi.min(axis=0))
+    np.testing.assert_allclose(header.labels.low, contact_from_xi(sets[0].xi).min(axis=0))
+    assert header.labels.are_contacts
     np.testing.assert_array_equal(load_model(out).reference, reference)
     assert sorted(path.name for path in out.parent.iterdir()) == [
         "model.safetensors",
@@ -99,7 +101,7 @@ def test_same_seed_same_file_other_seed_other_file(sets: tuple[LabelledImages, L
     files = []
     for i, seed in enumerate((0, 0, 1)):
         quick_train(sets, tmp_path / f"{i}.safetensors", settings=dataclasses.replace(QUICK, seed=seed))
-        files.append((tmp_path / f"{i}.safetensors").read_bytes())
+        files.append(taught(tmp_path / f"{i}.safetensors"))
     assert files[0] == files[1] != files[2]
     assert torch.equal(torch.random.get_rng_state(), state)
 
@@ -117,7 +119,7 @@ def test_interrupted_training_ends_in_the_same_model(
         assert checkpoint_path(parts).exists()
     rest = Recorder()
     quick_train(sets, parts, observer=rest)
-    assert parts.read_bytes() == whole.read_bytes()
+    assert taught(parts) == taught(whole)
     assert [record.epoch for record in rest.records] == [3, 4]
     assert rest.records == uninterrupted.records[2:]
     assert not checkpoint_path(parts).exists()
@@ -170,10 +172,10 @@ def test_impossible_settings(changes: dict[str, float]) -> None:
 
 
 def test_constant_labels(sets: tuple[LabelledImages, LabelledImages], tmp_path: Path) -> None:
-    constant = sets[0].xi.copy()
-    constant[:, 2] = -1e-3
+    constant = contact_from_xi(sets[0].xi)
+    constant[:, 2] = 1.0
     with pytest.raises(TrainingError, match="z_mm"):
-        quick_train((LabelledImages(sets[0].images, constant), sets[1]), tmp_path / "m.safetensors")
+        quick_train((LabelledImages(sets[0].images, xi_from_contact(constant)), sets[1]), tmp_path / "m.safetensors")
 
 
 @pytest.mark.parametrize("which", [0, 1])
@@ -215,7 +217,7 @@ def test_trains_from_a_folder(tmp_path: Path) -> None:
     assert recorder.decoded == {"train": 64, "val": 32}
     header = load_model(out).header
     assert header.preprocessing.input_size == (44, 48)
-    assert header.architecture == Architecture()
+    assert header.architecture == Architecture(input_size=(44, 48))
     assert header.training["seed"] == 3
 
     display = Display(Console(file=text, width=80))
@@ -226,6 +228,27 @@ def test_trains_from_a_folder(tmp_path: Path) -> None:
     assert len(lines) == 3
     assert "gamma_deg" in lines[0]
     assert f"{recorder.records[1].mae['gamma_deg']:.3f}" in lines[2]
+
+
+@pytest.mark.parametrize(
+    ("size", "crop", "reduced"),
+    [
+        ((440, 445), (0, 0, 444, 440), (110, 111)),
+        ((480, 640), None, (120, 160)),
+        ((44, 48), None, (44, 48)),
+    ],
+)
+def test_images_shrink_by_whole_numbers(
+    size: tuple[int, int], crop: tuple[int, ...] | None, reduced: tuple[int, int]
+) -> None:
+    preprocessing = preprocessing_for(np.zeros(size, np.uint8))
+    assert preprocessing.crop == crop
+    assert preprocessing.output_size == reduced
+
+
+def test_number_of_networks_is_for_markers_alone(tmp_path: Path) -> None:
+    with pytest.raises(TrainingError):
+        train(tmp_path, tmp_path / "m.safetensors", kind="gdn", networks=2, observer=Recorder())
 
 
 def test_damaged_data_set_writes_nothing(tmp_path: Path) -> None:

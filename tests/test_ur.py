@@ -41,6 +41,7 @@ from drivers.errors import (
     DeviceError,
     DeviceFault,
     DeviceGone,
+    FaultClass,
     LifecycleError,
     Rejection,
     Remedy,
@@ -122,6 +123,31 @@ def drive(arm: UrArm, lease: Lease, twist: list[float], emulator: EmulatorProces
 
 
 # Configuration and static facts
+
+
+def test_an_arm_of_another_model_than_its_chain_is_not_activated(emulator: EmulatorProcess, address: int) -> None:
+    other = UrArm("arm", config_of(address).model_copy(update={"chain": "ur10e"}), CLOCK)
+    other.connect()
+    try:
+        other.configure()
+        with pytest.raises(DeviceFault, match="from where the chain puts it") as caught:
+            other.activate()
+        assert caught.value.fault_class is FaultClass.CONFIGURATION
+    finally:
+        other.disconnect()
+
+
+def test_joints_are_kept_from_their_limits(arm: UrArm, lease: Lease) -> None:
+    sample = arm.joints(0.2)
+    arm._chain.upper[5] = sample.value.q[5] + np.deg2rad(1.0)
+    J = arm._chain.jacobian(sample.value.q)
+    sent = arm.send_twist(TwistCommand(0.4 * J[:, 5], TwistFrame.BASE, CLOCK.now_ns(), 0.2), lease)
+    np.testing.assert_allclose(
+        np.linalg.solve(J, sent.command.twist), [0, 0, 0, 0, 0, arm._chain.speed[5] / 5.0], atol=1e-3
+    )
+    assert "joint wrist_3" in [adjustment.limit for adjustment in sent.adjustments]
+    back = arm.send_twist(TwistCommand(-0.4 * J[:, 5], TwistFrame.BASE, CLOCK.now_ns(), 0.2), lease)
+    assert "joint wrist_3" not in [adjustment.limit for adjustment in back.adjustments]
 
 
 def test_importing_the_driver_imports_no_sdk() -> None:

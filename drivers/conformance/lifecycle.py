@@ -15,8 +15,11 @@ from drivers.conformance.suite import check
 from drivers.device import DeactivatePolicy, Lifecycle
 from drivers.errors import CommandRejected, DeviceError, LifecycleError, Rejection
 
+# What combines abilities, as ServoArm does, is none itself.
 _PROTOCOLS = {
-    name: protocol for name, protocol in vars(abilities).items() if getattr(protocol, "_is_runtime_protocol", False)
+    name: protocol
+    for name, protocol in vars(abilities).items()
+    if getattr(protocol, "_is_runtime_protocol", False) and len(protocol.__bases__) == 1
 }
 _WARM_UP_CYCLES = 2
 _CYCLES = 10

@@ -16,6 +16,8 @@ from drivers.simulation.timeline import Restore
 from geometry import se3
 from geometry.types import Array
 
+_IDENTITY = np.eye(4)
+
 
 @dataclass(frozen=True, slots=True)
 class ContactState:
@@ -28,6 +30,7 @@ class ContactState:
         in_contact: whether the tip touches.
         slipping: whether the contact slid in the last step.
         normal_force_n: force on the tip along the surface normal.
+        shear_force_n: force on the tip along the x and y axes of {f}; zero where the physics does not tell it.
     """
 
     T_f_s: Array
@@ -35,6 +38,7 @@ class ContactState:
     in_contact: bool
     slipping: bool
     normal_force_n: float
+    shear_force_n: tuple[float, float] = (0.0, 0.0)
 
     @property
     def T_s_f(self) -> Array:  # noqa: N802  the field's own name
@@ -46,6 +50,12 @@ class ContactState:
         """Indentation, negative out of contact."""
         return float(self.T_f_s[2, 3])
 
+    @property
+    def force_world_n(self) -> Array:
+        """(3,) force on the tip along the world's axes."""
+        force: Array = self.T_world_f[:3, :3] @ np.array([*self.shear_force_n, -self.normal_force_n])
+        return force
+
 
 @dataclass(frozen=True, slots=True)
 class ContactLaw:
@@ -54,6 +64,7 @@ class ContactLaw:
     Attributes:
         tip_radius_m: radius of the hemisphere.
         stiffness_n_m: normal force per depth.
+        friction: tangential force per normal force with which the skin slips.
         slip_at_1mm_m: shear that survives at 1 mm depth, measured on public images (SIMULATION part 5).
         slip_exponent: growth of that shear with depth, measured on the same.
         torsion_grip: share of the shear that sticks by which the patch may turn before it slips. The same images fit
@@ -62,6 +73,7 @@ class ContactLaw:
 
     tip_radius_m: float = 0.020
     stiffness_n_m: float = 1500.0
+    friction: float = 0.9
     slip_at_1mm_m: float = 0.34e-3
     slip_exponent: float = 1.83
     torsion_grip: float = 0.15
@@ -69,6 +81,10 @@ class ContactLaw:
     def max_shear_m(self, depth_m: float) -> float:
         """Largest tangential displacement that sticks."""
         return self.slip_at_1mm_m * (1e3 * depth_m) ** self.slip_exponent if depth_m > 0.0 else 0.0
+
+    def shear_stiffness_n_m(self, depth_m: float) -> float:
+        """Tangential force per shear at a positive depth: what sticks is used up when friction is."""
+        return self.friction * self.stiffness_n_m * depth_m / self.max_shear_m(depth_m)
 
     def max_torsion_rad(self, depth_m: float) -> float:
         """Largest rotation about the normal that sticks.
@@ -109,6 +125,11 @@ class ContactModel:
 
     law: ContactLaw = field(default_factory=ContactLaw)
     _anchor: _Anchor | None = None
+
+    def held_point(self, surface: Surface) -> Array | None:
+        """(3,) m, where the skin holds on to ``surface``, in its own frame; None where it does not."""
+        anchor = self._anchor
+        return anchor.point if anchor is not None and anchor.surface is surface else None
 
     def step(self, T_world_s: Array, surface: Surface, t_s: float) -> ContactState:
         """Bring the contact to time ``t_s`` with the sensor at ``T_world_s`` (4, 4)."""
@@ -166,10 +187,10 @@ class ContactModel:
     def _state(
         self, T_world_s: Array, R_world_f: Array, R_f_s: Array, position: tuple[float, float, float], *, slipping: bool
     ) -> ContactState:
-        T_f_s = np.eye(4)
+        T_f_s = _IDENTITY.copy()
         T_f_s[:3, :3] = R_f_s
         T_f_s[:3, 3] = position
-        T_world_f = np.eye(4)
+        T_world_f = _IDENTITY.copy()
         T_world_f[:3, :3] = R_world_f
         T_world_f[:3, 3] = T_world_s[:3, 3] - R_world_f @ T_f_s[:3, 3]
         depth = position[2]

@@ -19,7 +19,7 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.simulation.contact import ContactState, about_z, tilt_of
-from drivers.simulation.dynamics_model import TipMechanics, build_model, quaternion, rotation
+from drivers.simulation.dynamics_model import TipMechanics, build_model, cross, quaternion, rotation
 from drivers.simulation.motions import Still
 from drivers.simulation.objects import FreeObject
 from drivers.simulation.solids import shape_of
@@ -31,6 +31,7 @@ from geometry.types import Array
 _SWING_RAD = 0.1
 # Friction is regularised: what slides carries a little less than the cone allows.
 _SLIDING_SHARE = 0.97
+_IDENTITY = np.eye(4)
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
@@ -41,10 +42,12 @@ class _Mounted:
     Attributes:
         T_world_s: (4, 4) pose of the sensor.
         R_world_c: (3, 3) axes of the carriage.
+        normal: (3,) outward, of what was nearest.
     """
 
     T_world_s: Array
     R_world_c: Array
+    normal: Array
 
 
 class DynamicWorld:
@@ -86,7 +89,8 @@ class DynamicWorld:
 
     def mount(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
         """Let ``sensor`` feel; returns what it feels at ``T_world_s`` (4, 4) at ``t_s``. Its tip begins undeformed."""
-        self._mounted[sensor] = _Mounted(T_world_s, self._upright(T_world_s, self._nearest(T_world_s[:3, 3], t_s)))
+        normal = self._nearest(T_world_s[:3, 3], t_s).normal
+        self._mounted[sensor] = _Mounted(T_world_s, _upright(T_world_s, normal), normal)
         self._t_s = t_s
         self._build(self.objects())
         return self._feel(sensor, T_world_s, t_s)
@@ -95,7 +99,7 @@ class DynamicWorld:
         """Go on to ``t_s``."""
         span_s = t_s - self._t_s
         for sensor, pose in T_world_s.items():
-            self._carry(sensor, pose, t_s, span_s)
+            self._carry(sensor, pose, span_s)
         mujoco.mj_step(self._at.model, self._data, round(span_s / self._step_s))
         self._t_s = t_s
         return {sensor: self._feel(sensor, pose, t_s) for sensor, pose in T_world_s.items()}
@@ -132,11 +136,14 @@ class DynamicWorld:
         for name, pose in T_world_object.items():
             self._place(self._at.objects[name].qpos, pose[:3, 3], pose[:3, :3])
 
-    def _carry(self, sensor: str, T_world_s: Array, t_s: float, span_s: float) -> None:
-        """Let the carriage coast from where it is to ``T_world_s`` at ``t_s``, and put the surface before its tip."""
+    def _carry(self, sensor: str, T_world_s: Array, span_s: float) -> None:
+        """Let the carriage coast from where it is to ``T_world_s``, and put the surface before its tip.
+
+        The normal that keeps it upright is the last step's: what moves is not known yet where it will be.
+        """
         mounted, at = self._mounted[sensor], self._at.carriages[sensor]
         position = mounted.T_world_s[:3, 3]
-        R_end = self._upright(T_world_s, self._nearest(T_world_s[:3, 3], t_s))
+        R_end = _upright(T_world_s, mounted.normal)
         R_start, swing = mounted.R_world_c, _swing(mounted.R_world_c, R_end)
         if swing is None:
             R_start, swing = R_end, np.zeros(3)
@@ -150,17 +157,21 @@ class DynamicWorld:
 
     def _place_patch(self, sensor: str, tip_centre: Array) -> None:
         """Put the tangent of the surface that is nearest to the tip where it is now, moving as the surface does."""
-        surface = self._nearest_surface(tip_centre, self._t_s)
-        found = surface.nearest(tip_centre, self._t_s)
+        surface, found = self._nearest_surface(tip_centre, self._t_s)
         at = self._at.patches[sensor]
         R = _facing(found.normal)
         self._place(at.qpos, found.point, R)
-        T_world_body, twist = surface.motion.pose(self._t_s), surface.motion.twist(self._t_s)
-        self._qvel[at.qvel : at.qvel + 3] = twist[:3] + np.cross(twist[3:], found.point - T_world_body[:3, 3])
-        self._qvel[at.qvel + 3 : at.qvel + 6] = R.T @ twist[3:]
+        twist = surface.motion.twist(self._t_s)
+        if twist.any():
+            arm = found.point - surface.motion.pose(self._t_s)[:3, 3]
+            self._qvel[at.qvel : at.qvel + 3] = twist[:3] + cross(twist[3:], arm)
+            self._qvel[at.qvel + 3 : at.qvel + 6] = R.T @ twist[3:]
+        else:
+            self._qvel[at.qvel : at.qvel + 6] = 0.0
 
     def _feel(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
         nearest = self._nearest(T_world_s[:3, 3], t_s)
+        self._mounted[sensor].normal = nearest.normal
         R_tilt = tilt_of(-nearest.normal @ T_world_s[:3, :3])
         depth = self.tip.radius_m - nearest.distance_m
         if depth <= 0.0:
@@ -176,15 +187,15 @@ class DynamicWorld:
             tip.torsion_stiffness_n_m_rad * turned / tip.torsion_friction_m,
         )
         force = max(pressing - tip.damping_n_s_m * float(self._qvel[at.qvel + 2]), 0.0)
-        return _state(
-            T_world_s, R_tilt, -turned, (*shear, depth), slipping=held >= _SLIDING_SHARE * pressing, force_n=force
-        )
+        slipping = held >= _SLIDING_SHARE * pressing
+        pull = (-tip.shear_stiffness_n_m * shear[0], -tip.shear_stiffness_n_m * shear[1])
+        return _state(T_world_s, R_tilt, -turned, (*shear, depth), slipping=slipping, force_n=force, pull_n=pull)
 
     def _nearest(self, point: Array, t_s: float) -> SurfacePoint:
         """What is nearest to ``point`` (3,): a surface, the table, or an object where it is now."""
         found: SurfacePoint | None = None
         if self._surfaces:
-            found = self._nearest_surface(point, t_s).nearest(point, t_s)
+            found = self._nearest_surface(point, t_s)[1]
         if self._table is not None:
             found = _nearer(found, self._table.nearest(point, t_s))
         for name, shape in self._shapes.items():
@@ -196,19 +207,13 @@ class DynamicWorld:
         assert found is not None
         return found
 
-    def _nearest_surface(self, point: Array, t_s: float) -> Surface:
-        if len(self._surfaces) == 1:
-            return self._surfaces[0]
-        return min(self._surfaces, key=lambda surface: surface.nearest(point, t_s).distance_m)
-
-    def _upright(self, T_world_s: Array, nearest: SurfacePoint) -> Array:
-        """Axes of {s} without its tilt: z along the inward normal, turned about it as the sensor is."""
-        R: Array = T_world_s[:3, :3] @ tilt_of(-nearest.normal @ T_world_s[:3, :3]).T
-        return R
+    def _nearest_surface(self, point: Array, t_s: float) -> tuple[Surface, SurfacePoint]:
+        found = ((surface, surface.nearest(point, t_s)) for surface in self._surfaces)
+        return min(found, key=lambda each: each[1].distance_m)
 
     def _pose(self, name: str) -> Array:
         at = self._at.objects[name].qpos
-        T = np.eye(4)
+        T = _IDENTITY.copy()
         T[:3, :3] = rotation(self._qpos[at + 3 : at + 7])
         T[:3, 3] = self._qpos[at : at + 3]
         return T
@@ -226,14 +231,15 @@ def _state(
     *,
     slipping: bool = False,
     force_n: float = 0.0,
+    pull_n: tuple[float, float] = (0.0, 0.0),
 ) -> ContactState:
-    T_f_s = np.eye(4)
+    T_f_s = _IDENTITY.copy()
     T_f_s[:3, :3] = about_z(torsion) @ R_tilt
     T_f_s[:3, 3] = position
-    T_world_f = np.eye(4)
+    T_world_f = _IDENTITY.copy()
     T_world_f[:3, :3] = T_world_s[:3, :3] @ T_f_s[:3, :3].T
     T_world_f[:3, 3] = T_world_s[:3, 3] - T_world_f[:3, :3] @ T_f_s[:3, 3]
-    return ContactState(T_f_s, T_world_f, position[2] > 0.0, slipping, force_n)
+    return ContactState(T_f_s, T_world_f, position[2] > 0.0, slipping, force_n, pull_n)
 
 
 def _nearer(a: SurfacePoint | None, b: SurfacePoint) -> SurfacePoint:
@@ -247,10 +253,18 @@ def _swing(R_start: Array, R_end: Array) -> Array | None:
     return turn if float(np.trace(R)) > 1.0 + 2.0 * math.cos(_SWING_RAD) else None
 
 
+def _upright(T_world_s: Array, normal: Array) -> Array:
+    """Axes of {s} without its tilt: z along the inward normal, turned about it as the sensor is."""
+    R = T_world_s[:3, :3]
+    upright: Array = R @ tilt_of(-normal @ R).T
+    return upright
+
+
 def _facing(normal: Array) -> Array:
     """Axes (3, 3) with z along the unit vector ``normal``."""
-    across = np.zeros(3)
-    across[int(np.argmin(np.abs(normal)))] = 1.0
-    x = np.cross(across, normal)
-    x /= math.sqrt(float(x @ x))
-    return np.column_stack([x, np.cross(normal, x), normal])
+    x, y, z = normal.tolist()
+    # A rotation about an axis normal to both takes the world's z axis, or its opposite, there.
+    sign = math.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return np.array([[1.0 + sign * x * x * a, b, x], [sign * b, sign + y * y * a, y], [-sign * x, -y, z]])

@@ -129,10 +129,18 @@ def _turn(axis: int, angle: float) -> Array:
 
 
 def _offset(pose: Array) -> Array:
-    T = np.eye(4)
-    T[:3, :3] = _turn(2, pose[5]) @ _turn(1, pose[4]) @ _turn(0, pose[3])
-    T[:3, 3] = pose[:3]
-    return T
+    """As ``se3.from_euler_mm_deg`` in m and rad, without its checks: scenes ask for it in every step."""
+    x, y, z, alpha, beta, gamma = pose.tolist()
+    sa, ca, sb, cb = math.sin(alpha), math.cos(alpha), math.sin(beta), math.cos(beta)
+    sg, cg = math.sin(gamma), math.cos(gamma)
+    return np.array(
+        [
+            [cg * cb, cg * sb * sa - sg * ca, cg * sb * ca + sg * sa, x],
+            [sg * cb, sg * sb * sa + cg * ca, sg * sb * ca - cg * sa, y],
+            [-sb, cb * sa, cb * ca, z],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def _in_world(T: Array, v: Array, w: Array) -> Array:

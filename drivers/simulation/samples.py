@@ -105,10 +105,18 @@ def contacts(
             yield SampledContact(T_f_s[i], pixels[i][seen[i]], float(radius[i]))
 
 
-def random_poses(n: int, rng: np.random.Generator, depth_mm: tuple[float, float] = PUBLIC_DEPTH_MM) -> Array:
+def random_poses(
+    n: int,
+    rng: np.random.Generator,
+    depth_mm: tuple[float, float] = PUBLIC_DEPTH_MM,
+    *,
+    tilt_deg: float = 25.0,
+    shear_mm: float = 5.0,
+    torsion_deg: float = 5.0,
+) -> Array:
     """(n, 4, 4) contacts T_f_s over the ranges of the public data, before any slip."""
-    tilt, shear = _disc(n, 25.0, rng), _disc(n, 5.0, rng)
-    depth, gamma = rng.uniform(*depth_mm, n), rng.uniform(-5.0, 5.0, n)
+    tilt, shear = _disc(n, tilt_deg, rng), _disc(n, shear_mm, rng)
+    depth, gamma = rng.uniform(*depth_mm, n), rng.uniform(-torsion_deg, torsion_deg, n)
     return se3.from_euler_mm_deg(np.column_stack([shear, depth, tilt, gamma]))
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -16,6 +17,7 @@ from drivers.samples import Stamped
 from drivers.simulation.contact import ContactLaw, ContactState
 from drivers.simulation.motions import Glide, Motion, Periodic, Still
 from drivers.simulation.objects import ObjectConfig, PoseMmDeg, TableConfig
+from drivers.simulation.quasi_static import QuasiStaticWorld
 from drivers.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
 from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeline
 from drivers.simulation.world import KinematicWorld, World
@@ -47,6 +49,15 @@ class Carrier(Protocol):
 
     def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
         """(4, 4) at the present step of the simulation; must not advance time."""
+        ...
+
+
+@runtime_checkable
+class LoadBearer(Protocol):
+    """A simulated arm that gives way to what its sensors touch."""
+
+    def bear(self, force_world: Array, point_world: Array) -> None:
+        """From now on feel ``force_world`` (3,) N at ``point_world`` (3,) m."""
         ...
 
 
@@ -97,19 +108,29 @@ class Scene:
         self.timeline = Timeline(clock, step_s)
         self._start_ns = self.timeline.t_ns
         self._poses: dict[str, Callable[[], Array]] = {}
+        self._bearers: dict[str, Callable[[Array, Array], None]] = {}
         # The last one is of the timeline's present step, the one before it of the step before.
         self._felt: dict[str, deque[ContactState]] = {}
         self._kept = round(HISTORY_S * 1e9 / self.timeline.step_ns)
         self.timeline.add(Phase.CONTACT, self._step)
         self.timeline.keep(self._snapshot)
 
-    def mount(self, sensor: str, pose: Callable[[], Array]) -> None:
-        """Let ``sensor`` feel. ``pose`` gives T_world_s (4, 4) at the present step and must not advance time."""
+    def mount(self, sensor: str, pose: Callable[[], Array], bear: Callable[[Array, Array], None] | None = None) -> None:
+        """Let ``sensor`` feel.
+
+        Args:
+            sensor: its name.
+            pose: gives T_world_s (4, 4) at the present step and must not advance time.
+            bear: told after every step with which force (3,) N what is touched pushes the sensor, and at which point
+                (3,) m, both in the world frame.
+        """
         if sensor in self._poses:
             raise ConfigError(f"sensor {sensor!r} is mounted already", key="scene", value=sensor)
         t_ns = self.timeline.t_ns
         state = self.world.mount(sensor, pose(), self.seconds(t_ns))
         self._poses[sensor] = pose
+        if bear is not None:
+            self._bearers[sensor] = bear
         self._felt[sensor] = deque([state], maxlen=self._kept)
 
     def has(self, sensor: str) -> bool:
@@ -157,6 +178,8 @@ class Scene:
         poses = {sensor: pose() for sensor, pose in self._poses.items()}
         for sensor, state in self.world.step(poses, self.seconds(t_ns)).items():
             self._felt[sensor].append(state)
+            if sensor in self._bearers:
+                self._bearers[sensor](state.force_world_n, poses[sensor][:3, 3])
 
     def _snapshot(self) -> Callable[[int], None]:
         start_ns, world = self._start_ns, self.world.snapshot()
@@ -170,6 +193,20 @@ class Scene:
             world()
 
         return restore
+
+
+@contextmanager
+def physics_engine(key: str, value: str) -> Iterator[None]:
+    """Around imports that need MuJoCo. Raises ConfigError, with what to install, where it is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"needs {error.name}, which is not installed",
+            key=key,
+            value=value,
+            hint="pip install 'touchcell[physics]'",
+        ) from None
 
 
 _HERE: PoseMmDeg = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -274,21 +311,22 @@ class TipLawConfig(_Part):
 
     radius_mm: float = Field(default=20.0, gt=0.0)
     stiffness_n_mm: float = Field(default=1.5, gt=0.0)
-    friction: float = Field(default=0.9, gt=0.0, le=3.0, description="of the skin, where the physics is dynamic")
+    friction: float = Field(default=0.9, gt=0.0, le=3.0, description="of the skin, where objects are free")
 
     def build(self) -> ContactLaw:
-        return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3)
+        return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3, self.friction)
 
 
 class SceneConfig(_Part):
     """The ``scene:`` section of a cell file. Poses are in the world frame.
 
     ``physics`` says how true it is (docs/simulation.md). ``kinematic``: surfaces move as they were told, whatever
-    touches them. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms`` within
-    ``step_ms``, the grid on which arms move and contacts are kept.
+    touches them. ``quasi_static``: besides, objects slide on the table where tips push them, without inertia and always
+    upright. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms`` within ``step_ms``,
+    the grid on which arms move and contacts are kept.
     """
 
-    physics: Literal["kinematic", "dynamic"] = "kinematic"
+    physics: Literal["kinematic", "quasi_static", "dynamic"] = "kinematic"
     surfaces: dict[
         str,
         Annotated[PlaneConfig | RampConfig | DomeConfig | SphereConfig, Field(discriminator="kind")],
@@ -318,23 +356,15 @@ class SceneConfig(_Part):
         surfaces = {name: config.build() for name, config in self.surfaces.items()}
         if self.physics == "kinematic":
             return KinematicWorld(surfaces, self.tip.build())
+        if self.physics == "quasi_static":
+            objects = {name: config.build(self.table) for name, config in self.objects.items()}
+            return QuasiStaticWorld(surfaces, objects, self.tip.build())
         return self._dynamic_world(surfaces)
 
     def _dynamic_world(self, surfaces: Mapping[str, Surface]) -> World:
-        try:
+        with physics_engine("scene.physics", "dynamic"):
             from drivers.simulation.dynamics import DynamicWorld
             from drivers.simulation.dynamics_model import TipMechanics
-        except ModuleNotFoundError as error:
-            raise ConfigError(
-                f"physics: dynamic needs {error.name}, which is not installed",
-                key="scene.physics",
-                value="dynamic",
-                hint="pip install 'touchcell[physics]'",
-            ) from None
-        tip = TipMechanics(
-            radius_m=1e-3 * self.tip.radius_mm,
-            stiffness_n_m=1e3 * self.tip.stiffness_n_mm,
-            friction=self.tip.friction,
-        )
+        tip = TipMechanics(1e-3 * self.tip.radius_mm, 1e3 * self.tip.stiffness_n_mm, self.tip.friction)
         objects = {name: config.build(self.table) for name, config in self.objects.items()}
         return DynamicWorld(surfaces, objects, 1e-3 * self.table.height_mm, tip, 1e-3 * self.physics_step_ms)

@@ -117,7 +117,7 @@ class _PrismShape:
 
     def nearest(self, p: Array) -> SurfacePoint:
         x, y, z = (float(value) for value in p)
-        outside, best_sq, foot, out = False, math.inf, (0.0, 0.0), (1.0, 0.0)
+        outside, best_sq, foot, out, face = False, math.inf, (0.0, 0.0), (1.0, 0.0), (1.0, 0.0)
         deepest = -math.inf
         for (ax, ay), (bx, by) in self.edges:
             ex, ey = bx - ax, by - ay
@@ -131,8 +131,13 @@ class _PrismShape:
             distance_sq = (x - px) ** 2 + (y - py) ** 2
             if distance_sq < best_sq:
                 best_sq, foot = distance_sq, (px, py)
+                # Near a face its normal is exact, where the way to its nearest point is only rounding.
+                face = (ey / length, -ex / length) if 0.0 < u < 1.0 else (0.0, 0.0)
         if outside:
-            return _off_a_rim(x, y, z, foot, math.sqrt(best_sq), self.height_m)
+            beyond = math.sqrt(best_sq)
+            if face == (0.0, 0.0):
+                face = ((x - foot[0]) / beyond, (y - foot[1]) / beyond) if beyond > 0.0 else out
+            return _off_a_rim(z, foot, face, beyond, self.height_m)
         over, under = z - self.height_m, -z
         if deepest >= max(over, under):
             normal = np.array([out[0], out[1], 0.0])
@@ -153,7 +158,7 @@ class _TurnedShape:
             beyond, height = off_axis - radius, top - bottom
             over, under = z - top, bottom - z
             if beyond > 0.0:
-                point = _off_a_rim(x, y, z - bottom, (ux * radius, uy * radius), beyond, height)
+                point = _off_a_rim(z - bottom, (ux * radius, uy * radius), (ux, uy), beyond, height)
             elif beyond >= max(over, under):
                 point = SurfacePoint(beyond, np.array([ux, uy, 0.0]), np.array([ux * radius, uy * radius, z - bottom]))
             else:
@@ -165,16 +170,14 @@ class _TurnedShape:
         return found
 
 
-def _off_a_rim(x: float, y: float, z: float, foot: _Point, beyond: float, height: float) -> SurfacePoint:
-    """Nearest point to one that is ``beyond`` the outline, of which ``foot`` is nearest."""
+def _off_a_rim(z: float, foot: _Point, out: _Point, beyond: float, height: float) -> SurfacePoint:
+    """Nearest point to one that is ``beyond`` the outline along the unit vector ``out``, its nearest point ``foot``."""
     on_z = min(max(z, 0.0), height)
-    off = np.array([x - foot[0], y - foot[1], z - on_z])
     distance = math.hypot(beyond, z - on_z)
+    point = np.array([foot[0], foot[1], on_z])
     if distance == 0.0:
-        # On an edge any direction between its faces' is a normal.
-        off, distance = np.array([x, y, 0.0]), math.hypot(x, y)
-        return SurfacePoint(0.0, off / distance, np.array([x, y, z]))
-    return SurfacePoint(distance, off / distance, np.array([foot[0], foot[1], on_z]))
+        return SurfacePoint(0.0, np.array([out[0], out[1], 0.0]), point)
+    return SurfacePoint(distance, np.array([out[0] * beyond, out[1] * beyond, z - on_z]) / distance, point)
 
 
 def _off_an_end(x: float, y: float, height: float, over: float, under: float) -> SurfacePoint:

@@ -1,0 +1,159 @@
+"""``touchcell bench gdn-vs-cnn``: Gaussian-density networks against regression networks (Lloyd & Lepora 2024, 5.2).
+
+Both kinds share everything but the output layer and the loss: images, network, epochs, schedule, jitter, seeds and the
+split that chooses the epoch. Small images and few epochs keep twenty trainings within half an hour of a core.
+
+Trained networks are kept, so that an interrupted benchmark goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from benchmarks.provenance import provenance
+from drivers.tactile_data import read_split
+from geometry.types import Array
+from perception.architecture import Architecture
+from perception.dataset import LabelledImages, default_cache, load_reduced
+from perception.labels import xi_from_contact
+from perception.preprocessing import Preprocessing
+from perception.scores import SCORE_NAMES, Scores
+
+KINDS: tuple[Literal["gdn", "cnn"], ...] = ("gdn", "cnn")
+
+
+def run(arguments: Sequence[str], out: Path) -> None:
+    """Train what is missing, print the table; write ``gdn-vs-cnn.json`` and ``gdn-vs-cnn.png`` into ``out``.
+
+    Raises:
+        DataError: the data set is damaged.
+        TrainingError: an earlier training in the same folder had other settings.
+    """
+    options = _options(arguments)
+    out.mkdir(parents=True, exist_ok=True)
+    first = next(read_split(options.data, "train").read())
+    preprocessing = Preprocessing(input_size=(first.shape[0], first.shape[1]), output_size=(options.size, options.size))
+    sets = {name: _images(options.data, name, preprocessing) for name in ("train", "val")}
+    rows: dict[str, list[dict[str, float]]] = {kind: [] for kind in KINDS}
+    for seed in range(options.seeds):
+        for kind in KINDS:
+            model = options.networks / f"{kind}_{options.size}px_{options.epochs}epochs_{seed}.safetensors"
+            if not model.exists():
+                _train(sets["train"], sets["val"], model, preprocessing, kind, seed, options)
+            row = _scores(model, sets["val"])
+            rows[kind].append(row)
+            print(
+                f"{kind:<8} seed {seed}  " + "  ".join(f"{name} {value:.3f}" for name, value in row.items()), flush=True
+            )
+    result = {
+        "provenance": provenance(),
+        "options": {key: str(value) for key, value in vars(options).items()},
+        "networks": rows,
+        "summary": {kind: summary(found) for kind, found in rows.items()},
+    }
+    (out / "gdn-vs-cnn.json").write_text(json.dumps(result, indent=1) + "\n")
+    _print(rows)
+    _plot(rows, out / "gdn-vs-cnn.png")
+
+
+def summary(rows: Sequence[dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Mean and standard deviation over networks, of each figure."""
+    spread = len(rows) > 1
+    return {
+        name: {
+            "mean": float(np.mean([row[name] for row in rows])),
+            "sd": float(np.std([row[name] for row in rows], ddof=1)) if spread else 0.0,
+        }
+        for name in rows[0]
+    }
+
+
+def _options(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser("touchcell bench gdn-vs-cnn --", description=__doc__.partition("\n")[0])
+    parser.add_argument("--data", type=Path, required=True, help="data set folder with train/ and val/")
+    parser.add_argument("--seeds", type=int, default=10, help="networks of each kind")
+    parser.add_argument("--epochs", type=int, default=6)
+    parser.add_argument("--size", type=int, default=64, help="side of the networks' input, px")
+    parser.add_argument("--networks", type=Path, default=Path("runs/gdn-vs-cnn"), help="folder for trained networks")
+    return parser.parse_args(arguments)
+
+
+def _images(data: Path, split: str, preprocessing: Preprocessing) -> LabelledImages:
+    found = read_split(data, split)
+    return LabelledImages(
+        load_reduced(found, preprocessing, cache=default_cache()), xi_from_contact(found.contact_mm_deg)
+    )
+
+
+def _train(
+    training: LabelledImages,
+    validation: LabelledImages,
+    model: Path,
+    preprocessing: Preprocessing,
+    kind: Literal["gdn", "cnn"],
+    seed: int,
+    options: argparse.Namespace,
+) -> None:
+    import torch
+
+    from perception.training import Settings, train_on_arrays
+
+    torch.set_num_threads(1)
+    # The jitter is the same in millimetres of the sensor.
+    train_on_arrays(
+        training,
+        validation,
+        model,
+        preprocessing=preprocessing,
+        architecture=Architecture(kind=kind, input_size=preprocessing.output_size),
+        settings=Settings(seed=seed, epochs=options.epochs, shift_px=0.15 * options.size / 128),
+    )
+
+
+def _scores(model: Path, validation: LabelledImages) -> dict[str, float]:
+    from perception.inference import ContactModel
+    from perception.labels import contact_from_xi
+
+    network = ContactModel.load(model)
+    predictions = [network.predict_reduced(image) for image in validation.images]
+    scores = Scores.of(contact_from_xi(validation.xi), predictions)
+    return {**scores.mae(), "nll": float(scores.nll.mean())}
+
+
+def _print(rows: dict[str, list[dict[str, float]]]) -> None:
+    names = (*SCORE_NAMES, "nll")
+    print(f"\nMAE over {len(rows['gdn'])} networks, mean +- sd\n{'':<9}" + "".join(f"{name:>17}" for name in names))
+    for kind, found in rows.items():
+        figures = summary(found)
+        print(
+            f"{kind:<9}"
+            + "".join(f"{figures[name]['mean']:>10.3f} +-{figures[name]['sd']:5.3f}"[:17] for name in names)
+        )
+    better = [sum(one[name] < other[name] for one, other in zip(*rows.values(), strict=True)) for name in names]
+    print("gdn < cnn" + "".join(f"{n:>17}" for n in better))
+
+
+def _plot(rows: dict[str, list[dict[str, float]]], path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, len(SCORE_NAMES), figsize=(12, 3.2), layout="constrained")
+    for axis, name in zip(axes, SCORE_NAMES, strict=True):
+        values: list[Array] = [np.array([row[name] for row in rows[kind]]) for kind in KINDS]
+        for i, found in enumerate(values):
+            axis.plot(np.full(len(found), i), found, "o", alpha=0.5)
+            axis.plot([i - 0.25, i + 0.25], [found.mean()] * 2, "k-")
+        axis.set(title=name, xticks=range(len(KINDS)), xlim=(-0.5, len(KINDS) - 0.5))
+        axis.set_xticklabels(KINDS, fontsize=8)
+        axis.set_ylim(bottom=0.0)
+    axes[0].set_ylabel("MAE on val, one dot a network")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)

@@ -1,0 +1,90 @@
+"""``touchcell bench safety -- --processes``: every fault of a whole process while two arms move, and the cost.
+
+For each fault, over all arms and repeats: the time until the arms were told to stop, from then to rest, the way they
+went since the fault, and what was declared; then the cost of having arms in other processes.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from benchmarks.process_cost import measure
+from benchmarks.process_faults import FAULTS, ProcessCase, ProcessFault, TooBusy, run_fault
+from benchmarks.provenance import provenance
+
+CELLS: Final = {
+    "sway": (50.0, "two arms to and fro at 50 Hz, each in a process of its own"),
+    "push": (25.0, "two arms push an object at 25 Hz on tactile pictures, both in the process of the scene"),
+}
+"""Rate and description of each. With the scene's only host, both simulated arms are gone: nothing is measured there."""
+
+_TRIES: Final = 8
+
+
+def run(repeats: int, out: Path) -> None:
+    """Print both tables; writes ``processes.json`` into ``out``."""
+    reports: list[dict[str, Any]] = []
+    problems: list[str] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for what, (rate_hz, description) in CELLS.items():
+            print(f"\n{description}; {repeats} times each; median and worst of all arms")
+            print(
+                f"{'':<20}{'told to stop, ms':>18}{'stop time, ms':>16}{'way, mm':>16}{'rest, ms':>10}{'declared':>10}"
+            )
+            for fault in FAULTS:
+                cases = [_case(Path(folder) / f"{what} {fault.name} {k}", fault, rate_hz, what) for k in range(repeats)]
+                print(_row(fault, cases), flush=True)
+                problems += [f"{what}, {fault.name}: {problem}" for case in cases for problem in case.problems]
+                reports += [{"cell": what, "rate_hz": rate_hz, **_record(case)} for case in cases]
+        print(f"\n{len(problems)} problems" + "".join(f"\n  {problem}" for problem in problems))
+        print("clock step: by construction, nothing here reads a clock that can be set (tests/test_process_clocks.py)")
+        costs = {kind: measure(Path(folder), kind) for kind in ("one", "separate")}
+    print(f"\n{'two arms at 100 Hz, us':<32}{'one process':>18}{'separate':>18}")
+    for label, what in (("command to the arm's gate", "one_way"), ("cycle: read and send to both", "cycle")):
+        rows = [getattr(costs[kind], what) for kind in ("one", "separate")]
+        print(f"{label + ', p50 / p99':<32}" + "".join(f"{row['p50']:>9.0f} /{row['p99']:>7.0f}" for row in rows))
+    report = {**provenance(), "cases": reports, "cost_us": {k: asdict(c) for k, c in costs.items()}}
+    (out / "processes.json").write_text(json.dumps(report, indent=1) + "\n")
+
+
+def _case(folder: Path, fault: ProcessFault, rate_hz: float, what: str) -> ProcessCase:
+    """One case; tried again where the machine did not let the cell run at all."""
+    for k in range(_TRIES):
+        try:
+            return run_fault(folder / str(k), fault, rate_hz, what)
+        except TooBusy as busy:
+            reason = str(busy)
+    return ProcessCase(fault, (), 0.0, problems=[f"could not be run: {reason}"])
+
+
+def _row(fault: ProcessFault, cases: Sequence[ProcessCase]) -> str:
+    arms = [arm for case in cases for arm in case.arms]
+    told = _pair([1e3 * arm.detected_s for arm in arms if arm.detected_s is not None], 18, 0)
+    stop = _pair([1e3 * arm.stop_s for arm in arms if arm.stop_s is not None], 16, 0)
+    way = _pair([1e3 * arm.way_m for arm in arms], 16, 2)
+    rest = max((1e3 * arm.rest_s for arm in arms if arm.rest_s is not None), default=None)
+    declared = max((1e3 * case.declared_s for case in cases), default=0.0)
+    return f"{fault.name:<20}{told}{stop}{way}{'-' if rest is None else f'{rest:.0f}':>10}{declared:>10.0f}"
+
+
+def _pair(values: Sequence[float], width: int, digits: int) -> str:
+    words = f"{np.median(values):.{digits}f} / {max(values):.{digits}f}" if values else "-"
+    return f"{words:>{width}}"
+
+
+def _record(case: ProcessCase) -> dict[str, Any]:
+    return {
+        "fault": case.fault.name,
+        "declared_s": case.declared_s,
+        "arms": [asdict(arm) for arm in case.arms],
+        "outcome": dict(case.outcome),
+        "notes": dict(case.notes),
+        "problems": list(case.problems),
+    }

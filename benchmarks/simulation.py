@@ -1,0 +1,255 @@
+"""``touchcell bench simulation``: how true the simulated scenes are, and how fast.
+
+First, numbers of the dynamic scene against theory. Second, scripted touches at every fidelity against MuJoCo at 0.1 ms.
+Third, whole cells in closed loop: simulated seconds per second of one core, and where that second went. Times are of
+the processor, not of the wall, because cores are shared; ``--quick`` runs the first script and the first cell alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import yaml
+
+from benchmarks.cpu_shares import cpu_shares
+from benchmarks.provenance import provenance
+from benchmarks.simulation_checks import Check, checks
+from benchmarks.simulation_scripts import SCRIPTS, Script, Trace, perform
+from cell.compose import compose
+from cell.config import plan_cell
+from cell.loop import Progress, RunLoop, StopRequest
+from drivers.sim_tactip import SimTactip
+from drivers.simulation.scene import SceneConfig
+from geometry import se3
+
+_FINEST_MS = 0.1
+_CELLS = (
+    "surface_follow_sim",
+    "object_track_sim",
+    "single_push_sim",
+    "dual_push_sim",
+    "dual_push_tall_sim",
+)
+_PARTS = {
+    "drivers/simulation/render": "images",
+    "drivers/simulation/tip.py": "images",
+    "drivers/sim_tactip": "images",
+    "drivers/simulation/arm_dynamics": "arms",
+    "drivers/sim_joint_arm": "arms",
+    "drivers/sim_arm": "arms",
+    "drivers/joint_": "arms",
+    "drivers/kinematics": "arms",
+    "drivers/simulation/kinematics": "arms",
+    "drivers/simulation/": "physics",
+    "perception/": "perception",
+    "control/": "control and interlocks",
+    "tasks/": "control and interlocks",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Fidelity:
+    name: str
+    physics: str
+    physics_step_ms: float
+    step_ms: float = 2.0
+    joints: bool = False
+
+
+_FIDELITIES = (
+    _Fidelity("kinematic", "kinematic", 1.0),
+    _Fidelity("quasi-static", "quasi_static", 1.0),
+    _Fidelity("dynamic 2 ms", "dynamic", 2.0),
+    _Fidelity("dynamic 1 ms", "dynamic", 1.0),
+    _Fidelity("dynamic 1 ms, told every 5 ms", "dynamic", 1.0, 5.0),
+    _Fidelity("dynamic 1 ms, Pandas", "dynamic", 1.0, joints=True),
+)
+
+
+def run(arguments: Sequence[str], out: Path) -> None:
+    """Print three tables; writes ``simulation.json`` and ``simulation.png`` into ``out``."""
+    parser = argparse.ArgumentParser(prog="touchcell bench simulation")
+    parser.add_argument("--quick", action="store_true", help="the first script and the first cell alone")
+    quick = parser.parse_args(arguments).quick
+    scripts = dict(list(SCRIPTS.items())[: 1 if quick else None])
+    checked = [] if quick else _check()
+    fidelity = {name: _compare(name, script) for name, script in scripts.items()}
+    print()
+    speed = _speeds(quick=quick, out=out)
+    result = {
+        **provenance(),
+        "checks": [asdict(each) for each in checked],
+        "reference_step_ms": _FINEST_MS,
+        "fidelity": fidelity,
+        "speed": speed,
+    }
+    (out / "simulation.json").write_text(json.dumps(result, indent=1) + "\n")
+    _plot(fidelity, speed, out / "simulation.png")
+
+
+def _check() -> list[Check]:
+    found = checks()
+    for each in found:
+        print(f"{each.what:<72}{each.value:>12}  {each.aim:<12}{'' if each.passed else 'MISSED'}", flush=True)
+    print()
+    return found
+
+
+def _compare(name: str, script: Script) -> dict[str, dict[str, float]]:
+    print(f"{name:<34}{'tip rms um':>11}{'force rms mN':>13}{'object mm':>10}{'object deg':>11}{'x real time':>12}")
+    finest = {joints: perform(script, "dynamic", _FINEST_MS, joints=joints) for joints in (False, True)}
+    rows: dict[str, dict[str, float]] = {}
+    for fidelity in _FIDELITIES:
+        if not _offered(fidelity.physics, script.scene):
+            continue
+        on_grid = replace(script, scene={**script.scene, "step_ms": fidelity.step_ms})
+        trace = perform(on_grid, fidelity.physics, fidelity.physics_step_ms, joints=fidelity.joints)
+        rows[fidelity.name] = _errors(trace, finest[fidelity.joints])
+    for joints, label in ((False, "dynamic 0.1 ms (reference)"), (True, "the same, Pandas (reference)")):
+        rows[label] = {"times_real_time": finest[joints].duration_s / finest[joints].cpu_s}
+    for label, row in rows.items():
+        cells = [row.get(key) for key in ("tip_um", "force_mn", "object_mm", "object_deg", "times_real_time")]
+        widths, digits = (11, 13, 10, 11, 12), (1, 1, 2, 2, 1)
+        text = "".join(
+            f"{'-' if cell is None else f'{cell:.{n}f}':>{width}}"
+            for cell, width, n in zip(cells, widths, digits, strict=True)
+        )
+        print(f"  {label:<32}{text}", flush=True)
+    return rows
+
+
+def _offered(physics: str, scene: Mapping[str, Any]) -> bool:
+    """Whether this touchcell has such physics, and it can have such a scene."""
+    if physics not in get_args(SceneConfig.model_fields["physics"].annotation):
+        return False
+    return physics == "dynamic" or (physics == "kinematic") == ("surfaces" in scene)
+
+
+def _errors(trace: Trace, finest: Trace) -> dict[str, float]:
+    shear_mm = np.linalg.norm(trace.shear_mm - finest.shear_mm, axis=-1)
+    errors = {
+        "tip_um": 1e3 * float(np.sqrt(np.mean(shear_mm**2))),
+        "tip_max_um": 1e3 * float(shear_mm.max()),
+        "force_mn": 1e3 * float(np.sqrt(np.mean((trace.force_n - finest.force_n) ** 2))),
+        "times_real_time": trace.duration_s / trace.cpu_s,
+    }
+    for name, T_world_object in finest.objects.items():
+        found = trace.objects[name]
+        errors["object_mm"] = 1e3 * float(np.linalg.norm(found[:3, 3] - T_world_object[:3, 3]))
+        turn = se3.log(se3.inverse(T_world_object) @ found)[3:]
+        errors["object_deg"] = float(np.degrees(np.linalg.norm(turn)))
+    return errors
+
+
+def _speeds(*, quick: bool, out: Path) -> dict[str, dict[str, Any]]:
+    names = [name for name in _CELLS if _cell_file(name).exists()][: 1 if quick else None]
+    rows: dict[str, dict[str, Any]] = {}
+    print(f"{'cell':<22}{'physics':<14}{'arms':<8}{'images':<8}{'x real time':>12}   share of the processor")
+    for name in names:
+        data = yaml.safe_load(_cell_file(name).read_text())
+        offered = [physics for physics in ("kinematic", "quasi_static", "dynamic") if _fits(physics, data["scene"])]
+        for physics in offered:
+            for images in (False, True):
+                row = _speed(data, physics, images=images, out=out)
+                rows[f"{name}, {physics}, {'images' if images else 'no images'}"] = row
+                shares = ", ".join(f"{part} {100 * share:.0f} %" for part, share in row["shares"].items())
+                print(
+                    f"{name:<22}{physics:<14}{len(data['arms']):<8}{'yes' if images else 'no':<8}"
+                    f"{row['times_real_time']:12.1f}   {shares}; skipped: {', '.join(row['skipped'])}",
+                    flush=True,
+                )
+    return rows
+
+
+def _fits(physics: str, scene: Mapping[str, Any]) -> bool:
+    return _offered(physics, {"surfaces": scene["surfaces"]} if scene.get("surfaces") else {"objects": {}})
+
+
+def _cell_file(name: str) -> Path:
+    return Path(__file__).parent.parent / "configs" / f"{name}.yaml"
+
+
+def _speed(cell_file: Mapping[str, Any], physics: str, *, images: bool, out: Path, longest_s: float = 10.0) -> Any:
+    data = json.loads(json.dumps(cell_file))
+    data["scene"]["physics"] = physics
+    if not images:
+        for sensor in data["sensors"].values():
+            sensor["estimator"] = {"kind": "true_contact"}
+        # Without images nobody can see a frozen one.
+        blind = ("frame_frozen", "exposure", "uncertain", "out_of_range", "inconsistent")
+        data["interlocks"] = {key: item for key, item in data["interlocks"].items() if item["kind"] not in blind}
+    with tempfile.TemporaryDirectory(dir=out) as folder:
+        path = Path(folder) / "cell.yaml"
+        path.write_text(yaml.safe_dump(data))
+        stop = StopRequest()
+
+        def enough(progress: Progress) -> None:
+            if progress.t_s > longest_s:
+                stop.ask_at_once()
+
+        cell = compose(plan_cell(path))
+        with cell, cpu_shares(_PARTS, "loop") as counts:
+            started = time.process_time()
+            result = RunLoop(cell, None, stop=stop, on_cycle=enough).run()
+            cpu_s = time.process_time() - started
+        cameras = {name: camera for name, camera in cell.cameras.items() if isinstance(camera, SimTactip)}
+        drawn = {name: camera.health()["frames_drawn"] for name, camera in cameras.items()}
+    total = max(sum(counts.values()), 1)
+    skipped = [] if images else ["images"]
+    if all(arm["driver"] == "sim_arm" for arm in data["arms"].values()):
+        skipped.append("arm dynamics")
+    if physics != "dynamic":
+        skipped.append("toppling and inertia" if physics == "quasi_static" else "everything that moves when touched")
+    return {
+        "outcome": result.outcome.value,
+        "simulated_s": result.duration_s,
+        "cpu_s": cpu_s,
+        "times_real_time": result.duration_s / cpu_s,
+        "shares": {part: count / total for part, count in counts.most_common()},
+        "frames_drawn": drawn,
+        "skipped": skipped,
+    }
+
+
+def _plot(fidelity: Mapping[str, Mapping[str, Mapping[str, float]]], speed: Mapping[str, Any], path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(14, 5.5), layout="constrained")
+    markers = dict(zip(fidelity, "osD^v", strict=False))
+    colours = {each.name: f"C{index}" for index, each in enumerate(_FIDELITIES)}
+    for script, rows in fidelity.items():
+        for name, row in rows.items():
+            if "tip_um" in row:
+                left.scatter(row["times_real_time"], row["tip_um"], c=colours[name], marker=markers[script], s=60)
+    handles = [plt.Line2D([], [], ls="", marker=marker, c="0.4", label=script) for script, marker in markers.items()]
+    handles += [plt.Line2D([], [], ls="", marker="o", c=colour, label=name) for name, colour in colours.items()]
+    left.legend(handles=handles, fontsize=8)
+    left.set(xscale="log", yscale="log", xlabel="simulated seconds per second of one core")
+    left.set_ylabel("RMS error of the tip's deflection against 0.1 ms (um)")
+    left.axhline(100.0, c="0.6", ls="--")
+    left.grid(alpha=0.3, which="both")
+    names = list(speed)
+    begin = np.zeros(len(names))
+    for part in sorted({part for row in speed.values() for part in row["shares"]}):
+        costs = [1e3 * speed[name]["shares"].get(part, 0.0) / speed[name]["times_real_time"] for name in names]
+        right.barh(names, costs, left=begin, label=part)
+        begin += costs
+    for name, end in zip(names, begin, strict=True):
+        right.text(end, name, f" {speed[name]['times_real_time']:.0f}x", va="center")
+    right.set_xlabel("ms of one core per simulated second")
+    right.invert_yaxis()
+    right.legend(fontsize=8)
+    right.grid(axis="x", alpha=0.3)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

@@ -1,0 +1,111 @@
+"""Cells with two simulated arms in processes of their own, for faults of the watchdog chain: they sway, or push."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import yaml
+
+from cell.cli import find_cell
+from cell.config import CellFile, CellPlan, DevicePlan, plan_cell
+from drivers import registry
+from drivers.commands import TwistCommand, TwistFrame
+from tasks.interface import Action, Observation, TaskConfig, TaskContext, TaskSpec, TransitionRecord
+
+SPEED_M_S: Final = 0.03
+PERIOD_S: Final = 2.0
+_ABILITIES: Final = frozenset({"TcpSource", "TwistSink", "Stoppable"})
+
+
+class Sway:
+    """Both arms to and fro along x; finished when a person asks, or when the supervisor trips."""
+
+    def __init__(self, config: TaskConfig, context: TaskContext) -> None:
+        self._ttl_s = 3.0 / context.rate_hz
+        self.state = "sway"
+        self.finished = False
+        self.succeeded = False
+        self.transitions: tuple[TransitionRecord, ...] = ()
+
+    def tick(self, observation: Observation) -> Action:
+        """A twist for each arm, in opposite directions."""
+        now_ns = observation.now_ns
+        if observation.operator_stop:
+            self.finished = self.succeeded = True
+            return Action()
+        # A square wave is fastest almost always, which is the worst moment for a fault.
+        speed_m_s = math.copysign(SPEED_M_S, math.sin(2.0 * math.pi * now_ns * 1e-9 / PERIOD_S))
+        twist = np.array([speed_m_s, 0.0, 0.0, 0.0, 0.0, 0.0])
+        return Action(
+            {
+                role: TwistCommand(sign * twist, TwistFrame.BASE, now_ns, self._ttl_s)
+                for role, sign in (("left", 1.0), ("right", -1.0))
+            }
+        )
+
+    def trip(self, now_ns: int, reason: str) -> None:
+        """Nothing moves from here on."""
+        self.state, self.finished = "tripped", True
+
+
+SPEC: Final = TaskSpec(
+    name="sway",
+    summary="two arms to and fro",
+    config=TaskConfig,
+    arms={"left": _ABILITIES, "right": _ABILITIES},
+    sensors=frozenset(),
+    build=Sway,
+)
+
+
+def two_arm_plan(
+    folder: Path, rate_hz: float, *, processes: str = "separate", categories: Mapping[str, int] | None = None
+) -> CellPlan:
+    """The plan of the cell: no scene, so that each arm is a group by itself."""
+    driver = registry.spec("sim_arm")
+    places = {"left": -300.0, "right": 300.0}
+    arms = {
+        name: {
+            "driver": "sim_arm",
+            "deactivate": "hold",
+            "stop_category": (categories or {}).get(name, 2),
+            "start_pose_mm_deg": (x_mm, 0.0, 200.0, 180.0, 0.0, 0.0),
+        }
+        for name, x_mm in places.items()
+    }
+    cell = CellFile.model_validate(
+        {
+            "schema": 1,
+            "name": "two_arms",
+            "time": "real",
+            "rate_hz": rate_hz,
+            "processes": processes,
+            "arms": arms,
+            "task": {"name": SPEC.name},
+        }
+    )
+    devices = {
+        name: DevicePlan(name, driver, driver.config.model_validate(section.model_extra))
+        for name, section in cell.arms.items()
+    }
+    roles = {name: name for name in devices}
+    return CellPlan(folder / "cell.yaml", cell, devices, {}, roles, {}, SPEC, TaskConfig(), (), devices)
+
+
+def pushing_plan(folder: Path, rate_hz: float) -> CellPlan:
+    """The cell in which two arms push, as it ships but in real time, in several processes, and at this rate.
+
+    Raises:
+        ConfigError: the cell cannot run so slowly.
+    """
+    data = yaml.safe_load(find_cell(Path("configs/dual_push_sim.yaml")).read_text())
+    data |= {"time": "real", "processes": "separate", "rate_hz": rate_hz}
+    # A cycle is longer than in the cell that ships, and a state is as old as the perception that follows it takes.
+    data["interlocks"]["stale_arm"]["limit_ms"] = 4e3 / rate_hz
+    path = folder / "cell.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return plan_cell(path)
