@@ -17,11 +17,12 @@ from rich.table import Table
 
 from drivers.tactile_data import read_image, read_split
 from geometry.types import Array, ImageArray
-from perception.camera_change import CalibratedEstimator, find_change
+from perception.calibrated_estimator import CalibratedEstimator
 from perception.errors import TrainingError
 from perception.estimators import ContactEstimator, load_estimator
 from perception.labels import contact_from_xi
 from perception.model_file import load_model
+from perception.zero_frame import find_change
 
 _CHANGES = {
     "none": (1.0, 0.0, 0.0),

@@ -11,8 +11,9 @@ from drivers.abilities import FrameSource
 from drivers.errors import ConfigError, DataError
 from drivers.tactile_data import natural_order, read_image
 from geometry.types import ImageArray
-from perception.camera_change import CameraChange, find_change
+from perception.camera_change import CameraChange
 from perception.model_file import load_model
+from perception.zero_frame import find_change
 
 _FRAME_TIMEOUT_S = 5.0
 

@@ -53,7 +53,14 @@ class MarkerErrors:
 
 
 def calibrate_sim(
-    data: Path, out: Path, *, frames: int = 20, images: int = 600, rings: int = 10, seed: int = 0
+    data: Path,
+    out: Path,
+    *,
+    frames: int = 20,
+    images: int = 600,
+    rings: int = 10,
+    guess_steps: int = 600,
+    seed: int = 0,
 ) -> None:
     """Fit, print marker errors, and write the tip file ``out`` with a picture beside it.
 
@@ -63,6 +70,7 @@ def calibrate_sim(
         frames: labelled images that are fitted to.
         images: of ``train`` that teach, without labels, how the markers move.
         rings: of the sensor's lattice.
+        guess_steps: as of ``marker_learning.learn_markers``.
         seed: of everything random.
 
     Raises:
@@ -74,7 +82,7 @@ def calibrate_sim(
     training = read_split(data, "train")
     with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
         told = _teller(bar)
-        markers = learn_sensor(data, images=images, rings=rings, seed=seed, told=told)
+        markers = learn_sensor(data, images=images, rings=rings, guess_steps=guess_steps, seed=seed, told=told)
         chosen = evenly(len(training.images), frames)
         rest = np.setdiff1d(np.arange(len(training.images)), chosen)
         others = rest[evenly(len(rest), _HELD_OUT)]

@@ -118,11 +118,19 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument("--reference", type=Path, help="such images of the sensor that taught the model")
     calibrate.set_defaults(run=_calibrate)
 
+    adapt = commands.add_parser("adapt", help="bring a marker estimator to another sensor with a few labelled images")
+    adapt.add_argument("--model", type=Path, required=True)
+    adapt.add_argument("--data", type=Path, required=True, help="data set folder with train/ of the new sensor")
+    adapt.add_argument("--frames", type=int, help="so many of its images, evenly chosen (default: all)")
+    adapt.add_argument("--out", type=Path, required=True, help="model file to write (.safetensors)")
+    adapt.set_defaults(run=_adapt)
+
     evaluate = commands.add_parser("evaluate", help="error, likelihood, calibration and latency on labelled images")
     evaluate.add_argument("--data", type=Path, required=True)
     evaluate.add_argument("--split", default="val", help="train, val or test")
     evaluate.add_argument("--model", type=Path, required=True)
     evaluate.add_argument("--calibration", type=Path, help="file of `touchcell calibrate`")
+    evaluate.add_argument("--deeper-than", type=float, metavar="MM", help="leave out shallower contacts")
     evaluate.add_argument("--json", type=Path, help="also write the figures there")
     evaluate.set_defaults(run=_evaluate)
 
@@ -294,6 +302,18 @@ def _calibrate(options: argparse.Namespace) -> int:
     return EXIT_OK
 
 
+def _adapt(options: argparse.Namespace) -> int:
+    from perception.adaptation import adapt
+
+    model = adapt(options.model, options.data, options.out, frames=options.frames)
+    told, camera = model.header.training, model.header.camera
+    assert camera is not None
+    print(f"{told['adapted_images_matched']} of {told['adapted_images']} images matched and learned from")
+    print(f"camera: zoom {camera.zoom:.4f}, turn {camera.turn_deg:.1f} deg; labels' axes:", end=" ")
+    print(f"{model.header.label_turn_deg:.1f} deg; wrote {options.out}")
+    return EXIT_OK
+
+
 def _evaluate(options: argparse.Namespace) -> int:
     from rich.progress import Progress
 
@@ -306,6 +326,7 @@ def _evaluate(options: argparse.Namespace) -> int:
             options.split,
             options.model,
             calibration=options.calibration,
+            deeper_than_mm=options.deeper_than,
             progress=lambda done, total: bar.update(images, completed=done, total=total),
         )
     print_table(result)

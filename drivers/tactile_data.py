@@ -12,7 +12,7 @@ import math
 import re
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
@@ -65,6 +65,13 @@ class Split:
                     hint="one data set holds images of one size; collect or crop these again",
                 )
             yield image
+
+    def deeper_than(self, depth_mm: float) -> Split:
+        """The contacts of this split that are pressed further in. Raises DataError if there are none."""
+        kept = np.flatnonzero(self.contact_mm_deg[:, 2] > depth_mm)
+        if not len(kept):
+            raise DataError(self.folder, f"holds no contact deeper than {depth_mm:g} mm")
+        return replace(self, images=tuple(self.images[i] for i in kept), contact_mm_deg=self.contact_mm_deg[kept])
 
 
 def read_split(root: Path, split: str) -> Split:

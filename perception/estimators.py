@@ -47,12 +47,19 @@ def load_estimator(path: Path, calibration: Path | None = None) -> ContactEstima
         ModelError: as ``model_file.load_model``.
         ConfigError: the calibration file cannot be used.
     """
-    estimator = estimator_of(load_model(path))
-    if calibration is None:
-        return estimator
-    from perception.camera_change import CalibratedEstimator, load_change
+    model = load_model(path)
+    change = model.header.camera
+    if calibration is not None:
+        from perception.camera_change import load_change
 
-    return CalibratedEstimator(estimator, load_change(calibration))
+        found = load_change(calibration)
+        change = found if change is None else change.after(found)
+    estimator = estimator_of(model)
+    if change is None:
+        return estimator
+    from perception.calibrated_estimator import CalibratedEstimator
+
+    return CalibratedEstimator(estimator, change)
 
 
 def estimator_of(model: Model) -> ContactEstimator:

@@ -66,6 +66,7 @@ def evaluate(
     model: Path,
     *,
     calibration: Path | None = None,
+    deeper_than_mm: float | None = None,
     clock: Clock | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
@@ -76,6 +77,7 @@ def evaluate(
         split: train, val or test.
         model: model file.
         calibration: of the camera, as ``load_estimator`` takes it.
+        deeper_than_mm: leave out shallower contacts.
         clock: measures the latency; None for the machine's.
         progress: told (images done, images in all).
 
@@ -86,6 +88,8 @@ def evaluate(
     """
     clock = clock or MonotonicClock()
     labelled = read_split(data, split)
+    if deeper_than_mm is not None:
+        labelled = labelled.deeper_than(deeper_than_mm)
     contact_model = load_estimator(model, calibration)
     n = len(labelled.images)
     predictions: list[Prediction] = []

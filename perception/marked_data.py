@@ -90,8 +90,18 @@ def frame_origin(size: tuple[int, int]) -> Array:
     raise ImageError("size", expected, size, hint="record whole 640x480 frames")
 
 
-def learn_sensor(data: Path, *, images: int, rings: int, seed: int = 0, told: Told | None = None) -> SensorMarkers:
+def learn_sensor(
+    data: Path, *, images: int, rings: int, guess_steps: int = 600, seed: int = 0, told: Told | None = None
+) -> SensorMarkers:
     """Learn to find the markers from evenly chosen images of ``data/train``; their labels are not looked at.
+
+    Args:
+        data: data set.
+        images: how many.
+        rings: of the lattice.
+        guess_steps: as of ``marker_learning.learn_markers``.
+        seed: of everything random.
+        told: of what has been done.
 
     Raises:
         DataError: the data set is damaged.
@@ -113,6 +123,7 @@ def learn_sensor(data: Path, *, images: int, rings: int, seed: int = 0, told: To
         discs,
         preprocessing.output_size,
         rings=rings,
+        guess_steps=guess_steps,
         seed=seed,
         told=None if told is None else lambda done, total: told("markers learned", done, total),
     )

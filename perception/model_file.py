@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from geometry.types import Array, ImageArray
 from perception.architecture import Architecture
+from perception.camera_change import CameraChange
 from perception.errors import ModelError
 from perception.labels import CONTACT_NAMES, contact_from_xi, shear_direction, xi_gaussian
 from perception.marker_architecture import MarkerArchitecture
@@ -139,6 +140,9 @@ class Header(BaseModel):
             calibrated; cnn: the standard deviations themselves. In ``labels.sigma_unit``, along ``labels.aligned``.
             Found on the validation split.
         sigma_power: (6,) see ``calibration.calibrate``.
+        camera: from the pixels of this model's sensor to those of the one that taught its networks, where it was
+            adapted (``touchcell adapt``).
+        label_turn_deg: of its contacts' axes about the sensor's z axis, to those that its networks were taught with.
         training_data: digest of the training set (``LabelledImages.digest``).
         training: settings and outcome of the training, for people.
     """
@@ -152,6 +156,8 @@ class Header(BaseModel):
     labels: Labels
     sigma_scale: SixPositive
     sigma_power: SixPositive = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    camera: CameraChange | None = None
+    label_turn_deg: Finite = 0.0
     training_data: str
     training: dict[str, str | int | float | list[float] | None] = {}
 

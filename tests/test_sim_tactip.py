@@ -244,3 +244,40 @@ def test_a_simulated_sensor_sits_on_any_arm_that_tells_its_pose() -> None:
         arm.z_m = z_m
         clock.advance_s(0.01)
         assert scene.contact("tip").value.depth_m == pytest.approx(depth_m)
+
+
+def test_dropped_frames_never_come_and_are_the_same_for_the_same_seed() -> None:
+    def arrived(seed: int) -> list[int]:
+        cell = Cell(seed=seed, dropped=0.3, latency_ms=0)
+        seqs = [cell.tip.next(-1, 1.0).seq]
+        while seqs[-1] < 100:
+            seqs.append(cell.tip.next(seqs[-1], 1.0).seq)
+        return seqs
+
+    first = arrived(1)
+    assert first == arrived(1) != arrived(2)
+    assert 0.6 < len(first) / 101 < 0.8
+    cell = Cell(seed=1, dropped=0.3, latency_ms=0)
+    cell.clock.advance_s(2.0)
+    assert cell.tip.latest().seq == max(seq for seq in first if seq <= 100)
+
+
+def test_exposure_and_blur_show_in_the_image() -> None:
+    plain, bright, soft = (
+        Cell(noise=0, **changes).tip.next(-1, 1.0).value.image.astype(float)
+        for changes in ({}, {"exposure": 1.3}, {"blur_px": 2.0})
+    )
+    np.testing.assert_allclose(bright, np.minimum(1.3 * plain, 255), atol=2)
+    assert bright.max() > plain.max()
+    assert np.abs(np.diff(soft, axis=1)).max() < 0.5 * np.abs(np.diff(plain, axis=1)).max()
+    assert soft.mean() == pytest.approx(plain.mean(), abs=1.0)
+
+
+def test_a_tip_file_makes_another_sensor() -> None:
+    plain, other = (Cell(noise=0, **changes).tip.next(-1, 1.0).value.image for changes in ({}, TIP_FILE))
+    assert (plain != other).mean() > 0.01
+    with pytest.raises(ConfigError):
+        Cell(tip="nobody.yaml")
+
+
+TIP_FILE = {"tip": "franka_tactip_1"}
