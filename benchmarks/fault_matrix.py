@@ -5,6 +5,7 @@ The matrix is generated: faults are listed once, states come from the tasks' own
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import yaml
 
 from cell.cli import find_cell
 from cell.compose import Cell, compose
-from cell.config import plan_cell
+from cell.config import CellPlan, plan_cell
 from cell.loop import RunLoop, RunResult, StopRequest
 from drivers.sim_arm import SimArm
 from drivers.sim_tactip import SimTactip
@@ -24,8 +25,12 @@ _WATCHED_S = 3.0
 _SETTLED_CYCLES = 3
 # By then the camera has shown enough for its brightness to be known.
 _NOT_BEFORE_S = 0.4
+# Some tasks withdraw only when they are asked to end.
+_AFTER_STOP = "retract"
+_ASKED_AFTER_S = 0.8
 
-Inject = Callable[[Cell, StopRequest], None]
+Inject = Callable[[Cell, StopRequest, str], None]
+"""Hurts the device with that name (a camera) or in that role (an arm)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,22 +57,22 @@ class Fault:
 
 
 def _arm(**changes: Any) -> Inject:
-    def inject(cell: Cell, stop: StopRequest) -> None:
-        for arm in cell.arms.values():
-            assert isinstance(arm, SimArm)
-            arm.faults = replace(arm.faults, **changes)
+    def inject(cell: Cell, stop: StopRequest, device: str) -> None:
+        arm = cell.arms[device]
+        assert isinstance(arm, SimArm)
+        arm.faults = replace(arm.faults, **changes)
 
     return inject
 
 
 def _camera(**changes: Any) -> Inject:
-    def inject(cell: Cell, stop: StopRequest) -> None:
-        for camera in cell.cameras.values():
-            assert isinstance(camera, SimTactip)
-            if "last_seq" in changes:
-                camera.faults = replace(camera.faults, last_seq=camera.latest().seq)
-            else:
-                camera.faults = replace(camera.faults, **changes)
+    def inject(cell: Cell, stop: StopRequest, device: str) -> None:
+        camera = cell.cameras[device]
+        assert isinstance(camera, SimTactip)
+        if "last_seq" in changes:
+            camera.faults = replace(camera.faults, last_seq=camera.latest().seq)
+        else:
+            camera.faults = replace(camera.faults, **changes)
 
     return inject
 
@@ -75,18 +80,18 @@ def _camera(**changes: Any) -> Inject:
 def _and_stop(inject: Inject) -> Inject:
     """The fault, and a stop by the operator at the same time, without which it would not show."""
 
-    def both(cell: Cell, stop: StopRequest) -> None:
-        inject(cell, stop)
+    def both(cell: Cell, stop: StopRequest, device: str) -> None:
+        inject(cell, stop, device)
         stop.ask_at_once()
 
     return both
 
 
-_STANDS = {"prepare": "nothing moves yet"}
+_STANDS = {"prepare": "nothing moves yet", "grab": "it stands while a frame is taken"}
 _NO_BASELINE = {"prepare": "the first frames are the measure", "wait": "the first frames are the measure"}
 
 FAULTS: Final = (
-    Fault("operator's stop", "arm", _and_stop(lambda cell, stop: None), frozenset(), {}),
+    Fault("operator's stop", "arm", _and_stop(lambda cell, stop, device: None), frozenset(), {}),
     Fault("arm: nan_state", "arm", _arm(nan_state=True), frozenset({"finite"}), {}),
     Fault("arm: stale", "arm", _arm(stale=True), frozenset({"arm_state_age"}), {}),
     Fault(
@@ -99,7 +104,9 @@ FAULTS: Final = (
         extra_m_s=0.03,
     ),
     Fault("arm: deaf", "arm", _and_stop(_arm(deaf=True)), frozenset(), {}),
-    Fault("arm: runs_on", "arm", _and_stop(_arm(runs_on=True)), frozenset({"stop"}), _STANDS, obeys=False),
+    Fault(
+        "arm: runs_on", "arm", _and_stop(_arm(runs_on=True)), frozenset({"stop"}), _STANDS, obeys=False, extra_m_s=0.02
+    ),
     Fault("camera: frozen", "camera", _camera(frozen=True), frozenset({"frame_frozen"}), {}),
     Fault("camera: last_seq", "camera", _camera(last_seq=0), frozenset({"frame_age"}), {}),
     # Where the loop waits for the first frame, the arm's state is too old when it comes; a task without an arm sees the
@@ -120,16 +127,17 @@ class Case:
     """One place in the matrix and what was found there.
 
     Attributes:
-        task, fault, state: which place.
+        task, device, fault, state: which place.
         ended_by: kind of the interlock that came first, "stop" for an arm that had to be stopped by stronger means, the
             kind of the error that was raised, or empty if none.
         detection_s: from the fault to the trip.
-        stop_s, distance_m: until the arm stood; None where there is no arm, or nothing to be read.
+        stop_s, distance_m: until the arm stood, of two the later; None where there is no arm, or nothing to be read.
         declared_s, declared_m: what that may take.
         problem: what was not as it has to be; empty if all was.
     """
 
     task: str
+    device: str
     fault: str
     state: str
     ended_by: str = ""
@@ -150,36 +158,64 @@ def cells() -> dict[str, dict[str, Any]]:
     observing["task"] = {"name": "observe"}
     of_sensors = ("frame_age", "frame_frozen", "exposure")
     observing["interlocks"] = {n: e for n, e in observing["interlocks"].items() if e["kind"] in of_sensors}
-    return {"surface_following": following, "object_tracking": tracking, "observe": observing}
+    single, dual = _shipped("single_push_sim.yaml"), _shipped("dual_push_sim.yaml")
+    for pushing in (single, dual):
+        pushing["task"] |= {"target_mm": [70, 0], "retract_mm": 10}
+    collecting = _shipped("collect_sim.yaml")
+    collecting["task"]["samples"] = 2
+    # Thresholded images are the same while nothing moves, which would seem frozen.
+    collecting["sensors"]["sensor"] |= {"output": "raw", "rate_hz": 30}
+    collecting["interlocks"]["stale_frame"]["limit_ms"] = 150
+    watching = ("frame_frozen", "exposure", "standstill")
+    collecting["interlocks"] |= {n: e for n, e in following["interlocks"].items() if e["kind"] in watching}
+    tasks = (following, tracking, observing, single, dual, collecting)
+    return {data["task"]["name"]: data for data in tasks}
 
 
-def matrix(folder: Path, devices: Sequence[str] = ("arm", "camera")) -> Iterator[Case]:
+def matrix(
+    folder: Path, devices: Sequence[str] = ("arm", "camera"), tasks: Sequence[str] | None = None
+) -> Iterator[Case]:
     """Run every place of the matrix and yield what was found.
 
     Args:
-        folder: for cell files.
+        folder: for cell files, and for what tasks collect.
         devices: whose faults; those of cameras need a model, those of arms run on the true contact.
+        tasks: of which; None for all.
     """
     for task, data in cells().items():
+        if tasks is not None and task not in tasks:
+            continue
         for kind in devices:
             path = folder / f"{task}_{kind}.yaml"
-            sensor = data["sensors"]["sensor"]
-            if kind == "arm":
-                sensor = {**sensor, "estimator": {"kind": "true_contact"}}
-            path.write_text(yaml.safe_dump({**data, "sensors": {"sensor": sensor}}))
-            probe = compose(plan_cell(path))
+            path.write_text(yaml.safe_dump(_on_true_contact(data) if kind == "arm" else data))
+            probe = compose(_plan(path))
             assert isinstance(probe.task, MachineTask)
-            if kind == "arm" and not probe.plan.arm_roles:
-                continue
+            hurt = probe.plan.arm_roles if kind == "arm" else probe.cameras
             for fault in (fault for fault in FAULTS if fault.device == kind):
-                for state in probe.task.states:
-                    yield run_case(path, fault, state)
+                for device in hurt:
+                    for state in probe.task.states:
+                        yield run_case(path, fault, device, state)
 
 
-def run_case(path: Path, fault: Fault, state: str) -> Case:
-    """Run the cell, let the fault happen in ``state``, and judge what comes of it."""
-    cell, stop, trace = compose(plan_cell(path)), StopRequest(), _Trace()
-    case = Case(cell.plan.task.name, fault.name, state)
+def _on_true_contact(data: Mapping[str, Any]) -> dict[str, Any]:
+    sensors = {name: dict(sensor) for name, sensor in data["sensors"].items()}
+    for sensor in sensors.values():
+        if sensor["estimator"]["kind"] == "network":
+            sensor["estimator"] = {"kind": "true_contact"}
+    return {**data, "sensors": sensors}
+
+
+def _plan(path: Path) -> CellPlan:
+    """Its plan; a task that collects begins anew."""
+    shutil.rmtree(path.with_suffix(".collected"), ignore_errors=True)
+    collects = "collect" in yaml.safe_load(path.read_text())
+    return plan_cell(path, {"data": path.with_suffix(".collected")} if collects else {})
+
+
+def run_case(path: Path, fault: Fault, device: str, state: str) -> Case:
+    """Run the cell, let the fault happen to ``device`` in ``state``, and judge what comes of it."""
+    cell, stop, trace = compose(_plan(path)), StopRequest(), _Trace()
+    case = Case(cell.plan.task.name, device, fault.name, state)
     injected_ns: int | None = None
     with cell:
         assert isinstance(cell.task, MachineTask)
@@ -194,9 +230,11 @@ def run_case(path: Path, fault: Fault, state: str) -> Case:
                 now_ns = cell.clock.now_ns()
                 if wait <= 0 and (initial or now_ns >= cell.start_ns + _NOT_BEFORE_S * 1e9):
                     injected_ns = now_ns
-                    fault.inject(cell, stop)
+                    fault.inject(cell, stop, device)
             if injected_ns is not None and cell.clock.now_ns() > injected_ns + _WATCHED_S * 1e9:
                 break
+            if state == _AFTER_STOP and cell.clock.now_ns() > cell.start_ns + _ASKED_AFTER_S * 1e9 and not stop.count:
+                stop.ask()
             going = loop.step()
         result = loop.end()
         at_rest = all(arm.at_rest() for arm in cell.arms.values())
@@ -233,21 +271,25 @@ def _judged(
     if not at_rest:
         problems.append("the arm does not stand")
     case = replace(case, ended_by=by, detection_s=None if first is None else (first.t_ns - injected_ns) * 1e-9)
-    for report in result.stops.values():
-        times = 1 if fault.obeys else 2
+    for role, report in result.stops.items():
+        hurt = role == case.device
+        times = 2 if hurt and not fault.obeys else 1
         longest_s = times * report.declared_s + 1.0 / cell.rate_hz
-        farthest_m = times * report.declared_m + fault.extra_m_s * longest_s
+        farthest_m = times * report.declared_m + (fault.extra_m_s * longest_s if hurt else 0.0)
         if report.time_s is None or report.time_s > longest_s:
-            problems.append(f"at rest after {report.time_s} s, declared {report.declared_s:.3f} s")
+            problems.append(f"{role} at rest after {report.time_s} s, declared {report.declared_s:.3f} s")
         if report.distance_m is not None and report.distance_m > farthest_m:
-            problems.append(f"stood after {1e3 * report.distance_m:.2f} mm, declared {1e3 * report.declared_m:.2f} mm")
-        case = replace(
-            case,
-            stop_s=report.time_s,
-            distance_m=report.distance_m,
-            declared_s=report.declared_s,
-            declared_m=report.declared_m,
-        )
+            problems.append(
+                f"{role} stood after {1e3 * report.distance_m:.2f} mm, declared {1e3 * report.declared_m:.2f} mm"
+            )
+        if case.stop_s is None or (report.time_s or 0.0) > case.stop_s:
+            case = replace(
+                case,
+                stop_s=report.time_s,
+                distance_m=report.distance_m,
+                declared_s=report.declared_s,
+                declared_m=report.declared_m,
+            )
     return replace(case, problem="; ".join(problems))
 
 

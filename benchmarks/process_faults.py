@@ -140,7 +140,9 @@ def run_fault(folder: Path, fault: ProcessFault, rate_hz: float, what: str = "sw
         _await_rest(survivors)
         at_rest = {name: state.read() for name, state in survivors.items()}
         if fault.signal is signal.SIGSTOP:
-            os.kill(victim, signal.SIGCONT)
+            # The cell may have ended it meanwhile.
+            with suppress(ProcessLookupError):
+                os.kill(victim, signal.SIGCONT)
             _await_rest(states)
         time.sleep(_AFTERWARDS_S)
         afterwards = {name: state.read() for name, state in states.items()}

@@ -58,7 +58,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
     seconds = time.perf_counter() - started
     print(f"\nas it has to be: {len(cases) - len(bad)} of {len(cases)} places of the matrix, in {seconds:.0f} s")
     for case in bad:
-        print(f"  {case.task}, {case.state}, {case.fault}: {case.problem}")
+        print(f"  {case.task}, {case.device}, {case.state}, {case.fault}: {case.problem}")
     print()
     cost_us = _print_costs()
     report = {**provenance(), "cases": [asdict(case) for case in cases], "cost_us": cost_us}
@@ -67,7 +67,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
 
 def _print_costs() -> dict[str, float]:
     found = costs()
-    print(f"{'cost per cycle':<64}{'median us':>11}")
+    print(f"{'cost per cycle':<64}{'us of CPU':>11}")
     for name, cost_us in found.items():
         print(f"{name:<64}{cost_us:11.1f}")
     return found

@@ -13,6 +13,7 @@ from drivers import sim_arm, sim_joint_arm
 from drivers.arm import Arm
 from drivers.clock import VirtualClock
 from drivers.commands import TwistCommand, TwistFrame
+from drivers.lease import Lease
 from drivers.registry import DriverContext
 from drivers.sim_arm import SimArm
 from drivers.sim_joint_arm import SimJointArm
@@ -147,6 +148,7 @@ class _Hand:
     physics_step_ms: float
     joints: bool
     arm: Arm = field(init=False)
+    lease: Lease = field(init=False)
 
     def __post_init__(self) -> None:
         T_world_tip = se3.from_euler_mm_deg(np.array(self.script.start_mm_deg[self.tip], dtype=np.float64))
@@ -167,10 +169,8 @@ class _Hand:
         arm.connect()
         arm.configure()
         arm.activate()
-        self.arm, self._lease = arm, arm.acquire("script")
-
-    _lease: Any = field(init=False)
+        self.arm, self.lease = arm, arm.acquire("script")
 
     def follow(self, twist_mm_deg: _Twist) -> None:
         twist = np.array(twist_mm_deg) * _SI
-        self.arm.send_twist(TwistCommand(twist, TwistFrame.TCP, self.clock.now_ns(), 2.0 * _CYCLE_S), self._lease)
+        self.arm.send_twist(TwistCommand(twist, TwistFrame.TCP, self.clock.now_ns(), 2.0 * _CYCLE_S), self.lease)

@@ -31,7 +31,7 @@ from cell.loop import Outcome, RunLoop, RunResult, StopRequest
 from cell.recording import Recorder
 from geometry.errors import TouchcellError
 
-CELLS = ("surface_follow_sim.yaml", "object_track_sim.yaml")
+CELLS = ("surface_follow_sim.yaml", "object_track_sim.yaml", "single_push_sim.yaml", "dual_push_sim.yaml")
 _ROWS = 12
 # The first runs import modules and fill caches.
 _WARM_UP = 0.2
@@ -99,7 +99,8 @@ def lap(path: Path, folder: Path, rng: np.random.Generator, before_s: float = 0.
         while loop.step():
             cycles += 1
             if fault is not None and cycles == after:
-                fault.inject(cell, stop)
+                hurt = list(cell.arms if fault.device == "arm" else cell.cameras)
+                fault.inject(cell, stop, hurt[rng.integers(len(hurt))])
         result = loop.end()
         stands = all(arm.at_rest() for arm in cell.arms.values())
         if result.outcome is Outcome.TRIPPED:

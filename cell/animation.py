@@ -76,7 +76,8 @@ def animate(folder: Path, *, max_frames: int = 90) -> Path:
     run = RunFolder(folder)
     if run.plan.cell.scene is None:
         raise ConfigError("only a simulated run can be animated: nobody knows where things were", key="scene")
-    roles = list(run.plan.sensor_roles)
+    names = {name: role for role, name in run.plan.sensor_roles.items()}
+    roles = [names[name] for name in run.plan.cell.sensors if name in names]
     shown = _Shown(
         run,
         scene(run),

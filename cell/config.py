@@ -369,7 +369,8 @@ class _Planner:
         for role in assigned.keys() - set(roles):
             self._add(("task", kind, role), f"{cell.task.name} has no such role", hint=suggest(role, sorted(roles)))
         found = {}
-        for role in roles:
+        # In one order in every process: a set of names has another in each.
+        for role in sorted(roles):
             name = assigned.get(role, role)
             if name in devices:
                 found[role] = name

@@ -9,6 +9,7 @@ import math
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -173,7 +174,7 @@ def _each(perform: Perform, trials: Sequence[Trial], jobs: int) -> Iterator[Fini
         return
     # Fresh processes: a fork would inherit the threads of libraries that do not outlive it.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(trials)), context, initializer=_leave_interrupts_to_parent) as executor:
+    with ProcessPoolExecutor(min(jobs, len(trials)), context, initializer=_belong_to_parent) as executor:
         running = [executor.submit(perform, trial) for trial in trials]
         try:
             for future in as_completed(running):
@@ -185,9 +186,18 @@ def _each(perform: Perform, trials: Sequence[Trial], jobs: int) -> Iterator[Fini
             raise
 
 
-def _leave_interrupts_to_parent() -> None:
+def _belong_to_parent() -> None:
     # A terminal's Ctrl-C reaches every process of the group.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # A worker whose parent was killed would wait for work forever.
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _finished(trial: Trial, folder: RunFolder, record: Mapping[str, Any]) -> Finished:

@@ -79,6 +79,7 @@ class Waiting:
             for role in self._leases:
                 if self._cell.arms[role].owner is None:
                     self._leases[role] = self._cell.arms[role].acquire(self._cell.task_name)
+            self._cell.watch.begin()
         except DeviceError as error:
             return False, f"refused: {error}"
         return True, "the task starts again from its first state"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,7 +13,7 @@ from control.path import Path, Point
 from control.pid import Pid, PidGains
 from geometry.types import Array
 
-MAX_CRAB_RAD: Final = math.radians(15.0)
+MAX_CRAB_RAD: Final = math.radians(25.0)
 """Furthest that an object is headed aside to go straight: it is pushed this far beside its middle."""
 MAX_INTEGRATED_M: Final = 0.015
 """Larger distances from the path are not integrated: on the way back to it the integral would only gather overshoot."""
@@ -73,22 +73,22 @@ class TargetAlignment:
     until the end, and along bent paths.
 
     Args:
-        path: points (x, y) of the way, m, in the base frame, without the object's own place at the start; the last one
-            is the target.
+        route: from where the object's middle is (x, y, m, in the base frame) and heads (rad) when pushing begins to the
+            points of the way, without the first one; the last one is the target.
         gains: see there.
 
     Raises:
-        ControlError: a number is not finite, a limit negative, or the path is none.
+        ControlError: a number is not finite or a limit negative.
     """
 
-    def __init__(self, path: Sequence[Point], gains: AlignmentGains) -> None:
+    def __init__(self, route: Callable[[Point, float], Sequence[Point]], gains: AlignmentGains) -> None:
         kp, ki, kd = np.zeros((3, 6, 6))
         kp[1, 1], ki[1, 0], kd[1, 1] = gains.kp, gains.kp * gains.ki, gains.kd
         most_aside = np.array([0.0, gains.kp * MAX_CRAB_RAD, 0.0, 0.0, 0.0, 0.0])
         zone = np.array([MAX_INTEGRATED_M, 0.0, 0.0, 0.0, 0.0, 0.0])
         limit = np.array([0.0, gains.limit_m_s, 0.0, 0.0, 0.0, 0.0])
         self._pid = Pid(PidGains(kp, ki, kd, most_aside, zone, limit))
-        self._points = list(path)
+        self._route = route
         self._gains = gains
         self._path: Path | None = None
         self._along_m = 0.0
@@ -103,23 +103,27 @@ class TargetAlignment:
         Args:
             T_base_sensor: (4, 4) pose of the sensor, its x axis upright.
             T_s_f: (4, 4) contact: z of the surface frame is the inward normal.
+
+        Raises:
+            ControlError: the path is none.
         """
         normal = T_base_sensor[:2, :3] @ T_s_f[:3, 2]
         length = math.hypot(normal[0], normal[1])
         nx, ny = float(normal[0]) / length, float(normal[1]) / length
         tip = float(T_base_sensor[0, 3]), float(T_base_sensor[1, 3])
         middle = tip[0] + self._gains.lead_m * nx, tip[1] + self._gains.lead_m * ny
+        heading = math.atan2(ny, nx)
         if self._path is None:
-            self._path = Path([middle, *self._points])
+            self._path = Path([middle, *self._route(middle, heading)])
         place = self._path.place(middle, self._along_m, self._gains.look_ahead_m)
         self._along_m = max(self._along_m, place.along_m)
         ahead = self._path.point(place.along_m + self._gains.look_ahead_m)
         dx, dy = ahead[0] - middle[0], ahead[1] - middle[1]
         theta = math.atan2(nx * dy - ny * dx, nx * dx + ny * dy)
-        target = self._points[-1]
+        target = self._path.end
         target_aside = nx * (target[1] - tip[1]) - ny * (target[0] - tip[0])
         rest_m = self._path.length_m - place.along_m
-        return Aim(theta, rest_m, place.aside_m, target_aside, math.atan2(ny, nx))
+        return Aim(theta, rest_m, place.aside_m, target_aside, heading)
 
     def step(self, aim: Aim, dt_s: float) -> float:
         """Speed of the contact to the left of the contact normal, m/s."""

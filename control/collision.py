@@ -132,23 +132,23 @@ def _links_between(frames: tuple[int, int], other: tuple[int, int]) -> int:
 
 
 def segment_distances(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
-    """(n,) distances between segments a0-a1 and b0-b1, each (n, 3); either may be a point."""
-    u, v, w = a1 - a0, b1 - b0, a0 - b0
-    uu, vv, uv, uw, vw = _dot(u, u), _dot(v, v), _dot(u, v), _dot(u, w), _dot(v, w)
-    # Either the two lines are nearest within both segments, or an end is nearest to the other segment.
+    """(n,) distances between segments a0-a1 and b0-b1, each (n, 3); either may be a point.
+
+    The place on one line that is nearest to the other is clamped to its segment, then what is nearest to it on the
+    other segment is sought, and what is nearest to that on the first (Ericson 2005, Real-Time Collision Detection).
+    Of nearly parallel segments of a metre the distance may come out 2 um too long.
+    """
+    sides = np.stack((a1 - a0, b1 - b0, a0 - b0), axis=1)
+    products = np.matmul(sides, sides.transpose(0, 2, 1))
+    uu, uv, uw, vv, vw = (products[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
     slant = uu * vv - uv * uv
-    crossing = slant > 1e-12 * uu * vv
-    safe = np.where(crossing, slant, 1.0)
-    s, t = (uv * vw - vv * uw) / safe, (uu * vw - uv * uw) / safe
-    within = crossing & (s >= 0.0) & (s <= 1.0) & (t >= 0.0) & (t <= 1.0)
-    gap = w + s[:, None] * u - t[:, None] * v
-    nearest = np.where(within, _dot(gap, gap), np.inf)
-    for point, start, along, length in ((a0, b0, v, vv), (a1, b0, v, vv), (b0, a0, u, uu), (b1, a0, u, uu)):
-        off = point - start
-        share = np.clip(_dot(off, along) / np.maximum(length, _TINY), 0.0, 1.0)
-        off = off - share[:, None] * along
-        nearest = np.minimum(nearest, _dot(off, off))
-    distances: Array = np.sqrt(nearest)
+    # Along parallel lines every place is as near as any other.
+    s = np.where(slant > 1e-12 * uu * vv, uv * vw - vv * uw, 0.0) / np.maximum(slant, _TINY)
+    s = np.minimum(np.maximum(s, 0.0), 1.0)
+    t = np.minimum(np.maximum((uv * s + vw) / np.maximum(vv, _TINY), 0.0), 1.0)
+    s = np.minimum(np.maximum((uv * t - uw) / np.maximum(uu, _TINY), 0.0), 1.0)
+    gap = sides[:, 2] + s[:, None] * sides[:, 0] - t[:, None] * sides[:, 1]
+    distances: Array = np.sqrt(_dot(gap, gap))
     return distances
 
 
@@ -192,4 +192,4 @@ def _dot(a: Array, b: Array) -> Array:
     return product
 
 
-_TINY = 1e-15
+_TINY = 1e-30

@@ -43,6 +43,7 @@ class Path:
         if min(lengths) < 1e-9:
             raise ControlError("path", "has the same point twice in a row", points)
         self._starts = list(points[:-1])
+        self._end = points[-1]
         self._directions = [
             ((b[0] - a[0]) / length, (b[1] - a[1]) / length)
             for (a, b), length in zip(pairwise(points), lengths, strict=True)
@@ -53,6 +54,11 @@ class Path:
     def length_m(self) -> float:
         """From the first point to the last."""
         return self._reached[-1]
+
+    @property
+    def end(self) -> Point:
+        """The last point."""
+        return self._end
 
     def point(self, along_m: float) -> Point:
         """The point at ``along_m``, which may lie beyond the end."""

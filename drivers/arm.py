@@ -183,8 +183,17 @@ class Arm(Device):
         return None
 
     def _local_ik(self) -> LocalIk | None:
-        """The same where the joints are now, for the gate to keep them within limits. Raises StaleData."""
+        """The same where the joints are now, for the gate to keep them within limits.
+
+        Raises StaleData, and CommandRejected for angles that are not finite.
+        """
         return None
+
+    def _ik_at(self, ik: DifferentialIk, q: Array) -> LocalIk:
+        """``ik`` at the measured joint angles ``q``. Raises CommandRejected if they are none."""
+        if not np.isfinite(q).all():
+            raise CommandRejected(self.name, Rejection.NON_FINITE, "the arm's own joint angles are not finite", value=q)
+        return ik.at(q)
 
     def _after_rest(self, policy: DeactivatePolicy) -> None:
         """Obey ``policy``; called when the arm stands still."""

@@ -389,7 +389,7 @@ class FrankaArm(Arm):
         self._start(motion, franky.CartesianVelocityStopMotion, franky.ControlSignalType.CartesianVelocities)
 
     def _local_ik(self) -> LocalIk:
-        return self._ik.at(self.joints(self._max_state_age_s).value.q)
+        return self._ik_at(self._ik, self.joints(self._max_state_age_s).value.q)
 
     def _begin_stop(self, category: StopCategory) -> None:
         # While a silent arm rests, franky would wait for it.

@@ -129,32 +129,29 @@ class TwistGate:
         The acceleration points along the way, as large as allowed and as can still be taken off before the way ends; it
         changes by no more than the jerk allows.
         """
-        limits = self._limits
-        parts = (
-            ("linear", slice(0, 3), limits.accel_m_s2, limits.jerk_m_s3),
-            ("angular", slice(3, 6), limits.rot_accel_rad_s2, limits.rot_jerk_rad_s3),
-        )
+        limits, last = self._limits, self._last_accel
+        accels, jerks = (limits.accel_m_s2, limits.rot_accel_rad_s2), (limits.jerk_m_s3, limits.rot_jerk_rad_s3)
+        lefts = _norms(way)
         rate = smooth = 1.0 / dt_s
-        for name, part, most, jerk in parts:
-            left = _norm(way[part])
+        for name, left, most, jerk in zip(_PARTS, lefts, accels, jerks, strict=True):
             if left > most * dt_s:
                 adjustments.append(Adjustment(f"tcp {name} acceleration", left / dt_s, most))
                 rate = min(rate, most / left)
-            if left > 0.0:
+            if left > _NEGLIGIBLE:
                 # The largest acceleration that the jerk can take off again before the way ends.
                 braked = math.sqrt(2.0 * jerk / left) - 0.5 * jerk * dt_s / left
                 smooth = min(smooth, max(braked, min(1.0 / dt_s, jerk * dt_s / left)))
-        change = min(rate, smooth) * way - self._last_accel
+        change = min(rate, smooth) * way - last
         share = 1.0
-        for name, part, _, jerk in parts:
-            asked = max(_norm(change[part]), rate * _norm(way[part]) if smooth < rate else 0.0) / dt_s
+        for name, left, step, jerk in zip(_PARTS, lefts, _norms(change), jerks, strict=True):
+            asked = max(step, rate * left if smooth < rate else 0.0) / dt_s
             if asked > jerk * _ROUNDING:
                 adjustments.append(Adjustment(f"tcp {name} jerk", asked, jerk))
-            if _norm(change[part]) > jerk * dt_s:
-                share = min(share, jerk * dt_s / _norm(change[part]))
+            if step > jerk * dt_s:
+                share = min(share, jerk * dt_s / step)
         if share == 1.0 and min(rate, smooth) * dt_s == 1.0:
             return way
-        return (self._last_accel + share * change) * dt_s
+        return (last + share * change) * dt_s
 
     def _check(self, command: TwistCommand, lease: Lease, state: Lifecycle, now_ns: int) -> None:
         twist = np.asarray(command.twist, dtype=np.float64)
@@ -194,8 +191,7 @@ def _limited(twist: Array, max_linear: float, max_angular: float, adjustments: l
     sensor that turns about its contact would be torn off it.
     """
     scale = 1.0
-    for part, vector, limit in (("linear", twist[:3], max_linear), ("angular", twist[3:], max_angular)):
-        size = _norm(vector)
+    for part, size, limit in zip(_PARTS, _norms(twist), (max_linear, max_angular), strict=True):
         if size > limit * _ROUNDING:
             adjustments.append(Adjustment(f"tcp {part} speed", size, limit))
         if size > limit:
@@ -212,9 +208,13 @@ def _within(local: LocalIk, twist: Array, adjustments: list[Adjustment]) -> Arra
     return twist if scale == 1.0 else scale * twist
 
 
-def _norm(vector: Array) -> float:
-    return math.sqrt(float(vector @ vector))
+def _norms(twist: Array) -> tuple[float, float]:
+    """Of the linear and of the angular part; NumPy takes longer for numbers this few."""
+    x, y, z, a, b, c = twist.tolist()
+    return math.sqrt(x * x + y * y + z * z), math.sqrt(a * a + b * b + c * c)
 
 
+_PARTS = ("linear", "angular")
+_NEGLIGIBLE = 1e-12
 _SHORTEST_STEP_S = 1e-6
 _ROUNDING = 1.0 + 1e-6

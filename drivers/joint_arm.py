@@ -61,7 +61,7 @@ class JointArm(Arm):
         return self._ik
 
     def _local_ik(self) -> LocalIk:
-        return self._ik.at(self.joints(self._max_state_age_s).value.q)
+        return self._ik_at(self._ik, self.joints(self._max_state_age_s).value.q)
 
     def _is_at(self, park_deg: tuple[float, ...] | None, tolerance_deg: float) -> bool:
         """Whether every joint is within ``tolerance_deg`` of the park pose; never where there is none."""

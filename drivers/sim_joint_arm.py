@@ -196,7 +196,8 @@ class SimJointArm(JointArm):
         self._setpoint.stop()
 
     def _recover(self, token: OperatorToken) -> None:
-        self._setpoint.reset(self._body.q)
+        self._from, self._phase = self._body.q, 0
+        self._setpoint.reset(self._from)
 
 
 def _dynamics(description: ChainDescription, tool: Tool, q: Array, step_s: float) -> ArmDynamics:

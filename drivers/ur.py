@@ -332,7 +332,7 @@ class UrArm(Arm):
             raise self._to_faulted(self._explained(error)) from None
 
     def _local_ik(self) -> LocalIk:
-        return self._ik.at(self.joints(self._max_state_age_s).value.q)
+        return self._ik_at(self._ik, self.joints(self._max_state_age_s).value.q)
 
     def _begin_stop(self, category: StopCategory) -> None:
         link = self._link

@@ -88,8 +88,8 @@ class MarkerEstimator:
     def predict_reduced(self, reduced: ImageArray) -> Prediction:
         """Contact in an image that ``reduce`` made.
 
-        Where the markers cannot be matched with certainty, ``in_range`` is False. Where next to nothing can be, the
-        prediction is the middle of the taught range, with sigmas as wide as the range.
+        Where the markers cannot be matched with certainty, ``in_range`` is False and sigmas are as wide as the taught
+        range. Where next to nothing can be, the prediction is the middle of that range.
         """
         discs = detect_markers(reduced, self._size)
         if self.change is not None:
@@ -101,7 +101,9 @@ class MarkerEstimator:
             return Prediction(*labels.xi_gaussian(np.zeros(6), np.ones(6)), in_range=False, markers=0.0)
         mean, sigma = self._infer(field.displacements)
         in_range = field.valid and bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
-        xi, covariance = labels.xi_gaussian(mean, self.header.calibrated(sigma))
+        calibrated = self.header.calibrated(sigma)
+        # The networks know how sure to be of markers that were matched, and of no others.
+        xi, covariance = labels.xi_gaussian(mean, calibrated if field.valid else np.maximum(calibrated, 1.0))
         return Prediction(xi, covariance, in_range, markers=field.score)
 
     def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from typing import Self
 
 import numpy as np
-from pydantic import NonNegativeFloat, PositiveFloat
+from pydantic import NonNegativeFloat, PositiveFloat, model_validator
 
 from control.alignment import Aim, AlignmentGains, TargetAlignment
+from control.path import Point
 from geometry.types import Array
 from tasks.hand import Hand, HandConfig, Six, SixGains
 from tasks.interface import TaskContext, TaskSpec
+from tasks.push_path import Obstacle, plan
 from tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
 
 Mm = tuple[float, float]
@@ -23,7 +27,12 @@ class PushConfig(HandConfig):
     Attributes:
         reference_mm_deg: contact to hold; only the components with gains count.
         target_mm: x and y of the target in the arm's base frame, whose z axis is upright.
-        path_mm: points to push it past on the way there.
+        path_mm: points to push it past on the way there, where no way is planned.
+        goal_heading_deg: how it shall head there, as the contact normal from the base's x axis; then, or with
+            obstacles, the way is planned (``tasks.push_path``).
+        obstacles_mm: x, y and radius of discs on the table.
+        clearance_mm: how far the object's middle keeps from obstacles.
+        turning_radius_mm: of planned ways; no less than a stable push can turn.
         push_speed_mm_s: speed along the sensor's axis.
         middle_mm: the object's middle, ahead of the middle of the tip: the tip's radius and half of the object. It is
             what is brought to the target, and about which the object turns.
@@ -40,6 +49,10 @@ class PushConfig(HandConfig):
     ki_per_s2: SixGains = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     target_mm: Mm
     path_mm: tuple[Mm, ...] = ()
+    goal_heading_deg: float | None = None
+    obstacles_mm: tuple[tuple[float, float, PositiveFloat], ...] = ()
+    clearance_mm: PositiveFloat = 60.0
+    turning_radius_mm: PositiveFloat = 120.0
     push_speed_mm_s: PositiveFloat = 20.0
     middle_mm: PositiveFloat = 60.0
     look_ahead_mm: PositiveFloat = 60.0
@@ -60,7 +73,24 @@ class PushConfig(HandConfig):
             look_ahead_m=1e-3 * self.look_ahead_mm,
             lead_m=1e-3 * self.middle_mm,
         )
-        return TargetAlignment([(1e-3 * x, 1e-3 * y) for x, y in (*self.path_mm, self.target_mm)], gains)
+        return TargetAlignment(self.route, gains)
+
+    def route(self, middle: Point, heading_rad: float) -> Sequence[Point]:
+        """Points of the way, m, from where the object's middle is and heads. Raises NoWay."""
+        target = 1e-3 * self.target_mm[0], 1e-3 * self.target_mm[1]
+        if self.goal_heading_deg is None and not self.obstacles_mm:
+            return [*((1e-3 * x, 1e-3 * y) for x, y in self.path_mm), target]
+        goal_rad = math.atan2(target[1] - middle[1], target[0] - middle[0])
+        if self.goal_heading_deg is not None:
+            goal_rad = math.radians(self.goal_heading_deg)
+        obstacles = [Obstacle(1e-3 * x, 1e-3 * y, 1e-3 * (r + self.clearance_mm)) for x, y, r in self.obstacles_mm]
+        return plan((*middle, heading_rad), (*target, goal_rad), 1e-3 * self.turning_radius_mm, obstacles)
+
+    @model_validator(mode="after")
+    def _one_kind_of_way(self) -> Self:
+        if self.path_mm and (self.goal_heading_deg is not None or self.obstacles_mm):
+            raise ValueError("path_mm is a way already: leave out goal_heading_deg and obstacles_mm")
+        return self
 
 
 class SingleArmPushingConfig(PushConfig, ServoConfig):
@@ -74,9 +104,15 @@ class Push:
         self._speed_m_s = 1e-3 * config.push_speed_mm_s
         self._timeout_s = config.push_timeout_s
         self._alignment = config.alignment()
+        self._goal_heading_deg = config.goal_heading_deg
         self._aim: Aim | None = None
         self._left_m_s = 0.0
         self._y_is_left = 1.0
+
+    @property
+    def left_m_s(self) -> float:
+        """How fast alignment moves the contact to the left of the contact normal."""
+        return self._left_m_s
 
     @property
     def feedforward(self) -> Array:
@@ -103,13 +139,17 @@ class Push:
         """Way that is left, distance of the target from the contact normal, and how the object is steered."""
         if self._aim is None:
             return {}
+        heading_deg = float(np.degrees(self._aim.heading_rad))
+        goal_deg = self._goal_heading_deg
+        off = {} if goal_deg is None else {"heading_error_deg": math.remainder(heading_deg - goal_deg, 360.0)}
         return {
             "rest_mm": 1e3 * self._aim.rest_m,
             "target_aside_mm": 1e3 * self._aim.target_aside_m,
             "aside_mm": 1e3 * self._aim.aside_m,
             "bearing_deg": float(np.degrees(self._aim.theta_rad)),
-            "heading_deg": float(np.degrees(self._aim.heading_rad)),
+            "heading_deg": heading_deg,
             "align_mm_s": 1e3 * self._left_m_s,
+            **off,
         }
 
 

@@ -67,7 +67,7 @@ def test_what_is_no_path_is_refused(points):
 
 def test_the_contact_goes_to_the_other_side_of_the_target():
     for target_y, sign in ((0.1, -1.0), (-0.1, 1.0)):
-        alignment = TargetAlignment([(0.3, target_y)], GAINS)
+        alignment = TargetAlignment(lambda middle, heading, y=target_y: [(0.3, y)], GAINS)
         aim = alignment.aim(FORWARD, np.eye(4))
         assert math.copysign(1.0, aim.theta_rad) == -sign
         assert aim.target_aside_m == pytest.approx(target_y)
@@ -76,12 +76,12 @@ def test_the_contact_goes_to_the_other_side_of_the_target():
 
 
 def test_straight_ahead_nothing_moves_sideways():
-    alignment = TargetAlignment([(0.3, 0.0)], GAINS)
+    alignment = TargetAlignment(lambda middle, heading: [(0.3, 0.0)], GAINS)
     assert alignment.step(alignment.aim(FORWARD, np.eye(4)), 0.01) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_heading_is_that_of_the_contact_normal_not_of_the_sensor():
-    alignment = TargetAlignment([(0.3, 0.0)], GAINS)
+    alignment = TargetAlignment(lambda middle, heading: [(0.3, 0.0)], GAINS)
     # About the sensor's x axis, which points down: to the right as seen from above.
     T_s_f = se3.from_euler_mm_deg(np.array([0.0, 0.0, 0.0, 10.0, 0.0, 0.0]))
     assert math.degrees(alignment.aim(FORWARD, T_s_f).heading_rad) == pytest.approx(-10.0)
@@ -93,7 +93,7 @@ def steered(gains: AlignmentGains, points: list[tuple[float, float]], crab_rad: 
     """Distance from the path at every mm of a push of the object that the closed forms describe: its middle goes where
     it heads, turned by ``crab_rad`` since it is not pushed through its middle, and it turns by 15.8 rad per m of the
     contact's sideways motion (an 80 mm square)."""
-    alignment = TargetAlignment(points, gains)
+    alignment = TargetAlignment(lambda middle, heading: points, gains)
     x, y, heading, asides = 0.0, 0.0, 0.0, []
     for _ in range(round(length_m / 0.0002)):
         c, s = math.cos(heading), math.sin(heading)

@@ -17,6 +17,7 @@ from drivers.errors import (
     StaleData,
     TransportError,
 )
+from drivers.kinematics import ChainDescription, DifferentialIk, SerialChain
 from drivers.samples import Stamped, TcpState
 
 
@@ -141,6 +142,16 @@ def test_a_pose_that_is_not_finite_or_fresh_turns_nothing(arm: NotedArm, clock: 
     arm.pose_age_ns = 200_000_000
     with pytest.raises(StaleData):
         arm.send_twist(command(clock, frame=TwistFrame.TCP), lease)
+    assert arm.streamed == []
+
+
+def test_joints_that_are_not_finite_limit_nothing_and_are_refused(arm: NotedArm, clock: VirtualClock) -> None:
+    lease = arm.acquire("task")
+    ik = DifferentialIk(SerialChain(ChainDescription.shipped("generic_6r")))
+    arm._local_ik = lambda: arm._ik_at(ik, np.full(6, math.nan))  # type: ignore[method-assign]
+    with pytest.raises(CommandRejected) as caught:
+        arm.send_twist(command(clock), lease)
+    assert caught.value.reason is Rejection.NON_FINITE
     assert arm.streamed == []
 
 

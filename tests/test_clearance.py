@@ -170,7 +170,7 @@ def test_an_arm_that_folds_onto_itself_is_slowed():
     assert clear.check(CellView(NOW, {"arm": jointed(q, -bend)})) is None or found.severity is Severity.TRIP
 
 
-@pytest.mark.parametrize("name", ["generic_6r", "so101_5r", "ur3e", "ur5e", "ur10e", "fr3"])
+@pytest.mark.parametrize("name", ["generic_6r", "so101_5r", "ur3e", "ur5e", "ur10e", "ur16e", "fr3"])
 def test_no_shipped_arm_touches_itself_where_it_works(name):
     chain = SerialChain(ChainDescription.shipped(name))
     poses = {"generic_6r": [0, 40, 90, 0, 50, 0], "so101_5r": [0, 10, 90, 80, 0], "fr3": [0, -45, 0, -135, 0, 90, 45]}

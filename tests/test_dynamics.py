@@ -107,7 +107,7 @@ def test_an_off_centre_push_turns_as_uniform_pressure_says(width_mm: tuple[int, 
     T = hand.object()
     yaw = np.arctan2(T[1, 0], T[0, 0])
     expected = uniform_pressure_yaw(1e-3 * np.array(width_mm), np.array([-0.042, 0.010]), 0.060)
-    assert yaw == pytest.approx(expected, rel=0.05)
+    assert yaw == pytest.approx(expected, rel=0.1)
 
 
 def test_a_tall_prism_pushed_high_falls_and_pushed_low_does_not() -> None:
@@ -181,6 +181,17 @@ def test_a_snapshot_brings_back_the_very_same_future(physics: str) -> None:
     hand.scene.mount("late", lambda: pose)
     with pytest.raises(ConfigError, match="mounted after"):
         restore()
+
+
+def test_numbers_that_are_not_finite_are_told_not_computed_with() -> None:
+    from drivers.simulation.dynamics import PhysicsError
+
+    hand = Hand(FLOOR, ABOVE)
+    hand.move(STILL, 0.01)
+    hand.poses["tip"] = np.full((4, 4), np.nan)
+    with pytest.raises(PhysicsError, match="pose of 'tip' is not finite") as error:
+        hand.move(STILL, 0.002)
+    assert error.value.t_s == pytest.approx(0.010)
 
 
 def test_physics_asks_for_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:

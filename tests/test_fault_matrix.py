@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import fields
 from pathlib import Path
+from typing import Literal
 
 import pytest
 import yaml
 
-from benchmarks.fault_matrix import FAULTS, cells, matrix, run_case
+from benchmarks.fault_matrix import FAULTS, Case, cells, matrix, run_case
 from cell.compose import MODELS
 from drivers.simulation.faults import ArmFaults, FrameFaults
 from tasks import registry
@@ -21,21 +23,34 @@ def test_every_fault_and_every_task_is_in_the_matrix() -> None:
     assert set(cells()) == set(registry.installed())
 
 
+MOVING = ("surface_following", "object_tracking", "single_arm_pushing", "dual_arm_pushing", "data_collection")
+
+
+def run_all(folder: Path, kind: Literal["arm", "camera"], task: str) -> list[Case]:
+    """All places of one task, none of them with a problem, and none left out."""
+    cases = list(matrix(folder, [kind], [task]))
+    assert [f"{c.state}, {c.device}, {c.fault}: {c.problem}" for c in cases if c.problem] == []
+    faults = {fault.name for fault in FAULTS if fault.device == kind}
+    places = {(case.fault, case.device, case.state) for case in cases}
+    states, devices = {case.state for case in cases}, {case.device for case in cases}
+    assert places == set(itertools.product(faults, devices, states))
+    assert len(devices) == (2 if task == "dual_arm_pushing" else 1)
+    assert states >= ({"prepare", "approach", "run", "retract"} if task in MOVING[:4] else {"prepare"} & states)
+    return cases
+
+
 @pytest.mark.slow
-def test_faults_of_arms_in_every_state(tmp_path: Path) -> None:
-    cases = list(matrix(tmp_path, ["arm"]))
-    assert [f"{c.task}, {c.state}, {c.fault}: {c.problem}" for c in cases if c.problem] == []
-    arm_faults = [fault for fault in FAULTS if fault.device == "arm"]
-    # Two tasks with an arm, five states each.
-    assert len(cases) == 2 * 5 * len(arm_faults)
+@pytest.mark.parametrize("task", MOVING)
+def test_faults_of_arms_in_every_state(task: str, tmp_path: Path) -> None:
+    run_all(tmp_path, "arm", task)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not (MODELS / "sim_gdn.safetensors").exists(), reason="needs the model that ships")
-def test_faults_of_cameras_in_every_state(tmp_path: Path) -> None:
-    cases = list(matrix(tmp_path, ["camera"]))
-    assert [f"{c.task}, {c.state}, {c.fault}: {c.problem}" for c in cases if c.problem] == []
-    assert len(cases) == 4 * (5 + 5 + 2)
+@pytest.mark.parametrize("task", ["surface_following", "object_tracking", "observe", "data_collection"])
+def test_faults_of_cameras_in_every_state(task: str, tmp_path: Path) -> None:
+    """Those of the pushing tasks take minutes; ``touchcell bench safety`` has them."""
+    run_all(tmp_path, "camera", task)
 
 
 def test_the_matrix_would_notice_a_missing_interlock(tmp_path: Path) -> None:
@@ -47,4 +62,4 @@ def test_the_matrix_would_notice_a_missing_interlock(tmp_path: Path) -> None:
     path = tmp_path / "cell.yaml"
     path.write_text(yaml.safe_dump(data))
     stale = next(fault for fault in FAULTS if fault.name == "arm: stale")
-    assert "expected arm_state_age" in run_case(path, stale, "run").problem
+    assert "expected arm_state_age" in run_case(path, stale, "arm", "run").problem

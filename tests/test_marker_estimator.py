@@ -129,8 +129,11 @@ def test_images_that_show_no_lattice_are_told(trained: Path, name: str) -> None:
         "few": np.where(np.arange(SIZE[1]) < 60, lit, 0).astype(np.uint8),
         "half": np.where(np.arange(SIZE[0])[:, None] < 200, lit, 0).astype(np.uint8),
     }
-    prediction = load_estimator(trained).predict(images[name])
+    estimator = load_estimator(trained)
+    prediction = estimator.predict(images[name])
     assert not prediction.in_range
+    widest = np.sqrt(np.diagonal(estimator.header.labels.xi_gaussian(np.zeros(6), np.ones(6))[1]))
+    assert (prediction.sigma > 0.5 * widest).all()
     assert prediction.markers is not None
     assert prediction.markers < 0.9
     whole = load_estimator(trained).predict(lit)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,8 +17,8 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.process_faults import FAULTS, run_fault
-from benchmarks.two_arms import two_arm_plan
+from benchmarks.process_faults import FAULTS, ProcessCase, ProcessFault, TooBusy, run_fault
+from benchmarks.two_arms import SPEED_M_S, two_arm_plan
 from cell.cli import main
 from cell.compose import Cell, compose
 from cell.config import plan_cell
@@ -37,8 +39,10 @@ from drivers.process.groups import Group, HostedDevice
 from drivers.process.proxies import RemoteJointArm
 from drivers.process.selftest import SelfTestFailed, self_test
 
-RATE_HZ = 10.0
+RATE_HZ = 5.0
 """Slow, so that a machine that does other things besides is not taken for dead."""
+
+TRIES = 2
 
 SHIPPED = Path(__file__).parent.parent / "configs" / "surface_follow_sim.yaml"
 
@@ -58,9 +62,9 @@ def shared() -> list[str]:
 
 @pytest.fixture(autouse=True)
 def nothing_is_left_behind() -> Iterator[None]:
-    segments, blocks, before = set(os.listdir("/dev/shm")), shared(), children()
+    blocks, before = shared(), children()
     yield
-    assert set(os.listdir("/dev/shm")) <= segments
+    assert not list(Path("/dev/shm").glob("*touchcell*")), "the memory has no names"
     assert shared() == blocks
     assert children() == before
 
@@ -171,7 +175,7 @@ def test_a_task_runs_on_pictures_from_another_process(tmp_path: Path, capsys: py
     assert main(["check", str(path)]) == 0
     told = capsys.readouterr().out
     assert "host 'scene': arm, sensor at 500 Hz" in told
-    assert "watchdog: stops all arms after 250 ms of silence" in told
+    assert "watchdog: stops all arms after 500 ms of silence" in told
     cell, stop = compose(plan_cell(path)), StopRequest()
     with cell:
         camera = cell.cameras["sensor"]
@@ -201,22 +205,33 @@ def test_activation_is_refused_when_the_chain_does_not_stop_in_time(
     assert caught.value.declared_s < 2.5 / RATE_HZ
 
 
+def hurt(tmp_path: Path, fault: ProcessFault) -> ProcessCase:
+    """The fault in a cell that ran until then; where this machine starves it, the watchdog has done its work before."""
+    for k in range(TRIES - 1):
+        with contextlib.suppress(TooBusy):
+            return run_fault(tmp_path / str(k), fault, RATE_HZ)
+    return run_fault(tmp_path / "last", fault, RATE_HZ)
+
+
 @pytest.mark.parametrize(
     ("name", "told_by"),
     [
         ("task killed", "TASK_GONE"),
         ("task stopped", "TASK_SILENT"),
         ("watchdog killed", None),
-        ("host killed", "HOST_SILENT"),
     ],
 )
 def test_both_arms_stand_in_time_whatever_dies(tmp_path: Path, name: str, told_by: str | None) -> None:
     """The others of ``FAULTS`` are in ``touchcell bench safety -- --processes``."""
     fault = next(fault for fault in FAULTS if fault.name == name)
-    case = run_fault(tmp_path, fault, RATE_HZ)
+    case = hurt(tmp_path, fault)
     assert list(case.problems) == []
-    assert len(case.arms) == (1 if fault.who == "host" else 2)
+    assert len(case.arms) == 2
     assert case.notes.get("reason") == told_by
+    for arm in case.notes.get("arms", {}).values():
+        assert arm["speed_m_s"] == pytest.approx(SPEED_M_S)
+        assert arm["time_s"] == pytest.approx(SPEED_M_S / 0.5, abs=0.02)
+        assert arm["last_obeyed_ns"] <= arm["stopped_ns"]
     if fault.name != "task killed":
         assert case.outcome["outcome"] == "tripped"
         assert case.outcome["causes"][0][0] == "watchdog"
@@ -235,6 +250,21 @@ def test_a_dead_host_is_a_fault_of_its_devices(tmp_path: Path) -> None:
         assert caught.value.device == "left"
         assert cell.arms["left"].state is Lifecycle.FAULTED
         assert cell.arms["right"].tcp().age_s(cell.clock.now_ns()) < 1.0
+
+
+def test_a_host_that_hangs_delays_nobody_for_long(tmp_path: Path) -> None:
+    started_s = time.monotonic()
+    with compose(two_arm_plan(tmp_path, RATE_HZ)) as cell:
+        watch = cell.watch
+        assert isinstance(watch, ProcessWatch)
+        os.kill(watch.chain.hosts[0].pid, signal.SIGSTOP)
+        while not watch.chain.hosts[0].hangs():
+            time.sleep(0.05)
+        with pytest.raises(DeviceFault, match="hangs"):
+            cell.arms["left"].acquire("test")
+        assert cell.arms["left"].state is Lifecycle.FAULTED
+    # A call that waited would have taken twenty seconds.
+    assert time.monotonic() - started_s < 18.0
 
 
 def test_a_cell_says_what_other_processes_cannot_do(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from cell.compose import Cell, compose
 from cell.config import plan_cell
 from cell.desk import Ask, OperatorDesk, Request, ask_run, is_waiting
 from cell.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
+from cell.watch import OneProcess
 from cell.yaml_file import InvalidCell
 from control.latch import LatchState
 from drivers.device import Lifecycle
@@ -259,6 +260,35 @@ def test_a_stop_ends_the_waiting_and_time_spent_in_it_does_not_count(tmp_path: P
     run.go(1)
     assert not run.going
     assert run.end().outcome is Outcome.TRIPPED
+
+
+class NotedWatch(OneProcess):
+    """Writes down when it is told to guard and when not."""
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+
+    def begin(self) -> None:
+        self.told.append("begin")
+
+    def end(self) -> None:
+        self.told.append("end")
+
+
+def test_nobody_guards_while_it_waits_so_that_no_arm_obeys(tmp_path: Path) -> None:
+    run = tripped(tmp_path)
+    watch = run.cell.watch = NotedWatch()
+    run.fault(stale=False)
+    run.go(2)
+    run.ask(Ask.RESET)
+    assert watch.told == []
+    run.ask(Ask.RESUME)
+    assert watch.told == ["begin"]
+    run.go(5)
+    run.fault(stale=True)
+    run.until("tripped")
+    assert watch.told == ["begin", "end"]
+    run.end()
 
 
 class Impatient(RuleBasedStateMachine):

@@ -37,7 +37,10 @@ class SafetyWalk(RuleBasedStateMachine):
         self.folder = tempfile.TemporaryDirectory()
         self.result: Any = None
 
-    @initialize(task=st.sampled_from(["surface_following", "object_tracking"]), category=st.sampled_from([1, 2]))
+    @initialize(
+        task=st.sampled_from(["surface_following", "object_tracking", "single_arm_pushing"]),
+        category=st.sampled_from([1, 2]),
+    )
     def start(self, task: str, category: int) -> None:
         data = cells()[task]
         data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}

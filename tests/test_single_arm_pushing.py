@@ -53,3 +53,18 @@ def test_without_an_object_it_gives_up(tmp_path):
     data["scene"]["objects"]["prism"]["pose_mm_deg"] = [200, 0, 0, 0, 0, 0]
     pushed = push(data, tmp_path)
     assert pushed.path[-2:] == [("approach", "no_contact", "retract"), ("retract", "retracted", "failed")]
+
+
+def test_the_object_is_brought_to_a_full_pose(tmp_path):
+    data = cell_file(CELL, scene__step_ms=10, task__target_mm=[220, 40], task__goal_heading_deg=20.0)
+    pushed = push(data, tmp_path)
+    assert pushed.path == WHOLE
+    assert abs(pushed.error_mm) < 3.0
+    assert pushed.object_mm_deg[2] == pytest.approx(20.0, abs=10.0)
+
+
+def test_without_a_way_past_the_obstacle_it_faults_before_it_pushes(tmp_path):
+    pushed = push(cell_file(CELL, task__obstacles_mm=[[90, 0, 20]]), tmp_path)
+    assert pushed.cell.task.state == "faulted"
+    assert "no way" in pushed.cell.task.transitions[-1].reason
+    assert pushed.object_mm_deg[:2] == pytest.approx((0.0, 3.0), abs=0.1)

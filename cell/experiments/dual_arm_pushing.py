@@ -12,6 +12,7 @@ from cell.experiments.pushing import (
     ERROR_NOTE,
     ESTIMATORS,
     PRISMS,
+    PUSH_HEIGHT_MM,
     SURFACES,
     Pushed,
     estimator_changes,
@@ -26,7 +27,6 @@ from cell.trials import Finished, Trial
 
 LEADER_SENSOR, FOLLOWER_SENSOR = "leader_sensor", "follower_sensor"
 CELL = "dual_push_sim.yaml"
-_HEIGHT_MM = 30.0
 
 
 def trials(scale: Scale) -> list[Trial]:
@@ -34,9 +34,9 @@ def trials(scale: Scale) -> list[Trial]:
     found = []
     for estimator in ESTIMATORS:
         for surface in SURFACES:
-            for pushed in PRISMS:
+            for pushed in PRISMS[:1] if scale.quick and estimator != "learned" else PRISMS:
                 row = f"{pushed.name}, {surface}, {estimator}"
-                changes = two_arms(pushed, surface, _HEIGHT_MM)
+                changes = two_arms(pushed, surface, PUSH_HEIGHT_MM)
                 changes |= estimator_changes(estimator, (LEADER_SENSOR, FOLLOWER_SENSOR))
                 for seed, pose in starts(scale.repetitions(5)):
                     whole = changes | object_changes(pushed, pose) | {"seed": seed}

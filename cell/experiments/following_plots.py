@@ -41,6 +41,7 @@ def plot_dome(trials: Sequence[RunFolder], path: Path) -> Path:
         end = 1e3 * poses.T_world[-1, :3, 3]
         direction = end[:2] / np.linalg.norm(end[:2])
         axes[0, 0].annotate(str(number), 1.12 * end[:2], ha="center", va="center", fontsize=11)
+        axes[0, 0].update_datalim([1.25 * end[:2]])
         out_mm = 1e3 * poses.T_world[:, :2, 3] @ direction
         axes[0, 1].plot(out_mm, 1e3 * poses.T_world[:, 2, 3], lw=1.0, color="black")
         names.append(str(number))

@@ -1,7 +1,7 @@
 """What the pushing experiments share: the paper's objects, how a trial starts, and what is measured at its end.
 
-The paper names masses and not sizes. These follow from its masses at one density and one height: squares of 80 and
-60 mm, a circle of 80 mm and a hexagon of 70 mm across flats.
+The paper tells masses and not sizes, and that the sensor is 45 mm above the table. Sizes here follow from its masses at
+one density: squares of 80 and 60 mm, a circle of 80 mm and a hexagon of 70 mm across flats, all 80 mm high.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from geometry.types import Array
 
 OBJECT = "prism"
 SURFACES = ("mdf", "foam")
-_HEIGHT_MM = 60.0
+PUSH_HEIGHT_MM = 45.0
+_HEIGHT_MM = 80.0
 _GAP_MM = 5.0
 _TIP_MM = 20.0
 # How far an object stands from where it should: a person puts it there.

@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from cell.experiments.frames import BLUE, ORANGE, frames_2d, label_2d, path_2d, save
-from cell.experiments.pushing import OBJECT, pushed_until_s, target_mm
+from cell.experiments.pushing import OBJECT, lean_deg, pushed_until_s, target_mm
 from cell.outlines import ABOVE, SIDE, View, solid_outlines_mm
 from cell.run_folder import Poses, RunFolder, object_poses, scene, sensor_poses
 from cell.trials import Finished
@@ -74,3 +74,20 @@ def _draw_push(axis: plt.Axes, run: RunFolder, view: View) -> None:
         x, y = target_mm(run)
         axis.plot(x, y, "o", ms=9, mfc="none", mec=_RED, mew=1.2)
         axis.plot(x, y, ".", ms=4, color=_RED)
+
+
+def plot_leans(finished: Sequence[Finished], path: Path) -> Path:
+    """How far each object leant over time, with the follower and alone."""
+    figure, axes = plt.subplots(1, 2, figsize=(12, 4.4), sharey=True, layout="constrained")
+    for axis, arms in zip(axes, ("with follower", "alone"), strict=True):
+        for each in finished:
+            name, _, row_arms = each.trial.row.partition(", ")
+            if row_arms == arms:
+                axis.plot(object_poses(each.folder)[OBJECT].t_s, lean_deg(each.folder), lw=1.1, label=name)
+        axis.set_title(arms)
+        axis.set_xlabel("time (s)")
+        axis.set_yscale("symlog", linthresh=1.0)
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("lean from upright (deg)")
+    axes[1].legend(fontsize=8, ncols=2)
+    return save(figure, path, dpi=80)

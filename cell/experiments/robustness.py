@@ -10,7 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from cell.experiment import ExperimentSpec, Scale
-from cell.experiments.pushing import COLUMNS, ERROR_NOTE, PRISMS, leader_changes, object_changes, push_measures, starts
+from cell.experiments.pushing import (
+    COLUMNS,
+    ERROR_NOTE,
+    PRISMS,
+    PUSH_HEIGHT_MM,
+    leader_changes,
+    object_changes,
+    push_measures,
+    starts,
+)
 from cell.run_folder import RunFolder
 from cell.trials import Finished, Trial
 
@@ -60,7 +69,7 @@ def trials(scale: Scale) -> list[Trial]:
         if scale.quick and row not in _QUICK:
             continue
         for seed, pose in starts(scale.repetitions(3)):
-            whole = leader_changes(_PRISM, "mdf", "arm", 30.0) | object_changes(_PRISM, pose) | dict(changes)
+            whole = leader_changes(_PRISM, "mdf", "arm", PUSH_HEIGHT_MM) | object_changes(_PRISM, pose) | dict(changes)
             found.append(Trial(f"{_slug(row)}_{seed}", row, CELL, whole | {"seed": seed}))
     return found
 

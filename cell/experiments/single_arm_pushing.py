@@ -11,6 +11,7 @@ from cell.experiments.pushing import (
     ERROR_NOTE,
     ESTIMATORS,
     PRISMS,
+    PUSH_HEIGHT_MM,
     SURFACES,
     estimator_changes,
     leader_changes,
@@ -23,7 +24,6 @@ from cell.trials import Finished, Trial
 
 SENSOR = "sensor"
 CELL = "single_push_sim.yaml"
-_HEIGHT_MM = 30.0
 
 
 def trials(scale: Scale) -> list[Trial]:
@@ -31,10 +31,10 @@ def trials(scale: Scale) -> list[Trial]:
     found = []
     for estimator in ESTIMATORS:
         for surface in SURFACES:
-            for pushed in PRISMS:
+            for pushed in PRISMS[:1] if scale.quick and estimator != "learned" else PRISMS:
                 row = f"{pushed.name}, {surface}, {estimator}"
                 for seed, pose in starts(scale.repetitions(5)):
-                    changes = leader_changes(pushed, surface, "arm", _HEIGHT_MM) | object_changes(pushed, pose)
+                    changes = leader_changes(pushed, surface, "arm", PUSH_HEIGHT_MM) | object_changes(pushed, pose)
                     changes |= estimator_changes(estimator, [SENSOR]) | {"seed": seed}
                     found.append(Trial(f"{row.replace(', ', '_').replace(' ', '_')}_{seed}", row, CELL, changes))
     return found

@@ -113,7 +113,7 @@ class ArmSeat:
 
     def _answer(self, command: Any, number: int, refuse: str, now_ns: int) -> None:
         answer = self._answers.value
-        answer["number"], answer["written_ns"] = number, command["written_ns"]
+        answer["number"] = number
         try:
             if refuse:
                 raise CommandRejected(self.arm.name, Rejection.MODE, refuse)
@@ -149,8 +149,9 @@ class ArmSeat:
         self._deadline_ns = now_ns + round(1e9 * (braking_s + REST_MARGIN_S))
 
     def clear(self) -> None:
-        """Be ready for the next stop."""
+        """Forget the stop, and be ready for the next."""
         self._deadline_ns = 0
+        self._state.value["stop_ns"] = self._state.value["rest_ns"] = 0
 
     def stands(self) -> bool:
         """Whether it was at rest when it was looked at; what is not connected does not move by us."""
@@ -344,7 +345,7 @@ class Host:
         message = receive(self._control)
         if message is None or message["call"] == "end":
             self.ending = True
-            if message is None and self._cause is None and any(not seat.free() for seat in self._arms.values()):
+            if message is None and self._cause is None:
                 self._latch(Cause(Reason.TASK_GONE, self._clock.now_ns()), self._clock.now_ns())
             return
         try:
@@ -354,7 +355,7 @@ class Host:
         # So that who asked finds what has become of it.
         self._tell(self._clock.now_ns())
         with suppress(OSError):
-            send(self._control, answer)
+            send(self._control, {**answer, "number": message["number"]})
 
     def _call(self, message: Mapping[str, Any]) -> dict[str, Any]:
         if message["call"] == "clear":
@@ -451,14 +452,17 @@ def main() -> None:
     try:
         host = Host(spec, control, MonotonicClock())
     except TouchcellError as error:
-        send(control, {"ok": False, "error": encode_error(error)})
+        send(control, {"ok": False, "number": 0, "error": encode_error(error)})
         return
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda *_: setattr(host, "ending", True))
     with ExitStack() as exits:
         for device in host.devices.values():
             exits.callback(device.disconnect)
-        send(control, {"ok": True, "realtime": ask_for_realtime()})
+        realtime = ask_for_realtime()
+        # The first beat: from now on silence means something.
+        host.cycle()
+        send(control, {"ok": True, "number": 0, "realtime": realtime})
         host.run()
 
 

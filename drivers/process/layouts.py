@@ -97,12 +97,9 @@ COMMAND: Final = np.dtype(
         ("ttl_s", "f8"),
         ("has_cause", "u8"),
         ("t_cause_ns", "i8"),
-        ("written_ns", "i8"),
     ]
 )
-ANSWER: Final = np.dtype(
-    [("number", "u8"), ("refused", "u8"), ("twist", "f8", (6,)), ("t_ns", "i8"), ("written_ns", "i8")]
-)
+ANSWER: Final = np.dtype([("number", "u8"), ("refused", "u8"), ("twist", "f8", (6,)), ("t_ns", "i8")])
 ARM: Final = np.dtype(
     [
         ("lifecycle", "u8"),

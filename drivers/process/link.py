@@ -19,8 +19,11 @@ from drivers.process.layouts import Cause, RecordReader, cause_of
 from drivers.process.wire import decode_error, receive, send
 
 _START_S: Final = 30.0
-_CALL_S: Final = 20.0
+_CALL_S: Final = 60.0
+"""Parking an arm takes its time."""
+
 _END_S: Final = 5.0
+_HANGING_NS: Final = 2_000_000_000
 
 
 class Child:
@@ -39,6 +42,7 @@ class Child:
     def __init__(self, name: str, module: str, spec: Mapping[str, Any], fds: Sequence[int]) -> None:
         self.name = name
         self.realtime = ""
+        self._calls = 0
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         spec = {**spec, "fds": {**spec["fds"], "socket": theirs.fileno()}}
         with theirs:
@@ -68,8 +72,9 @@ class Child:
             TransportTimeout: it does not answer.
             TouchcellError: what it raised.
         """
+        self._calls += 1
         try:
-            send(self._socket, {"call": call, **arguments})
+            send(self._socket, {"call": call, "number": self._calls, **arguments})
         except OSError:
             raise self._gone() from None
         return self._answer(_CALL_S)
@@ -77,7 +82,9 @@ class Child:
     def _answer(self, wait_s: float) -> dict[str, Any]:
         self._socket.settimeout(wait_s)
         try:
-            message = receive(self._socket)
+            # What answers a call that was given up is not for this one.
+            while (message := receive(self._socket)) is not None and message["number"] != self._calls:
+                continue
         except TimeoutError:
             raise TransportTimeout(self.name, "answer of its process", wait_s) from None
         if message is None:
@@ -99,16 +106,16 @@ class Child:
         return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"has ended with code {code}"
 
     def close(self) -> None:
-        """End it: by closing the socket; a stopped one is continued; one that does not end is killed."""
+        """End it: by a message and by closing the socket, also if it was stopped; one that does not end is killed."""
         with suppress(OSError):
             send(self._socket, {"call": "end"})
         self._socket.close()
-        for action in (signal.SIGCONT, signal.SIGKILL):
-            with suppress(subprocess.TimeoutExpired):
-                self.process.wait(_END_S)
-                return
-            self.process.send_signal(action)
-        self.process.wait()
+        self.process.send_signal(signal.SIGCONT)
+        try:
+            self.process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
 
 
 class HostLink(Child):
@@ -160,6 +167,10 @@ class HostLink(Child):
         """How long (s) it has been silent, if that is too long; 0 while its arms are not guarded."""
         silent_s = (self._clock.now_ns() - int(self.beats.read()["t_ns"])) * 1e-9
         return silent_s if self.judged and silent_s > self._silence_s else 0.0
+
+    def hangs(self) -> bool:
+        """Whether a call would wait in vain; a host beats also while nobody judges it."""
+        return self._clock.now_ns() - int(self.beats.read()["t_ns"]) > _HANGING_NS
 
     def latched(self) -> Cause | None:
         """Why it has stopped its arms, or None."""

@@ -16,6 +16,7 @@ from drivers.errors import (
     CommandRejected,
     DeviceError,
     DeviceFault,
+    FaultClass,
     LifecycleError,
     Rejection,
     StaleData,
@@ -66,6 +67,8 @@ class RemoteDevice(Device):
     def _call(self, call: str, **arguments: Any) -> dict[str, Any]:
         if self._link is None:
             raise LifecycleError(self.name, call, "without a process", ["its host runs"])
+        if self._link.hangs():
+            raise self._to_faulted(DeviceFault(self.name, "its process hangs", fault_class=FaultClass.COMMUNICATION))
         try:
             return self._link.call(call, device=self.name, **arguments)
         except TransportError as error:
@@ -100,7 +103,7 @@ class RemoteDevice(Device):
 
     def _close(self) -> None:
         # A host that has gone has disconnected; what hangs is ended by the chain.
-        if self._link is not None and not self._link.end_words():
+        if self._link is not None and not self._link.end_words() and not self._link.hangs():
             try:
                 self._link.call("disconnect", device=self.name)
             except DeviceError:
@@ -245,7 +248,6 @@ class RemoteArm(RemoteDevice):
 
     def _write(self, link: HostLink) -> None:
         self._written_ns = self._clock.now_ns()
-        self._commands.value["written_ns"] = self._written_ns
         self._commands.publish()
         link.wake()
 

@@ -159,7 +159,7 @@ class _Watchdog:
 
     def _hear(self) -> None:
         message = receive(self._lifeline)
-        if message is None:
+        if message is None or message["call"] == "end":
             self._task_gone_ns = time.monotonic_ns()
             return
         if message["call"] == "notes":
@@ -168,7 +168,7 @@ class _Watchdog:
             self._cause = None
             self._publish(time.monotonic_ns())
         with suppress(OSError):
-            send(self._lifeline, {"ok": self._cause is None})
+            send(self._lifeline, {"ok": self._cause is None, "number": message["number"]})
 
     def _settled(self, now_ns: int) -> bool:
         """Whether all arms stand, or have had their time."""
@@ -224,7 +224,7 @@ def _host_beat(record: Any) -> Beat:
 def main() -> None:
     """Run as ``python -m drivers.process.watchdog SPEC``, with the descriptors that SPEC names inherited."""
     watchdog = _Watchdog(json.loads(sys.argv[1]))
-    send(watchdog._lifeline, {"ok": True, "realtime": ask_for_realtime()})
+    send(watchdog._lifeline, {"ok": True, "number": 0, "realtime": ask_for_realtime()})
     watchdog.run()
 
 

@@ -25,6 +25,7 @@ from drivers.simulation.objects import FreeObject
 from drivers.simulation.solids import shape_of
 from drivers.simulation.surfaces import Plane, Surface, SurfacePoint
 from drivers.simulation.timeline import Restore
+from geometry.errors import TouchcellError
 from geometry.types import Array
 
 # A carriage that would turn faster than this in one step has come to another face: it is set there, not swung.
@@ -48,6 +49,23 @@ class _Mounted:
     T_world_s: Array
     R_world_c: Array
     normal: Array
+
+
+class PhysicsError(TouchcellError, ArithmeticError):
+    """The physics was given, or came to, numbers that are not finite.
+
+    Attributes:
+        what: where they are.
+        t_s: time of the scene.
+    """
+
+    def __init__(self, what: str, t_s: float) -> None:
+        super().__init__(
+            f"{what} is not finite at {t_s:.3f} s of the scene",
+            hint="a smaller physics_step_ms helps where motions are very fast or tips very stiff",
+        )
+        self.what = what
+        self.t_s = t_s
 
 
 class DynamicWorld:
@@ -88,7 +106,8 @@ class DynamicWorld:
         self._build({})
 
     def mount(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
-        """Let ``sensor`` feel; returns what it feels at ``T_world_s`` (4, 4) at ``t_s``. Its tip begins undeformed."""
+        """Let ``sensor`` feel; returns what it feels at ``T_world_s`` (4, 4) at ``t_s``. All tips begin undeformed
+        and all objects at rest."""
         normal = self._nearest(T_world_s[:3, 3], t_s).normal
         self._mounted[sensor] = _Mounted(T_world_s, _upright(T_world_s, normal), normal)
         self._t_s = t_s
@@ -96,11 +115,13 @@ class DynamicWorld:
         return self._feel(sensor, T_world_s, t_s)
 
     def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, ContactState]:
-        """Go on to ``t_s``."""
+        """Go on to ``t_s``. Raises PhysicsError."""
         span_s = t_s - self._t_s
         for sensor, pose in T_world_s.items():
             self._carry(sensor, pose, span_s)
         mujoco.mj_step(self._at.model, self._data, round(span_s / self._step_s))
+        if not math.isfinite(float(self._qpos.sum())):
+            raise PhysicsError("the state", t_s)
         self._t_s = t_s
         return {sensor: self._feel(sensor, pose, t_s) for sensor, pose in T_world_s.items()}
 
@@ -141,6 +162,8 @@ class DynamicWorld:
 
         The normal that keeps it upright is the last step's: what moves is not known yet where it will be.
         """
+        if not math.isfinite(float(T_world_s.sum())):
+            raise PhysicsError(f"the pose of {sensor!r}", self._t_s)
         mounted, at = self._mounted[sensor], self._at.carriages[sensor]
         position = mounted.T_world_s[:3, 3]
         R_end = _upright(T_world_s, mounted.normal)
@@ -248,9 +271,10 @@ def _nearer(a: SurfacePoint | None, b: SurfacePoint) -> SurfacePoint:
 
 def _swing(R_start: Array, R_end: Array) -> Array | None:
     """Rotation vector (3,) along world axes from one to the other; None if it is no small one."""
-    R = R_end @ R_start.T
-    turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return turn if float(np.trace(R)) > 1.0 + 2.0 * math.cos(_SWING_RAD) else None
+    (a, b, c), (d, e, f), (g, h, i) = (R_end @ R_start.T).tolist()
+    if a + e + i <= 1.0 + 2.0 * math.cos(_SWING_RAD):
+        return None
+    return np.array([0.5 * (h - f), 0.5 * (c - g), 0.5 * (d - b)])
 
 
 def _upright(T_world_s: Array, normal: Array) -> Array:

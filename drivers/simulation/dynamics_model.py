@@ -125,7 +125,11 @@ def build_model(
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = 1000.0
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    # Relative to the mean inertia, which the carriages make large: 1e-8 leaves contacts rattling.
+    option.tolerance = 1e-10
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    # It would hide a state that is not finite by starting anew.
+    option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     if table_height_m is not None:
         spec.worldbody.add_geom(
             name="table",
