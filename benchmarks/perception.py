@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 
 from benchmarks import perception_figures
-from benchmarks.perception_runtimes import installed
+from benchmarks.perception_runtimes import by_turns, installed
 from benchmarks.perception_serving import FRAME_SIZE, OWN, from_camera
 from benchmarks.provenance import as_installed, provenance
 from drivers.simulation.render import FrameRenderer, Lighting
@@ -65,10 +65,15 @@ def run(arguments: Sequence[str], out: Path) -> None:
         else:
             about = f"{options.data}, split {options.split}"
         rows, scores = _measured(options, Path(scratch))
-    text = f"{about}\n{table(rows)}"
+    turns = {
+        path.stem: by_turns(load_model(path), options.runtimes, options.frames)
+        for path in options.models
+        if isinstance(load_model(path).header.architecture, Architecture)
+    }
+    text = "\n".join([about, table(rows), *_turn_lines(turns)])
     print(text)
     (out / "perception.txt").write_text(text + "\n")
-    report = {"provenance": provenance(), "about": about, "shares": SHARES, "rows": rows}
+    report = {"provenance": provenance(), "about": about, "shares": SHARES, "rows": rows, "by_turns": turns}
     (out / "perception.json").write_text(json.dumps(report, indent=1) + "\n")
     perception_figures.write_run_time_against_error(out / "perception.png", rows)
     perception_figures.write_reliability(out / "perception_reliability.png", SHARES, rows)
@@ -252,3 +257,11 @@ def _cost_lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     yield "again: the same frame once more, CPU; start: from a fresh process to its first estimate, wall and CPU;"
     yield "apart: largest difference from the xi of the estimator's first runtime, m or rad;"
     yield "training: CPU time of all epochs, where the model file tells it; decoding and matching come on top"
+
+
+def _turn_lines(turns: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Iterator[str]:
+    if turns:
+        yield "\nthe network alone, runtimes by turns in one process; ms CPU, median and p99"
+    for name, row in turns.items():
+        cells = "".join(f"{runtime:>14} {times['median']:.2f} / {times['p99']:.2f}" for runtime, times in row.items())
+        yield f"{name:<22}{cells}"

@@ -5,8 +5,9 @@ Each is given what it needs to be at its best on one thread and batches of one.
 
 from __future__ import annotations
 
+import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 
 import numpy as np
@@ -101,6 +102,28 @@ RUNTIMES: dict[str, Callable[[Model], Runner]] = {
     "openvino": openvino,
     "torch": torch,
 }
+
+
+def by_turns(model: Model, runtimes: Sequence[str], rounds: int) -> dict[str, dict[str, float]]:
+    """Milliseconds that the network alone takes in each runtime, all of them by turns in one process.
+
+    On a machine that does other work, processes one after the other meet different competition; runtimes that take
+    turns meet the same.
+    """
+    architecture = model.header.architecture
+    assert isinstance(architecture, Architecture)
+    runners = {name: RUNTIMES[name](model) for name in runtimes}
+    image = np.random.default_rng(0).random((1, 1, *architecture.input_size), dtype=np.float32)
+    times_ns: dict[str, list[int]] = {name: [] for name in runners}
+    for _ in range(rounds):
+        for name, runner in runners.items():
+            start_ns = time.process_time_ns()
+            runner(image)
+            times_ns[name].append(time.process_time_ns() - start_ns)
+    return {
+        name: {"median": 1e-6 * float(np.median(row)), "p99": 1e-6 * float(np.percentile(row, 99))}
+        for name, row in times_ns.items()
+    }
 
 
 def installed() -> list[str]:

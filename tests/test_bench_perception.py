@@ -38,6 +38,8 @@ def test_without_data_the_shipped_model_sees_simulated_frames(
     assert (row["estimator"], row["runtime"], row["all"]["n"]) == ("sim_gdn", "onnxruntime", 12)
     assert row["slip_free"]["n"] + row["slipping"]["n"] == 12
     assert row["all"]["mae"]["z_mm"] < 0.2
+    turns = json.loads((tmp_path / "perception.json").read_text())["by_turns"]["sim_gdn"]
+    assert 0.0 < turns["onnxruntime"]["median"] <= turns["onnxruntime"]["p99"]
     assert 40.0 < row["memory_mb"] <= row["peak_mb"] < 400.0
     assert 0.0 < row["latency_ms"]["cpu"]["median"] <= row["latency_ms"]["cpu"]["p99"]
     assert 0.0 < row["start_cpu_s"] < 60.0
