@@ -93,15 +93,23 @@ def plot_agreement(run: Run, sensor: str, path: Path) -> Path:
     return path
 
 
-def plot_trajectory(run: Run, path: Path) -> Path:
-    """The arms' paths from the side and from above with the tool's axis, coloured by the task's state."""
+def plot_trajectory(run: Run, path: Path, mounts: Mapping[str, tuple[Array, Array]]) -> Path:
+    """The arms' paths from the side and from above with the sensor's axis, coloured by the task's state.
+
+    Args:
+        run: its recording.
+        path: PNG to write.
+        mounts: by arm, the poses (4, 4) of its base in the world and of its sensor in its tool; none means that both
+            are the same.
+    """
     figure, axes = plt.subplots(1, 2, figsize=(15, 6), layout="constrained")
     states = _states(run)
     colours = {state: _STATE_COLOURS[i % len(_STATE_COLOURS)] for i, state in enumerate(states)}
     for arm in run.roles("arms", "tcp"):
         series = run.series(f"/arms/{arm}/tcp")
         assert series is not None
-        T = tip_points(series)
+        T_world_base, T_tcp_sensor = mounts.get(arm, (np.eye(4), np.eye(4)))
+        T = T_world_base @ tip_points(series) @ T_tcp_sensor
         points = 1e3 * T[:, :3, 3]
         # The view from the side looks along the horizontal axis in which the path is narrowest.
         along = int(np.argmax(np.ptp(points[:, :2], axis=0)))

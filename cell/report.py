@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cell.messages import COMPONENTS
 from cell.recording import RECORDING, Message, read
+from drivers.errors import ConfigError
 from geometry import se3
 from geometry.types import Array
 
@@ -120,7 +121,7 @@ def _pictures(run: Run, folder: Path) -> list[Path]:
         if not moved and run.series(f"/sensors/{sensor}/truth") is not None:
             pictures.append(plot_agreement(run, sensor, folder / f"agreement_{sensor}.png"))
     if moved:
-        pictures.append(plot_trajectory(run, folder / "trajectory.png"))
+        pictures.append(plot_trajectory(run, folder / "trajectory.png", _mounts(folder)))
     for sensor in run.roles("sensors", "preprocessing"):
         strip = write_strip(folder / RECORDING, run, sensor, folder / f"markers_{sensor}.png")
         pictures += [strip] if strip is not None else []
@@ -128,6 +129,22 @@ def _pictures(run: Run, folder: Path) -> list[Path]:
         title = "time that each stage of a control cycle took, in the cycles in which it ran"
         pictures.append(plot_budget(stages_ms, folder / "budget.png", title))
     return pictures
+
+
+def _mounts(folder: Path) -> dict[str, tuple[Array, Array]]:
+    """Where each arm stands in the world, and where its sensor sits on its tool, as far as the cell file is there."""
+    from cell.run_folder import RunFolder
+
+    try:
+        plan = RunFolder(folder).plan
+    except (ConfigError, OSError):
+        return {}
+    sits = {
+        section.mounted_on: se3.from_euler_mm_deg(np.array(section.tcp_to_sensor_mm_deg))
+        for section in plan.cell.sensors.values()
+    }
+    stands = {name: se3.from_euler_mm_deg(np.array(arm.base_pose_mm_deg)) for name, arm in plan.cell.arms.items()}
+    return {role: (stands[name], sits.get(name, np.eye(4))) for role, name in plan.arm_roles.items()}
 
 
 def _stages_ms(run: Run) -> dict[str, Array]:
