@@ -281,7 +281,8 @@ def build_devices(
     devices: dict[str, Device] = {}
     if scene is None and wanted:
         scene = _scene(plan, clock)
-    context = DriverContext(clock, devices, scene, plan.cell.seed)
+    bases = {name: se3.from_euler_mm_deg(np.array(arm.base_pose_mm_deg)) for name, arm in plan.cell.arms.items()}
+    context = DriverContext(clock, devices, scene, plan.cell.seed, bases)
     for name, device in wanted.items():
         devices[name] = device.spec.build(name, device.config, context)
     return devices

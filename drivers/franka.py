@@ -153,7 +153,8 @@ class FrankaArm(Arm):
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
         """Newest state. Raises StaleData if it is older than ``max_age_s``, and the fault that makes it FAULTED."""
         reading = self._reading("tell its pose", max_age_s)
-        return _stamped(TcpState(reading.T_base_tcp, reading.twist), reading)
+        # The controller's rotation is one to about 1e-6 only.
+        return _stamped(TcpState(se3.project(reading.T_base_tcp), reading.twist), reading)
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
         """Newest joint state. Raises as ``tcp``."""

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict
 from drivers import entry_points
 from drivers.clock import Clock
 from drivers.device import Device
+from geometry.types import Array
 
 GROUP = "touchcell.drivers"
 
@@ -65,12 +66,14 @@ class DriverContext:
         devices: devices of the cell that are built already, by name.
         scene: the simulated scene, for simulated devices; None in a real cell.
         seed: seed of everything random.
+        bases: T_world_base (4, 4) of arms by name, where a cell file says where they stand.
     """
 
     clock: Clock
     devices: Mapping[str, Device] = field(default_factory=dict)
     scene: Any = None
     seed: int = 0
+    bases: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -194,7 +194,7 @@ def _build(name: str, config: Any, context: DriverContext) -> SimTactip:
     arm: object = context.devices.get(config.mounted_on)
     mount: object = arm
     if not isinstance(arm, Carrier) and isinstance(arm, TcpSource):
-        mount = MeasuredCarrier(arm, np.eye(4))
+        mount = MeasuredCarrier(arm, context.bases.get(config.mounted_on, np.eye(4)))
     if not isinstance(scene, Scene):
         raise ConfigError("a simulated sensor needs a scene", key=name, hint="add a scene: section to the cell file")
     if not isinstance(mount, Carrier):

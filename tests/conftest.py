@@ -14,6 +14,7 @@ _BESIDE_EMULATORS = (
     "test_conformance",
     "test_damiao",
     "test_emulated_matrix",
+    "test_emulated_push",
     "test_emulator_process",
     "test_feetech",
     "test_franka",
