@@ -35,11 +35,12 @@ _PRISM_MM = 200.0
 _PUSHED_AT = 0.8
 _BELOW_TOP_MM = 15.0
 _FOLLOWER_MM = 3.0
-# Each tip's share of the object's weight. Shear stiffness of the cells' tips, and how far the follower's may be sheared:
-# 80 % of what sticks under _FOLLOWER_MM.
+# Each tip's share of the object's weight, shear stiffness of the cells' tips, and how far they may be sheared: 80 % of
+# what sticks under _FOLLOWER_MM, and under the 2 mm that friction on the table leaves the leader before it pushes.
 _SHARE = 0.35
 _SHEAR_N_MM = 0.4
-_SHEAR_MAX_MM = 3.2
+_LIFT_MAX_MM = 3.2
+_PRESS_MAX_MM = 2.2
 _TALL_G = (566.0, 436.0, 324.0, 373.0)
 
 
@@ -78,9 +79,9 @@ def _cell_changes(pushed: Pushed, arms: str, estimator: str) -> dict[str, Any]:
     same = {"scene.step_ms": 5}
     if arms == WITH:
         same |= two_arms(pushed, "mdf", height_mm) | _boxes_up_to(height_mm, "leader_box", "follower_box")
-        shear_mm = held_with_mm(pushed)
-        same["task.reference_mm_deg"] = [shear_mm, 0, 0, 0, 0, 0]
-        same["task.follower.reference_mm_deg"] = [-shear_mm, 0, _FOLLOWER_MM, 0, 0, 0]
+        press_mm, lift_mm = held_with_mm(pushed)
+        same["task.reference_mm_deg"] = [press_mm, 0, 0, 0, 0, 0]
+        same["task.follower.reference_mm_deg"] = [-lift_mm, 0, _FOLLOWER_MM, 0, 0, 0]
         return same | estimator_changes(estimator, (LEADER_SENSOR, FOLLOWER_SENSOR))
     same |= leader_changes(pushed, "mdf", "arm", height_mm) | _boxes_up_to(height_mm, "workspace")
     return same | estimator_changes(estimator, ("sensor",))
@@ -113,14 +114,14 @@ def pushed_at_mm(pushed: Pushed) -> float:
     return _PUSHED_AT * float(pushed.shape["size_mm"][2] if "size_mm" in pushed.shape else pushed.shape["height_mm"])
 
 
-def held_with_mm(pushed: Pushed) -> float:
-    """Shear with which the leader presses down where it pushes and the follower lifts where it holds.
+def held_with_mm(pushed: Pushed) -> tuple[float, float]:
+    """Shear with which the leader presses down where it pushes, and with which the follower lifts where it holds.
 
     Both make a moment against toppling. Too little and the object topples over its leading edge while it is pushed;
     too much and it tips backwards while it stands.
     """
-    weight_n = 1e-3 * pushed.mass_g * GRAVITY_M_S2
-    return round(min(_SHARE * weight_n / _SHEAR_N_MM, _SHEAR_MAX_MM), 2)
+    shear_mm = _SHARE * 1e-3 * pushed.mass_g * GRAVITY_M_S2 / _SHEAR_N_MM
+    return round(min(shear_mm, _PRESS_MAX_MM), 2), round(min(shear_mm, _LIFT_MAX_MM), 2)
 
 
 def _boxes_up_to(height_mm: float, *interlocks: str) -> dict[str, Any]:
