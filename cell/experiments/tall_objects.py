@@ -1,8 +1,8 @@
-"""Tall objects (paper 5.7.2): four prisms of double height and five bottles, pushed high up, with and without follower.
+"""Tall objects (paper 5.7.2): four tall prisms and five bottles, pushed high up, with and without follower.
 
-The paper tells masses and neither sizes nor how high it pushes. Prisms are the short ones doubled; bottles are turned
-bodies of about the size of those that the paper names. Each is pushed a tenth higher than where one sticky tip begins
-to topple it, or just below the top of its straight part.
+The paper tells masses and neither sizes nor how high it pushes. Prisms are those of the other experiments, but 200 mm
+high; bottles are turned bodies about as thick as those that the paper names. Each is pushed at 80 % of its height, or
+just below the top of its straight part.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ _SHARE = 0.35
 _SHEAR_N_MM = 0.4
 _LIFT_MAX_MM = 3.2
 _PRESS_MAX_MM = 2.2
+_LOST_DEG = 10.0
 _TALL_G = (566.0, 436.0, 324.0, 373.0)
 
 
@@ -76,7 +77,7 @@ def trials(scale: Scale) -> list[Trial]:
 def _cell_changes(pushed: Pushed, arms: str, estimator: str) -> dict[str, Any]:
     height_mm = pushed_at_mm(pushed)
     # Both in the same world: the cells that ship differ in this.
-    same = {"scene.step_ms": 5}
+    same: dict[str, Any] = {"scene.step_ms": 5}
     if arms == WITH:
         same |= two_arms(pushed, "mdf", height_mm) | _boxes_up_to(height_mm, "leader_box", "follower_box")
         press_mm, lift_mm = held_with_mm(pushed)
@@ -88,21 +89,25 @@ def _cell_changes(pushed: Pushed, arms: str, estimator: str) -> dict[str, Any]:
 
 
 def measure(run: RunFolder) -> Mapping[str, float]:
-    """See ``pushing.push_measures``."""
+    """See ``pushing.push_measures``; ``lost`` are those that leant too far to be pushed on, fallen or not."""
     sensors = run.plan.sensor_roles
-    return push_measures(run, LEADER_SENSOR if LEADER_SENSOR in sensors else next(iter(sensors)))
+    found = push_measures(run, LEADER_SENSOR if LEADER_SENSOR in sensors else next(iter(sensors)))
+    return found | {"lost": float(found["lean_max_deg"] > _LOST_DEG)}
 
 
 def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
-    """The paper's figure 20, the same from the side without follower, and how far each leant."""
+    """The paper's figure 20, the same from the side without follower, and how far each leant; learned estimator."""
     from cell.experiments.pushing_plots import plot_leans, plot_pushes
     from cell.outlines import SIDE
 
-    first = [each for each in finished if each.trial.name.endswith("_1")]
+    arms = {
+        arms: [each for each in finished if each.trial.name.endswith(f"{arms}_learned_1".replace(" ", "_"))]
+        for arms in _CELLS
+    }
     return [
-        plot_pushes([each for each in first if WITH in each.trial.row], folder / "with_follower.png"),
-        plot_pushes([each for each in first if WITHOUT in each.trial.row], folder / "alone_side.png", view=SIDE),
-        plot_leans(first, folder / "leans.png"),
+        plot_pushes(arms[WITH], folder / "with_follower.png"),
+        plot_pushes(arms[WITHOUT], folder / "alone_side.png", view=SIDE),
+        plot_leans(arms, folder / "leans.png"),
     ]
 
 
@@ -141,6 +146,7 @@ SPEC = ExperimentSpec(
     measure=measure,
     columns=(
         Column("toppled", "toppled", "count"),
+        Column("lost", "lean > 10 deg", "count"),
         Column("lean_max_deg", "lean deg", "worst", 1),
         Column("error_mm", "error mm", digits=2),
         Column("error_mm", "worst", "worst"),
