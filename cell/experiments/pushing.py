@@ -56,14 +56,13 @@ class Pushed:
     mass_g: float
     reach_mm: float
 
-    def taller(self, mass_g: float) -> Pushed:
-        """Two of them on top of each other, with the paper's mass for that."""
+    def taller(self, height_mm: float, mass_g: float) -> Pushed:
+        """One of the same outline, that high."""
         tall = dict(self.shape)
         if "size_mm" in tall:
-            x, y, z = tall["size_mm"]
-            tall["size_mm"] = [x, y, 2.0 * z]
+            tall["size_mm"] = [*tall["size_mm"][:2], height_mm]
         else:
-            tall["height_mm"] = 2.0 * tall["height_mm"]
+            tall["height_mm"] = height_mm
         return Pushed(f"tall {self.name}", tall, mass_g, self.reach_mm)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -76,18 +76,17 @@ def _draw_push(axis: plt.Axes, run: RunFolder, view: View) -> None:
         axis.plot(x, y, ".", ms=4, color=_RED)
 
 
-def plot_leans(finished: Sequence[Finished], path: Path) -> Path:
-    """How far each object leant over time, with the follower and alone."""
-    figure, axes = plt.subplots(1, 2, figsize=(12, 4.4), sharey=True, layout="constrained")
-    for axis, arms in zip(axes, ("with follower", "alone"), strict=True):
-        for each in finished:
-            name, _, row_arms = each.trial.row.partition(", ")
-            if row_arms == arms:
-                axis.plot(object_poses(each.folder)[OBJECT].t_s, lean_deg(each.folder), lw=1.1, label=name)
-        axis.set_title(arms)
+def plot_leans(finished: Mapping[str, Sequence[Finished]], path: Path) -> Path:
+    """How far each object leant over time, one panel for each of ``finished``."""
+    figure, axes = plt.subplots(1, len(finished), figsize=(6 * len(finished), 4.4), sharey=True, layout="constrained")
+    for axis, (title, trials) in zip(axes, finished.items(), strict=True):
+        for each in trials:
+            name = each.trial.row.partition(",")[0]
+            axis.plot(object_poses(each.folder)[OBJECT].t_s, lean_deg(each.folder), lw=1.1, label=name)
+        axis.set_title(title)
         axis.set_xlabel("time (s)")
         axis.set_yscale("symlog", linthresh=1.0)
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("lean from upright (deg)")
-    axes[1].legend(fontsize=8, ncols=2)
+    axes[-1].legend(fontsize=8, ncols=2)
     return save(figure, path, dpi=80)

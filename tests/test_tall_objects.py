@@ -1,0 +1,27 @@
+"""The tall objects' push heights and the moment that two tips put against toppling, by statics."""
+
+from __future__ import annotations
+
+import pytest
+
+from cell.experiments.pushing import Pushed
+from cell.experiments.tall_objects import OBJECTS, held_with_mm, pushed_at_mm
+
+_MDF = 0.3
+_SHEAR_N_MM = 0.4
+
+
+def moments_n_mm(pushed: Pushed) -> tuple[float, float, float]:
+    """Of the push, of the weight about an edge, and of the two tips."""
+    weight_n = 9.81e-3 * pushed.mass_g
+    tips = _SHEAR_N_MM * sum(held_with_mm(pushed)) * pushed.reach_mm
+    return _MDF * weight_n * pushed_at_mm(pushed), weight_n * pushed.reach_mm, tips
+
+
+@pytest.mark.parametrize("pushed", OBJECTS, ids=lambda pushed: pushed.name)
+def test_a_push_topples_all_but_the_tin_and_two_tips_hold_them(pushed: Pushed) -> None:
+    push, weight, tips = moments_n_mm(pushed)
+    assert (push > weight) == (pushed.name != "coffee tin")
+    assert push - tips < weight
+    # Nor do the tips tip it backwards before it is pushed.
+    assert tips < weight
