@@ -22,6 +22,7 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
+from benchmarks.fault_matrix import median_and_worst
 from benchmarks.provenance import provenance
 from cell.compose import compose
 from cell.config import plan_cell
@@ -325,14 +326,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
 
 
 def _row(key: tuple[str, str, str], cases: Sequence[EmulatedCase]) -> str:
-    detection = _quantiles([1e3 * c.detection_s for c in cases if c.detection_s is not None], (12, 8, 0))
-    rest = _quantiles([1e3 * c.rest_s for c in cases if c.rest_s is not None], (12, 8, 0))
-    way = _quantiles([1e3 * c.distance_m for c in cases if c.distance_m is not None], (9, 7, 1))
+    detection = median_and_worst([1e3 * c.detection_s for c in cases if c.detection_s is not None], 12, 8, 0)
+    rest = median_and_worst([1e3 * c.rest_s for c in cases if c.rest_s is not None], 12, 8, 0)
+    way = median_and_worst([1e3 * c.distance_m for c in cases if c.distance_m is not None], 9, 7, 1)
     return f"{', '.join(key):<40}{detection}{rest}{way}  {', '.join(sorted({c.ended_by or '-' for c in cases}))}"
-
-
-def _quantiles(values: Sequence[float], form: tuple[int, int, int]) -> str:
-    first, second, digits = form
-    if not values:
-        return f"{'-':>{first}}{'-':>{second}}"
-    return f"{np.median(values):{first}.{digits}f}{max(values):{second}.{digits}f}"

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
+import numpy as np
 import yaml
 
 from cell.cli import find_cell
@@ -296,3 +297,10 @@ def _judged(
 def _shipped(name: str) -> dict[str, Any]:
     data: dict[str, Any] = yaml.safe_load(find_cell(Path("configs") / name).read_text())
     return data
+
+
+def median_and_worst(values: Sequence[float], first: int, second: int, digits: int) -> str:
+    """Two columns of the given widths; dashes where there is nothing."""
+    if not values:
+        return f"{'-':>{first}}{'-':>{second}}"
+    return f"{np.median(values):{first}.{digits}f}{max(values):{second}.{digits}f}"

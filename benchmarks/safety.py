@@ -14,9 +14,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-
-from benchmarks.fault_matrix import FAULTS, Case, matrix
+from benchmarks.fault_matrix import FAULTS, Case, matrix, median_and_worst
 from benchmarks.provenance import provenance
 from benchmarks.safety_cost import costs
 
@@ -74,9 +72,9 @@ def _print_costs() -> dict[str, float]:
 
 
 def _row(name: str, cases: Sequence[Case]) -> str:
-    detection = _quantiles([1e3 * c.detection_s for c in cases if c.detection_s is not None], 11, 8, 0)
-    stop = _quantiles([1e3 * c.stop_s for c in cases if c.stop_s is not None], 10, 8, 0)
-    way = _quantiles([1e3 * c.distance_m for c in cases if c.distance_m is not None], 10, 8, 2)
+    detection = median_and_worst([1e3 * c.detection_s for c in cases if c.detection_s is not None], 11, 8, 0)
+    stop = median_and_worst([1e3 * c.stop_s for c in cases if c.stop_s is not None], 10, 8, 0)
+    way = median_and_worst([1e3 * c.distance_m for c in cases if c.distance_m is not None], 10, 8, 2)
     by = ", ".join(sorted({case.ended_by or "-" for case in cases}))
     return f"{name:<26}{len(cases):>7}{detection}{stop}{way}  {by}"
 
@@ -86,9 +84,3 @@ def _worst(cases: Sequence[Case]) -> str:
     ways = [case.distance_m for case in cases if case.distance_m is not None]
     words = f"{1e3 * max(times):.0f}" if times else "-"
     return f"{words + (f' / {1e3 * max(ways):.2f}' if ways else ' / -' if times else ''):>14}"
-
-
-def _quantiles(values: Sequence[float], first: int, second: int, digits: int) -> str:
-    if not values:
-        return f"{'-':>{first}}{'-':>{second}}"
-    return f"{np.median(values):{first}.{digits}f}{max(values):{second}.{digits}f}"

@@ -14,7 +14,7 @@ from drivers import replay_camera, sim_arm, sim_joint_arm, sim_tactip
 from drivers.clock import Clock, VirtualClock
 from drivers.device import Device
 from drivers.emulators.rig import Rig
-from drivers.registry import DriverContext
+from drivers.registry import DriverConfig, DriverContext, DriverSpec
 from drivers.sim_arm import SimArm
 from drivers.sim_joint_arm import SimJointArm
 from drivers.simulation.faults import FrameFaults
@@ -69,11 +69,19 @@ class StandIn:
 
 def sim_arm_rig(folder: Path, address: int) -> Rig:
     """A simulated arm with no scene around it."""
-    config = sim_arm.SimArmConfig(start_pose_mm_deg=_START)
-    arms: list[SimArm] = []
+    return _arm_rig(sim_arm.SPEC, sim_arm.SimArmConfig(start_pose_mm_deg=_START))
+
+
+def sim_joint_arm_rig(folder: Path, address: int) -> Rig:
+    """A simulated Panda with no scene around it."""
+    return _arm_rig(sim_joint_arm.SPEC, sim_joint_arm.SimJointArmConfig(model="panda", start_pose_mm_deg=_START))
+
+
+def _arm_rig(spec: DriverSpec, config: DriverConfig) -> Rig:
+    arms: list[SimArm | SimJointArm] = []
 
     def build(clock: Clock) -> Device:
-        arm = cast(SimArm, sim_arm.SPEC.build("arm", config, DriverContext(clock)))
+        arm = cast(SimArm | SimJointArm, spec.build("arm", config, DriverContext(clock)))
         arms.append(arm)
         return arm
 
@@ -84,33 +92,7 @@ def sim_arm_rig(folder: Path, address: int) -> Rig:
         return {"T_base_tcp": T.tolist(), "position_m": T[:3, 3].tolist()}
 
     return Rig(
-        spec=sim_arm.SPEC,
-        start=lambda: StandIn(truth),
-        build=build,
-        energising=None,
-        pose="T_base_tcp",
-        clock=VirtualClock,
-        process=False,
-    )
-
-
-def sim_joint_arm_rig(folder: Path, address: int) -> Rig:
-    """A simulated Panda with no scene around it."""
-    config = sim_joint_arm.SimJointArmConfig(model="panda", start_pose_mm_deg=_START)
-    arms: list[SimJointArm] = []
-
-    def build(clock: Clock) -> Device:
-        arm = cast(SimJointArm, sim_joint_arm.SPEC.build("arm", config, DriverContext(clock)))
-        arms.append(arm)
-        return arm
-
-    def truth() -> dict[str, Any]:
-        arms[-1].health()
-        T = arms[-1].T_world_tcp()
-        return {"T_base_tcp": T.tolist(), "position_m": T[:3, 3].tolist()}
-
-    return Rig(
-        spec=sim_joint_arm.SPEC,
+        spec=spec,
         start=lambda: StandIn(truth),
         build=build,
         energising=None,
