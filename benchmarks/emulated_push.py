@@ -192,8 +192,7 @@ class _Witness:
 
     def truth(self) -> _Truth:
         """What was seen."""
-        t_s, T_world_object, T_world_f = zip(*self._seen, strict=True)
-        return _Truth(np.array(t_s), np.array(T_world_object), np.array(T_world_f))
+        return _Truth(*(np.array([each[i] for each in self._seen]) for i in range(3)))
 
     def _look(self) -> None:
         while not self._done.wait(_ASKED_EVERY_S):
