@@ -20,16 +20,15 @@ from torch.nn import functional
 from drivers.tactile_data import read_rest, read_split
 from geometry.types import Array, ImageArray
 from perception.architecture import Architecture
-from perception.calibration import calibrate
 from perception.checkpoint import EpochRecord, Progress, delete_checkpoint, load_checkpoint, save_checkpoint
 from perception.dataset import LabelledImages, default_cache, label_range, load_reduced
 from perception.errors import TrainingError
-from perception.figures import write_curves, write_predictions
 from perception.labels import CONTACT_NAMES, contact_from_xi, xi_from_contact
-from perception.model_file import Header, Labels, Model, save_model, touchcell_version
+from perception.model_file import Labels, Model
 from perception.networks import Alignment, ContactNetwork, gaussian_loss, weighted_absolute_loss, weighted_square_loss
 from perception.preprocessing import Crop, Preprocessing, scale
 from perception.training_display import Display, Observer
+from perception.training_end import write_trained
 
 _EVALUATION_BATCH = 100
 _SHORT_SIDE_PX = 100
@@ -240,40 +239,20 @@ def train_on_arrays(
         run = _Run(network, settings, labels, training, validation, observer)
         run.fit(out, recipe, resume=resume)
     mean, sigma = run.predict()
-    scale, power = calibrate(labels.aligned(labels.targets(validation.xi) - mean, mean), sigma)
-    model = Model(
-        Header(
-            touchcell_version=touchcell_version(),
-            architecture=architecture,
-            preprocessing=preprocessing,
-            labels=labels,
-            sigma_scale=tuple(scale.tolist()),
-            sigma_power=tuple(power.tolist()),
-            training_data=training_data,
-            training={
-                **{key: list(value) if isinstance(value, tuple) else value for key, value in asdict(settings).items()},
-                "images": len(training),
-                "epochs_run": len(run.progress.history),
-                "best_epoch": run.progress.best_epoch,
-                "epochs_cpu_s": round(run.progress.cpu_s, 1),
-                "validation_loss": run.progress.best_loss,
-                "validation_mae": list(run.progress.history[run.progress.best_epoch - 1].mae.values()),
-            },
-        ),
-        run.average.folded(),
-        reference,
+    return write_trained(
+        out,
+        architecture=architecture,
+        preprocessing=preprocessing,
+        labels=labels,
+        tensors=run.average.folded(),
+        reference=reference,
+        training_data=training_data,
+        told={**asdict(settings), "images": len(training)},
+        progress=run.progress,
+        mean=mean,
+        sigma=sigma,
+        validation_xi=validation.xi,
     )
-    save_model(model, out)
-    xi, covariance = labels.xi_gaussian(mean, model.header.calibrated(sigma))
-    write_predictions(
-        out.with_name(f"{out.stem}_predictions.png"),
-        truth=contact_from_xi(validation.xi),
-        predicted=contact_from_xi(xi),
-        sigma=np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)),
-    )
-    write_curves(out.with_name(f"{out.stem}_curves.png"), run.progress.history)
-    delete_checkpoint(out)
-    return model
 
 
 @dataclass
