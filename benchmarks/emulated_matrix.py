@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -24,6 +24,7 @@ import yaml
 
 from benchmarks.fault_matrix import median_and_worst
 from benchmarks.provenance import provenance
+from benchmarks.sent_commands import SentCommands
 from cell.compose import compose
 from cell.config import plan_cell
 from cell.loop import Outcome, RunLoop, RunResult, StopRequest
@@ -164,7 +165,7 @@ def cell_file(rig: Rig, T_base_tcp: Array) -> dict[str, Any]:
 
 
 def _run(case: EmulatedCase, rig: Rig, emulator: Emulated, path: Path, value: Any) -> EmulatedCase:
-    cell, stop, sent = compose(plan_cell(path)), StopRequest(), _Sent()
+    cell, stop, sent = compose(plan_cell(path)), StopRequest(), SentCommands()
     injected_s: float | None = None
     witness: _Witness | None = None
     with ExitStack() as watch, suppress(DeviceError), cell:
@@ -213,7 +214,9 @@ def _inject(emulator: Emulated, fault: str, value: Any) -> bool:
     return False
 
 
-def _judged(case: EmulatedCase, result: RunResult, sent: _Sent, injected_s: float, ended_s: float) -> EmulatedCase:
+def _judged(
+    case: EmulatedCase, result: RunResult, sent: SentCommands, injected_s: float, ended_s: float
+) -> EmulatedCase:
     problems = []
     first = result.causes[0] if result.causes else None
     by = "" if result.error is None else type(result.error).__name__
@@ -221,7 +224,7 @@ def _judged(case: EmulatedCase, result: RunResult, sent: _Sent, injected_s: floa
     by = by or ("retreat" if result.outcome is Outcome.FAILED else "")
     if case.lawful == "fault" and not by:
         problems.append(f"nothing ended the run, which went on for {_WATCHED_S:g} s ({result.outcome.value})")
-    if first is not None and sent.last_ns > first.t_ns:
+    if first is not None and sent.since(first.t_ns):
         problems.append("a command was sent after the trip")
     return replace(case, ended_by=by, detection_s=ended_s - injected_s if by else None, problem="; ".join(problems))
 
@@ -261,17 +264,6 @@ class _Witness:
         start = next((p for t, p in self.seen if t >= since_s), last)
         way_m = max(float(np.linalg.norm(p - start)) for t, p in self.seen if t >= since_s or p is last)
         return moved_s, way_m
-
-
-class _Sent:
-    """Remembers when the last command was sent."""
-
-    def __init__(self) -> None:
-        self.last_ns = -1
-
-    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
-        if topic.endswith("/command"):
-            self.last_ns = t_ns
 
 
 def _true_pose(rig: Rig, emulator: Emulated) -> Array:
