@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from geometry.types import ImageArray
+from perception import kernels
 from perception.errors import ImageError
 
 _INTERPOLATIONS = {"area": cv2.INTER_AREA, "linear": cv2.INTER_LINEAR, "nearest": cv2.INTER_NEAREST}
@@ -108,20 +109,12 @@ class Preprocessing(BaseModel):
             image = image[self.crop.top : self.crop.bottom, self.crop.left : self.crop.right]
         if image.ndim == 3:
             image = cast(ImageArray, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)) if image.shape[2] == 3 else image[:, :, 0]
-        if self.median_px is not None:
+        if self.median_px == 5:
+            image = kernels.median_5(image)
+        elif self.median_px is not None:
             image = cast(ImageArray, cv2.medianBlur(np.ascontiguousarray(image), self.median_px))
         if self.threshold is not None:
-            image = cast(
-                ImageArray,
-                cv2.adaptiveThreshold(
-                    np.ascontiguousarray(image),
-                    255,
-                    cv2.ADAPTIVE_THRESH_MEAN_C,
-                    cv2.THRESH_BINARY,
-                    self.threshold.block_px,
-                    self.threshold.offset,
-                ),
-            )
+            image = kernels.threshold(image, self.threshold.block_px, self.threshold.offset)
         if self.mask_radius_px is not None:
             image = image * _disc(image.shape[0], image.shape[1], self.mask_radius_px)
         height, width = self.output_size
