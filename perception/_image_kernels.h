@@ -111,42 +111,99 @@ WIDE_VECTORS static void median_of_columns(const uint8_t *restrict sorted, ptrdi
     }
 }
 
-/* Room for rows of a width in whole vectors: what lies behind the last pixel is computed too, and not looked at. */
-static ptrdiff_t whole_vectors(ptrdiff_t width) { return (width + 31) / 32 * 32; }
+/* Rows of a grey image, or their medians of 5x5, which are made one after the other and kept for `kept` rows. What lies
+ * beyond a border repeats it. */
+typedef struct {
+    const uint8_t *image;
+    ptrdiff_t row_bytes, height, width;
+    uint8_t *medians, *sorted;
+    ptrdiff_t whole, kept, made;
+} Rows;
 
-/* Medians of 5x5 pixels, in rows of `whole_vectors(width)`; the border is repeated outwards. 0: out of memory. */
-static int median_5(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width, uint8_t *medians)
+static int open_rows(Rows *rows, const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width,
+                     int with_median, ptrdiff_t kept)
 {
-    ptrdiff_t whole = whole_vectors(width), stride = whole + 4;
-    uint8_t *sorted = calloc(5, (size_t)stride);
-    if (!sorted)
-        return 0;
-    for (ptrdiff_t y = 0; y < height; y++) {
-        const uint8_t *rows[5];
-        for (ptrdiff_t i = 0; i < 5; i++)
-            rows[i] = image + clamp(y + i - 2, height) * row_bytes;
-        sort_columns(rows, width, sorted + 2, stride);
-        for (uint8_t *row = sorted; row < sorted + 5 * stride; row += stride) {
-            row[0] = row[1] = row[2];
-            row[width + 2] = row[width + 3] = row[width + 1];
-        }
-        median_of_columns(sorted, stride, whole, medians + y * whole);
+    /* Whole vectors: what lies behind the last pixel is computed too, and not looked at. */
+    ptrdiff_t whole = (width + 31) / 32 * 32;
+    *rows = (Rows){.image = image, .row_bytes = row_bytes, .height = height, .width = width, .whole = whole, .kept = kept};
+    if (!with_median)
+        return 1;
+    rows->medians = calloc((size_t)(kept * whole + 5 * (whole + 4)), 1);
+    rows->sorted = rows->medians + kept * whole;
+    return rows->medians != NULL;
+}
+
+static void close_rows(Rows *rows) { free(rows->medians); }
+
+static void make_median_row(Rows *rows)
+{
+    const uint8_t *five[5];
+    ptrdiff_t y = rows->made++, stride = rows->whole + 4;
+    for (ptrdiff_t i = 0; i < 5; i++)
+        five[i] = rows->image + clamp(y + i - 2, rows->height) * rows->row_bytes;
+    sort_columns(five, rows->width, rows->sorted + 2, stride);
+    for (uint8_t *row = rows->sorted; row < rows->sorted + 5 * stride; row += stride) {
+        row[0] = row[1] = row[2];
+        row[rows->width + 2] = row[rows->width + 3] = row[rows->width + 1];
     }
-    free(sorted);
+    median_of_columns(rows->sorted, stride, rows->whole, rows->medians + y % rows->kept * rows->whole);
+}
+
+/* Row y, or the one at the border; not further back than `kept`. */
+static const uint8_t *row_at(Rows *rows, ptrdiff_t y)
+{
+    y = clamp(y, rows->height);
+    if (!rows->medians)
+        return rows->image + y * rows->row_bytes;
+    while (rows->made <= y)
+        make_median_row(rows);
+    return rows->medians + y % rows->kept * rows->whole;
+}
+
+/* 0: out of memory. */
+static int median_5(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width, uint8_t *to)
+{
+    Rows rows;
+    if (!open_rows(&rows, image, row_bytes, height, width, 1, 1))
+        return 0;
+    for (ptrdiff_t y = 0; y < height; y++)
+        memcpy(to + y * width, row_at(&rows, y), (size_t)width);
+    close_rows(&rows);
     return 1;
 }
 
 /* Column sums that take one row in and give one up. */
-WIDE_VECTORS static void roll_columns(uint16_t *restrict sums, const uint8_t *restrict in, const uint8_t *restrict out,
-                                      ptrdiff_t width)
+WIDE_VECTORS static void roll_columns(uint16_t *restrict sums, const uint8_t *in, const uint8_t *out, ptrdiff_t width)
 {
     for (ptrdiff_t x = 0; x < width; x++)
         sums[x] = (uint16_t)(sums[x] + in[x] - out[x]);
 }
 
+/* before[i]: the sum of the first i numbers, whose count is a multiple of four. Four parts at once, since each addition
+ * waits for the one before. */
+static void add_up(const uint16_t *restrict numbers, ptrdiff_t count, uint32_t *restrict before)
+{
+    ptrdiff_t part = count / 4;
+    const uint16_t *n0 = numbers, *n1 = n0 + part, *n2 = n1 + part, *n3 = n2 + part;
+    uint32_t a = 0, b = 0, c = 0, d = 0, *to = before + 1;
+    *before = 0;
+    for (ptrdiff_t i = 0; i < part; i++) {
+        to[i] = a += n0[i];
+        to[i + part] = b += n1[i];
+        to[i + 2 * part] = c += n2[i];
+        to[i + 3 * part] = d += n3[i];
+    }
+    for (ptrdiff_t i = part; i < 2 * part; i++)
+        to[i] += a;
+    for (ptrdiff_t i = 2 * part; i < 3 * part; i++)
+        to[i] += a + b;
+    for (ptrdiff_t i = 3 * part; i < count; i++)
+        to[i] += a + b + c;
+}
+
 /* White where a pixel exceeds the rounded mean of its neighbourhood less the offset, in whole numbers throughout. */
-WIDE_VECTORS static void above_mean(const uint8_t *restrict pixels, const uint32_t *restrict before, ptrdiff_t block,
-                                    int32_t offset, ptrdiff_t width, uint8_t *restrict to)
+WIDE_VECTORS static void above_mean(const uint8_t *pixels, const uint32_t *before, ptrdiff_t block, int32_t offset,
+                                    ptrdiff_t width, uint8_t *restrict to)
 {
     int32_t area = (int32_t)(block * block), half = (area - 1) / 2;
     for (ptrdiff_t x = 0; x < width; x++) {
@@ -155,42 +212,72 @@ WIDE_VECTORS static void above_mean(const uint8_t *restrict pixels, const uint32
     }
 }
 
-/* Adaptive threshold; the border is repeated outwards. 0: out of memory.
+/* Adaptive threshold of an image or of its medians; the border is repeated outwards. 0: out of memory.
  *
  * The same as OpenCV's adaptiveThreshold with ADAPTIVE_THRESH_MEAN_C and THRESH_BINARY, which rounds the mean to 8 bits
  * before it compares. A block of an odd side has no mean half way between two numbers, so there is one way to round.
  */
-static int threshold(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width, ptrdiff_t block,
-                     int32_t offset, uint8_t *to)
+static int threshold(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width, int with_median,
+                     ptrdiff_t block, int32_t offset, uint8_t *to)
 {
-    ptrdiff_t half = block / 2;
-    uint16_t *columns = calloc((size_t)width, sizeof *columns);
-    uint32_t *before = malloc((size_t)(width + block) * sizeof *before);
-    if (columns && before) {
+    Rows rows;
+    ptrdiff_t half = block / 2, padded = (width + block + 3) / 4 * 4;
+    uint16_t *columns = calloc((size_t)padded, sizeof *columns);
+    uint32_t *before = malloc((size_t)(padded + 1) * sizeof *before);
+    int done = columns && before && open_rows(&rows, image, row_bytes, height, width, with_median, block + 1);
+    if (done) {
+        uint16_t *middle = columns + half;
         for (ptrdiff_t y = -half - 1; y < half; y++) {
-            const uint8_t *row = image + clamp(y, height) * row_bytes;
+            const uint8_t *row = row_at(&rows, y);
             for (ptrdiff_t x = 0; x < width; x++)
-                columns[x] = (uint16_t)(columns[x] + row[x]);
+                middle[x] = (uint16_t)(middle[x] + row[x]);
         }
         for (ptrdiff_t y = 0; y < height; y++) {
-            roll_columns(columns, image + clamp(y + half, height) * row_bytes,
-                         image + clamp(y - half - 1, height) * row_bytes, width);
-            uint32_t total = 0;
-            uint32_t *next = before;
-            *next++ = 0;
-            for (ptrdiff_t x = 0; x < half; x++)
-                *next++ = total += columns[0];
-            for (ptrdiff_t x = 0; x < width; x++)
-                *next++ = total += columns[x];
-            for (ptrdiff_t x = 0; x < half; x++)
-                *next++ = total += columns[width - 1];
-            above_mean(image + y * row_bytes, before, block, offset, width, to + y * width);
+            const uint8_t *in = row_at(&rows, y + half);
+            roll_columns(middle, in, row_at(&rows, y - half - 1), width);
+            for (ptrdiff_t x = 0; x < half; x++) {
+                columns[x] = middle[0];
+                middle[width + x] = middle[width - 1];
+            }
+            add_up(columns, padded, before);
+            above_mean(row_at(&rows, y), before, block, offset, width, to + y * width);
         }
+        close_rows(&rows);
     }
     free(before);
-    int done = columns && before;
     free(columns);
     return done;
+}
+
+/* Means of squares of `factor` pixels, rounded to the nearest and to even where two are as near: the same as OpenCV's
+ * resize with INTER_AREA by a whole factor. `to` is (height / factor, width / factor). 0: out of memory. */
+WIDE_VECTORS static int shrink(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width, ptrdiff_t factor,
+                  uint8_t *to)
+{
+    ptrdiff_t rows = height / factor, columns = width / factor;
+    /* Up to a factor of 64 the product with the inverse, rounded down, is the quotient. */
+    uint32_t area = (uint32_t)(factor * factor);
+    uint64_t inverse = ((1ull << 32) + area - 1) / area;
+    uint16_t *sums = malloc((size_t)width * sizeof *sums);
+    if (!sums)
+        return 0;
+    for (ptrdiff_t y = 0; y < rows; y++) {
+        memset(sums, 0, (size_t)width * sizeof *sums);
+        for (ptrdiff_t i = 0; i < factor; i++) {
+            const uint8_t *row = image + (y * factor + i) * row_bytes;
+            for (ptrdiff_t x = 0; x < width; x++)
+                sums[x] = (uint16_t)(sums[x] + row[x]);
+        }
+        for (ptrdiff_t x = 0; x < columns; x++) {
+            uint32_t sum = 0;
+            for (ptrdiff_t i = 0; i < factor; i++)
+                sum += sums[x * factor + i];
+            uint32_t mean = (uint32_t)(sum * inverse >> 32), rest = sum - mean * area;
+            to[y * columns + x] = (uint8_t)(mean + (2 * rest + mean % 2 > area));
+        }
+    }
+    free(sums);
+    return 1;
 }
 
 /* A run of white pixels in one row, its end exclusive, and the component that it belongs to. */

@@ -131,14 +131,14 @@ static PyObject *ended(Call *call, int done)
 static PyObject *py_median_5(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
 {
     Call call = {.function = "median_5"};
-    Py_buffer *image, *medians;
+    Py_buffer *image, *to;
     if (!takes(&call, count, 2) || !(image = take_image(&call, arguments[0])) ||
-        !(medians = take(&call, "medians", arguments[1], 'B', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, image->shape[0],
-                         (Py_ssize_t)whole_vectors(image->shape[1]))))
+        !(to = take(&call, "to", arguments[1], 'B', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, image->shape[0],
+                    image->shape[1])))
         return finish(&call, NULL);
     int done;
     Py_BEGIN_ALLOW_THREADS;
-    done = median_5(image->buf, image->strides[0], image->shape[0], image->shape[1], medians->buf);
+    done = median_5(image->buf, image->strides[0], image->shape[0], image->shape[1], to->buf);
     Py_END_ALLOW_THREADS;
     return ended(&call, done);
 }
@@ -146,13 +146,14 @@ static PyObject *py_median_5(PyObject *module, PyObject *const *arguments, Py_ss
 static PyObject *py_threshold(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
 {
     Call call = {.function = "threshold"};
-    Py_buffer *image, *binary;
-    double block_px, offset;
-    if (!takes(&call, count, 4) || !(image = take_image(&call, arguments[0])) ||
-        !number(&call, "block_px", arguments[1], 3.0, 255.0, &block_px) ||
-        !number(&call, "offset", arguments[2], -256.0, 256.0, &offset) ||
-        !(binary = take(&call, "binary", arguments[3], 'B', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, image->shape[0],
-                        image->shape[1])))
+    Py_buffer *image, *to;
+    double with_median, block_px, offset;
+    if (!takes(&call, count, 5) || !(image = take_image(&call, arguments[0])) ||
+        !number(&call, "with_median", arguments[1], 0.0, 1.0, &with_median) ||
+        !number(&call, "block_px", arguments[2], 3.0, 255.0, &block_px) ||
+        !number(&call, "offset", arguments[3], -256.0, 256.0, &offset) ||
+        !(to = take(&call, "to", arguments[4], 'B', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, image->shape[0],
+                    image->shape[1])))
         return finish(&call, NULL);
     if ((int)block_px % 2 == 0) {
         refuse(&call, "block_px", "is even");
@@ -160,10 +161,23 @@ static PyObject *py_threshold(PyObject *module, PyObject *const *arguments, Py_s
     }
     int done;
     Py_BEGIN_ALLOW_THREADS;
-    done = threshold(image->buf, image->strides[0], image->shape[0], image->shape[1], (ptrdiff_t)block_px,
-                     (int32_t)offset, binary->buf);
+    done = threshold(image->buf, image->strides[0], image->shape[0], image->shape[1], with_median != 0.0,
+                     (ptrdiff_t)block_px, (int32_t)offset, to->buf);
     Py_END_ALLOW_THREADS;
     return ended(&call, done);
+}
+
+static PyObject *py_shrink(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "shrink"};
+    Py_buffer *image, *to;
+    double factor;
+    if (!takes(&call, count, 3) || !(image = take_image(&call, arguments[0])) ||
+        !number(&call, "factor", arguments[1], 1.0, 64.0, &factor) ||
+        !(to = take(&call, "to", arguments[2], 'B', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2,
+                    image->shape[0] / (Py_ssize_t)factor, image->shape[1] / (Py_ssize_t)factor)))
+        return finish(&call, NULL);
+    return ended(&call, shrink(image->buf, image->strides[0], image->shape[0], image->shape[1], (ptrdiff_t)factor, to->buf));
 }
 
 static PyObject *py_discs(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
@@ -352,7 +366,7 @@ static PyObject *py_affine(PyObject *module, PyObject *const *arguments, Py_ssiz
 
 #define FAST(name) {#name, (PyCFunction)(void (*)(void))py_##name, METH_FASTCALL, NULL}
 
-static PyMethodDef METHODS[] = {FAST(median_5), FAST(threshold), FAST(discs),  FAST(pair), FAST(fit),
+static PyMethodDef METHODS[] = {FAST(median_5), FAST(threshold), FAST(shrink),  FAST(discs),  FAST(pair), FAST(fit),
                                 FAST(settle),   FAST(density),   FAST(affine), {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "perception._kernelsc",

@@ -77,6 +77,9 @@ static int32_t nearest_point(const Buckets *buckets, const double *place, double
 {
     ptrdiff_t u = bucket_along(place[0], buckets->low[0], buckets->cell, buckets->columns);
     ptrdiff_t v = bucket_along(place[1], buckets->low[1], buckets->cell, buckets->rows);
+    double du0 = place[0] - (buckets->low[0] + (double)u * buckets->cell);
+    double dv0 = place[1] - (buckets->low[1] + (double)v * buckets->cell);
+    double border = fmin(fmin(du0, buckets->cell - du0), fmin(dv0, buckets->cell - dv0));
     int32_t best = -1;
     *square = INFINITY;
     for (ptrdiff_t ring = 0;; ring++) {
@@ -98,7 +101,7 @@ static int32_t nearest_point(const Buckets *buckets, const double *place, double
                 }
             }
         }
-        double clear = (double)ring * buckets->cell;
+        double clear = (double)ring * buckets->cell + fmax(border, 0.0);
         int all = left <= 0 && top <= 0 && right >= buckets->columns - 1 && bottom >= buckets->rows - 1;
         if (all || *square < clear * clear)
             return best;
@@ -168,7 +171,7 @@ WIDE_VECTORS static void add_toward(const Modes *modes, const double *weight, co
 }
 
 /* places += basis * coefficients; the largest of the shifts along u or v. */
-static double shift_places(const Modes *modes, const double *coefficients, double *places)
+WIDE_VECTORS static double shift_places(const Modes *modes, const double *coefficients, double *places)
 {
     double largest = 0.0;
     const double *row = modes->basis;

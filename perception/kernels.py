@@ -1,7 +1,7 @@
 """The inner loops of perception, in C: arrays in, new arrays out.
 
 Each raises ``ArrayError`` where an argument has another shape or type than it says, or is not finite. Without a compiler
-there is no extension: the two image filters then are OpenCV's, whose results are the same to the bit, and the others
+there is no extension: the image filters then are OpenCV's, whose results are the same to the bit, and the others
 raise ``KernelsMissing``.
 """
 
@@ -19,6 +19,7 @@ from perception.errors import KernelsMissing
 
 _COLUMNS = 8
 _MOST_OFFSET = 256.0
+_MOST_FACTOR = 64
 
 
 def _find() -> ModuleType | None:
@@ -45,31 +46,44 @@ def _in_rows(image: ImageArray) -> ImageArray:
 def median_5(image: ImageArray) -> ImageArray:
     """Median of 5x5 pixels of a grey image, its border repeated outwards; half the time of OpenCV's."""
     if _FOUND is None:
-        median: ImageArray = np.asarray(cv2.medianBlur(np.ascontiguousarray(image), 5), np.uint8)
-        return median
-    height, width = image.shape
-    whole = np.empty((height, -(-width // 32) * 32), np.uint8)
-    _FOUND.median_5(_in_rows(image), whole)
-    return whole[:, :width]
+        return np.asarray(cv2.medianBlur(np.ascontiguousarray(image), 5), np.uint8)
+    medians = np.empty(image.shape, np.uint8)
+    _FOUND.median_5(_in_rows(image), medians)
+    return medians
 
 
-def threshold(image: ImageArray, block_px: int, offset: float) -> ImageArray:
+def threshold(image: ImageArray, block_px: int, offset: float, *, of_median_5: bool) -> ImageArray:
     """255 where a grey pixel exceeds the mean of its neighbourhood less ``offset``, 0 elsewhere.
 
     Args:
         image: uint8 (height, width).
         block_px: side of the square neighbourhood, odd, 3 to 255; the image's border is repeated outwards.
         offset: grey levels.
+        of_median_5: take the medians of 5x5 pixels first, which then are never held all at once.
     """
     if _FOUND is None:
+        image = median_5(image) if of_median_5 else np.ascontiguousarray(image)
         mean, binary = cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY
-        white: ImageArray = np.asarray(
-            cv2.adaptiveThreshold(np.ascontiguousarray(image), 255, mean, binary, block_px, offset), np.uint8
-        )
-        return white
-    result = np.empty(image.shape, np.uint8)
-    _FOUND.threshold(_in_rows(image), block_px, max(-_MOST_OFFSET, min(math.ceil(offset), _MOST_OFFSET)), result)
-    return result
+        return np.asarray(cv2.adaptiveThreshold(image, 255, mean, binary, block_px, offset), np.uint8)
+    white = np.empty(image.shape, np.uint8)
+    whole = max(-_MOST_OFFSET, min(math.ceil(offset), _MOST_OFFSET))
+    _FOUND.threshold(_in_rows(image), of_median_5, block_px, whole, white)
+    return white
+
+
+def area_means(image: ImageArray, size: tuple[int, int]) -> ImageArray:
+    """A grey image as means over the area of each new pixel, rounded.
+
+    Args:
+        image: uint8 (height, width).
+        size: (height, width) of the result.
+    """
+    factor = image.shape[0] // size[0]
+    if _FOUND is None or not 1 < factor <= _MOST_FACTOR or image.shape != (factor * size[0], factor * size[1]):
+        return np.asarray(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA), np.uint8)
+    means = np.empty(size, np.uint8)
+    _FOUND.shrink(_in_rows(image), factor, means)
+    return means
 
 
 def discs(image: ImageArray, smallest_px: int, largest_px: int, longest_side_px: int) -> tuple[Array, Array]:
