@@ -97,9 +97,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
         for case in _run_all(missing, options.jobs, part, Path(folder)):
             found[case.place] = case
     cases = [found[place] for place in wanted if place in found]
-    _print_table(
-        cases, {driver: {fault: each[1] for fault, each in faults.items()} for driver, faults in lawful.items()}
-    )
+    _print_table(cases, faults)
     _print_coverage(cases, len(wanted), len(everything))
     report = {**provenance(), "places": len(wanted), "cases": [asdict(case) for case in cases]}
     (out / "faults.json").write_text(json.dumps(report, indent=1) + "\n")
