@@ -32,6 +32,7 @@ from perception.training_end import write_trained
 
 _EVALUATION_BATCH = 100
 _SHORT_SIDE_PX = 100
+_LEAST_SIDE_PX = 32
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,7 @@ def train(
     kind: Literal["gdn", "cnn", "markers"] = "gdn",
     epochs: int | None = None,
     networks: int | None = None,
+    short_side_px: int | None = None,
     seed: int = 0,
     resume: bool = True,
     cache: Path | None = None,
@@ -110,6 +112,7 @@ def train(
         kind: gdn predicts a Gaussian, cnn means alone; markers as ``marker_training``.
         epochs: None for the default of ``Settings`` or ``MarkerSettings``.
         networks: of a marker estimator; None for the default of ``MarkerSettings``.
+        short_side_px: least of the images that a gdn or cnn sees, see ``preprocessing_for``; None for its default.
         seed: of everything random; the same seed on the same machine gives the same file, but for the time it took.
         resume: go on with an interrupted training; False begins anew.
         cache: folder for preprocessed images; None for ``dataset.default_cache()``.
@@ -128,6 +131,7 @@ def train(
                 kind=kind,
                 epochs=epochs,
                 networks=networks,
+                short_side_px=short_side_px,
                 seed=seed,
                 resume=resume,
                 cache=cache,
@@ -137,6 +141,8 @@ def train(
     if kind == "markers":
         from perception.marker_training import MarkerSettings, train_markers
 
+        if short_side_px is not None:
+            raise TrainingError("markers are looked for in all pixels", hint="a short side is for --kind gdn or cnn")
         marker_settings = MarkerSettings(seed=seed)
         if epochs is not None:
             marker_settings = replace(marker_settings, epochs=epochs)
@@ -147,7 +153,8 @@ def train(
     if networks is not None:
         raise TrainingError(f"a {kind} is one network", hint="the number of networks is for --kind markers")
     splits = {name: read_split(data, name) for name in ("train", "val")}
-    preprocessing = preprocessing_for(next(splits["train"].read()))
+    first = next(splits["train"].read())
+    preprocessing = preprocessing_for(first, _SHORT_SIDE_PX if short_side_px is None else short_side_px)
     sets = {
         name: LabelledImages(
             load_reduced(
@@ -173,14 +180,19 @@ def train(
     )
 
 
-def preprocessing_for(image: ImageArray) -> Preprocessing:
-    """Whole pixels averaged into one, to a short side of 100 to 199.
+def preprocessing_for(image: ImageArray, short_side_px: int = _SHORT_SIDE_PX) -> Preprocessing:
+    """Whole pixels averaged into one, as many as leave the short side ``short_side_px`` or more.
 
     OpenCV shrinks by whole numbers three times as fast as to the paper's 128x128. What is left over at the border is
     cut off.
+
+    Raises:
+        TrainingError: a short side of less than 32, of which a network's five halvings leave nothing.
     """
+    if short_side_px < _LEAST_SIDE_PX:
+        raise TrainingError(f"a short side of {short_side_px} px is less than {_LEAST_SIDE_PX}")
     height, width = image.shape[:2]
-    factor = max(1, min(height, width) // _SHORT_SIDE_PX)
+    factor = max(1, min(height, width) // short_side_px)
     rows, columns = height // factor, width // factor
     left, top = (width - columns * factor) // 2, (height - rows * factor) // 2
     crop = Crop(left, top, left + columns * factor, top + rows * factor)
