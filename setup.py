@@ -14,6 +14,13 @@ setup(
             extra_compile_args=["-O3", "-ffp-contract=off"],
             # Without a compiler the plain kernels serve.
             optional=True,
-        )
+        ),
+        Extension(
+            "drivers.simulation._paint",
+            sources=["drivers/simulation/_paint.c"],
+            include_dirs=[numpy.get_include()],
+            extra_compile_args=["-O3"],
+            optional=True,
+        ),
     ]
 )
