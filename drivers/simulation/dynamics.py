@@ -37,6 +37,7 @@ _SWING_RAD = 0.1
 _SLIDING_SHARE = 0.97
 _IDENTITY = np.eye(4)
 _UP = np.array([0.0, 0.0, 1.0])
+_STILL = np.zeros(3)
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
@@ -57,6 +58,26 @@ class _Mounted:
     R_start: Array
     speed: Array
     normal: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _Coordinates:
+    """A tip's part of MuJoCo's state, to be read and written in place.
+
+    Attributes:
+        q, rate: (6,) how far the springs have given way along and about the carriage's axes, and how fast they do.
+        applied: (6,) forces along the same.
+        ctrl, act: (4,) speed of the springs' other ends along x, y, z and about z, and how far they have come.
+        position, turn: (3,), (4,) of the carriage in the world.
+    """
+
+    q: Array
+    rate: Array
+    applied: Array
+    ctrl: Array
+    act: Array
+    position: Array
+    turn: Array
 
 
 class PhysicsError(TouchcellError, ArithmeticError):
@@ -133,11 +154,12 @@ class DynamicWorld:
         if not math.isfinite(float(self._qpos.sum())):
             raise PhysicsError("the state", t_s)
         self._t_s = t_s
+        self._look()
         return {sensor: self._feel(sensor, pose, t_s) for sensor, pose in T_world_s.items()}
 
     def objects(self) -> Mapping[str, Array]:
         """T_world_object (4, 4) of every free object now."""
-        return {name: self._pose(name) for name in self._things}
+        return self._T_world_object
 
     def snapshot(self) -> Restore:
         """What puts objects, tips and carriages back."""
@@ -149,8 +171,13 @@ class DynamicWorld:
         def restore() -> None:
             mujoco.mj_setState(model, data, state, _STATE)
             self._t_s, self._mounted = t_s, {sensor: replace(each) for sensor, each in mounted.items()}
+            self._look()
 
         return restore
+
+    def _look(self) -> None:
+        """See where objects are: anew each time, for what has been told stays as it was."""
+        self._T_world_object = {name: self._pose(name) for name in self._things}
 
     def _build(self, T_world_object: Mapping[str, Array]) -> None:
         """Compile the model anew, with objects at ``T_world_object`` (4, 4) or else where they stand at first."""
@@ -164,10 +191,22 @@ class DynamicWorld:
         )
         self._data = mujoco.MjData(self._at.model)
         model, data = self._at.model, self._data
-        self._qpos, self._qvel, self._act, self._ctrl = data.qpos, data.qvel, data.act, data.ctrl
-        self._applied, self._body_pos, self._body_quat = data.qfrc_applied, model.body_pos, model.body_quat
+        self._qpos, self._qvel = data.qpos, data.qvel
+        self._tips = {
+            sensor: _Coordinates(
+                data.qpos[at.qpos : at.qpos + 6],
+                data.qvel[at.qvel : at.qvel + 6],
+                data.qfrc_applied[at.qvel : at.qvel + 6],
+                data.ctrl[at.servo : at.servo + 4],
+                data.act[at.servo : at.servo + 4],
+                model.body_pos[at.body],
+                model.body_quat[at.body],
+            )
+            for sensor, at in self._at.tips.items()
+        }
         for name, pose in T_world_object.items():
             self._place(self._at.objects[name].qpos, pose[:3, 3], pose[:3, :3])
+        self._look()
 
     def _carry(self, sensor: str, T_world_s: Array, span_s: float) -> None:
         """Send the carriage from where it is to ``T_world_s``, and put the surface before its tip.
@@ -176,41 +215,36 @@ class DynamicWorld:
         """
         if not math.isfinite(float(T_world_s.sum())):
             raise PhysicsError(f"the pose of {sensor!r}", self._t_s)
-        mounted, at = self._mounted[sensor], self._at.tips[sensor]
+        mounted, tip = self._mounted[sensor], self._tips[sensor]
         position = mounted.T_world_s[:3, 3]
         R_start, R_end = mounted.R_world_c, _upright(T_world_s, mounted.normal)
         swing = _swing(R_start, R_end)
         if swing is None:
-            R_start, swing = R_end, np.zeros(3)
-        v = R_start.T @ (T_world_s[:3, 3] - position) / span_s
-        w = R_start.T @ swing / span_s
-        self._body_pos[at.body] = position
-        self._body_quat[at.body] = quaternion(R_start)
-        self._ctrl[at.servo : at.servo + 3] = v
-        self._ctrl[at.servo + 3] = w[2]
+            R_start, swing = R_end, _STILL
+        v = (T_world_s[:3, 3] - position) @ R_start / span_s
+        w = swing @ R_start / span_s
+        tip.position[:], tip.turn[:] = position, quaternion(R_start)
+        tip.ctrl[:3], tip.ctrl[3] = v, w[2]
         # Of the carriage where the tip is on it: springs are damped against that, and carrying a tip takes no force.
-        deflection = self._qpos[at.qpos : at.qpos + 3]
-        speed = np.concatenate([v + cross(w, deflection), w])
-        self._qvel[at.qvel : at.qvel + 6] += speed
-        self._applied[at.qvel : at.qvel + 6] = self._damping * speed
+        speed = np.concatenate([v + cross(w, tip.q[:3]), w])
+        tip.rate[:] += speed
+        tip.applied[:] = self._damping * speed
         if self._surfaces:
-            self._place_patch(sensor, position + R_start @ deflection)
+            self._place_patch(sensor, position + R_start @ tip.q[:3])
         mounted.T_world_s, mounted.R_world_c = T_world_s, R_end
         mounted.R_start, mounted.speed = R_start, speed
 
     def _settle(self, sensor: str) -> None:
         """Tell the tip's coordinates, and how they change, along its carriage as it is now."""
-        mounted, at = self._mounted[sensor], self._at.tips[sensor]
+        mounted, tip = self._mounted[sensor], self._tips[sensor]
         turned = mounted.R_world_c.T @ mounted.R_start
-        q, act = self._qpos[at.qpos : at.qpos + 6], self._act[at.servo : at.servo + 4]
-        q[:3] = turned @ (q[:3] - act[:3])
-        q[3:5] = 0.0
-        q[5] -= act[3]
-        act[:] = 0.0
-        rate = self._qvel[at.qvel : at.qvel + 6]
-        rate -= mounted.speed
-        rate[:3] = turned @ rate[:3]
-        rate[3:5] = 0.0
+        tip.q[:3] = turned @ (tip.q[:3] - tip.act[:3])
+        tip.q[3:5] = 0.0
+        tip.q[5] -= tip.act[3]
+        tip.act[:] = 0.0
+        tip.rate[:] -= mounted.speed
+        tip.rate[:3] = turned @ tip.rate[:3]
+        tip.rate[3:5] = 0.0
 
     def _place_patch(self, sensor: str, tip_centre: Array) -> None:
         """Put the tangent of the surface that is nearest to the tip where it is now, moving as the surface does."""
@@ -227,10 +261,10 @@ class DynamicWorld:
             self._qvel[at.qvel : at.qvel + 6] = 0.0
 
     def _feel(self, sensor: str, T_world_s: Array, t_s: float) -> Feeling:
-        nearest, at = self._nearest(T_world_s[:3, 3], t_s), self._at.tips[sensor]
+        nearest, tip = self._nearest(T_world_s[:3, 3], t_s), self._tips[sensor]
         self._mounted[sensor].normal = nearest.normal
-        dx, dy, dz, _, _, turned = self._qpos[at.qpos : at.qpos + 6].tolist()
-        rate = float(self._qvel[at.qvel + 2])
+        dx, dy, dz, _, _, turned = tip.q.tolist()
+        rate = float(tip.rate[2])
         return lambda: _contact(self.tip, T_world_s, nearest, (dx, dy, dz), turned, rate)
 
     def _nearest(self, point: Array, t_s: float) -> SurfacePoint:
@@ -239,7 +273,7 @@ class DynamicWorld:
         if self._surfaces:
             found = self._nearest_surface(point, t_s)[1]
         for name, shape in self._shapes.items():
-            T = self._pose(name)
+            T = self._T_world_object[name]
             R, origin = T[:3, :3], T[:3, 3]
             local = shape.nearest((point - origin) @ R)
             if found is None or local.distance_m < found.distance_m:
