@@ -23,11 +23,11 @@ import numpy as np
 from drivers.errors import ConfigError
 from drivers.simulation.contact import ContactState, about_z, tilt_of
 from drivers.simulation.dynamics_model import TipMechanics, build_model, cross, quaternion, rotation
-from drivers.simulation.motions import Still
 from drivers.simulation.objects import FreeObject
 from drivers.simulation.solids import shape_of
-from drivers.simulation.surfaces import Plane, Surface, SurfacePoint
+from drivers.simulation.surfaces import Surface, SurfacePoint
 from drivers.simulation.timeline import Restore
+from drivers.simulation.world import Feeling
 from geometry.errors import TouchcellError
 from geometry.types import Array
 
@@ -36,6 +36,7 @@ _SWING_RAD = 0.1
 # Friction is regularised: what slides carries a little less than the cone allows.
 _SLIDING_SHARE = 0.97
 _IDENTITY = np.eye(4)
+_UP = np.array([0.0, 0.0, 1.0])
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
@@ -104,9 +105,6 @@ class DynamicWorld:
         self._things = dict(objects)
         self._shapes = {name: shape_of(thing.solid) for name, thing in objects.items()}
         self._table_height_m = table_height_m if objects else None
-        T_world_table = np.eye(4)
-        T_world_table[2, 3] = table_height_m
-        self._table = Surface(Plane(), Still(T_world_table)) if objects else None
         self._step_s = step_s
         across = tip.shear_damping_n_s_m
         self._damping = np.array([across, across, tip.damping_n_s_m, 0.0, 0.0, tip.torsion_damping_n_m_s])
@@ -122,9 +120,9 @@ class DynamicWorld:
         self._mounted[sensor] = _Mounted(T_world_s, R_world_c, R_world_c, np.zeros(6), normal)
         self._t_s = t_s
         self._build(self.objects())
-        return self._feel(sensor, T_world_s, t_s)
+        return self._feel(sensor, T_world_s, t_s)()
 
-    def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, ContactState]:
+    def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, Feeling]:
         """Go on to ``t_s``. Raises PhysicsError."""
         span_s = t_s - self._t_s
         for sensor, pose in T_world_s.items():
@@ -228,41 +226,27 @@ class DynamicWorld:
         else:
             self._qvel[at.qvel : at.qvel + 6] = 0.0
 
-    def _feel(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
-        nearest = self._nearest(T_world_s[:3, 3], t_s)
+    def _feel(self, sensor: str, T_world_s: Array, t_s: float) -> Feeling:
+        nearest, at = self._nearest(T_world_s[:3, 3], t_s), self._at.tips[sensor]
         self._mounted[sensor].normal = nearest.normal
-        R_tilt = tilt_of(-nearest.normal @ T_world_s[:3, :3])
-        depth = self.tip.radius_m - nearest.distance_m
-        if depth <= 0.0:
-            return _state(T_world_s, R_tilt, 0.0, (0.0, 0.0, depth))
-        tip, at = self.tip, self._at.tips[sensor]
         dx, dy, dz, _, _, turned = self._qpos[at.qpos : at.qpos + 6].tolist()
-        # The sphere stays behind with the surface, so its deflection is the sensor's own displacement reversed.
-        sin, cos = math.sin(turned), math.cos(turned)
-        shear = (-cos * dx - sin * dy, sin * dx - cos * dy)
-        pressing = -tip.stiffness_n_m * dz
-        held = math.hypot(
-            tip.shear_stiffness_n_m * math.hypot(dx, dy) / tip.friction,
-            tip.torsion_stiffness_n_m_rad * turned / tip.torsion_friction_m,
-        )
-        force = max(pressing - tip.damping_n_s_m * float(self._qvel[at.qvel + 2]), 0.0)
-        slipping = held >= _SLIDING_SHARE * pressing
-        pull = (-tip.shear_stiffness_n_m * shear[0], -tip.shear_stiffness_n_m * shear[1])
-        return _state(T_world_s, R_tilt, -turned, (*shear, depth), slipping=slipping, force_n=force, pull_n=pull)
+        rate = float(self._qvel[at.qvel + 2])
+        return lambda: _contact(self.tip, T_world_s, nearest, (dx, dy, dz), turned, rate)
 
     def _nearest(self, point: Array, t_s: float) -> SurfacePoint:
         """What is nearest to ``point`` (3,): a surface, the table, or an object where it is now."""
         found: SurfacePoint | None = None
         if self._surfaces:
             found = self._nearest_surface(point, t_s)[1]
-        if self._table is not None:
-            found = _nearer(found, self._table.nearest(point, t_s))
         for name, shape in self._shapes.items():
             T = self._pose(name)
             R, origin = T[:3, :3], T[:3, 3]
             local = shape.nearest((point - origin) @ R)
             if found is None or local.distance_m < found.distance_m:
                 found = SurfacePoint(local.distance_m, R @ local.normal, R @ local.point + origin)
+        if self._table_height_m is not None and (found is None or point[2] - self._table_height_m < found.distance_m):
+            x, y, z = point.tolist()
+            found = SurfacePoint(z - self._table_height_m, _UP, np.array([x, y, self._table_height_m]))
         assert found is not None
         return found
 
@@ -282,27 +266,39 @@ class DynamicWorld:
         self._qpos[at + 3 : at + 7] = quaternion(R)
 
 
-def _state(
+def _contact(
+    tip: TipMechanics,
     T_world_s: Array,
-    R_tilt: Array,
-    torsion: float,
-    position: tuple[float, float, float],
-    *,
-    slipping: bool = False,
-    force_n: float = 0.0,
-    pull_n: tuple[float, float] = (0.0, 0.0),
+    nearest: SurfacePoint,
+    deflection: tuple[float, float, float],
+    turned: float,
+    rate: float,
 ) -> ContactState:
+    """What a tip feels whose springs have given way by ``deflection`` and ``turned``, at ``rate`` along the normal."""
+    R_f_s, depth = tilt_of(-nearest.normal @ T_world_s[:3, :3]), tip.radius_m - nearest.distance_m
+    shear = pull = (0.0, 0.0)
+    force, slipping = 0.0, False
+    if depth > 0.0:
+        dx, dy, dz = deflection
+        # The sphere stays behind with the surface, so its deflection is the sensor's own displacement reversed.
+        sin, cos = math.sin(turned), math.cos(turned)
+        shear = (-cos * dx - sin * dy, sin * dx - cos * dy)
+        pull = (-tip.shear_stiffness_n_m * shear[0], -tip.shear_stiffness_n_m * shear[1])
+        pressing = -tip.stiffness_n_m * dz
+        held = math.hypot(
+            tip.shear_stiffness_n_m * math.hypot(dx, dy) / tip.friction,
+            tip.torsion_stiffness_n_m_rad * turned / tip.torsion_friction_m,
+        )
+        force = max(pressing - tip.damping_n_s_m * rate, 0.0)
+        slipping = held >= _SLIDING_SHARE * pressing
+        R_f_s = about_z(-turned) @ R_f_s
     T_f_s = _IDENTITY.copy()
-    T_f_s[:3, :3] = about_z(torsion) @ R_tilt
-    T_f_s[:3, 3] = position
+    T_f_s[:3, :3] = R_f_s
+    T_f_s[:3, 3] = (*shear, depth)
     T_world_f = _IDENTITY.copy()
-    T_world_f[:3, :3] = T_world_s[:3, :3] @ T_f_s[:3, :3].T
+    T_world_f[:3, :3] = T_world_s[:3, :3] @ R_f_s.T
     T_world_f[:3, 3] = T_world_s[:3, 3] - T_world_f[:3, :3] @ T_f_s[:3, 3]
-    return ContactState(T_f_s, T_world_f, position[2] > 0.0, slipping, force_n, pull_n)
-
-
-def _nearer(a: SurfacePoint | None, b: SurfacePoint) -> SurfacePoint:
-    return b if a is None or b.distance_m < a.distance_m else a
+    return ContactState(T_f_s, T_world_f, depth > 0.0, slipping, force, pull)
 
 
 def _swing(R_start: Array, R_end: Array) -> Array | None:
