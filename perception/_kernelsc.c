@@ -177,6 +177,10 @@ static PyObject *py_shrink(PyObject *module, PyObject *const *arguments, Py_ssiz
         !(to = take(&call, "to", arguments[2], 'B', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2,
                     image->shape[0] / (Py_ssize_t)factor, image->shape[1] / (Py_ssize_t)factor)))
         return finish(&call, NULL);
+    if ((int)factor & ((int)factor - 1)) {
+        refuse(&call, "factor", "is no power of two");
+        return finish(&call, NULL);
+    }
     return ended(&call, shrink(image->buf, image->strides[0], image->shape[0], image->shape[1], (ptrdiff_t)factor, to->buf));
 }
 

@@ -1,4 +1,4 @@
-"""Contact pose and shear from the markers of one image, in a running cell: NumPy and the compiled kernels, nothing else."""
+"""Contact pose and shear from the markers of one image, in a running cell: NumPy and the compiled kernels alone."""
 
 from __future__ import annotations
 
@@ -116,8 +116,8 @@ class MarkerEstimator:
         x = x.reshape(self._networks, -1)
         for weight, bias in self._layers:
             # Below -80 the exponential overflows, and the product is zero to float32 anyway.
-            x = x / (1.0 + np.exp(-np.maximum(x, -80.0)))
-            x = np.stack([kernels.affine(*each) for each in zip(weight, bias, x, strict=True)])
+            active = x / (1.0 + np.exp(-np.maximum(x, np.float32(-80.0))))
+            x = np.stack([kernels.affine(*each) for each in zip(weight, bias, active, strict=True)])
         outputs = x.astype(np.float64)
         log_precision = np.clip(outputs[:, 6:], *LOG_PRECISION_BOUNDS)
         return mixed(outputs[:, :6], log_precision, self.header.labels)
