@@ -18,7 +18,7 @@ from perception.errors import ArrayError, KernelsMissing
 from perception.marker_matching import disc_density
 
 pytest.importorskip("perception._kernelsc")
-from perception import _kernelsc  # noqa: E402
+from perception import _kernelsc
 
 GREY = st.one_of(st.integers(0, 255), st.sampled_from([0, 1, 127, 128, 254, 255]))
 
