@@ -204,6 +204,13 @@ def density(centres: Array, weights: Array, low: Array, cell_px: float, grid: in
     return result
 
 
+def bytes_apart(rows: NDArray[np.uint8], one: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """(b,) squared distances of rows (b, n) from one more (n,), n at most 32768."""
+    apart = np.empty(len(rows), np.int32)
+    _compiled().bytes_apart(rows, one, apart)
+    return apart
+
+
 def affine(weight: NDArray[np.float32], bias: NDArray[np.float32], x: NDArray[np.float32]) -> NDArray[np.float32]:
     """x W + b on the thread that calls it: (outputs,) of a weight (inputs, outputs)."""
     result = np.empty(len(bias), np.float32)

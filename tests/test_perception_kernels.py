@@ -230,6 +230,14 @@ def test_affine_is_a_matrix_product(inputs: int, outputs: int) -> None:
     np.testing.assert_allclose(kernels.affine(weight, bias, x), x @ weight + bias, rtol=1e-4, atol=1e-4)
 
 
+@given(st.integers(0, 40), st.integers(0, 70), st.integers(0, 999))
+@settings(max_examples=50, deadline=None)
+def test_distances_of_bytes_are_whole(count: int, length: int, seed: int) -> None:
+    rows = np.random.default_rng(seed).integers(0, 256, (count + 1, length), dtype=np.uint8)
+    expected = np.square(rows[1:].astype(np.int32) - rows[0]).sum(axis=1)
+    np.testing.assert_array_equal(kernels.bytes_apart(np.ascontiguousarray(rows[1:]), rows[0]), expected)
+
+
 GOOD: dict[Callable[..., object], tuple[object, ...]] = {
     _kernelsc.median_5: (np.zeros((4, 5), np.uint8), np.zeros((4, 5), np.uint8)),
     _kernelsc.threshold: (np.zeros((4, 5), np.uint8), True, 3, 0.0, np.zeros((4, 5), np.uint8)),
@@ -242,6 +250,7 @@ GOOD: dict[Callable[..., object], tuple[object, ...]] = {
         *(5.0, 2.0, 0.1, 12, np.zeros(2)),
     ),
     _kernelsc.density: (np.zeros((2, 3, 2)), np.zeros((2, 3)), np.zeros(2), 4.0, np.zeros((2, 5, 5))),
+    _kernelsc.bytes_apart: (np.zeros((3, 5), np.uint8), np.zeros(5, np.uint8), np.zeros(3, np.int32)),
     _kernelsc.affine: (*(np.zeros(shape, np.float32) for shape in ((2, 3), 3, 2)), np.zeros(3, np.float32)),
 }
 SHAPES = st.sampled_from([(), (0,), (1,), (2,), (3,), (6,), (2, 3), (4, 5), (6, 8), (0, 2), (3, 0), (4, 2), (2, 3, 2)])
