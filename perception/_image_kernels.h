@@ -249,15 +249,15 @@ static int threshold(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height
     return done;
 }
 
-/* Means of squares of `factor` pixels, rounded to the nearest and to even where two are as near: the same as OpenCV's
- * resize with INTER_AREA by a whole factor. `to` is (height / factor, width / factor). 0: out of memory. */
+/* Means of squares of `factor` pixels, a power of two up to 64, rounded to the nearest and to even where two are as near:
+ * what OpenCV's resize with INTER_AREA gives for these factors but 2. `to` is (height / factor, width / factor).
+ * 0: out of memory. */
 WIDE_VECTORS static int shrink(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width, ptrdiff_t factor,
                   uint8_t *to)
 {
     ptrdiff_t rows = height / factor, columns = width / factor;
-    /* Up to a factor of 64 the product with the inverse, rounded down, is the quotient. */
     uint32_t area = (uint32_t)(factor * factor);
-    uint64_t inverse = ((1ull << 32) + area - 1) / area;
+    int bits = lowest_bit(area);
     uint16_t *sums = malloc((size_t)width * sizeof *sums);
     if (!sums)
         return 0;
@@ -272,7 +272,7 @@ WIDE_VECTORS static int shrink(const uint8_t *image, ptrdiff_t row_bytes, ptrdif
             uint32_t sum = 0;
             for (ptrdiff_t i = 0; i < factor; i++)
                 sum += sums[x * factor + i];
-            uint32_t mean = (uint32_t)(sum * inverse >> 32), rest = sum - mean * area;
+            uint32_t mean = sum >> bits, rest = sum - mean * area;
             to[y * columns + x] = (uint8_t)(mean + (2 * rest + mean % 2 > area));
         }
     }
