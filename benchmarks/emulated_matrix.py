@@ -46,7 +46,7 @@ MORE_FAULTS: Final[Mapping[str, Mapping[str, tuple[Any, str]]]] = {
     "ur": {
         "fault_bits": (5, "fault"),
         "local_control": (True, "unseen"),
-        "other_program": (True, "fault"),
+        "other_program": (True, "unseen"),
         "registers_in_use": (True, "unseen"),
         "speed_slider": (0.5, "unseen"),
         "wrench": ([0.0, 0.0, 5.0, 0.0, 0.0, 0.0], "unseen"),
@@ -154,44 +154,52 @@ def faults_of(driver: str, folder: Path) -> dict[str, tuple[Any, str]]:
     return {**rig_of(driver, folder, 0).faults, **MORE_FAULTS[driver], **ends}
 
 
-_ONE_CODE: Final = (
-    "the same as another by rule: prepare, approach, settle and retract are one code in all tasks that servo, and are "
-    "tried in surface_following (one arm) and dual_arm_pushing (two); both hands of the latter are one code, and the "
-    "follower is hurt in `run`"
+SERVO: Final = (
+    "prepare, approach, settle and retract are one code, whatever the task that servoes and however many hands it has: "
+    "tried in surface_following"
 )
-_TOO_COARSE: Final = (
-    "data_collection asks an arm to repeat to 20 um, which damiao_can and feetech_serial cannot by the steps of their "
-    "encoders"
+REACH: Final = "lift, tilt, press and shear of data_collection are one code, motion to a place: tried in press"
+HIDDEN: Final = "what a driver takes in without a word reaches no task: faults that end nothing are tried in one task"
+RULES: Final = (SERVO, REACH, HIDDEN)
+"""Why a place is the same as another by construction."""
+
+LEFT_OUT: Final = (
+    "data_collection asks an arm to repeat to 20 um, which damiao_can and feetech_serial cannot by their encoders",
+    "what becomes of a camera's fault does not depend on the arm that carries it: v4l2 sits on simulated arms",
 )
-RULES: Final = (_ONE_CODE, _TOO_COARSE, "a camera's fault does not depend on the arm: v4l2 sits on simulated ones")
-"""Why places are left out."""
+"""What is no part of the matrix."""
 
 _COARSE: Final = ("damiao_can", "feetech_serial")
 
 
-def places(driver: str, folder: Path, *, everything: bool = False) -> Iterator[tuple[Place, bool]]:
-    """Every place of ``driver`` with whether it is tried; those that are the same as another by ``RULES`` are not.
+def places(driver: str, folder: Path) -> Iterator[tuple[Place, str]]:
+    """Every place of ``driver``, with which of ``RULES`` makes it the same as another one; empty for none.
 
     Args:
         driver: of ``ARMS`` or ``CAMERAS``.
         folder: for the rig, of which only the faults are looked at.
-        everything: try them all.
     """
     tasks: list[str] = [*HURT]
     if driver in CAMERAS:
         tasks.append("observe")
     elif driver in _COARSE:
         tasks.remove("data_collection")
+    faults = faults_of(driver, folder)
     for task in tasks:
         states, servoes = states_of(task)
-        roles = HURT.get(task, ("",))
-        for role in roles:
+        for role in HURT.get(task, ("",)):
             hurt = role if driver in ARMS else sensor_of(role or "arm")
             for state in states:
-                same = servoes and state != "run" and task not in ("surface_following", "dual_arm_pushing")
-                same = same or (role == "follower" and state != "run")
-                for fault in faults_of(driver, folder):
-                    yield Place(driver, fault, task, hurt, state), everything or not same
+                rule = _rule(task, state, servoes=servoes)
+                for fault, (_, lawful) in faults.items():
+                    hidden = lawful in ("transient", "unseen") and task != "surface_following"
+                    yield Place(driver, fault, task, hurt, state), HIDDEN if hidden else rule
+
+
+def _rule(task: str, state: str, *, servoes: bool) -> str:
+    if servoes and state != "run" and task != "surface_following":
+        return SERVO
+    return REACH if task == "data_collection" and state in ("lift", "tilt", "shear") else ""
 
 
 def rig_of(driver: str, folder: Path, number: int) -> Rig:
