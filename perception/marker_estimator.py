@@ -1,4 +1,4 @@
-"""Contact pose and shear from the markers of one image, in a running cell: OpenCV and NumPy, nothing else."""
+"""Contact pose and shear from the markers of one image, in a running cell: NumPy and the compiled kernels, nothing else."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from drivers.samples import Frame, Stamped
 from geometry.types import Array, ImageArray
+from perception import kernels
 from perception.errors import ModelError
 from perception.inference import RANGE_TOLERANCE, Prediction
 from perception.marker_architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture
@@ -47,19 +48,15 @@ class MarkerEstimator:
         self.change: CameraChange | None = None
         self._size = architecture.size
         self._matcher = matcher_of(model, architecture)
-        layers = range(len(architecture.hidden) + 1)
+        self._networks = architecture.networks
         self._layers = [
-            (
-                np.ascontiguousarray(model.tensors[f"layer{i}.weight"].transpose(0, 2, 1)),
-                model.tensors[f"layer{i}.bias"][:, 0],
-            )
-            for i in layers
+            (model.tensors[f"layer{i}.weight"], model.tensors[f"layer{i}.bias"][:, 0])
+            for i in range(len(architecture.hidden) + 1)
         ]
         # One long product is faster than several short ones that read the same input.
         first, bias = self._layers.pop(0)
-        self._first = first.reshape(-1, first.shape[2])
+        self._first = np.ascontiguousarray(first.transpose(1, 0, 2)).reshape(first.shape[1], -1)
         self._first_bias = bias.reshape(-1)
-        self._networks = architecture.networks
 
     @classmethod
     def load(cls, path: Path) -> MarkerEstimator:
@@ -115,12 +112,12 @@ class MarkerEstimator:
     def _infer(self, displacements: Array) -> tuple[Array, Array]:
         """Mean (6,) in label half-ranges, and standard deviations (6,) in label units, of the mixture of all networks'
         Gaussians."""
-        x = np.einsum("ij,j->i", self._first, displacements.ravel().astype(np.float32)) + self._first_bias
+        x = kernels.affine(self._first, self._first_bias, displacements.ravel().astype(np.float32))
         x = x.reshape(self._networks, -1)
         for weight, bias in self._layers:
             # Below -80 the exponential overflows, and the product is zero to float32 anyway.
             x = x / (1.0 + np.exp(-np.maximum(x, -80.0)))
-            x = np.einsum("noi,ni->no", weight, x) + bias
+            x = np.stack([kernels.affine(*each) for each in zip(weight, bias, x, strict=True)])
         outputs = x.astype(np.float64)
         log_precision = np.clip(outputs[:, 6:], *LOG_PRECISION_BOUNDS)
         return mixed(outputs[:, :6], log_precision, self.header.labels)

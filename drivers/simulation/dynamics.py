@@ -1,8 +1,11 @@
 """Full dynamics of free objects and soft tips, by MuJoCo: pushing, slipping, toppling, holding.
 
-Each sensor rides on a heavy carriage that coasts from pose to pose; between it and what it touches are springs and a
-rigid sphere (``dynamics_model.TipMechanics``). A carriage keeps its z axis along the surface normal: tilting about the
-tip's centre shears nothing, as in SPEC part 2, and the springs' deflection is the contact's shear and torsion.
+Between a sensor and what it touches are springs and a rigid sphere (``dynamics_model.TipMechanics``). The springs'
+other end, the carriage, goes from pose to pose at an even speed, whatever pulls. It keeps its z axis along the surface
+normal: tilting about the tip's centre shears nothing, as in SPEC part 2, and the springs' deflection is the contact's
+shear and torsion. MuJoCo is told the carriage's speed for all physics steps of a step of the scene, and the tip's
+coordinates, along the axes that the carriage had at its start, are told anew along those at its end.
+
 Surfaces that move as they were told are given to each tip as the patch that is tangent before it.
 
 Free objects touch the table, tips and each other, no prescribed surfaces.
@@ -38,16 +41,20 @@ _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 @dataclass(slots=True)
 class _Mounted:
-    """One sensor's carriage at the last step.
+    """One sensor's carriage after the last step.
 
     Attributes:
         T_world_s: (4, 4) pose of the sensor.
         R_world_c: (3, 3) axes of the carriage.
+        R_start: (3, 3) the same before that step.
+        speed: (6,) [v, w] in that step along ``R_start``, where the tip was on it.
         normal: (3,) outward, of what was nearest.
     """
 
     T_world_s: Array
     R_world_c: Array
+    R_start: Array
+    speed: Array
     normal: Array
 
 
@@ -101,6 +108,8 @@ class DynamicWorld:
         T_world_table[2, 3] = table_height_m
         self._table = Surface(Plane(), Still(T_world_table)) if objects else None
         self._step_s = step_s
+        across = tip.shear_damping_n_s_m
+        self._damping = np.array([across, across, tip.damping_n_s_m, 0.0, 0.0, tip.torsion_damping_n_m_s])
         self._mounted: dict[str, _Mounted] = {}
         self._t_s = 0.0
         self._build({})
@@ -109,7 +118,8 @@ class DynamicWorld:
         """Let ``sensor`` feel; returns what it feels at ``T_world_s`` (4, 4) at ``t_s``. All tips begin undeformed
         and all objects at rest."""
         normal = self._nearest(T_world_s[:3, 3], t_s).normal
-        self._mounted[sensor] = _Mounted(T_world_s, _upright(T_world_s, normal), normal)
+        R_world_c = _upright(T_world_s, normal)
+        self._mounted[sensor] = _Mounted(T_world_s, R_world_c, R_world_c, np.zeros(6), normal)
         self._t_s = t_s
         self._build(self.objects())
         return self._feel(sensor, T_world_s, t_s)
@@ -120,6 +130,8 @@ class DynamicWorld:
         for sensor, pose in T_world_s.items():
             self._carry(sensor, pose, span_s)
         mujoco.mj_step(self._at.model, self._data, round(span_s / self._step_s))
+        for sensor in T_world_s:
+            self._settle(sensor)
         if not math.isfinite(float(self._qpos.sum())):
             raise PhysicsError("the state", t_s)
         self._t_s = t_s
@@ -153,30 +165,54 @@ class DynamicWorld:
             patches=bool(self._surfaces),
         )
         self._data = mujoco.MjData(self._at.model)
-        self._qpos, self._qvel = self._data.qpos, self._data.qvel
+        model, data = self._at.model, self._data
+        self._qpos, self._qvel, self._act, self._ctrl = data.qpos, data.qvel, data.act, data.ctrl
+        self._applied, self._body_pos, self._body_quat = data.qfrc_applied, model.body_pos, model.body_quat
         for name, pose in T_world_object.items():
             self._place(self._at.objects[name].qpos, pose[:3, 3], pose[:3, :3])
 
     def _carry(self, sensor: str, T_world_s: Array, span_s: float) -> None:
-        """Let the carriage coast from where it is to ``T_world_s``, and put the surface before its tip.
+        """Send the carriage from where it is to ``T_world_s``, and put the surface before its tip.
 
         The normal that keeps it upright is the last step's: what moves is not known yet where it will be.
         """
         if not math.isfinite(float(T_world_s.sum())):
             raise PhysicsError(f"the pose of {sensor!r}", self._t_s)
-        mounted, at = self._mounted[sensor], self._at.carriages[sensor]
+        mounted, at = self._mounted[sensor], self._at.tips[sensor]
         position = mounted.T_world_s[:3, 3]
-        R_end = _upright(T_world_s, mounted.normal)
-        R_start, swing = mounted.R_world_c, _swing(mounted.R_world_c, R_end)
+        R_start, R_end = mounted.R_world_c, _upright(T_world_s, mounted.normal)
+        swing = _swing(R_start, R_end)
         if swing is None:
             R_start, swing = R_end, np.zeros(3)
-        self._place(at.qpos, position, R_start)
-        self._qvel[at.qvel : at.qvel + 3] = (T_world_s[:3, 3] - position) / span_s
-        self._qvel[at.qvel + 3 : at.qvel + 6] = R_start.T @ swing / span_s
+        v = R_start.T @ (T_world_s[:3, 3] - position) / span_s
+        w = R_start.T @ swing / span_s
+        self._body_pos[at.body] = position
+        self._body_quat[at.body] = quaternion(R_start)
+        self._ctrl[at.servo : at.servo + 3] = v
+        self._ctrl[at.servo + 3] = w[2]
+        # Of the carriage where the tip is on it: springs are damped against that, and carrying a tip takes no force.
+        deflection = self._qpos[at.qpos : at.qpos + 3]
+        speed = np.concatenate([v + cross(w, deflection), w])
+        self._qvel[at.qvel : at.qvel + 6] += speed
+        self._applied[at.qvel : at.qvel + 6] = self._damping * speed
         if self._surfaces:
-            tip = self._at.tips[sensor].qpos
-            self._place_patch(sensor, position + R_start @ self._qpos[tip : tip + 3])
+            self._place_patch(sensor, position + R_start @ deflection)
         mounted.T_world_s, mounted.R_world_c = T_world_s, R_end
+        mounted.R_start, mounted.speed = R_start, speed
+
+    def _settle(self, sensor: str) -> None:
+        """Tell the tip's coordinates, and how they change, along its carriage as it is now."""
+        mounted, at = self._mounted[sensor], self._at.tips[sensor]
+        turned = mounted.R_world_c.T @ mounted.R_start
+        q, act = self._qpos[at.qpos : at.qpos + 6], self._act[at.servo : at.servo + 4]
+        q[:3] = turned @ (q[:3] - act[:3])
+        q[3:5] = 0.0
+        q[5] -= act[3]
+        act[:] = 0.0
+        rate = self._qvel[at.qvel : at.qvel + 6]
+        rate -= mounted.speed
+        rate[:3] = turned @ rate[:3]
+        rate[3:5] = 0.0
 
     def _place_patch(self, sensor: str, tip_centre: Array) -> None:
         """Put the tangent of the surface that is nearest to the tip where it is now, moving as the surface does."""
@@ -200,7 +236,7 @@ class DynamicWorld:
         if depth <= 0.0:
             return _state(T_world_s, R_tilt, 0.0, (0.0, 0.0, depth))
         tip, at = self.tip, self._at.tips[sensor]
-        dx, dy, dz, turned = self._qpos[at.qpos : at.qpos + 4].tolist()
+        dx, dy, dz, _, _, turned = self._qpos[at.qpos : at.qpos + 6].tolist()
         # The sphere stays behind with the surface, so its deflection is the sensor's own displacement reversed.
         sin, cos = math.sin(turned), math.cos(turned)
         shear = (-cos * dx - sin * dy, sin * dx - cos * dy)

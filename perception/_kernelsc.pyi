@@ -1,0 +1,33 @@
+from geometry.types import ArrayLike
+
+def median_5(image: ArrayLike, to: ArrayLike, /) -> None: ...
+def threshold(image: ArrayLike, with_median: bool, block_px: int, offset: float, to: ArrayLike, /) -> None: ...
+def shrink(image: ArrayLike, factor: int, to: ArrayLike, /) -> None: ...
+def discs(image: ArrayLike, smallest_px: int, largest_px: int, longest_side_px: int, /) -> bytearray: ...
+def pair(places: ArrayLike, points: ArrayLike, partner: ArrayLike, square: ArrayLike, owns: ArrayLike, /) -> None: ...
+def fit(
+    basis: ArrayLike,
+    weight: ArrayLike,
+    off: ArrayLike,
+    from_start: ArrayLike,
+    ridge: ArrayLike,
+    change: ArrayLike,
+    /,
+) -> None: ...
+def settle(
+    basis: ArrayLike,
+    base: ArrayLike,
+    start: ArrayLike,
+    ridge: ArrayLike,
+    points: ArrayLike,
+    reach_px: float,
+    least_reach_px: float,
+    settled_px: float,
+    turns: int,
+    coefficients: ArrayLike,
+    /,
+) -> None: ...
+def density(
+    centres: ArrayLike, weights: ArrayLike, low: ArrayLike, cell_px: float, density: ArrayLike, /
+) -> None: ...
+def affine(weight: ArrayLike, bias: ArrayLike, x: ArrayLike, to: ArrayLike, /) -> None: ...
