@@ -14,6 +14,7 @@ from typing import Any, Final, Literal
 import numpy as np
 import yaml
 
+from benchmarks.sent_commands import SentCommands
 from cell.cli import find_cell
 from cell.compose import Cell, compose
 from cell.config import CellPlan, plan_cell
@@ -188,8 +189,8 @@ def matrix(
             continue
         for kind in devices:
             path = folder / f"{task}_{kind}.yaml"
-            path.write_text(yaml.safe_dump(_on_true_contact(data) if kind == "arm" else data))
-            probe = compose(_plan(path))
+            path.write_text(yaml.safe_dump(on_true_contact(data) if kind == "arm" else data))
+            probe = compose(plan_anew(path))
             assert isinstance(probe.task, MachineTask)
             hurt = probe.plan.arm_roles if kind == "arm" else probe.cameras
             for fault in (fault for fault in FAULTS if fault.device == kind):
@@ -198,7 +199,8 @@ def matrix(
                         yield run_case(path, fault, device, state)
 
 
-def _on_true_contact(data: Mapping[str, Any]) -> dict[str, Any]:
+def on_true_contact(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The cell file ``data`` with the scene's own contact in place of a network's estimate."""
     sensors = {name: dict(sensor) for name, sensor in data["sensors"].items()}
     for sensor in sensors.values():
         if sensor["estimator"]["kind"] == "network":
@@ -206,23 +208,24 @@ def _on_true_contact(data: Mapping[str, Any]) -> dict[str, Any]:
     return {**data, "sensors": sensors}
 
 
-def _plan(path: Path) -> CellPlan:
-    """Its plan; a task that collects begins anew."""
-    shutil.rmtree(path.with_suffix(".collected"), ignore_errors=True)
-    collects = "collect" in yaml.safe_load(path.read_text())
-    return plan_cell(path, {"data": path.with_suffix(".collected")} if collects else {})
+def plan_anew(path: Path) -> CellPlan:
+    """Its plan; a task that collects begins anew, in a folder beside the file."""
+    collected = path.with_suffix(".collected")
+    shutil.rmtree(collected, ignore_errors=True)
+    # Only a cell that collects has something to be overridden.
+    return plan_cell(path, {"data": collected})
 
 
 def run_case(path: Path, fault: Fault, device: str, state: str) -> Case:
     """Run the cell, let the fault happen to ``device`` in ``state``, and judge what comes of it."""
-    cell, stop, trace = compose(_plan(path)), StopRequest(), _Trace()
+    cell, stop, sent = compose(plan_anew(path)), StopRequest(), SentCommands()
     case = Case(cell.plan.task.name, device, fault.name, state)
     injected_ns: int | None = None
     with cell:
         assert isinstance(cell.task, MachineTask)
         initial = state == cell.task.states[0]
         wait = 1 if initial else _SETTLED_CYCLES
-        loop = RunLoop(cell, None, box=trace, stop=stop)
+        loop = RunLoop(cell, None, box=sent, stop=stop)
         loop.begin()
         going = True
         while going:
@@ -241,22 +244,11 @@ def run_case(path: Path, fault: Fault, device: str, state: str) -> Case:
         at_rest = all(arm.at_rest() for arm in cell.arms.values())
     if injected_ns is None:
         return replace(case, problem="the state was not reached")
-    return _judged(case, fault, cell, result, trace, injected_ns, at_rest=at_rest)
-
-
-class _Trace:
-    """Remembers when commands were sent."""
-
-    def __init__(self) -> None:
-        self.sent_ns: list[int] = []
-
-    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
-        if topic.endswith("/command"):
-            self.sent_ns.append(t_ns)
+    return _judged(case, fault, cell, result, sent, injected_ns, at_rest=at_rest)
 
 
 def _judged(
-    case: Case, fault: Fault, cell: Cell, result: RunResult, trace: _Trace, injected_ns: int, *, at_rest: bool
+    case: Case, fault: Fault, cell: Cell, result: RunResult, sent: SentCommands, injected_ns: int, *, at_rest: bool
 ) -> Case:
     problems = []
     first = result.causes[0] if result.causes else None
@@ -267,7 +259,7 @@ def _judged(
     expected: frozenset[str] = frozenset() if case.state in fault.unseen else fault.expected
     if by not in (expected or {""}):
         problems.append(f"ended by {by or 'nothing'}, expected {' or '.join(sorted(expected)) or 'nothing'}")
-    if first is not None and any(t_ns >= first.t_ns for t_ns in trace.sent_ns):
+    if first is not None and sent.since(first.t_ns):
         problems.append("a command was sent after the trip")
     if not at_rest:
         problems.append("the arm does not stand")

@@ -13,25 +13,25 @@ import json
 import os
 import tempfile
 import threading
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
 
-from benchmarks.fault_matrix import FAULTS, Fault
+from benchmarks.fault_matrix import FAULTS, Fault, on_true_contact, plan_anew
 from benchmarks.provenance import provenance
+from benchmarks.sent_commands import SentCommands
 from cell.blackbox import BlackBox
-from cell.cli import find_cell
-from cell.compose import compose
-from cell.config import plan_cell
+from cell.compose import Cell, compose
 from cell.loop import Outcome, RunLoop, RunResult, StopRequest
 from cell.recording import Recorder
+from drivers.sim_arm import SimArm
 from geometry.errors import TouchcellError
 
-CELLS = ("surface_follow_sim.yaml", "object_track_sim.yaml", "single_push_sim.yaml", "dual_push_sim.yaml")
+CONFIGS = Path(__file__).parent.parent / "configs"
+_SAMPLES = 10
 _ROWS = 12
 # The first runs import modules and fill caches.
 _WARM_UP = 0.2
@@ -88,9 +88,10 @@ def lap(path: Path, folder: Path, rng: np.random.Generator, before_s: float = 0.
         rng: decides which fault comes when.
         before_s: cell time of earlier runs.
     """
-    cell, stop, sent = compose(plan_cell(path)), StopRequest(), _Sent(BlackBox())
-    faults: list[Fault | None] = [fault for fault in FAULTS if fault.device == "arm" or cell.cameras]
-    fault = faults[rng.integers(len(faults))] if rng.random() < 0.75 else None
+    cell, stop, box = compose(plan_anew(path)), StopRequest(), BlackBox()
+    sent = SentCommands(box)
+    places = [(fault, device) for fault in FAULTS for device in _hurt(fault, cell)]
+    fault, device = places[rng.integers(len(places))] if places and rng.random() < 0.75 else (None, "")
     after = int(rng.integers(1, 1500))
     with Recorder(folder / "run.mcap") as recorder, cell:
         loop = RunLoop(cell, recorder, box=sent, stop=stop)
@@ -99,30 +100,23 @@ def lap(path: Path, folder: Path, rng: np.random.Generator, before_s: float = 0.
         while loop.step():
             cycles += 1
             if fault is not None and cycles == after:
-                hurt = list(cell.arms if fault.device == "arm" else cell.cameras)
-                fault.inject(cell, stop, hurt[rng.integers(len(hurt))])
+                fault.inject(cell, stop, device)
         result = loop.end()
         stands = all(arm.at_rest() for arm in cell.arms.values())
         if result.outcome is Outcome.TRIPPED:
-            sent.box.dump(folder, result, {"cell": path.name})
+            box.dump(folder, result, {"cell": path.name})
     problem = "" if stands else "an arm does not stand"
-    if result.causes and sent.last_ns is not None and sent.last_ns >= result.causes[0].t_ns:
+    if result.causes and sent.since(result.causes[0].t_ns):
         problem = "a command was sent after the trip"
     injected = fault.name if fault is not None and cycles >= after else ""
     return Lap(before_s + result.duration_s, result.outcome.value, injected, held(), problem or _unexpected(result))
 
 
-@dataclass
-class _Sent:
-    """A black box that remembers when the last command was sent."""
-
-    box: BlackBox
-    last_ns: int | None = field(default=None)
-
-    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
-        if topic.endswith("/command"):
-            self.last_ns = t_ns
-        self.box.add(topic, t_ns, data)
+def _hurt(fault: Fault, cell: Cell) -> list[str]:
+    """Devices that can have it: arms with joints are simulated without faults of their own."""
+    if fault.device == "camera":
+        return list(cell.cameras)
+    return [role for role, arm in cell.arms.items() if isinstance(arm, SimArm)]
 
 
 def _unexpected(result: RunResult) -> str:
@@ -135,7 +129,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
     parser = argparse.ArgumentParser("touchcell bench soak")
     parser.add_argument("--hours", type=float, default=1.0, help="of cell time")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--cell", type=Path, action="append", help="cell file (default: every analytic one that ships)")
+    parser.add_argument("--cell", type=Path, action="append", help="cell file (default: all simulated that ship)")
     parser.add_argument(
         "--learned", action="store_true", help="keep the cells' estimators in place of the true contact"
     )
@@ -145,7 +139,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
     print(f"{'cell time, h':>12}{'runs':>7}{'memory, MB':>12}{'descriptors':>13}{'threads':>9}{'segments':>10}")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        paths = [_prepared(path, folder, learned=options.learned) for path in options.cell or map(_shipped, CELLS)]
+        paths = [_prepared(path, folder, learned=options.learned) for path in options.cell or simulated_cells()]
         end_s = 3600.0 * options.hours
         shown = 0
         try:
@@ -197,17 +191,18 @@ def _print_row(laps: Sequence[Lap]) -> None:
     )
 
 
-def _shipped(name: str) -> Path:
-    return find_cell(Path("configs") / name)
+def simulated_cells() -> list[Path]:
+    """Every cell file that ships and runs in simulated time by itself."""
+    files = {path: yaml.safe_load(path.read_text()) for path in sorted(CONFIGS.glob("*.yaml"))}
+    return [path for path, data in files.items() if data.get("time") == "simulated" and "scene" in data]
 
 
 def _prepared(path: Path, folder: Path, *, learned: bool) -> Path:
     data = yaml.safe_load(path.read_text())
-    if not learned:
-        for sensor in data["sensors"].values():
-            sensor["estimator"] = {"kind": "true_contact"}
+    if "collect" in data:
+        data["task"]["samples"] = _SAMPLES
     prepared = folder / path.name
-    prepared.write_text(yaml.safe_dump(data))
+    prepared.write_text(yaml.safe_dump(data if learned else on_true_contact(data)))
     return prepared
 
 

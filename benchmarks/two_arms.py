@@ -63,7 +63,12 @@ SPEC: Final = TaskSpec(
 
 
 def two_arm_plan(
-    folder: Path, rate_hz: float, *, processes: str = "separate", categories: Mapping[str, int] | None = None
+    folder: Path,
+    rate_hz: float,
+    *,
+    processes: str = "separate",
+    categories: Mapping[str, int] | None = None,
+    on_trip: str = "end",
 ) -> CellPlan:
     """The plan of the cell: no scene, so that each arm is a group by itself."""
     driver = registry.spec("sim_arm")
@@ -84,6 +89,7 @@ def two_arm_plan(
             "time": "real",
             "rate_hz": rate_hz,
             "processes": processes,
+            "on_trip": on_trip,
             "arms": arms,
             "task": {"name": SPEC.name},
         }

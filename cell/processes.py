@@ -118,6 +118,10 @@ class ProcessWatch:
         """Nobody is guarded any more."""
         self.chain.end()
 
+    def clear(self) -> None:
+        """Clear the latches of watchdog and hosts. Raises LifecycleError, DeviceFault."""
+        self.chain.clear()
+
     def note_to(self, folder: Path) -> None:
         """Have the watchdog write ``watchdog.json`` there when it stops the arms."""
         self.chain.note_to(folder / NOTES)

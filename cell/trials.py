@@ -60,7 +60,7 @@ class Trial:
                 if not isinstance(section.get(word), dict):
                     raise ConfigError("no such section", file=self.cell, key=key, hint=suggest(word, list(section)))
                 section = section[word]
-            section[leaf] = value
+            section[leaf] = copy.deepcopy(value)
         return data
 
 

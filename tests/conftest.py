@@ -15,7 +15,7 @@ _BESIDE_EMULATORS = (
     "test_damiao",
     "test_emulated_matrix",
     "test_emulated_push",
-    "test_emulator_process",
+    "test_emulator_",
     "test_feetech",
     "test_franka",
     "test_opencv_camera",

@@ -38,6 +38,7 @@ class Recorder:
     def __init__(self, interrupt_after: int = 0) -> None:
         self.records: list[EpochRecord] = []
         self.told: dict[str, tuple[int, int]] = {}
+        self.batches = 0
         self._interrupt_after = interrupt_after
 
     def images(self, split: str, done: int, total: int) -> None:
@@ -46,6 +47,7 @@ class Recorder:
     def batch(self, epoch: int, epochs: int, done: int, total: int, loss: float) -> None:
         if self._interrupt_after and epoch > self._interrupt_after:
             raise KeyboardInterrupt
+        self.batches = total
 
     def epoch(self, record: EpochRecord, *, best: bool) -> None:
         self.records.append(record)
@@ -67,6 +69,8 @@ def trained(data: Path) -> Path:
     assert recorder.told["train"] == (160, 160)
     assert recorder.told["matched"][0] == recorder.told["matched"][1]
     assert len(recorder.records) == 8
+    # Ten batches hold all images once.
+    assert recorder.batches == 20
     return out
 
 

@@ -8,21 +8,20 @@ just below the top of its straight part.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from cell.experiment import ExperimentSpec, Scale
-from cell.experiments.dual_arm_pushing import FOLLOWER_SENSOR, LEADER_SENSOR, two_arms
 from cell.experiments.pushing import (
     ERROR_NOTE,
     ESTIMATORS,
+    ONE_ARM,
     PRISMS,
+    TWO_ARMS,
     Pushed,
-    estimator_changes,
-    leader_changes,
-    object_changes,
     push_measures,
-    starts,
+    row_trials,
 )
 from cell.run_folder import RunFolder
 from cell.trial_table import Column
@@ -30,7 +29,7 @@ from cell.trials import Finished, Trial
 from drivers.simulation.quasi_static import GRAVITY_M_S2
 
 WITH, WITHOUT = "with follower", "alone"
-_CELLS = {WITH: "dual_push_tall_sim.yaml", WITHOUT: "single_push_sim.yaml"}
+_ARMS = {WITH: replace(TWO_ARMS, cell="dual_push_tall_sim.yaml"), WITHOUT: ONE_ARM}
 _PRISM_MM = 200.0
 _PUSHED_AT = 0.8
 _BELOW_TOP_MM = 15.0
@@ -62,36 +61,36 @@ OBJECTS = (
 
 def trials(scale: Scale) -> list[Trial]:
     """Every object with both arms, and with the leader alone from the same starts; with both estimators."""
-    found = []
-    for estimator in ESTIMATORS:
-        for arms, cell in _CELLS.items():
-            for pushed in OBJECTS[::4] if scale.quick else OBJECTS:
-                row = f"{pushed.name}, {arms}, {estimator}"
-                changes = _cell_changes(pushed, arms, estimator)
-                for seed, pose in starts(scale.repetitions(5)):
-                    whole = changes | object_changes(pushed, pose) | {"seed": seed}
-                    found.append(Trial(f"{row.replace(', ', '_').replace(' ', '_')}_{seed}", row, cell, whole))
-    return found
+    return [
+        trial
+        for estimator in ESTIMATORS
+        for arms in _ARMS
+        for pushed in (OBJECTS[::4] if scale.quick else OBJECTS)
+        for trial in row_trials(
+            f"{pushed.name}, {arms}, {estimator}",
+            _ARMS[arms].cell,
+            pushed,
+            _cell_changes(pushed, arms) | _ARMS[arms].estimating(estimator),
+            scale.repetitions(5),
+        )
+    ]
 
 
-def _cell_changes(pushed: Pushed, arms: str, estimator: str) -> dict[str, Any]:
+def _cell_changes(pushed: Pushed, arms: str) -> dict[str, Any]:
     height_mm = pushed_at_mm(pushed)
     # Both in the same world: the cells that ship differ in this.
-    same: dict[str, Any] = {"scene.step_ms": 5}
-    if arms == WITH:
-        same |= two_arms(pushed, "mdf", height_mm) | _boxes_up_to(height_mm, "leader_box", "follower_box")
-        press_mm, lift_mm = held_with_mm(pushed)
-        same["task.reference_mm_deg"] = [press_mm, 0, 0, 0, 0, 0]
-        same["task.follower.reference_mm_deg"] = [-lift_mm, 0, _FOLLOWER_MM, 0, 0, 0]
-        return same | estimator_changes(estimator, (LEADER_SENSOR, FOLLOWER_SENSOR))
-    same |= leader_changes(pushed, "mdf", "arm", height_mm) | _boxes_up_to(height_mm, "workspace")
-    return same | estimator_changes(estimator, ("sensor",))
+    same = {"scene.step_ms": 5} | _ARMS[arms].around(pushed, "mdf", height_mm)
+    if arms == WITHOUT:
+        return same | _boxes_up_to(height_mm, "workspace")
+    press_mm, lift_mm = held_with_mm(pushed)
+    same["task.reference_mm_deg"] = [press_mm, 0, 0, 0, 0, 0]
+    same["task.follower.reference_mm_deg"] = [-lift_mm, 0, _FOLLOWER_MM, 0, 0, 0]
+    return same | _boxes_up_to(height_mm, "leader_box", "follower_box")
 
 
 def measure(run: RunFolder) -> Mapping[str, float]:
     """See ``pushing.push_measures``; ``lost`` are those that leant too far to be pushed on, fallen or not."""
-    sensors = run.plan.sensor_roles
-    found = push_measures(run, LEADER_SENSOR if LEADER_SENSOR in sensors else next(iter(sensors)))
+    found = push_measures(run)
     return found | {"lost": float(found["lean_max_deg"] > _LOST_DEG)}
 
 
@@ -102,7 +101,7 @@ def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
 
     arms = {
         arms: [each for each in finished if each.trial.name.endswith(f"{arms}_learned_1".replace(" ", "_"))]
-        for arms in _CELLS
+        for arms in _ARMS
     }
     return [
         plot_pushes(arms[WITH], folder / "with_follower.png"),
@@ -155,7 +154,7 @@ SPEC = ExperimentSpec(
     paper={
         f"{pushed.name}, {arms}, {estimator}": "stands" if arms == WITH else "topples"
         for estimator in ESTIMATORS
-        for arms in _CELLS
+        for arms in _ARMS
         for pushed in OBJECTS
     },
     notes=(ERROR_NOTE, "aims: none of nine topples with the follower, at least seven without"),

@@ -52,7 +52,7 @@ class Rig:
         spec: the driver.
         start: starts a fresh emulator and waits until it is ready; None on a real bench, where nothing knows the truth.
         build: makes the DISCONNECTED device that will find that emulator; called again after a restart.
-        config: the arm's part of a cell file, for running tasks on the emulator; None for other devices.
+        config: the device's part of a cell file, for running tasks on the emulator; None where nobody does.
         energising: entry of the emulator's ``state()`` that counts messages which change power, mode or zero; None for
             a device that has no such messages.
         position: entry with the tool's true position [x, y, z] in m (arms), or None for cameras.

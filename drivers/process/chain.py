@@ -37,6 +37,8 @@ from drivers.process.watchdog import SLOW_PERIODS, silence_s
 from drivers.registry import DriverContext
 
 _GUARD_S: Final = 1.0
+_UNGUARDED_SILENCE_S: Final = 2.0
+"""Silence that counts while nothing moves and nobody guards."""
 
 
 class Chain:
@@ -141,7 +143,9 @@ class Chain:
         self._clock.sleep_until_ns(self._clock.now_ns() + round(1e9 * seconds))
 
     def alarm(self) -> Cause | None:
-        """Why all arms have been stopped, or None."""
+        """Why all arms have been stopped, or None. Once nobody is guarded: what keeps them from being guarded again."""
+        if not self._task.value["guard"]:
+            return self._trouble(max(self.silence_s, _UNGUARDED_SILENCE_S))
         watch = self._watch.read()
         cause: Cause | None
         if watch["stop"] and (cause := cause_of(watch)).reason is not Reason.HOST_LATCHED:
@@ -153,10 +157,22 @@ class Chain:
                 return Cause(Reason.HOST_GONE, self._clock.now_ns(), host=number)
             if too_long_s := link.silent_too_long():
                 return Cause(Reason.HOST_SILENT, self._clock.now_ns(), too_long_s, self.silence_s, number)
-        silent_s = (self._clock.now_ns() - int(watch["t_ns"])) * 1e-9
-        if self._task.value["guard"] and silent_s > self.silence_s:
-            return Cause(Reason.WATCHDOG_SILENT, self._clock.now_ns(), silent_s, self.silence_s)
-        return None
+        return self._watchdog_silent(self.silence_s)
+
+    def _trouble(self, longest_s: float) -> Cause | None:
+        """A process that has gone, or has been silent for longer than ``longest_s``; None if all live."""
+        for number, link in enumerate(self._links):
+            now_ns = self._clock.now_ns()
+            if link.end_words():
+                return Cause(Reason.HOST_GONE, now_ns, host=number)
+            if (silent_s := link.silent_s()) > longest_s:
+                return Cause(Reason.HOST_SILENT, now_ns, silent_s, longest_s, number)
+        return self._watchdog_silent(longest_s)
+
+    def _watchdog_silent(self, longest_s: float) -> Cause | None:
+        now_ns = self._clock.now_ns()
+        silent_s = (now_ns - int(self._watch.read()["t_ns"])) * 1e-9
+        return Cause(Reason.WATCHDOG_SILENT, now_ns, silent_s, longest_s) if silent_s > longest_s else None
 
     @property
     def guarding(self) -> bool:
@@ -164,7 +180,19 @@ class Chain:
         return bool(self._watch.read()["guarding"])
 
     def clear(self) -> None:
-        """Clear a stop after ``end``, with all arms at rest and nobody's. Moves nothing. Raises LifecycleError."""
+        """Clear a stop after ``end``, with all arms at rest and nobody's. Moves nothing.
+
+        Raises:
+            LifecycleError: an arm moves, or somebody holds its lease.
+            DeviceFault: a process has gone or is silent.
+        """
+        deadline_ns = self._clock.now_ns() + round(1e9 * _GUARD_S)
+        # Calls to those that do not answer would wait for long.
+        while (cause := self._trouble(self.silence_s)) is not None or self.guarding:
+            if self._clock.now_ns() > deadline_ns:
+                words = "the watchdog still guards" if cause is None else cause.reason.words
+                raise DeviceFault("chain", words, fault_class=FaultClass.COMMUNICATION, needs=Remedy.OPERATOR)
+            self.sleep(self.period_s / 4)
         self.watchdog.call("clear")
         for link in self._links:
             link.call("clear")

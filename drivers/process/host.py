@@ -368,7 +368,7 @@ class Host:
             "activate": device.activate,
             "deactivate": lambda: device.deactivate(DeactivatePolicy(message["policy"])),
             "disconnect": device.disconnect,
-            "recover": lambda: device.recover(OperatorToken(message["operator"], message["t_ns"])),
+            "recover": lambda: _recover(device, OperatorToken(message["operator"], message["t_ns"])),
             "health": lambda: {"health": device.health() if isinstance(device, HealthSource) else {}},
             "acquire": lambda: self._arms[name].acquire(message["owner"]),
             "release": lambda: self._arms[name].release(message["epoch"]),
@@ -433,6 +433,14 @@ def _build(spec: Mapping[str, Any], clock: Clock) -> dict[str, Device]:
         driver = registry.spec(each["driver"])
         devices[each["name"]] = driver.build(each["name"], driver.config.model_validate(each["config"]), context)
     return devices
+
+
+def _recover(device: Device, token: OperatorToken) -> None:
+    """FAULTED -> READY. What the task has given up while it went on here is only given back."""
+    if device.state is Lifecycle.ACTIVE:
+        device.deactivate()
+    elif device.state is not Lifecycle.READY:
+        device.recover(token)
 
 
 def _twist_command(command: Any) -> TwistCommand:

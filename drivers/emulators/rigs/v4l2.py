@@ -30,6 +30,7 @@ def rig(folder: Path, address: int) -> Rig:
         spec=SPEC,
         start=start,
         build=build,
+        config=config,
         position=None,
         state_rate_hz=_RATE_HZ,
         faults={
