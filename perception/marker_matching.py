@@ -356,7 +356,8 @@ class MarkerMatcher:
 
 def _in_bytes(density: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Densities to a hundredth of a disc, in a quarter of the memory."""
-    return np.minimum(100.0 * density + 0.5, 255.0).astype(np.uint8)
+    rounded: NDArray[np.uint8] = np.minimum(100.0 * density + 0.5, 255.0).astype(np.uint8)
+    return rounded
 
 
 def _convincing(field: MarkerField) -> bool:

@@ -23,7 +23,7 @@ from perception.estimators import load_estimator  # noqa: E402
 from perception.evaluate import evaluate  # noqa: E402
 from perception.inference import ContactModel  # noqa: E402
 from perception.marker_estimator import MarkerEstimator, mixed  # noqa: E402
-from perception.marker_matching import DisplacementModel  # noqa: E402
+from perception.marker_matching import DisplacementModel, MarkerField  # noqa: E402
 from perception.marker_training import MarkerSettings, preprocessing_for, train_markers  # noqa: E402
 from perception.model_file import Labels, Model, load_model, save_model  # noqa: E402
 from perception.networks import Alignment  # noqa: E402
@@ -209,7 +209,10 @@ def test_numpy_and_torch_say_the_same(trained: Path) -> None:
             inputs = torch.from_numpy(displacements.ravel().astype(np.float32))
             outputs = network(inputs.expand(QUICK.networks, 1, -1)).numpy()[:, 0].astype(np.float64)
         mean, sigma = mixed(outputs[:, :6], outputs[:, 12:], model.header.labels)
-        found = estimator._infer(displacements)
+        field = MarkerField(
+            displacements, displacements, np.ones(331, bool), np.zeros(QUICK.modes), score=1.0, rms_px=0.1, valid=True
+        )
+        found = estimator.infer(field)
         np.testing.assert_allclose(found[0], mean, atol=1e-4)
         np.testing.assert_allclose(found[1], sigma, rtol=1e-3)
 
