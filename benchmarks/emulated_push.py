@@ -16,7 +16,8 @@ import sys
 import tempfile
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Final
 
@@ -131,7 +132,9 @@ def emulated(data: Mapping[str, Any], folder: Path) -> Push:
     return _push(RunFolder(folder / "run"), f"{result['outcome']}: {result['reason']}", witness.truth())
 
 
-def simulated(data: Mapping[str, Any], folder: Path, *, like: Path, late: Mapping[str, Latency] | None = None) -> Push:
+def simulated(
+    data: Mapping[str, Any], folder: Path, *, like: Path, late: Mapping[str, Latency] | None = None, seed: int = 1
+) -> Push:
     """The same cell with simulated devices, its arms where those of the run ``like`` began.
 
     Args:
@@ -139,10 +142,11 @@ def simulated(data: Mapping[str, Any], folder: Path, *, like: Path, late: Mappin
         folder: for the recording.
         like: run folder of the emulated cell.
         late: latency to add, by arm; None for none.
+        seed: of the camera's noise.
     """
     folder.mkdir(parents=True, exist_ok=True)
     before = RunFolder(like)
-    cell = {**data, "time": "simulated", "scene": data["emulated_scene"]}
+    cell = {**data, "time": "simulated", "seed": seed, "scene": data["emulated_scene"]}
     del cell["emulated_scene"]
     cell["arms"], cell["sensors"] = {}, {}
     for role, sensor in _SENSORS.items():
@@ -258,50 +262,80 @@ def _obeying_s(run: RunFolder, role: str) -> float:
     return float(min(_DELAYS_S, key=misfit))
 
 
-def mean_way_mm(pushes: Sequence[Push]) -> Array:
-    """(n, 2) where the object's middle was on average, every _GRID_S, for as long as the shortest push took."""
+def median_way_mm(pushes: Sequence[Push]) -> Array:
+    """(n, 2) where the object's middle was in the median, every _GRID_S, for as long as the shortest push took.
+
+    The median, because a machine that is busy elsewhere for a tenth of a second makes one push unlike the others.
+    """
     n = min(len(push.t_s) for push in pushes)
-    mean: Array = np.mean([push.object_mm_deg[:n, :2] for push in pushes], axis=0)
-    return mean
+    median: Array = np.median([push.object_mm_deg[:n, :2] for push in pushes], axis=0)
+    return median
 
 
 def differences_mm(push: Push, way_mm: Array) -> tuple[Array, Array]:
     """(n,) each: how far the object's middle was from where ``way_mm`` (n, 2) is then, and from the nearest of it."""
     points = push.object_mm_deg[: len(way_mm), :2]
-    then: Array = np.linalg.norm(points - way_mm[: len(points)], axis=1)
+    then = _then(points, way_mm)
     aside: Array = np.linalg.norm(points[:, None] - way_mm[None], axis=2).min(axis=1)
     return then, aside
+
+
+def _then(points_mm: Array, way_mm: Array) -> Array:
+    n = min(len(points_mm), len(way_mm))
+    away: Array = np.linalg.norm(points_mm[:n] - way_mm[:n], axis=1)
+    return away
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
     """Print the table; writes ``emulated-push.json`` and ``emulated-push.png`` into ``out``."""
     parser = argparse.ArgumentParser(prog="touchcell bench emulated-push", description=__doc__.partition("\n")[0])
-    parser.add_argument("--runs", type=int, default=3, help="of the emulated cell; they differ, as time is real")
+    parser.add_argument("--runs", type=int, default=3, help="of each kind: emulated ones differ as time is real")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="touchcell-push-") as name:
         folder = Path(name)
         data = cell_file(1)
-        real = [emulated(data, folder / f"emulated_{i}") for i in range(options.runs)]
-        done = [push for push in real if push.outcome.startswith(Outcome.DONE.value)]
+        done, failed = [], []
+        for i in range(options.runs):
+            try:
+                push = emulated(data, folder / f"emulated_{i}")
+            except DeviceError as error:
+                failed.append(str(error))
+                continue
+            if push.outcome.startswith(Outcome.DONE.value):
+                done.append(push)
+                like = folder / f"emulated_{i}" / "run"
+            else:
+                failed.append(push.outcome)
         if not done:
-            raise DeviceError("emulated cell", f"no push came to its end: {real[0].outcome}")
-        like = folder / f"emulated_{real.index(done[0])}" / "run"
-        prompt = simulated(data, folder / "prompt", like=like)
-        measured = {role: _mean([push.latency[role] for push in done]) for role in _SENSORS}
-        added = {role: measured[role].beyond(prompt.latency[role]) for role in _SENSORS}
-        late = simulated(data, folder / "late", like=like, late=added)
-    pushes = {f"emulated, run {i}": push for i, push in enumerate(real, start=1)}
-    pushes |= {"simulated, no latency added": prompt, "simulated, latency as measured": late}
-    way_mm = mean_way_mm(done)
+            raise DeviceError("emulated cell", "no push came to its end:\n" + "\n".join(failed))
+        seeds = range(1, options.runs + 1)
+        prompt = [simulated(data, folder / f"prompt_{seed}", like=like, seed=seed) for seed in seeds]
+        added = {role: _median(done, role).beyond(_median(prompt, role)) for role in _SENSORS}
+        late = [simulated(data, folder / f"late_{seed}", like=like, late=added, seed=seed) for seed in seeds]
+    kinds = {"emulated": done, "simulated": prompt, "simulated, latency added": late}
+    pushes = {f"{kind}, {i}": push for kind, runs in kinds.items() for i, push in enumerate(runs, start=1)}
+    way_mm = median_way_mm(done)
+    medians = {kind: median_way_mm(runs) for kind, runs in kinds.items()}
+    apart_mm = {
+        f"'{left}' and '{right}'": _rms(_then(medians[left], medians[right]))
+        for left, right in combinations(medians, 2)
+    }
     words = "; ".join(
         f"{role} {1e3 * each.sensing_s:.0f} ms of sensing, {1e3 * each.obeying_s:.0f} ms of obeying"
         for role, each in added.items()
     )
-    print(f"{table(pushes, way_mm)}\nadded: {words}")
+    lines = [f"medians apart, RMS: {pair} {distance_mm:.2f} mm" for pair, distance_mm in apart_mm.items()]
+    lines += [f"did not come to its end: {reason}" for reason in failed]
+    print("\n".join([table(pushes, way_mm), f"added: {words}", *lines]))
     _plot(pushes, way_mm, out / "emulated-push.png")
     report = {
         **provenance(),
         "added": {role: asdict(each) for role, each in added.items()},
+        "medians_apart_mm": apart_mm,
         "pushes": {title: _figures(push, way_mm) for title, push in pushes.items()},
     }
     (out / "emulated-push.json").write_text(json.dumps(report, indent=1) + "\n")
@@ -310,7 +344,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
 def table(pushes: Mapping[str, Push], way_mm: Array) -> str:
     """Every push, its latencies (leader / follower), and how far its object was from ``way_mm`` (n, 2)."""
     heads = (
-        ("", "error", "push", "frame to", "command to", "from the emulated runs' mean", "aside from its way"),
+        ("", "error", "push", "frame to", "command to", "from the emulated median", "aside from its way"),
         ("", "mm", "s", "command, ms", "motion, ms", "RMS mm    worst", "RMS mm    worst"),
     )
     lines = [_line(head) for head in heads]
@@ -322,8 +356,7 @@ def table(pushes: Mapping[str, Push], way_mm: Array) -> str:
         cells.append(" / ".join(f"{1e3 * each.obeying_s:.0f}" for each in latencies))
         cells += [f"{found[f'{kind}_rms_mm']:.2f}{found[f'{kind}_worst_mm']:>9.2f}" for kind in ("then", "aside")]
         lines.append(_line(cells))
-    bad = {title: push.outcome for title, push in pushes.items() if not push.outcome.startswith(Outcome.DONE.value)}
-    return "\n".join(lines + [f"{title}: {outcome}" for title, outcome in bad.items()])
+    return "\n".join(lines)
 
 
 def _line(cells: Sequence[str]) -> str:
@@ -339,16 +372,19 @@ def _figures(push: Push, way_mm: Array) -> dict[str, Any]:
         "error_mm": push.error_mm,
         "duration_s": push.duration_s,
         "latency": {role: asdict(each) for role, each in push.latency.items()},
-        "then_rms_mm": float(np.sqrt(np.mean(then**2))),
+        "then_rms_mm": _rms(then),
         "then_worst_mm": float(then.max()),
-        "aside_rms_mm": float(np.sqrt(np.mean(aside**2))),
+        "aside_rms_mm": _rms(aside),
         "aside_worst_mm": float(aside.max()),
     }
 
 
-def _mean(latencies: Sequence[Latency]) -> Latency:
-    sensing_s, obeying_s = np.mean([(each.sensing_s, each.obeying_s) for each in latencies], axis=0)
+def _median(pushes: Sequence[Push], role: str) -> Latency:
+    sensing_s, obeying_s = np.median([astuple(push.latency[role]) for push in pushes], axis=0)
     return Latency(float(sensing_s), float(obeying_s))
+
+
+_COLOURS: Final = {"emulated": "#1f77b4", "simulated": "#ff7f0e", "simulated, latency added": "#2ca02c"}
 
 
 def _plot(pushes: Mapping[str, Push], way_mm: Array, path: Path) -> None:
@@ -356,12 +392,13 @@ def _plot(pushes: Mapping[str, Push], way_mm: Array, path: Path) -> None:
 
     figure, (above, away) = plt.subplots(1, 2, figsize=(11, 3.8), layout="constrained")
     for title, push in pushes.items():
-        style = "-" if title.startswith("emulated") else "--"
-        above.plot(push.object_mm_deg[:, 0], push.object_mm_deg[:, 1], style, lw=1.2, label=title)
+        kind, _, number = title.rpartition(", ")
+        style = {"color": _COLOURS[kind], "lw": 1.0, "label": kind if number == "1" else None}
+        above.plot(push.object_mm_deg[:, 0], push.object_mm_deg[:, 1], **style)
         then, _ = differences_mm(push, way_mm)
-        away.plot(push.t_s[: len(then)], then, style, lw=1.2)
+        away.plot(push.t_s[: len(then)], then, **style)
     above.set(xlabel="x (mm)", ylabel="y (mm)", title="object's middle, from above")
-    away.set(xlabel="time since the push began (s)", ylabel="mm", title="from the emulated runs' mean at the same time")
+    away.set(xlabel="time since the push began (s)", ylabel="mm", title="from the emulated median at the same time")
     above.legend(fontsize=8)
     for axis in (above, away):
         axis.grid(alpha=0.3)

@@ -41,6 +41,14 @@ _SHEAR_N_MM = 0.4
 _LIFT_MAX_MM = 3.2
 _PRESS_MAX_MM = 2.2
 _LOST_DEG = 10.0
+_ROUND = ("cylinder", "bottle")
+# The cell's follower gives way sideways but slowly, for objects with flat sides: on these its contact would wander off
+# the line of the push, and the squeeze then turns a light slim one as much as friction on the table resists. The
+# squeeze on a round one always points at its axis, and it is a follower that stays put which pushes it aside.
+_FOLLOWER_OF_ROUND = {
+    "task.follower.kp_per_s": [4, 10, 10, 10, 0, 0],
+    "task.follower.ki_per_s2": [0, 25, 25, 25, 0, 0],
+}
 _TALL_G = (566.0, 436.0, 324.0, 373.0)
 
 
@@ -85,6 +93,8 @@ def _cell_changes(pushed: Pushed, arms: str) -> dict[str, Any]:
     press_mm, lift_mm = held_with_mm(pushed)
     same["task.reference_mm_deg"] = [press_mm, 0, 0, 0, 0, 0]
     same["task.follower.reference_mm_deg"] = [-lift_mm, 0, _FOLLOWER_MM, 0, 0, 0]
+    if pushed.shape["kind"] in _ROUND:
+        same |= _FOLLOWER_OF_ROUND
     return same | _boxes_up_to(height_mm, "leader_box", "follower_box")
 
 
