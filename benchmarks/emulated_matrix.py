@@ -125,6 +125,7 @@ class EmulatedCase:
         rest_s: from the end of the run until the arm truly stood; None where it cannot be told.
         distance_m: way of the tool in that time.
         reached: whether the fault was made to happen.
+        stalled_s: longest time for which this process was not let run from the fault on.
         problem: what was not as it has to be; empty if all was.
     """
 
@@ -135,6 +136,7 @@ class EmulatedCase:
     rest_s: float | None = None
     distance_m: float | None = None
     reached: bool = True
+    stalled_s: float = 0.0
     problem: str = ""
 
 
@@ -224,9 +226,8 @@ class Bench:
     def run(self, place: Place) -> EmulatedCase:
         """Let the fault happen and judge what comes of it; tried again where this machine does not let it be."""
         for _ in range(_TRIES):
-            with closing(_Stalls()) as stalls:
-                case = self._run_once(place)
-            if case.reached and stalls.longest_s < _STALL_S:
+            case = self._run_once(place)
+            if case.reached and case.stalled_s < _STALL_S:
                 break
         return case
 
@@ -291,6 +292,7 @@ def _run(case: EmulatedCase, rig: Rig, emulator: Emulated, plan: CellPlan, value
     cell, stop, sent = compose(plan), StopRequest(), SentCommands()
     injected_s: float | None = None
     witness: _Witness | None = None
+    stalls: _Stalls | None = None
     with ExitStack() as watch, suppress(DeviceError), cell:
         task = cell.task
         assert isinstance(task, MachineTask)
@@ -304,6 +306,7 @@ def _run(case: EmulatedCase, rig: Rig, emulator: Emulated, plan: CellPlan, value
             if injected_s is None and task.state == place.state:
                 wait -= 1
                 if wait <= 0:
+                    stalls = watch.enter_context(closing(_Stalls()))
                     injected_s = time.monotonic()
                     asked = _inject(emulator, place.fault, value)
                     if asked and rig.pose is not None and not rig.spec.capabilities.falls_on_power_loss:
@@ -315,10 +318,11 @@ def _run(case: EmulatedCase, rig: Rig, emulator: Emulated, plan: CellPlan, value
             going = loop.step()
         ended_s = time.monotonic()
         result = loop.end()
-        if injected_s is None:
+        if injected_s is None or stalls is None:
             case = replace(case, reached=False, problem=f"the state was not reached: {result.reason}")
         else:
             case = _judged(case, cell, result, sent, injected_s, ended_s)
+            case = replace(case, stalled_s=stalls.longest_s)
         if witness is not None:
             time.sleep(_STILL_S)
             witness.close()
