@@ -129,7 +129,7 @@ def pushing_plan(folder: Path, rate_hz: float) -> CellPlan:
 @contextmanager
 def pushing_emulators(folder: Path, number: int) -> Iterator[None]:
     """The emulated arms of ``pushing_plan``, at addresses that differ by ``number``."""
-    hosts = {arm: f"127.98.{number % 250}.{k}" for k, arm in enumerate(("leader", "follower"), start=2)}
+    hosts = {arm: f"127.99.{number % 250}.{k}" for k, arm in enumerate(("leader", "follower"), start=2)}
     (folder / EMULATORS).write_text(json.dumps(hosts))
     with (
         EmulatorProcess("franka", "--host", hosts["leader"]),
