@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ from drivers.process.chain import Chain
 from drivers.process.groups import Group, HostedDevice
 from drivers.process.proxies import RemoteJointArm
 from drivers.process.selftest import SelfTestFailed, self_test
+from drivers.simulation.scene import Scene
 
 RATE_HZ = 5.0
 """Slow, so that a machine that does other things besides is not taken for dead."""
@@ -357,11 +358,55 @@ def test_a_cell_says_what_other_processes_cannot_do(tmp_path: Path) -> None:
     with pytest.raises(InvalidCell) as caught:
         plan_cell(separate_cell(tmp_path, time="simulated"))
     assert [problem.key for problem in caught.value.problems] == ["processes"]
-    sensors = yaml.safe_load(SHIPPED.read_text())["sensors"]
-    sensors["sensor"]["estimator"] = {"kind": "true_contact"}
-    with pytest.raises(InvalidCell) as caught:
-        plan_cell(separate_cell(tmp_path, sensors=sensors))
-    assert [problem.key for problem in caught.value.problems] == ["sensors.sensor.estimator"]
+
+
+class Topics:
+    """A black box that remembers what it was told of."""
+
+    def __init__(self) -> None:
+        self.told: set[str] = set()
+
+    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
+        self.told.add(topic)
+
+
+def test_the_truth_of_a_scene_in_a_host_is_told_and_recorded(tmp_path: Path) -> None:
+    """A task runs on it, and objects are on record, though their scene is in another process."""
+    data = yaml.safe_load((SHIPPED.parent / "single_push_sim.yaml").read_text())
+    data |= {"time": "real", "processes": "separate", "rate_hz": RATE_HZ}
+    data["arms"]["arm"]["limits"]["tcp_speed_m_s"] = 0.03
+    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    path = tmp_path / "cell.yaml"
+    path.write_text(yaml.safe_dump(data))
+    box = Topics()
+    with compose(plan_cell(path)) as cell:
+        assert cell.scene is not None
+        assert not isinstance(cell.scene, Scene)
+        T_world_prism = cell.scene.objects().value["prism"]
+        np.testing.assert_allclose(T_world_prism[:2, 3], [0.0, 0.003], atol=1e-6)
+        contact = cell.scene.contact("sensor")
+        assert not contact.value.in_contact
+        # The tip stands 5 mm before the prism.
+        assert contact.value.depth_m == pytest.approx(-0.005, abs=1e-4)
+        stop = StopRequest()
+        loop = RunLoop(cell, None, box=box, stop=stop)
+        loop.begin()
+        for _ in range(12):
+            loop.step()
+        stop.ask_at_once()
+        loop.step()
+        loop.end()
+    assert {"/objects/prism", "/sensors/sensor/truth", "/sensors/sensor/contact"} <= box.told
+
+
+def test_a_scene_without_a_simulated_arm_stays_in_the_tasks_process(tmp_path: Path) -> None:
+    """So that real arms have hosts of their own, and one may die while another goes on."""
+    data = yaml.safe_load((SHIPPED.parent / "dual_push_emulated.yaml").read_text()) | {"processes": "separate"}
+    path = tmp_path / "cell.yaml"
+    path.write_text(yaml.safe_dump(data))
+    plan = plan_cell(path)
+    assert {group.name: group.scene for group in hosted_groups(plan)} == {"leader": None, "follower": None}
+    assert isinstance(compose(plan).scene, Scene)
 
 
 def test_arms_without_a_scene_live_alone(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from drivers.arm import Arm
 from drivers.clock import Clock
@@ -21,7 +21,9 @@ from drivers.process.layouts import (
     COMMAND,
     FRAME,
     HOST,
+    OBJECTS,
     TASK,
+    TRUTH,
     WATCH,
     Cause,
     Reason,
@@ -35,6 +37,9 @@ from drivers.process.link import Child, HostLink
 from drivers.process.proxies import RemoteArm, RemoteCamera, RemoteDevice, RemoteJointArm
 from drivers.process.watchdog import SLOW_PERIODS, silence_s
 from drivers.registry import DriverContext
+
+if TYPE_CHECKING:
+    from drivers.process.truth import RemoteScene
 
 _GUARD_S: Final = 1.0
 _UNGUARDED_SILENCE_S: Final = 2.0
@@ -52,6 +57,7 @@ class Chain:
 
     Attributes:
         devices: proxies of all hosted devices, by name, there from the beginning.
+        scene: the scene that lives in a host, as far as it can be looked into; None for none.
         state_fds: descriptors of the arms' state blocks, by name, while it runs.
     """
 
@@ -61,6 +67,7 @@ class Chain:
         self._seed = seed
         self._clock = clock
         self.devices: dict[str, Device] = {each.name: _proxy(each, clock) for group in groups for each in group.devices}
+        self.scene = next((_remote_scene(group.scene) for group in groups if group.scene is not None), None)
         self.state_fds: dict[str, int] = {}
         self._links: list[HostLink] = []
         self._watchdog: Child | None = None
@@ -213,7 +220,8 @@ class Chain:
                 "wake": self._event(),
                 "answered": self._event(),
                 "host": self._block(f"{group.name}-host", HOST),
-                "devices": {each.name: self._device_blocks(each) for each in group.devices},
+                "devices": {each.name: self._device_blocks(each, group) for each in group.devices},
+                **({} if group.scene is None else {"objects": self._block(f"{group.name}-objects", OBJECTS)}),
             }
             for group in self.groups
         ]
@@ -245,6 +253,10 @@ class Chain:
                 assert isinstance(device, RemoteDevice)
                 device.attach(link, device_fds)
                 self._exit.callback(device.detach)
+            if self.scene is not None and "objects" in fds:
+                truths = {name: each["truth"] for name, each in fds["devices"].items() if "truth" in each}
+                self.scene.attach(truths, fds["objects"])
+                self._exit.callback(self.scene.detach)
         self._watchdog.await_ready()
 
     def _start_host(self, group: Group, fds: Mapping[str, Any]) -> HostLink:
@@ -271,8 +283,10 @@ class Chain:
         self._exit.callback(link.close)
         return link
 
-    def _device_blocks(self, device: HostedDevice) -> dict[str, int]:
+    def _device_blocks(self, device: HostedDevice, group: Group) -> dict[str, int]:
         wanted = {"command": COMMAND, "answer": ANSWER, "state": ARM} if device.is_arm else {"frame": FRAME}
+        if not device.is_arm and group.scene is not None:
+            wanted["truth"] = TRUTH
         return {kind: self._block(f"{device.name}-{kind}", dtype) for kind, dtype in wanted.items()}
 
     def _block(self, name: str, dtype: Any) -> int:
@@ -294,6 +308,12 @@ def _proxy(device: HostedDevice, clock: Clock) -> RemoteDevice:
     # Never connected: it knows the arm's links by its configuration.
     twin = device.spec.build(device.name, device.config, DriverContext(clock))
     return RemoteJointArm(device.name, clock, twin.kinematics() if isinstance(twin, Arm) else None)
+
+
+def _remote_scene(section: Mapping[str, Any]) -> RemoteScene:
+    from drivers.process.truth import RemoteScene
+
+    return RemoteScene(list(section.get("objects", {})))
 
 
 def _numbers(fds: Any) -> tuple[int, ...]:

@@ -91,6 +91,18 @@ class MeasuredCarrier:
         return self._T_world_base @ self._T_base_tcp
 
 
+class SceneTruth(Protocol):
+    """What can be asked of a scene, also of one in another process."""
+
+    def contact(self, sensor: str, t_ns: int | None = None) -> Stamped[ContactState]:
+        """What ``sensor`` feels."""
+        ...
+
+    def objects(self) -> Stamped[Mapping[str, Array]]:
+        """T_world_object (4, 4) of every free object."""
+        ...
+
+
 class Scene:
     """A world and the sensors that touch it. One thread only.
 
