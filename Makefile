@@ -2,7 +2,7 @@
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
 BIN := .venv/bin
-SOURCES := pyproject.toml setup.py $(wildcard geometry/*.[ch] perception/*.[ch])
+SOURCES := pyproject.toml setup.py $(wildcard geometry/*.[ch] perception/*.[ch] drivers/simulation/*.[ch])
 
 .PHONY: demo test check fast stress clean
 

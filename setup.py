@@ -23,5 +23,12 @@ setup(
             # Without a compiler image networks serve, and marker estimators say what is missing.
             optional=True,
         ),
+        Extension(
+            "drivers.simulation._paint",
+            sources=["drivers/simulation/_paint.c"],
+            include_dirs=[numpy.get_include()],
+            extra_compile_args=["-O3"],
+            optional=True,
+        ),
     ]
 )

@@ -95,7 +95,7 @@ def arm_cell(task: str, role: str, rig: Rig, T_base_tcp: Array, collected: str) 
     yaw_deg = np.degrees(np.arctan2(ahead[1], ahead[0]))
     scene = {
         "physics": "quasi_static",
-        "step_ms": 5,
+        "step_ms": 10,
         "table": {"friction": "mdf", "height_mm": float(1e3 * (middle[2] - _PRISM_M[2] / 2))},
         "tip": {"stiffness_n_mm": 0.6},
         "objects": {
@@ -168,7 +168,8 @@ def _cell(
         "schema": 1,
         "name": f"matrix_{task}",
         "time": "real",
-        "rate_hz": 50,
+        # Objects that are pushed are computed beside a driver and what watches it.
+        "rate_hz": 25 if task.endswith("pushing") else 50,
         "arms": dict(arms),
         "sensors": dict(sensors),
         "interlocks": moving if arms else {},

@@ -12,6 +12,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -20,7 +21,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Final
 
-from benchmarks.emulated_matrix import ARMS, CAMERAS, RULES, EmulatedCase, Place, faults_of, places
+from benchmarks.emulated_matrix import ARMS, CAMERAS, LEFT_OUT, RULES, EmulatedCase, Place, faults_of, places
 from benchmarks.fault_matrix import median_and_worst
 from benchmarks.provenance import provenance
 
@@ -84,22 +85,23 @@ def run(arguments: Sequence[str], out: Path) -> None:
         part.unlink(missing_ok=True)
     with tempfile.TemporaryDirectory(prefix="touchcell-faults-") as folder:
         everything = [
-            (place, tried)
+            (place, rule)
             for driver in options.names or (*ARMS, *CAMERAS)
-            for place, tried in places(driver, Path(folder), everything=options.all)
+            for place, rule in places(driver, Path(folder))
             if (options.state is None or place.state in options.state)
             and (options.task is None or place.task in options.task)
         ]
         faults = {driver: faults_of(driver, Path(folder)) for driver in dict.fromkeys(p.driver for p, _ in everything)}
         found = {case.place: case for case in _kept(part)}
-        wanted = [place for place, tried in everything if tried]
+        wanted = [place for place, rule in everything if options.all or not rule]
         missing = [place for place in wanted if place not in found]
         for case in _run_all(missing, options.jobs, part, Path(folder)):
             found[case.place] = case
     cases = [found[place] for place in wanted if place in found]
     _print_table(cases, faults)
-    _print_coverage(cases, len(wanted), len(everything))
-    report = {**provenance(), "places": len(wanted), "cases": [asdict(case) for case in cases]}
+    same = Counter(rule for place, rule in everything if rule and place not in found)
+    _print_coverage(cases, len(wanted), len(everything), same)
+    report = {**provenance(), "places": len(everything), "same": same, "cases": [asdict(case) for case in cases]}
     (out / "faults.json").write_text(json.dumps(report, indent=1) + "\n")
     if len(cases) == len(wanted):
         part.unlink(missing_ok=True)
@@ -174,11 +176,14 @@ def _row(name: str, cases: Sequence[EmulatedCase]) -> str:
     return f"{name:<43}{len(cases):>7}{detection}{rest}{way}  {', '.join(sorted({c.ended_by or '-' for c in cases}))}"
 
 
-def _print_coverage(cases: Sequence[EmulatedCase], wanted: int, everything: int) -> None:
+def _print_coverage(cases: Sequence[EmulatedCase], wanted: int, everything: int, same: Mapping[str, int]) -> None:
     bad = [case for case in cases if case.problem]
-    print(f"\ntried: {len(cases)} of {wanted} places; as it has to be: {len(cases) - len(bad)}")
+    print(f"\nas it has to be: {len(cases) - len(bad)} of {len(cases)} places tried, {wanted} to be tried")
     for case in bad:
         print(f"  {case.place}: {case.problem}")
-    print(f"not tried of {everything} places: {everything - wanted}")
+    print(f"the same by construction: {sum(same.values())} of all {everything} places (--all tries them)")
     for rule in RULES:
-        print(f"  {rule}")
+        print(f"  {same[rule]:>4}: {rule}")
+    print("no part of the matrix:")
+    for reason in LEFT_OUT:
+        print(f"        {reason}")

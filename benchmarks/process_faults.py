@@ -6,6 +6,7 @@ believed but the records of the hosts, which are read from their memory, also wh
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -22,7 +23,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.two_arms import PERIOD_S
+from benchmarks.two_arms import PERIOD_S, pushing_emulators
 from cell.watch import NOTES
 from drivers.arm import LimitsConfig
 from drivers.process.layouts import ARM, RecordReader
@@ -35,7 +36,10 @@ _WATCHED_S: Final = 8.0
 _AFTERWARDS_S: Final = 0.3
 _END_S: Final = 30.0
 _STEADY_S: Final = 0.1
-MARGIN_S: Final = 0.1
+MARGIN_S: Final = {"sway": 0.1, "push": 0.2}
+"""What a stop may take besides: an emulated arm rounds its corners, and takes its time to say that it stands."""
+
+_numbers = itertools.count(os.getpid())
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,10 +118,10 @@ class TooBusy(RuntimeError):
     """The cell stopped before anything was done to it: this machine does not let it run."""
 
 
-def declared_s(rate_hz: float, speed_m_s: float) -> float:
+def declared_s(rate_hz: float, fastest_m_s: float, what: str = "sway") -> float:
     """Longest time (s) from a fault until both arms stand: two missed beats, a cycle of everybody, braking, margin."""
     limits = LimitsConfig().build()
-    return silence_s(1.0 / rate_hz) + 1.0 / rate_hz + speed_m_s / limits.accel_m_s2 + MARGIN_S
+    return silence_s(1.0 / rate_hz) + 1.0 / rate_hz + fastest_m_s / limits.accel_m_s2 + MARGIN_S[what]
 
 
 def run_fault(folder: Path, fault: ProcessFault, rate_hz: float, what: str = "sway") -> ProcessCase:
@@ -128,8 +132,8 @@ def run_fault(folder: Path, fault: ProcessFault, rate_hz: float, what: str = "sw
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "fault").write_text(fault.inner)
-    with _cell(folder, rate_hz, what) as (process, who, states):
-        _await_motion(process, states)
+    with running_cell(folder, rate_hz, what) as (process, who, states):
+        await_motion(process, states)
         host = next(iter(who["hosts"]))
         victim = {"task": who["task"], "watchdog": who["watchdog"], "host": who["hosts"][host]}[fault.who]
         hurt_arms = set(who["arms"][host]) if fault.who == "host" else set()
@@ -147,10 +151,10 @@ def run_fault(folder: Path, fault: ProcessFault, rate_hz: float, what: str = "sw
         time.sleep(_AFTERWARDS_S)
         afterwards = {name: state.read() for name, state in states.items()}
         process.send_signal(signal.SIGTERM)
-        outcome = _last_line(process)
-        problems = _left_over([who["task"], who["watchdog"], *who["hosts"].values()])
+        outcome = last_line(process)
+        problems = left_over([who["task"], who["watchdog"], *who["hosts"].values()])
         arms = [_arm_case(name, before[name], record, hurt_ns) for name, record in at_rest.items()]
-        longest_s = declared_s(rate_hz, max(_speed_m_s(record) for record in before.values()))
+        longest_s = declared_s(rate_hz, max(speed_m_s(record) for record in before.values()), what)
         for case in arms:
             problems += _judged(case, fault, longest_s)
         for name, record in afterwards.items():
@@ -189,14 +193,20 @@ def _arm_case(name: str, before: Any, record: Any, hurt_ns: int) -> ArmCase:
 
 
 @contextmanager
-def _cell(
-    folder: Path, rate_hz: float, what: str
+def running_cell(
+    folder: Path, rate_hz: float, what: str, environment: Mapping[str, str] | None = None
 ) -> Iterator[tuple[subprocess.Popen[bytes], dict[str, Any], dict[str, RecordReader]]]:
     """The running cell, who takes part in it, and the records of its arms."""
     command = [sys.executable, "-m", "benchmarks.process_victim", str(folder), f"{rate_hz:g}", what]
     with ExitStack() as exits, (folder / "stderr").open("wb") as stderr:
+        if what == "push":
+            exits.enter_context(pushing_emulators(folder, next(_numbers)))
         process = subprocess.Popen(
-            command, bufsize=0, stdout=subprocess.PIPE, stderr=stderr, env=os.environ | {"OMP_NUM_THREADS": "1"}
+            command,
+            bufsize=0,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            env=os.environ | {"OMP_NUM_THREADS": "1", **(environment or {})},
         )
         exits.enter_context(process)
         exits.callback(process.kill)
@@ -215,7 +225,7 @@ def _cell(
         yield process, who, states
 
 
-def _await_motion(process: subprocess.Popen[bytes], states: Mapping[str, RecordReader]) -> None:
+def await_motion(process: subprocess.Popen[bytes], states: Mapping[str, RecordReader]) -> None:
     """Return when both arms are at work, and going as fast as they do."""
     assert process.stdout is not None
     if not select.select([process.stdout], [], [], _MOVING_S)[0]:
@@ -227,14 +237,15 @@ def _await_motion(process: subprocess.Popen[bytes], states: Mapping[str, RecordR
         if process.poll() is not None or time.monotonic() > deadline_s:
             raise TooBusy("it stopped by itself")
         turning = (time.monotonic() * 2.0 / PERIOD_S) % 1.0 > 0.5
-        if turning or min(_speed_m_s(state.read()) for state in states.values()) < _MOVING_M_S:
+        if turning or min(speed_m_s(state.read()) for state in states.values()) < _MOVING_M_S:
             since_s = None
         elif since_s is None:
             since_s = time.monotonic()
         time.sleep(0.005)
 
 
-def _speed_m_s(record: Any) -> float:
+def speed_m_s(record: Any) -> float:
+    """Speed of the tool that a host's record tells."""
     return float(np.linalg.norm(record["twist"][:3]))
 
 
@@ -250,7 +261,8 @@ def _await_rest(states: Mapping[str, RecordReader]) -> None:
         time.sleep(0.005)
 
 
-def _last_line(process: subprocess.Popen[bytes]) -> dict[str, Any]:
+def last_line(process: subprocess.Popen[bytes]) -> dict[str, Any]:
+    """What the cell says at its end; empty if it says nothing."""
     with suppress(subprocess.TimeoutExpired):
         process.wait(_END_S)
     process.kill()
@@ -259,7 +271,7 @@ def _last_line(process: subprocess.Popen[bytes]) -> dict[str, Any]:
     return dict(json.loads(lines[-1])) if lines else {}
 
 
-def _left_over(pids: Sequence[int]) -> list[str]:
+def left_over(pids: Sequence[int]) -> list[str]:
     """Processes of the cell that are still there when it has ended; they are ended then."""
     deadline_s = time.monotonic() + _END_S
     left = [pid for pid in pids if _alive(pid)]

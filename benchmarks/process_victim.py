@@ -13,6 +13,7 @@ import resource
 import signal
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any, Final
 
@@ -89,13 +90,16 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: stop.ask())
     signal.signal(signal.SIGUSR1, _InnerFault(folder))
     box = BlackBox()
+    wall_s = time.time() - time.monotonic()
     with Recorder(folder / "run.mcap") as recorder, compose(PLANS[what](folder, rate_hz)) as cell:
         cell.watch.note_to(folder)
         print(json.dumps(_participants(cell)), flush=True)
         result = RunLoop(cell, recorder, box=box, stop=stop, on_cycle=_Announce()).run()
         causes = [[cause.interlock, cause.subject, cause.reason] for cause in result.causes]
         kind = type(result.error).__name__ if result.error else ""
-        print(json.dumps({"outcome": result.outcome.value, "causes": causes, "error": kind}), flush=True)
+        stepped_s = time.time() - time.monotonic() - wall_s
+        told = {"outcome": result.outcome.value, "causes": causes, "error": kind, "clock_stepped_s": stepped_s}
+        print(json.dumps(told), flush=True)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -14,10 +16,12 @@ from cell.cli import find_cell
 from cell.config import CellFile, CellPlan, DevicePlan, plan_cell
 from drivers import registry
 from drivers.commands import TwistCommand, TwistFrame
+from drivers.emulators.process import EmulatorProcess
 from tasks.interface import Action, Observation, TaskConfig, TaskContext, TaskSpec, TransitionRecord
 
 SPEED_M_S: Final = 0.03
 PERIOD_S: Final = 2.0
+EMULATORS: Final = "emulators.json"
 _ABILITIES: Final = frozenset({"TcpSource", "TwistSink", "Stoppable"})
 
 
@@ -63,7 +67,12 @@ SPEC: Final = TaskSpec(
 
 
 def two_arm_plan(
-    folder: Path, rate_hz: float, *, processes: str = "separate", categories: Mapping[str, int] | None = None
+    folder: Path,
+    rate_hz: float,
+    *,
+    processes: str = "separate",
+    categories: Mapping[str, int] | None = None,
+    on_trip: str = "end",
 ) -> CellPlan:
     """The plan of the cell: no scene, so that each arm is a group by itself."""
     driver = registry.spec("sim_arm")
@@ -84,6 +93,7 @@ def two_arm_plan(
             "time": "real",
             "rate_hz": rate_hz,
             "processes": processes,
+            "on_trip": on_trip,
             "arms": arms,
             "task": {"name": SPEC.name},
         }
@@ -97,15 +107,32 @@ def two_arm_plan(
 
 
 def pushing_plan(folder: Path, rate_hz: float) -> CellPlan:
-    """The cell in which two arms push, as it ships but in real time, in several processes, and at this rate.
+    """The cell in which two emulated arms push, on the true contact, in several processes, at this rate.
+
+    Each arm has a host of its own; the scene, which nothing moves by, is in the task's process. The file ``EMULATORS``
+    in ``folder`` tells the address of each arm.
 
     Raises:
         ConfigError: the cell cannot run so slowly.
     """
-    data = yaml.safe_load(find_cell(Path("configs/dual_push_sim.yaml")).read_text())
-    data |= {"time": "real", "processes": "separate", "rate_hz": rate_hz}
-    # A cycle is longer than in the cell that ships, and a state is as old as the perception that follows it takes.
-    data["interlocks"]["stale_arm"]["limit_ms"] = 4e3 / rate_hz
+    data = yaml.safe_load(find_cell(Path("configs/dual_push_emulated.yaml")).read_text())
+    data |= {"processes": "separate", "rate_hz": rate_hz}
+    for arm, host in json.loads((folder / EMULATORS).read_text()).items():
+        data["arms"][arm]["host"] = host
+    for sensor in data["sensors"].values():
+        sensor["estimator"] = {"kind": "true_contact"}
     path = folder / "cell.yaml"
     path.write_text(yaml.safe_dump(data))
     return plan_cell(path)
+
+
+@contextmanager
+def pushing_emulators(folder: Path, number: int) -> Iterator[None]:
+    """The emulated arms of ``pushing_plan``, at addresses that differ by ``number``."""
+    hosts = {arm: f"127.99.{number % 250}.{k}" for k, arm in enumerate(("leader", "follower"), start=2)}
+    (folder / EMULATORS).write_text(json.dumps(hosts))
+    with (
+        EmulatorProcess("franka", "--host", hosts["leader"]),
+        EmulatorProcess("ur", "--host", hosts["follower"]),
+    ):
+        yield

@@ -83,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
         help="Gaussian-density network, regression or marker estimator",
     )
     train.add_argument("--epochs", type=int)
-    train.add_argument("--networks", type=int, help="of a marker estimator, whose mixture it gives (default: 4)")
+    train.add_argument("--networks", type=int, help="of a marker estimator, whose mixture it gives (default: 2)")
     train.add_argument(
         "--short-side",
         type=int,

@@ -43,7 +43,7 @@ from tasks.interface import Task, TaskContext
 
 if TYPE_CHECKING:
     from drivers.process.chain import Chain
-    from drivers.simulation.scene import Scene
+    from drivers.simulation.scene import Scene, SceneTruth
     from perception.filter import ContactFilter
 
 BUILTIN = "builtin:"
@@ -147,7 +147,7 @@ class Cell:
         stop_categories: by which each arm stops when something is wrong, by role.
         holding: roles of arms that keep their power when another's fault stops them.
         watched_joints: roles of arms whose joint angles an interlock looks at.
-        scene: what is simulated around the arms, None in a cell of real devices, or where it is in another process.
+        scene: what is simulated around the arms, as far as it can be looked into; None in a cell of real devices.
         collection: where labelled frames go, None where the task labels none.
         watch: who looks after the loop.
     """
@@ -163,7 +163,7 @@ class Cell:
     stop_categories: Mapping[str, StopCategory] = field(default_factory=dict)
     holding: frozenset[str] = frozenset()
     watched_joints: frozenset[str] = frozenset()
-    scene: Scene | None = None
+    scene: SceneTruth | None = None
     collection: Collection | None = None
     watch: Watch = field(default_factory=OneProcess)
     start_ns: int = 0
@@ -229,10 +229,12 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
     cell_clock = clock or _clock(plan)
     chain = _chain(plan, cell_clock)
     hosted = {} if chain is None else chain.devices
+    remote = None if chain is None else chain.scene
     # A scene that lives in a host is not here too.
-    scene = _scene(plan, cell_clock) if chain is None else None
+    local = _scene(plan, cell_clock) if remote is None else None
+    scene = local if remote is None else remote
     wanted = {name: device for name, device in {**plan.arms, **plan.sensors}.items() if name not in hosted}
-    devices = {**build_devices(plan, wanted, cell_clock, scene), **hosted}
+    devices = build_devices(plan, wanted, cell_clock, local, hosted)
     arm_of = {name: role for role, name in plan.arm_roles.items()}
     arm_of |= {name: name for name in plan.arms if name not in arm_of}
     sensors = {role: _sensor(plan, name, devices, scene, arm_of) for role, name in plan.sensor_roles.items()}
@@ -267,18 +269,23 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
 
 
 def build_devices(
-    plan: CellPlan, wanted: Mapping[str, DevicePlan], clock: Clock | None = None, scene: Scene | None = None
+    plan: CellPlan,
+    wanted: Mapping[str, DevicePlan],
+    clock: Clock | None = None,
+    scene: Scene | None = None,
+    present: Mapping[str, Device] | None = None,
 ) -> dict[str, Device]:
-    """Make the ``wanted`` devices of ``plan``, DISCONNECTED, each after those that it depends on.
+    """Make the ``wanted`` devices of ``plan``, DISCONNECTED, each after those that it depends on; with those present.
 
     Args:
         plan: a checked cell file.
         wanted: arms before the sensors that they carry.
         clock: in place of the one that the file asks for.
         scene: the simulated scene, if it is there already.
+        present: devices that are there already.
     """
     clock = clock or _clock(plan)
-    devices: dict[str, Device] = {}
+    devices: dict[str, Device] = dict(present or {})
     if scene is None and wanted:
         scene = _scene(plan, clock)
     bases = {name: se3.from_euler_mm_deg(np.array(arm.base_pose_mm_deg)) for name, arm in plan.cell.arms.items()}
@@ -329,7 +336,7 @@ def _collection(plan: CellPlan) -> Collection | None:
 
 
 def _sensor(
-    plan: CellPlan, name: str, devices: Mapping[str, Device], scene: Scene | None, arm_of: Mapping[str, str]
+    plan: CellPlan, name: str, devices: Mapping[str, Device], scene: SceneTruth | None, arm_of: Mapping[str, str]
 ) -> Sensor:
     section = plan.cell.sensors[name]
     T_tcp_sensor = se3.from_euler_mm_deg(np.array(section.tcp_to_sensor_mm_deg))
@@ -353,7 +360,7 @@ def _sensor(
     )
 
 
-def _truth(name: str, mount: Device | None, scene: Scene | None, T_tcp_sensor: Array) -> ContactSource | None:
+def _truth(name: str, mount: Device | None, scene: SceneTruth | None, T_tcp_sensor: Array) -> ContactSource | None:
     from cell.truth import LabelledContactSource, TrueContactSource
     from drivers.replay_arm import ReplayArm
 

@@ -468,13 +468,6 @@ class _Planner:
             self._add(
                 ("processes",), "several processes share real time only", value=cell.processes, hint="`time: real`"
             )
-        for name, section in cell.sensors.items():
-            if section.estimator.kind == "true_contact":
-                self._add(
-                    ("sensors", name, "estimator"),
-                    "true_contact needs the scene in the task's own process",
-                    hint="use kind: network, or leave out `processes:`",
-                )
         for role, abilities in task.arms.items():
             if missing := abilities - REMOTE_ABILITIES:
                 self._add(

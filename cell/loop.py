@@ -236,6 +236,8 @@ class RunLoop:
         cell = self._cell
         roles = {arm.name: role for role, arm in cell.arms.items()}
         now_ns, latch = cell.clock.now_ns(), cell.supervisor.latch
+        # Whoever looks on from outside may know better why a device does not answer.
+        latch.update(cell.watch.alarms(now_ns))
         fault = Violation("device", Severity.FAULT, roles.get(error.device, error.device), str(error), now_ns)
         is_new = (fault.interlock, fault.subject) not in {(cause.interlock, cause.subject) for cause in latch.causes}
         latch.update([fault])

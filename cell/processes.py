@@ -21,7 +21,8 @@ SCENE: Final = "scene"
 def hosted_groups(plan: CellPlan) -> tuple[Group, ...]:
     """The groups of a cell with `processes: separate`: everything that takes part in one scene, and each other arm.
 
-    Cameras without a scene, and arms that cannot be moved, stay in the task's process.
+    Cameras without a scene, and arms that cannot be moved, stay in the task's process; so does a scene without a
+    simulated arm in it, for nothing moves by it.
     """
     in_scene = _in_scene(plan)
     groups = []
@@ -118,6 +119,10 @@ class ProcessWatch:
         """Nobody is guarded any more."""
         self.chain.end()
 
+    def clear(self) -> None:
+        """Clear the latches of watchdog and hosts. Raises LifecycleError, DeviceFault."""
+        self.chain.clear()
+
     def note_to(self, folder: Path) -> None:
         """Have the watchdog write ``watchdog.json`` there when it stops the arms."""
         self.chain.note_to(folder / NOTES)
@@ -144,6 +149,8 @@ def build_chain(plan: CellPlan, clock: Any) -> Chain:
 def _in_scene(plan: CellPlan) -> list[DevicePlan]:
     """Everything that takes part in the simulated scene, arms first."""
     if plan.cell.scene is None:
+        return []
+    if not any(each.spec.capabilities.virtual_time for each in plan.arms.values()):
         return []
     sensors = [each for each in plan.sensors.values() if each.spec.capabilities.virtual_time]
     carriers = {plan.cell.sensors[each.name].mounted_on for each in sensors}

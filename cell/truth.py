@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from drivers.replay_arm import ReplayArm
-from drivers.simulation.scene import Scene
+from drivers.simulation.scene import SceneTruth
 from geometry import se3
 from geometry.gaussian import PoseGaussian
 from geometry.types import Array
@@ -23,7 +23,7 @@ class TrueContactSource:
 
     ended = False
 
-    def __init__(self, scene: Scene, sensor: str) -> None:
+    def __init__(self, scene: SceneTruth, sensor: str) -> None:
         self._scene = scene
         self._sensor = sensor
 

@@ -63,7 +63,16 @@ class Waiting:
             return False, f"refused: {error}"
         if view is None:
             return False, "refused: a device does not answer yet; if it has just been recovered, ask again"
-        outcome = self._cell.supervisor.reset(token, view, self._cell.watch.alarms(view.now_ns))
+        supervisor = self._cell.supervisor
+        if supervisor.latch.state is LatchState.CAUSE_GONE:
+            try:
+                # A host forgets its stop only for an arm that nobody holds.
+                for role, lease in self._leases.items():
+                    self._cell.arms[role].release(lease)
+                self._cell.watch.clear()
+            except DeviceError as error:
+                return False, f"refused: {error}"
+        outcome = supervisor.reset(token, view, self._cell.watch.alarms(view.now_ns))
         if not isinstance(outcome, ResetDone):
             return False, f"refused: {outcome.reason.value}"
         self.resets.append(outcome)

@@ -43,7 +43,11 @@ class Watch(Protocol):
         ...
 
     def end(self) -> None:
-        """The arms stand, or have been told all that can be told."""
+        """The arms stand, or have been told all that can be told. From here on ``alarms`` tells what is still wrong."""
+        ...
+
+    def clear(self) -> None:
+        """Forget why it has stopped the arms, on a person's reset: they stand and are nobody's. Raises DeviceError."""
         ...
 
     def note_to(self, folder: Path) -> None:
@@ -81,6 +85,9 @@ class OneProcess:
 
     def end(self) -> None:
         """Nobody watched."""
+
+    def clear(self) -> None:
+        """Nobody has stopped anything."""
 
     def note_to(self, folder: Path) -> None:
         """Nobody writes."""

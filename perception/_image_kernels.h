@@ -179,26 +179,15 @@ WIDE_VECTORS static void roll_columns(uint16_t *restrict sums, const uint8_t *in
         sums[x] = (uint16_t)(sums[x] + in[x] - out[x]);
 }
 
-/* before[i]: the sum of the first i numbers, whose count is a multiple of four. Four parts at once, since each addition
- * waits for the one before. */
+/* before[i]: the sum of the first i numbers. */
 static void add_up(const uint16_t *restrict numbers, ptrdiff_t count, uint32_t *restrict before)
 {
-    ptrdiff_t part = count / 4;
-    const uint16_t *n0 = numbers, *n1 = n0 + part, *n2 = n1 + part, *n3 = n2 + part;
-    uint32_t a = 0, b = 0, c = 0, d = 0, *to = before + 1;
-    *before = 0;
-    for (ptrdiff_t i = 0; i < part; i++) {
-        to[i] = a += n0[i];
-        to[i + part] = b += n1[i];
-        to[i + 2 * part] = c += n2[i];
-        to[i + 3 * part] = d += n3[i];
+    uint32_t total = 0;
+    for (ptrdiff_t i = 0; i < count; i++) {
+        before[i] = total;
+        total += numbers[i];
     }
-    for (ptrdiff_t i = part; i < 2 * part; i++)
-        to[i] += a;
-    for (ptrdiff_t i = 2 * part; i < 3 * part; i++)
-        to[i] += a + b;
-    for (ptrdiff_t i = 3 * part; i < count; i++)
-        to[i] += a + b + c;
+    before[count] = total;
 }
 
 /* White where a pixel exceeds the rounded mean of its neighbourhood less the offset, in whole numbers throughout. */
@@ -221,7 +210,7 @@ static int threshold(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height
                      ptrdiff_t block, int32_t offset, uint8_t *to)
 {
     Rows rows;
-    ptrdiff_t half = block / 2, padded = (width + block + 3) / 4 * 4;
+    ptrdiff_t half = block / 2, padded = width + block - 1;
     uint16_t *columns = calloc((size_t)padded, sizeof *columns);
     uint32_t *before = malloc((size_t)(padded + 1) * sizeof *before);
     int done = columns && before && open_rows(&rows, image, row_bytes, height, width, with_median, block + 1);
@@ -249,15 +238,15 @@ static int threshold(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height
     return done;
 }
 
-/* Means of squares of `factor` pixels, rounded to the nearest and to even where two are as near: the same as OpenCV's
- * resize with INTER_AREA by a whole factor. `to` is (height / factor, width / factor). 0: out of memory. */
+/* Means of squares of `factor` pixels, a power of two up to 64, rounded to the nearest and to even where two are as near:
+ * what OpenCV's resize with INTER_AREA gives for these factors but 2. `to` is (height / factor, width / factor).
+ * 0: out of memory. */
 WIDE_VECTORS static int shrink(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width, ptrdiff_t factor,
                   uint8_t *to)
 {
     ptrdiff_t rows = height / factor, columns = width / factor;
-    /* Up to a factor of 64 the product with the inverse, rounded down, is the quotient. */
     uint32_t area = (uint32_t)(factor * factor);
-    uint64_t inverse = ((1ull << 32) + area - 1) / area;
+    int bits = lowest_bit(area);
     uint16_t *sums = malloc((size_t)width * sizeof *sums);
     if (!sums)
         return 0;
@@ -272,7 +261,7 @@ WIDE_VECTORS static int shrink(const uint8_t *image, ptrdiff_t row_bytes, ptrdif
             uint32_t sum = 0;
             for (ptrdiff_t i = 0; i < factor; i++)
                 sum += sums[x * factor + i];
-            uint32_t mean = (uint32_t)(sum * inverse >> 32), rest = sum - mean * area;
+            uint32_t mean = sum >> bits, rest = sum - mean * area;
             to[y * columns + x] = (uint8_t)(mean + (2 * rest + mean % 2 > area));
         }
     }

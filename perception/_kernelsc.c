@@ -177,6 +177,10 @@ static PyObject *py_shrink(PyObject *module, PyObject *const *arguments, Py_ssiz
         !(to = take(&call, "to", arguments[2], 'B', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2,
                     image->shape[0] / (Py_ssize_t)factor, image->shape[1] / (Py_ssize_t)factor)))
         return finish(&call, NULL);
+    if ((int)factor & ((int)factor - 1)) {
+        refuse(&call, "factor", "is no power of two");
+        return finish(&call, NULL);
+    }
     return ended(&call, shrink(image->buf, image->strides[0], image->shape[0], image->shape[1], (ptrdiff_t)factor, to->buf));
 }
 
@@ -364,10 +368,27 @@ static PyObject *py_affine(PyObject *module, PyObject *const *arguments, Py_ssiz
     return ended(&call, 1);
 }
 
+static PyObject *py_bytes_apart(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "bytes_apart"};
+    Py_buffer *rows, *one, *apart;
+    if (!takes(&call, count, 3) ||
+        !(rows = take(&call, "rows", arguments[0], 'B', PyBUF_C_CONTIGUOUS, 2, (Py_ssize_t)ANY, (Py_ssize_t)ANY)) ||
+        !(one = take(&call, "one", arguments[1], 'B', PyBUF_C_CONTIGUOUS, 1, rows->shape[1])) ||
+        !(apart = take(&call, "apart", arguments[2], 'i', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1, rows->shape[0])))
+        return finish(&call, NULL);
+    if (rows->shape[1] > 32768) {
+        refuse(&call, "rows", "are longer than 32768");
+        return finish(&call, NULL);
+    }
+    bytes_apart(rows->buf, rows->shape[0], one->buf, rows->shape[1], apart->buf);
+    return ended(&call, 1);
+}
+
 #define FAST(name) {#name, (PyCFunction)(void (*)(void))py_##name, METH_FASTCALL, NULL}
 
 static PyMethodDef METHODS[] = {FAST(median_5), FAST(threshold), FAST(shrink),  FAST(discs),  FAST(pair), FAST(fit),
-                                FAST(settle),   FAST(density),   FAST(affine), {NULL, NULL, 0, NULL}};
+                                FAST(settle),   FAST(density),   FAST(bytes_apart), FAST(affine), {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "perception._kernelsc",
                                     "Compiled kernels of perception.kernels.", -1, METHODS};

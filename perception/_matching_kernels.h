@@ -330,6 +330,20 @@ static void add_density(const double *points, const double *weights, ptrdiff_t c
     }
 }
 
+/* Squared distances of rows of bytes from one more, up to 32768 of them. */
+WIDE_VECTORS static void bytes_apart(const uint8_t *rows, ptrdiff_t count, const uint8_t *one, ptrdiff_t length,
+                                     int32_t *apart)
+{
+    for (ptrdiff_t row = 0; row < count; row++, rows += length) {
+        int32_t sum = 0;
+        for (ptrdiff_t i = 0; i < length; i++) {
+            int16_t off = (int16_t)(rows[i] - one[i]);
+            sum += off * off;
+        }
+        apart[row] = sum;
+    }
+}
+
 /* to = bias + x' weight, weight being (inputs, outputs): all outputs advance together, input by input. */
 WIDE_VECTORS static void affine(const float *restrict weight, const float *restrict bias, const float *restrict x,
                                 ptrdiff_t inputs, ptrdiff_t outputs, float *restrict to)

@@ -1,8 +1,8 @@
 """The inner loops of perception, in C: arrays in, new arrays out.
 
-Each raises ``ArrayError`` where an argument has another shape or type than it says, or is not finite. Without a compiler
-there is no extension: the image filters then are OpenCV's, whose results are the same to the bit, and the others
-raise ``KernelsMissing``.
+Each raises ``ArrayError`` where an argument has another shape or type than it says, or is not finite. Without a
+compiler there is no extension: the image filters then are OpenCV's, whose results are the same to the bit, and the
+others raise ``KernelsMissing``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from perception.errors import KernelsMissing
 
 _COLUMNS = 8
 _MOST_OFFSET = 256.0
-_MOST_FACTOR = 64
+_FACTORS = (4, 8, 16, 32, 64)
 
 
 def _find() -> ModuleType | None:
@@ -79,7 +79,7 @@ def area_means(image: ImageArray, size: tuple[int, int]) -> ImageArray:
         size: (height, width) of the result.
     """
     factor = image.shape[0] // size[0]
-    if _FOUND is None or not 1 < factor <= _MOST_FACTOR or image.shape != (factor * size[0], factor * size[1]):
+    if _FOUND is None or factor not in _FACTORS or image.shape != (factor * size[0], factor * size[1]):
         return np.asarray(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA), np.uint8)
     means = np.empty(size, np.uint8)
     _FOUND.shrink(_in_rows(image), factor, means)
@@ -112,7 +112,8 @@ def pair(places: Array, points: Array) -> tuple[NDArray[np.int64], Array, NDArra
     Returns:
         (m,) each; of equals the first counts.
     """
-    partner, square, owns = (np.empty(len(places), dtype) for dtype in (np.int64, np.float64, np.bool_))
+    m = len(places)
+    partner, square, owns = np.empty(m, np.int64), np.empty(m), np.empty(m, np.bool_)
     _compiled().pair(np.ascontiguousarray(places), np.ascontiguousarray(points), partner, square, owns)
     return partner, square, owns
 
@@ -201,6 +202,13 @@ def density(centres: Array, weights: Array, low: Array, cell_px: float, grid: in
     result = np.zeros((len(centres), grid, grid))
     _compiled().density(np.ascontiguousarray(centres), np.ascontiguousarray(weights), low, cell_px, result)
     return result
+
+
+def bytes_apart(rows: NDArray[np.uint8], one: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """(b,) squared distances of rows (b, n) from one more (n,), n at most 32768."""
+    apart = np.empty(len(rows), np.int32)
+    _compiled().bytes_apart(rows, one, apart)
+    return apart
 
 
 def affine(weight: NDArray[np.float32], bias: NDArray[np.float32], x: NDArray[np.float32]) -> NDArray[np.float32]:

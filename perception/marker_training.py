@@ -41,6 +41,7 @@ from perception.training_display import Display, Observer
 from perception.training_end import write_trained
 
 _LEAST_SCORE_TAUGHT = 0.9
+_LEAST_BATCHES = 16
 _MATCHING = 2  # Counts the ways of matching there have been, so that no other way's result is taken from the cache.
 
 
@@ -49,7 +50,7 @@ class MarkerSettings:
     """How to train. The figures that chose the defaults are in docs/decisions/0006-markers.md.
 
     Attributes:
-        epochs: passes over the training set.
+        epochs: passes over the training set; over few images, as many passes each as make 16 batches.
         seed: of everything random.
         rings: of the sensor's lattice.
         modes: in which its markers move together.
@@ -69,8 +70,8 @@ class MarkerSettings:
     rings: int = 10
     modes: int = 24
     guess_steps: int = 1200
-    hidden: tuple[int, ...] = (384, 384, 192)
-    networks: int = 4
+    hidden: tuple[int, ...] = (384, 512, 512, 256)
+    networks: int = 2
     batch_size: int = 64
     learning_rate: float = 1e-3
     weight_decay: float = 0.01
@@ -372,7 +373,7 @@ class _Run:
         self.average = copy.deepcopy(self.network).eval()
         self.alignment = Alignment(self.labels)
         self.optimizer = torch.optim.AdamW(
-            self.network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
+            self.network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True
         )
         self.inputs = torch.from_numpy(self.matched.training[self.matched.taught])
         self.targets = self._normalised(self.training_xi[self.matched.taught])
@@ -423,8 +424,11 @@ class _Run:
         torch.manual_seed(int(np.random.SeedSequence((self.settings.seed, epoch)).generate_state(1)[0]))
         settings = self.settings
         self.network.train()
-        order = torch.stack([torch.randperm(len(self.inputs)) for _ in range(settings.networks)])
-        batches = max(1, len(self.inputs) // settings.batch_size)
+        # Of few images, an epoch sees each several times: eighty steps would not teach a network to its end.
+        passes = math.ceil(_LEAST_BATCHES * settings.batch_size / len(self.inputs))
+        n, networks = len(self.inputs), range(settings.networks)
+        order = torch.cat([torch.stack([torch.randperm(n) for _ in networks]) for _ in range(passes)], dim=1)
+        batches = order.shape[1] // settings.batch_size
         total = 0.0
         for i in range(batches):
             step = (epoch - 1) * batches + i

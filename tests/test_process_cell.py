@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,13 @@ from benchmarks.two_arms import SPEED_M_S, two_arm_plan
 from cell.cli import main
 from cell.compose import Cell, compose
 from cell.config import plan_cell
+from cell.desk import Ask, OperatorDesk
 from cell.loop import Outcome, RunLoop, StopRequest
 from cell.processes import ProcessWatch, hosted_groups
 from cell.watch import NOTES
 from cell.why import explain
 from cell.yaml_file import InvalidCell
+from control.latch import LatchState
 from drivers.clock import MonotonicClock
 from drivers.commands import TwistCommand, TwistFrame
 from drivers.device import Lifecycle
@@ -38,6 +40,7 @@ from drivers.process.chain import Chain
 from drivers.process.groups import Group, HostedDevice
 from drivers.process.proxies import RemoteJointArm
 from drivers.process.selftest import SelfTestFailed, self_test
+from drivers.simulation.scene import Scene
 
 RATE_HZ = 5.0
 """Slow, so that a machine that does other things besides is not taken for dead."""
@@ -237,6 +240,90 @@ def test_both_arms_stand_in_time_whatever_dies(tmp_path: Path, name: str, told_b
         assert case.outcome["causes"][0][0] == "watchdog"
 
 
+class Waiting:
+    """A run with two swaying arms that waits for its operator after a trip; the operator is the test."""
+
+    def __init__(self, cell: Cell) -> None:
+        watch = cell.watch
+        assert isinstance(watch, ProcessWatch)
+        self.cell, self.chain, self.desk, self.stop = cell, watch.chain, OperatorDesk(), StopRequest()
+        self.loop = RunLoop(cell, None, stop=self.stop, desk=self.desk)
+        self.loop.begin()
+
+    def until(self, done: Callable[[], bool]) -> None:
+        deadline_s = time.monotonic() + 20.0
+        while not done():
+            assert time.monotonic() < deadline_s
+            assert self.loop.step()
+
+    def ask(self, ask: Ask) -> str:
+        self.desk.said = ""
+        self.desk.ask(ask, "ada")
+        assert self.loop.step()
+        return self.desk.said
+
+    def positions(self) -> Any:
+        return [arm.tcp().value.T_base_tcp[:3, 3] for arm in self.cell.arms.values()]
+
+    def moves(self) -> bool:
+        return not any(arm.at_rest() for arm in self.cell.arms.values())
+
+    def is_latched(self) -> bool:
+        return all(link.latched() is not None for link in self.chain.hosts)
+
+
+def test_a_stop_by_the_chain_is_reset_when_its_cause_has_gone_and_the_run_goes_on_to_its_end(tmp_path: Path) -> None:
+    with compose(two_arm_plan(tmp_path, RATE_HZ, categories={"right": 1}, on_trip="wait_for_reset")) as cell:
+        run = Waiting(cell)
+        run.until(run.moves)
+        run.chain.hold_watchdog(True)
+        run.until(lambda: cell.task.finished)
+        assert cell.supervisor.latch.first_cause is not None
+        assert cell.supervisor.latch.first_cause.interlock == "watchdog"
+        assert run.is_latched()
+        assert run.ask(Ask.RESET).startswith("refused"), "the watchdog still hangs"
+        assert run.ask(Ask.RESUME) == "refused: reset first"
+        assert run.is_latched()
+        run.chain.hold_watchdog(False)
+        run.until(lambda: cell.supervisor.latch.state is LatchState.CAUSE_GONE)
+        stood = run.positions()
+        run.until(lambda: run.ask(Ask.RESET).startswith("reset; nothing moves"))
+        assert not any(link.latched() for link in run.chain.hosts)
+        for _ in range(5):
+            assert run.loop.step()
+        np.testing.assert_array_equal(run.positions(), stood)
+        lease = cell.arms["left"].acquire("somebody")
+        with pytest.raises(CommandRejected, match="no watchdog guards it"):
+            cell.arms["left"].send_twist(twist(cell), lease)
+        cell.arms["left"].release(lease)
+        assert "starts again" in run.ask(Ask.RESUME)
+        run.until(run.moves)
+        run.stop.ask()
+        while run.loop.step():
+            continue
+        result = run.loop.end()
+    assert (result.outcome, result.reason) == (Outcome.DONE, "")
+    assert [(reset.operator, reset.causes[0].interlock) for reset in result.resets] == [("ada", "watchdog")]
+
+
+def test_a_reset_is_refused_for_good_when_a_host_has_died(tmp_path: Path) -> None:
+    with compose(two_arm_plan(tmp_path, RATE_HZ, on_trip="wait_for_reset")) as cell:
+        run = Waiting(cell)
+        run.until(run.moves)
+        os.kill(run.chain.hosts[0].pid, signal.SIGKILL)
+        run.until(lambda: cell.task.finished)
+        for _ in range(5):
+            assert run.loop.step()
+        assert run.ask(Ask.RESET).startswith("refused")
+        assert run.ask(Ask.RESUME) == "refused: reset first"
+        assert cell.arms["right"].at_rest()
+        run.stop.ask()
+        assert not run.loop.step()
+        result = run.loop.end()
+    assert result.outcome is Outcome.TRIPPED
+    assert result.resets == ()
+
+
 def test_a_dead_host_is_a_fault_of_its_devices(tmp_path: Path) -> None:
     cell = compose(two_arm_plan(tmp_path, RATE_HZ))
     with cell:
@@ -271,11 +358,55 @@ def test_a_cell_says_what_other_processes_cannot_do(tmp_path: Path) -> None:
     with pytest.raises(InvalidCell) as caught:
         plan_cell(separate_cell(tmp_path, time="simulated"))
     assert [problem.key for problem in caught.value.problems] == ["processes"]
-    sensors = yaml.safe_load(SHIPPED.read_text())["sensors"]
-    sensors["sensor"]["estimator"] = {"kind": "true_contact"}
-    with pytest.raises(InvalidCell) as caught:
-        plan_cell(separate_cell(tmp_path, sensors=sensors))
-    assert [problem.key for problem in caught.value.problems] == ["sensors.sensor.estimator"]
+
+
+class Topics:
+    """A black box that remembers what it was told of."""
+
+    def __init__(self) -> None:
+        self.told: set[str] = set()
+
+    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
+        self.told.add(topic)
+
+
+def test_the_truth_of_a_scene_in_a_host_is_told_and_recorded(tmp_path: Path) -> None:
+    """A task runs on it, and objects are on record, though their scene is in another process."""
+    data = yaml.safe_load((SHIPPED.parent / "single_push_sim.yaml").read_text())
+    data |= {"time": "real", "processes": "separate", "rate_hz": RATE_HZ}
+    data["arms"]["arm"]["limits"]["tcp_speed_m_s"] = 0.03
+    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    path = tmp_path / "cell.yaml"
+    path.write_text(yaml.safe_dump(data))
+    box = Topics()
+    with compose(plan_cell(path)) as cell:
+        assert cell.scene is not None
+        assert not isinstance(cell.scene, Scene)
+        T_world_prism = cell.scene.objects().value["prism"]
+        np.testing.assert_allclose(T_world_prism[:2, 3], [0.0, 0.003], atol=1e-6)
+        contact = cell.scene.contact("sensor")
+        assert not contact.value.in_contact
+        # The tip stands 5 mm before the prism.
+        assert contact.value.depth_m == pytest.approx(-0.005, abs=1e-4)
+        stop = StopRequest()
+        loop = RunLoop(cell, None, box=box, stop=stop)
+        loop.begin()
+        for _ in range(12):
+            loop.step()
+        stop.ask_at_once()
+        loop.step()
+        loop.end()
+    assert {"/objects/prism", "/sensors/sensor/truth", "/sensors/sensor/contact"} <= box.told
+
+
+def test_a_scene_without_a_simulated_arm_stays_in_the_tasks_process(tmp_path: Path) -> None:
+    """So that real arms have hosts of their own, and one may die while another goes on."""
+    data = yaml.safe_load((SHIPPED.parent / "dual_push_emulated.yaml").read_text()) | {"processes": "separate"}
+    path = tmp_path / "cell.yaml"
+    path.write_text(yaml.safe_dump(data))
+    plan = plan_cell(path)
+    assert {group.name: group.scene for group in hosted_groups(plan)} == {"leader": None, "follower": None}
+    assert isinstance(compose(plan).scene, Scene)
 
 
 def test_arms_without_a_scene_live_alone(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from benchmarks.fault_matrix import cells
+from benchmarks.fault_matrix import cells, on_true_contact
 from cell.blackbox import BlackBox
 from cell.compose import compose
 from cell.config import plan_cell
@@ -30,7 +30,7 @@ SLACK_S = 0.05
 
 
 class SafetyWalk(RuleBasedStateMachine):
-    """A cell on true contacts, stepped by rules. The arm's own simulation is what is believed, not what it tells."""
+    """A cell on true contacts, stepped by rules. The arms' own simulation is what is believed, not what they tell."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -38,38 +38,45 @@ class SafetyWalk(RuleBasedStateMachine):
         self.result: Any = None
 
     @initialize(
-        task=st.sampled_from(["surface_following", "object_tracking", "single_arm_pushing"]),
+        task=st.sampled_from(["surface_following", "object_tracking", "single_arm_pushing", "dual_arm_pushing"]),
         category=st.sampled_from([1, 2]),
     )
     def start(self, task: str, category: int) -> None:
-        data = cells()[task]
-        data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
-        data["arms"]["arm"]["stop_category"] = category
+        data = on_true_contact(cells()[task])
+        for section in data["arms"].values():
+            section["stop_category"] = category
         path = Path(self.folder.name) / "cell.yaml"
         path.write_text(yaml.safe_dump(data))
         self.cell = compose(plan_cell(path))
         self.cell.__enter__()
-        arm = self.cell.arms["arm"]
-        assert isinstance(arm, SimArm)
-        self.arm = arm
+        self.arms: dict[str, SimArm] = dict(self.cell.arms)
+        assert all(isinstance(arm, SimArm) for arm in self.arms.values())
         self.stop = StopRequest()
         self.box = BlackBox()
         self.loop = RunLoop(self.cell, None, box=self.box, stop=self.stop)
-        self.streamed_ns: list[int] = []
+        self.streamed = 0
+        self.streamed_ns: dict[str, int] = {}
+        for role in self.arms:
+            self.watch(role)
+        self.latched_ns: int | None = None
+        self.going = True
+        self.disobeyed: set[str] = set()
+        self.loop.begin()
+
+    def watch(self, role: str) -> None:
+        """See every twist that the arm in ``role`` is given."""
+        arm = self.arms[role]
         follow = arm._body.follow
 
         def watched(twist: Any, expires_ns: int) -> None:
             assert np.isfinite(twist).all()
             assert self.latched_ns is None, "a command after the latch"
             assert np.linalg.norm(twist[:3]) <= arm.limits.speed_m_s * (1 + 1e-9)
-            self.streamed_ns.append(self.cell.clock.now_ns())
+            self.streamed += 1
+            self.streamed_ns[role] = self.cell.clock.now_ns()
             follow(twist, expires_ns)
 
         arm._body.follow = watched  # type: ignore[method-assign]
-        self.latched_ns: int | None = None
-        self.going = True
-        self.disobeyed = False
-        self.loop.begin()
 
     def going_on(self) -> bool:
         return self.result is None
@@ -95,6 +102,7 @@ class SafetyWalk(RuleBasedStateMachine):
 
     @precondition(going_on)
     @rule(
+        which=st.integers(0, 1),
         change=st.sampled_from(
             [
                 {"nan_state": True},
@@ -106,11 +114,13 @@ class SafetyWalk(RuleBasedStateMachine):
                 {"drift_m_s": 0.03},
                 {"drift_m_s": 0.0},
             ]
-        )
+        ),
     )
-    def fault(self, change: dict[str, Any]) -> None:
-        self.arm.faults = replace(self.arm.faults, **change)
-        self.disobeyed |= any(change.get(name) for name in ("runs_on", "drift_m_s"))
+    def fault(self, which: int, change: dict[str, Any]) -> None:
+        role = sorted(self.arms)[which % len(self.arms)]
+        self.arms[role].faults = replace(self.arms[role].faults, **change)
+        if any(change.get(name) for name in ("runs_on", "drift_m_s")):
+            self.disobeyed.add(role)
 
     @precondition(going_on)
     @rule(pause_ms=st.integers(1, 400))
@@ -122,53 +132,54 @@ class SafetyWalk(RuleBasedStateMachine):
     @rule(seconds=st.floats(0.01, 1.0))
     def look_on(self, seconds: float) -> None:
         """Once a run has ended nothing moves, whatever it was."""
-        before = self.arm.T_world_tcp()
+        before = {role: arm.T_world_tcp() for role, arm in self.arms.items()}
         self.cell.clock.sleep_until_ns(self.cell.clock.now_ns() + round(1e9 * seconds))
-        self.arm._timeline.advance()
-        if not self.disobeyed:
-            np.testing.assert_array_equal(self.arm.T_world_tcp(), before)
+        for role, arm in self.arms.items():
+            arm._timeline.advance()
+            if role not in self.disobeyed:
+                np.testing.assert_array_equal(arm.T_world_tcp(), before[role])
 
     def end(self) -> None:
-        obeys = not (self.arm.faults.deaf or self.arm.faults.runs_on or self.arm.faults.drift_m_s)
-        sent = len(self.streamed_ns)
+        faults = {role: arm.faults for role, arm in self.arms.items()}
+        sent = self.streamed
         self.result = self.loop.end()
-        assert len(self.streamed_ns) == sent, "a command while stopping"
+        assert self.streamed == sent, "a command while stopping"
         trip = self.cell.supervisor.latch.first_cause
         assert (self.result.outcome is Outcome.TRIPPED) == (trip is not None)
-        report = self.result.stops["arm"]
-        if obeys:
-            assert report.kept or report.time_s <= report.declared_s + 1.0 / self.cell.rate_hz
-            assert not report.escalated
-        if not self.arm.faults.deaf:
-            assert self.arm.at_rest()
-            assert report.time_s is not None
-        assert self.arm.owner is None
+        for role, arm in self.arms.items():
+            report = self.result.stops[role]
+            if not (faults[role].deaf or faults[role].runs_on or faults[role].drift_m_s):
+                assert report.kept or report.time_s <= report.declared_s + 1.0 / self.cell.rate_hz
+                assert not report.escalated
+            if not faults[role].deaf:
+                assert arm.at_rest()
+                assert report.time_s is not None
+            assert arm.owner is None
 
     @invariant()
     def never_moves_without_a_fresh_command(self) -> None:
-        if not hasattr(self, "arm") or self.disobeyed:
+        if not hasattr(self, "arms"):
             return
-        now_ns = self.cell.clock.now_ns()
-        quiet_s = 1e-9 * (now_ns - (self.streamed_ns[-1] if self.streamed_ns else 0))
-        limits = self.arm.limits
-        longest_s = (
-            0.03 + SLACK_S + max(limits.speed_m_s / limits.accel_m_s2, limits.rot_speed_rad_s / limits.rot_accel_rad_s2)
-        )
-        self.arm._timeline.advance()
-        if quiet_s > longest_s:
-            assert self.arm._body.at_rest()
+        for role in self.arms.keys() - self.disobeyed:
+            arm, limits = self.arms[role], self.arms[role].limits
+            quiet_s = 1e-9 * (self.cell.clock.now_ns() - self.streamed_ns.get(role, 0))
+            braking_s = max(limits.speed_m_s / limits.accel_m_s2, limits.rot_speed_rad_s / limits.rot_accel_rad_s2)
+            arm._timeline.advance()
+            if quiet_s > 0.03 + SLACK_S + braking_s:
+                assert arm._body.at_rest()
 
     @invariant()
     def the_latch_and_the_task_agree(self) -> None:
         if hasattr(self, "cell") and self.cell.supervisor.latch.first_cause is not None:
             assert self.cell.task.finished or self.result is not None
-            assert self.arm.state in (Lifecycle.ACTIVE, Lifecycle.READY)
+            assert all(arm.state in (Lifecycle.ACTIVE, Lifecycle.READY) for arm in self.arms.values())
 
     def teardown(self) -> None:
         if hasattr(self, "cell"):
             if self.result is None:
                 self.end()
-            self.arm.faults = replace(self.arm.faults, deaf=False, runs_on=False, drift_m_s=0.0)
+            for arm in self.arms.values():
+                arm.faults = replace(arm.faults, deaf=False, runs_on=False, drift_m_s=0.0)
             self.cell.__exit__(None, None, None)
         self.folder.cleanup()
 

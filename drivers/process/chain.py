@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from drivers.arm import Arm
 from drivers.clock import Clock
@@ -21,7 +21,9 @@ from drivers.process.layouts import (
     COMMAND,
     FRAME,
     HOST,
+    OBJECTS,
     TASK,
+    TRUTH,
     WATCH,
     Cause,
     Reason,
@@ -36,7 +38,12 @@ from drivers.process.proxies import RemoteArm, RemoteCamera, RemoteDevice, Remot
 from drivers.process.watchdog import SLOW_PERIODS, silence_s
 from drivers.registry import DriverContext
 
+if TYPE_CHECKING:
+    from drivers.process.truth import RemoteScene
+
 _GUARD_S: Final = 1.0
+_UNGUARDED_SILENCE_S: Final = 2.0
+"""Silence that counts while nothing moves and nobody guards."""
 
 
 class Chain:
@@ -50,6 +57,7 @@ class Chain:
 
     Attributes:
         devices: proxies of all hosted devices, by name, there from the beginning.
+        scene: the scene that lives in a host, as far as it can be looked into; None for none.
         state_fds: descriptors of the arms' state blocks, by name, while it runs.
     """
 
@@ -59,6 +67,7 @@ class Chain:
         self._seed = seed
         self._clock = clock
         self.devices: dict[str, Device] = {each.name: _proxy(each, clock) for group in groups for each in group.devices}
+        self.scene = next((_remote_scene(group.scene) for group in groups if group.scene is not None), None)
         self.state_fds: dict[str, int] = {}
         self._links: list[HostLink] = []
         self._watchdog: Child | None = None
@@ -141,7 +150,9 @@ class Chain:
         self._clock.sleep_until_ns(self._clock.now_ns() + round(1e9 * seconds))
 
     def alarm(self) -> Cause | None:
-        """Why all arms have been stopped, or None."""
+        """Why all arms have been stopped, or None. Once nobody is guarded: what keeps them from being guarded again."""
+        if not self._task.value["guard"]:
+            return self._trouble(max(self.silence_s, _UNGUARDED_SILENCE_S))
         watch = self._watch.read()
         cause: Cause | None
         if watch["stop"] and (cause := cause_of(watch)).reason is not Reason.HOST_LATCHED:
@@ -153,10 +164,22 @@ class Chain:
                 return Cause(Reason.HOST_GONE, self._clock.now_ns(), host=number)
             if too_long_s := link.silent_too_long():
                 return Cause(Reason.HOST_SILENT, self._clock.now_ns(), too_long_s, self.silence_s, number)
-        silent_s = (self._clock.now_ns() - int(watch["t_ns"])) * 1e-9
-        if self._task.value["guard"] and silent_s > self.silence_s:
-            return Cause(Reason.WATCHDOG_SILENT, self._clock.now_ns(), silent_s, self.silence_s)
-        return None
+        return self._watchdog_silent(self.silence_s)
+
+    def _trouble(self, longest_s: float) -> Cause | None:
+        """A process that has gone, or has been silent for longer than ``longest_s``; None if all live."""
+        for number, link in enumerate(self._links):
+            now_ns = self._clock.now_ns()
+            if link.end_words():
+                return Cause(Reason.HOST_GONE, now_ns, host=number)
+            if (silent_s := link.silent_s()) > longest_s:
+                return Cause(Reason.HOST_SILENT, now_ns, silent_s, longest_s, number)
+        return self._watchdog_silent(longest_s)
+
+    def _watchdog_silent(self, longest_s: float) -> Cause | None:
+        now_ns = self._clock.now_ns()
+        silent_s = (now_ns - int(self._watch.read()["t_ns"])) * 1e-9
+        return Cause(Reason.WATCHDOG_SILENT, now_ns, silent_s, longest_s) if silent_s > longest_s else None
 
     @property
     def guarding(self) -> bool:
@@ -164,7 +187,19 @@ class Chain:
         return bool(self._watch.read()["guarding"])
 
     def clear(self) -> None:
-        """Clear a stop after ``end``, with all arms at rest and nobody's. Moves nothing. Raises LifecycleError."""
+        """Clear a stop after ``end``, with all arms at rest and nobody's. Moves nothing.
+
+        Raises:
+            LifecycleError: an arm moves, or somebody holds its lease.
+            DeviceFault: a process has gone or is silent.
+        """
+        deadline_ns = self._clock.now_ns() + round(1e9 * _GUARD_S)
+        # Calls to those that do not answer would wait for long.
+        while (cause := self._trouble(self.silence_s)) is not None or self.guarding:
+            if self._clock.now_ns() > deadline_ns:
+                words = "the watchdog still guards" if cause is None else cause.reason.words
+                raise DeviceFault("chain", words, fault_class=FaultClass.COMMUNICATION, needs=Remedy.OPERATOR)
+            self.sleep(self.period_s / 4)
         self.watchdog.call("clear")
         for link in self._links:
             link.call("clear")
@@ -185,7 +220,8 @@ class Chain:
                 "wake": self._event(),
                 "answered": self._event(),
                 "host": self._block(f"{group.name}-host", HOST),
-                "devices": {each.name: self._device_blocks(each) for each in group.devices},
+                "devices": {each.name: self._device_blocks(each, group) for each in group.devices},
+                **({} if group.scene is None else {"objects": self._block(f"{group.name}-objects", OBJECTS)}),
             }
             for group in self.groups
         ]
@@ -217,6 +253,10 @@ class Chain:
                 assert isinstance(device, RemoteDevice)
                 device.attach(link, device_fds)
                 self._exit.callback(device.detach)
+            if self.scene is not None and "objects" in fds:
+                truths = {name: each["truth"] for name, each in fds["devices"].items() if "truth" in each}
+                self.scene.attach(truths, fds["objects"])
+                self._exit.callback(self.scene.detach)
         self._watchdog.await_ready()
 
     def _start_host(self, group: Group, fds: Mapping[str, Any]) -> HostLink:
@@ -243,8 +283,10 @@ class Chain:
         self._exit.callback(link.close)
         return link
 
-    def _device_blocks(self, device: HostedDevice) -> dict[str, int]:
+    def _device_blocks(self, device: HostedDevice, group: Group) -> dict[str, int]:
         wanted = {"command": COMMAND, "answer": ANSWER, "state": ARM} if device.is_arm else {"frame": FRAME}
+        if not device.is_arm and group.scene is not None:
+            wanted["truth"] = TRUTH
         return {kind: self._block(f"{device.name}-{kind}", dtype) for kind, dtype in wanted.items()}
 
     def _block(self, name: str, dtype: Any) -> int:
@@ -266,6 +308,12 @@ def _proxy(device: HostedDevice, clock: Clock) -> RemoteDevice:
     # Never connected: it knows the arm's links by its configuration.
     twin = device.spec.build(device.name, device.config, DriverContext(clock))
     return RemoteJointArm(device.name, clock, twin.kinematics() if isinstance(twin, Arm) else None)
+
+
+def _remote_scene(section: Mapping[str, Any]) -> RemoteScene:
+    from drivers.process.truth import RemoteScene
+
+    return RemoteScene(list(section.get("objects", {})))
 
 
 def _numbers(fds: Any) -> tuple[int, ...]:

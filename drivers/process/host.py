@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -48,6 +48,9 @@ from drivers.process.wire import encode_adjustments, encode_error, error_note, r
 from drivers.registry import DriverContext
 from drivers.samples import Frame, JointState, Quality, Stamped
 from geometry.errors import TouchcellError
+
+if TYPE_CHECKING:
+    from drivers.simulation.scene import Scene
 
 LIFECYCLES: Final = tuple(Lifecycle)
 REST_MARGIN_S: Final = 0.1
@@ -260,7 +263,7 @@ class Host:
         self._answered: int = fds["answered"]
         self._watch = RecordReader(fds["watch"], WATCH)
         self._beat = RecordWriter(fds["host"], HOST)
-        self.devices = _build(spec, clock)
+        self.devices, scene = _build(spec, clock)
         self._policies = {each["name"]: DeactivatePolicy(each["policy"]) for each in spec["devices"] if each["policy"]}
         self._arms = {
             each["name"]: ArmSeat(arm, StopCategory(each["category"]), fds["devices"][each["name"]])
@@ -272,6 +275,12 @@ class Host:
             for name, device in self.devices.items()
             if name not in self._arms
         ]
+        self._truth = None
+        if scene is not None:
+            from drivers.process.truth import TruthSeat
+
+            sensors = {name: each["truth"] for name, each in fds["devices"].items() if "truth" in each}
+            self._truth = TruthSeat(scene, sensors, fds["objects"])
         self._cause: Cause | None = None
         self._guarded = False
         self._turn = 0
@@ -332,6 +341,8 @@ class Host:
     def _tell(self, now_ns: int) -> None:
         for seat in self._arms.values():
             seat.look(now_ns)
+        if self._truth is not None:
+            self._truth.look()
         if self._cameras:
             # One in each cycle: drawing or decoding a picture takes as long as many cycles.
             self._turn = (self._turn + 1) % len(self._cameras)
@@ -368,7 +379,7 @@ class Host:
             "activate": device.activate,
             "deactivate": lambda: device.deactivate(DeactivatePolicy(message["policy"])),
             "disconnect": device.disconnect,
-            "recover": lambda: device.recover(OperatorToken(message["operator"], message["t_ns"])),
+            "recover": lambda: _recover(device, OperatorToken(message["operator"], message["t_ns"])),
             "health": lambda: {"health": device.health() if isinstance(device, HealthSource) else {}},
             "acquire": lambda: self._arms[name].acquire(message["owner"]),
             "release": lambda: self._arms[name].release(message["epoch"]),
@@ -421,7 +432,7 @@ class Host:
         self._tell(self._clock.now_ns())
 
 
-def _build(spec: Mapping[str, Any], clock: Clock) -> dict[str, Device]:
+def _build(spec: Mapping[str, Any], clock: Clock) -> tuple[dict[str, Device], Scene | None]:
     scene = None
     if spec["scene"] is not None:
         from drivers.simulation.scene import SceneConfig
@@ -432,7 +443,15 @@ def _build(spec: Mapping[str, Any], clock: Clock) -> dict[str, Device]:
     for each in spec["devices"]:
         driver = registry.spec(each["driver"])
         devices[each["name"]] = driver.build(each["name"], driver.config.model_validate(each["config"]), context)
-    return devices
+    return devices, scene
+
+
+def _recover(device: Device, token: OperatorToken) -> None:
+    """FAULTED -> READY. What the task has given up while it went on here is only given back."""
+    if device.state is Lifecycle.ACTIVE:
+        device.deactivate()
+    elif device.state is not Lifecycle.READY:
+        device.recover(token)
 
 
 def _twist_command(command: Any) -> TwistCommand:

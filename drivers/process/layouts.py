@@ -146,6 +146,23 @@ FRAME: Final = np.dtype(
     ]
 )
 
+MAX_OBJECTS: Final = 16
+"""Free objects of a scene that its host tells of."""
+
+TRUTH: Final = np.dtype(
+    [
+        ("t_ns", "i8"),
+        ("seq", "i8"),
+        ("T_f_s", "f8", (4, 4)),
+        ("T_world_f", "f8", (4, 4)),
+        ("in_contact", "u8"),
+        ("slipping", "u8"),
+        ("normal_force_n", "f8"),
+        ("shear_force_n", "f8", (2,)),
+    ]
+)
+OBJECTS: Final = np.dtype([("t_ns", "i8"), ("seq", "i8"), ("T_world_object", "f8", (MAX_OBJECTS, 4, 4))])
+
 _TAILS = {id(ANSWER): MAX_NOTE_BYTES, id(ARM): MAX_NOTE_BYTES, id(FRAME): MAX_IMAGE_BYTES}
 
 

@@ -23,7 +23,7 @@ _CALL_S: Final = 60.0
 """Parking an arm takes its time."""
 
 _END_S: Final = 5.0
-_HANGING_NS: Final = 2_000_000_000
+_HANGING_S: Final = 2.0
 
 
 class Child:
@@ -165,12 +165,16 @@ class HostLink(Child):
 
     def silent_too_long(self) -> float:
         """How long (s) it has been silent, if that is too long; 0 while its arms are not guarded."""
-        silent_s = (self._clock.now_ns() - int(self.beats.read()["t_ns"])) * 1e-9
+        silent_s = self.silent_s()
         return silent_s if self.judged and silent_s > self._silence_s else 0.0
+
+    def silent_s(self) -> float:
+        """How long (s) ago it gave its last beat."""
+        return (self._clock.now_ns() - int(self.beats.read()["t_ns"])) * 1e-9
 
     def hangs(self) -> bool:
         """Whether a call would wait in vain; a host beats also while nobody judges it."""
-        return self._clock.now_ns() - int(self.beats.read()["t_ns"]) > _HANGING_NS
+        return self.silent_s() > _HANGING_S
 
     def latched(self) -> Cause | None:
         """Why it has stopped its arms, or None."""

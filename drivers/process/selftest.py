@@ -126,7 +126,7 @@ def _part(chain: Chain, link: str, reason: Reason, withhold: Callable[[], None] 
     if cause is None or cause.reason is not reason:
         found = "nothing" if cause is None else cause.reason.words
         raise SelfTestFailed("chain", link, f"it stopped for {found}, not {reason.words}", within_s, time_s)
-    _clear(chain)
+    chain.clear()
     for arm in arms.values():
         # A stop of a category that removes power ends there.
         if arm.state is Lifecycle.READY:
@@ -202,11 +202,3 @@ def _rested_ns(chain: Chain, arm: RemoteArm, deadline_ns: int) -> int | None:
         if chain.now_ns() > deadline_ns:
             return None
         chain.sleep(chain.period_s / 4)
-
-
-def _clear(chain: Chain) -> None:
-    """Clear the stop, as soon as the watchdog has seen that nobody is guarded any more."""
-    deadline_ns = chain.now_ns() + round(1e9 * _SEEN_WITHIN_S)
-    while chain.guarding and chain.now_ns() < deadline_ns:
-        chain.sleep(chain.period_s / 4)
-    chain.clear()

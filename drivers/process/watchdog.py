@@ -115,6 +115,7 @@ class _Watchdog:
         self._guarding = False
         self._cause: Cause | None = None
         self._notes: Path | None = None
+        self._noted = False
         self._task_gone_ns: int | None = None
 
     def run(self) -> None:
@@ -140,9 +141,9 @@ class _Watchdog:
                 )
         self._guarding = wanted
         self._publish(now_ns)
-        if self._notes is not None and self._cause is not None and self._settled(now_ns):
+        if self._notes is not None and not self._noted and self._cause is not None and self._settled(now_ns):
             self._write_notes(self._notes, self._cause)
-            self._notes = None
+            self._noted = True
 
     def _publish(self, now_ns: int) -> None:
         value = self._watch.value
@@ -166,6 +167,7 @@ class _Watchdog:
             self._notes = Path(message["path"])
         elif message["call"] == "clear" and not self._guarding:
             self._cause = None
+            self._noted = False
             self._publish(time.monotonic_ns())
         with suppress(OSError):
             send(self._lifeline, {"ok": self._cause is None, "number": message["number"]})
@@ -196,7 +198,7 @@ class _Watchdog:
             return False
         if time.monotonic_ns() - self._task_gone_ns > _LINGER_S * 1e9:
             return True
-        return self._notes is None or self._cause is None
+        return self._notes is None or self._noted or self._cause is None
 
 
 def stop_record(arm: Any) -> dict[str, Any]:
