@@ -28,7 +28,7 @@ def test_a_push_topples_all_but_the_tin_and_two_tips_hold_them(pushed: Pushed) -
     assert tips < weight
 
 
-def test_the_follower_goes_along_round_objects_and_gives_way_to_flat_sides_slowly() -> None:
+def test_the_follower_goes_along_light_round_objects_and_gives_way_to_flat_sides_slowly() -> None:
     gains = {
         trial.row.partition(",")[0]: (follower["kp_per_s"][1], follower["ki_per_s2"][1], follower.get("active", False))
         for trial in SPEC.trials(Scale(trials=1))
@@ -37,4 +37,6 @@ def test_the_follower_goes_along_round_objects_and_gives_way_to_flat_sides_slowl
     }
     slow = {name for name, found in gains.items() if found == (2, 0, False)}
     assert slow == {"tall large square", "tall small square", "tall hexagonal"}
-    assert {gains[name] for name in gains.keys() - slow} == {(10, 25, True)}
+    # Friction holds the glass bottle with 1.9 N, more than the 1.8 N of the squeeze.
+    assert gains["glass bottle"] == (10, 25, False)
+    assert {gains[name] for name in gains.keys() - slow - {"glass bottle"}} == {(10, 25, True)}

@@ -44,13 +44,14 @@ _LOST_DEG = 10.0
 _ROUND = ("cylinder", "bottle")
 # The cell's follower gives way sideways but slowly, for objects with flat sides: on these its contact would wander off
 # the line of the push, and the squeeze then turns a light slim one as much as friction on the table resists. The
-# squeeze on a round one always points at its axis. There the leader steers by going round it, and a follower that only
-# gives way comes too late: wide light ones then weave by centimetres.
+# squeeze on a round one always points at its axis. There the leader steers by going round it; of one that is squeezed
+# harder than the table holds it, a follower that only gives way comes too late, and wide ones weave by centimetres.
 _FOLLOWER_OF_ROUND = {
     "task.follower.kp_per_s": [4, 10, 10, 10, 0, 0],
     "task.follower.ki_per_s2": [0, 25, 25, 25, 0, 0],
-    "task.follower.active": True,
 }
+_MDF = 0.3
+_STIFFNESS_N_MM = 0.6
 _TALL_G = (566.0, 436.0, 324.0, 373.0)
 
 
@@ -97,6 +98,8 @@ def _cell_changes(pushed: Pushed, arms: str) -> dict[str, Any]:
     same["task.follower.reference_mm_deg"] = [-lift_mm, 0, _FOLLOWER_MM, 0, 0, 0]
     if pushed.shape["kind"] in _ROUND:
         same |= _FOLLOWER_OF_ROUND
+        held_n = _MDF * 1e-3 * pushed.mass_g * GRAVITY_M_S2
+        same["task.follower.active"] = held_n < _STIFFNESS_N_MM * _FOLLOWER_MM
     return same | _boxes_up_to(height_mm, "leader_box", "follower_box")
 
 
