@@ -173,6 +173,8 @@ class CellEmulator(Emulator):
         device = self._plan.sensors[name]
         if device.spec.name != "v4l2":
             raise _not_emulated("sensors", name, device.spec.name, "v4l2")
+        if self._plan.cell.sensors[name].mounted_on is None:
+            raise ConfigError("nothing carries it", key=f"sensors.{name}.mounted_on", hint="name one of the arms")
         node = str(getattr(device.config, "device", ""))
         found = _CAMERA.fullmatch(node)
         if found is None:

@@ -89,6 +89,7 @@ def test_emulated_arms_and_cameras_push_a_prism_that_only_they_know(tmp_path: Pa
     [
         ("emulated_scene", lambda data: data.pop("emulated_scene")),
         ("sensors.leader_sensor.device", lambda data: data["sensors"]["leader_sensor"].update(device="/dev/tip")),
+        ("sensors.leader_sensor.mounted_on", lambda data: data["sensors"]["leader_sensor"].pop("mounted_on")),
         ("sensors.leader_sensor.driver", lambda data: data["sensors"]["leader_sensor"].update(driver="opencv_camera")),
     ],
 )
