@@ -28,13 +28,13 @@ def test_a_push_topples_all_but_the_tin_and_two_tips_hold_them(pushed: Pushed) -
     assert tips < weight
 
 
-def test_the_follower_gives_way_sideways_to_round_objects_at_once_and_to_flat_sides_slowly() -> None:
+def test_the_follower_goes_along_round_objects_and_gives_way_to_flat_sides_slowly() -> None:
     gains = {
-        trial.row.partition(",")[0]: (follower["kp_per_s"][1], follower["ki_per_s2"][1])
+        trial.row.partition(",")[0]: (follower["kp_per_s"][1], follower["ki_per_s2"][1], follower.get("active", False))
         for trial in SPEC.trials(Scale(trials=1))
         if f", {WITH}," in trial.row
         for follower in [trial.cell_data()["task"]["follower"]]
     }
-    slow = {name for name, (kp, ki) in gains.items() if (kp, ki) == (2, 0)}
+    slow = {name for name, found in gains.items() if found == (2, 0, False)}
     assert slow == {"tall large square", "tall small square", "tall hexagonal"}
-    assert {gains[name] for name in gains.keys() - slow} == {(10, 25)}
+    assert {gains[name] for name in gains.keys() - slow} == {(10, 25, True)}

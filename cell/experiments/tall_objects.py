@@ -44,10 +44,12 @@ _LOST_DEG = 10.0
 _ROUND = ("cylinder", "bottle")
 # The cell's follower gives way sideways but slowly, for objects with flat sides: on these its contact would wander off
 # the line of the push, and the squeeze then turns a light slim one as much as friction on the table resists. The
-# squeeze on a round one always points at its axis, and it is a follower that stays put which pushes it aside.
+# squeeze on a round one always points at its axis. There the leader steers by going round it, and a follower that only
+# gives way comes too late: wide light ones then weave by centimetres.
 _FOLLOWER_OF_ROUND = {
     "task.follower.kp_per_s": [4, 10, 10, 10, 0, 0],
     "task.follower.ki_per_s2": [0, 25, 25, 25, 0, 0],
+    "task.follower.active": True,
 }
 _TALL_G = (566.0, 436.0, 324.0, 373.0)
 
