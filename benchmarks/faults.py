@@ -100,7 +100,8 @@ def run(arguments: Sequence[str], out: Path) -> None:
             found[case.place] = case
     cases = [found[place] for place in wanted if place in found]
     _print_table(cases, faults)
-    same = Counter(rule for place, rule in everything if rule and place not in found)
+    tried = set(wanted)
+    same = Counter(rule for place, rule in everything if rule and place not in tried)
     _print_coverage(cases, len(wanted), len(everything), same)
     report = {**provenance(), "places": len(everything), "same": same, "cases": [asdict(case) for case in cases]}
     (out / "faults.json").write_text(json.dumps(report, indent=1) + "\n")
