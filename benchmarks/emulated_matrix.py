@@ -80,6 +80,7 @@ MORE_FAULTS: Final[Mapping[str, Mapping[str, tuple[Any, str]]]] = {
 
 UNSEEN: Final[Mapping[tuple[str, str], Mapping[str, str]]] = {
     ("franka", "drop"): {"prepare": "the controller waits for the first command of a motion"},
+    ("feetech_serial", "carry"): {"retract": "the tool is carried farther than it has to withdraw: the task has ended"},
 }
 """States in which a fault ends nothing, and why."""
 

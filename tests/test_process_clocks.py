@@ -3,8 +3,17 @@
 from __future__ import annotations
 
 import ast
+import json
+import os
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
+
+from benchmarks.clock_step import clock_shim
 
 ROOT = Path(__file__).parent.parent
 SETTABLE = {
@@ -46,3 +55,24 @@ def test_no_clock_that_can_be_set_is_read() -> None:
                 found[str(path)] = names
     assert found == {}
     assert list(reads("import time\ntime.time()\n")) == ["time.time"], "the search finds what it looks for"
+
+
+def test_the_shim_of_the_bench_steps_the_wall_clock_of_a_process_and_no_other_clock(tmp_path: Path) -> None:
+    """``touchcell bench safety -- --processes`` sets the clock of a whole cell by it."""
+    library = clock_shim(tmp_path)
+    if library is None:
+        pytest.skip("no C compiler")
+    offset = tmp_path / "offset"
+    offset.write_bytes((-3600).to_bytes(8, "little", signed=True))
+    script = "import json, time; print(json.dumps([time.time(), time.monotonic()])); time.sleep(0.01)"
+    before = time.time(), time.monotonic()
+    run = subprocess.run(
+        [sys.executable, "-c", script],
+        env=os.environ | {"LD_PRELOAD": str(library), "TOUCHCELL_CLOCK": str(offset)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    wall_s, monotonic_s = json.loads(run.stdout)
+    assert before[0] - 3600.0 <= wall_s <= time.time() - 3600.0
+    assert before[1] <= monotonic_s <= time.monotonic()

@@ -84,7 +84,7 @@ def time_to_live_stops_the_motion(bench: Bench) -> None:
     assert np.linalg.norm(steady[:3]) > 0.5 * bench.speed()
     rest = bench.track_to_rest(_TTL_S + 2.0)
     travelled_m = np.linalg.norm(rest.poses[-1][:3, 3] - rest.position_at(expires_ns))
-    assert travelled_m <= _braking_m(bench, 0.0)
+    assert travelled_m <= _braking_m(bench, rest.late_s)
 
 
 @check("TwistSink", on_bench=True)
@@ -96,7 +96,7 @@ def stop_stops_at_once(bench: Bench) -> None:
     start = bench.position()
     bench.arm.stop()
     rest = bench.track_to_rest(2.0)
-    assert np.linalg.norm(rest.poses[-1][:3, 3] - start) <= _braking_m(bench, 0.0)
+    assert np.linalg.norm(rest.poses[-1][:3, 3] - start) <= _braking_m(bench, rest.late_s)
     bench.until(bench.arm.at_rest, 1.0, "at_rest")
 
 
@@ -109,7 +109,7 @@ def release_stops_at_once(bench: Bench) -> None:
     start = bench.position()
     bench.arm.release(lease)
     rest = bench.track_to_rest(2.0)
-    assert np.linalg.norm(rest.poses[-1][:3, 3] - start) <= _braking_m(bench, 0.0)
+    assert np.linalg.norm(rest.poses[-1][:3, 3] - start) <= _braking_m(bench, rest.late_s)
 
 
 @check("TwistSink", "truth", "process")
@@ -127,12 +127,15 @@ def killed_client_leaves_the_arm_at_rest(bench: Bench) -> None:
         start_ns = bench.clock.now_ns()
         silence_s = client.silence_s
         rest = bench.track_to_rest(silence_s + 3.0, (lambda truth: not truth["energised"]) if falls else None)
-    assert (rest.t_ns[-1] - start_ns) * 1e-9 <= silence_s + 0.5
-    assert np.linalg.norm(rest.poses[-1][:3, 3] - start) <= _braking_m(bench, silence_s)
+    assert (rest.t_ns[-1] - start_ns) * 1e-9 <= silence_s + 0.5 + rest.late_s
+    assert np.linalg.norm(rest.poses[-1][:3, 3] - start) <= _braking_m(bench, silence_s + rest.late_s)
 
 
 def _braking_m(bench: Bench, silence_s: float) -> float:
-    """Longest lawful way from the moment when the arm should begin to notice, at test speed."""
+    """Longest lawful way from the moment when the arm should begin to notice, at test speed.
+
+    ``silence_s`` is what it may take besides: what its client does by itself, and what this machine lost.
+    """
     capabilities = bench.rig.spec.capabilities
     speed = bench.speed()
     delay_s = capabilities.command_latency_s + 1.0 / capabilities.state_rate_hz + _HOST_DELAY_S + silence_s
