@@ -24,7 +24,7 @@ from benchmarks.provenance import provenance
 
 CELLS: Final = {
     "sway": (50.0, "two arms to and fro at 50 Hz, each in a process of its own"),
-    "push": (25.0, "an emulated Franka and an emulated UR push an object at 25 Hz, each in a process of its own"),
+    "push": (12.5, "an emulated Franka and an emulated UR push an object at 12.5 Hz, each in a process of its own"),
 }
 """Rate and description of each."""
 

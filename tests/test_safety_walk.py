@@ -1,6 +1,6 @@
 """Random operators, faults and timing against a running simulated cell: what must never happen does not.
 
-The bound of the walk is set for CI; ``TOUCHCELL_WALK`` multiplies it.
+The bound of the walk is set for CI; ``TOUCHCELL_WALK`` multiplies it (with ``--timeout 0``).
 """
 
 from __future__ import annotations
