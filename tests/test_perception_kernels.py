@@ -37,7 +37,7 @@ def images(largest: int = 70) -> st.SearchStrategy[ImageArray]:
 
 
 @given(images())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_median_is_opencvs(image: ImageArray) -> None:
     np.testing.assert_array_equal(kernels.median_5(image), cv2.medianBlur(np.ascontiguousarray(image), 5))
 
@@ -57,7 +57,7 @@ def test_median_of_all_columns_of_zeros_and_ones() -> None:
     st.floats(-300.0, 300.0) | st.sampled_from([-5.0, 0.0, 0.5, -0.5, 5.0]),
     st.booleans(),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @example(np.full((40, 50), 255, np.uint8), 255, 0.0, True)
 @example(np.zeros((1, 1), np.uint8), 3, -1.0, False)
 def test_threshold_is_opencvs(image: ImageArray, block_px: int, offset: float, of_median_5: bool) -> None:
@@ -73,7 +73,7 @@ def test_threshold_is_opencvs(image: ImageArray, block_px: int, offset: float, o
 
 
 @given(images(200), st.integers(2, 9) | st.sampled_from([16, 32, 64]))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_area_means_are_opencvs(image: ImageArray, factor: int) -> None:
     size = (max(1, image.shape[0] // factor), max(1, image.shape[1] // factor))
     whole = np.resize(image, (size[0] * factor, size[1] * factor))
@@ -89,7 +89,7 @@ def test_area_means_round_halves_to_even() -> None:
 
 
 @given(images(), st.integers(0, 255), st.integers(1, 30), st.integers(1, 300), st.integers(1, 40))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_discs_are_opencvs_components(image: ImageArray, level: int, smallest: int, more: int, longest: int) -> None:
     white = np.where(image > level, image, np.uint8(0))
     centres, areas = kernels.discs(white, smallest, smallest + more, longest)
@@ -121,7 +121,7 @@ def paired(places: Array, others: Array) -> tuple[Array, Array, Array]:
 
 
 @given(points(), points())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_pairs_are_those_of_all_distances(places: Array, others: Array) -> None:
     for found, expected in zip(kernels.pair(places, others), paired(places, others), strict=True):
         np.testing.assert_array_equal(found, expected)
@@ -143,7 +143,7 @@ def change(basis: Array, weight: Array, off: Array, from_start: Array, ridge: Ar
 
 
 @given(st.integers(0, 999), st.integers(1, 26), st.integers(20, 60))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_fit_solves_the_weighted_least_squares(seed: int, modes: int, markers: int) -> None:
     rng, base, basis = problem(seed, modes, markers)
     weight = rng.random(markers) * (rng.random(markers) < 0.7)
@@ -180,7 +180,7 @@ def settled(
 
 
 @given(st.integers(0, 999), st.floats(0.0, 20.0), st.floats(4.0, 15.0))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_settling_takes_the_turns_of_the_reference(seed: int, far_px: float, reach: float) -> None:
     rng, base, basis = problem(seed, modes=6, markers=50)
     truth = rng.normal(0.0, far_px, 6)
@@ -223,7 +223,7 @@ def test_density_is_shared_among_four_cells() -> None:
 
 
 @given(st.integers(0, 30), st.integers(0, 30))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_affine_is_a_matrix_product(inputs: int, outputs: int) -> None:
     rng = np.random.default_rng(31 * inputs + outputs)
     weight, bias, x = (rng.normal(size=n).astype(np.float32) for n in ((inputs, outputs), outputs, inputs))
@@ -231,7 +231,7 @@ def test_affine_is_a_matrix_product(inputs: int, outputs: int) -> None:
 
 
 @given(st.integers(0, 40), st.integers(0, 70), st.integers(0, 999))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_distances_of_bytes_are_whole(count: int, length: int, seed: int) -> None:
     rows = np.random.default_rng(seed).integers(0, 256, (count + 1, length), dtype=np.uint8)
     expected = np.square(rows[1:].astype(np.int32) - rows[0]).sum(axis=1)
@@ -258,7 +258,7 @@ TYPES = st.sampled_from([np.uint8, np.int64, np.float32, np.float64, np.bool_, n
 
 
 @pytest.mark.parametrize("kernel", GOOD, ids=lambda kernel: kernel.__name__)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_other_arrays_are_refused_or_computed(kernel: Callable[..., object], data: st.DataObject) -> None:
     arguments = list(GOOD[kernel])

@@ -154,7 +154,7 @@ def test_pressing_down_adds_to_the_weight():
 MOVES = st.lists(st.tuples(st.floats(-0.03, 0.05), st.floats(-0.04, 0.04), st.integers(1, 40)), min_size=1, max_size=4)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(shape=st.sampled_from([SQUARE, HEXAGON, ROUND]), offset=st.floats(-20.0, 20.0), moves=MOVES)
 def test_friction_dissipates_and_its_limit_holds_whatever_the_tip_does(shape, offset, moves):
     it, T = world(shape), tip(-61.0, offset)

@@ -19,7 +19,6 @@ def centroid(image: np.ndarray) -> np.ndarray:
     return np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum()
 
 
-@settings(deadline=None, derandomize=True)
 @given(u=st.floats(8, 32), v=st.floats(8, 32))
 def test_a_disc_is_where_it_belongs_to_a_fiftieth_of_a_pixel(u: float, v: float) -> None:
     image = np.zeros((41, 41), np.uint8)
@@ -29,7 +28,6 @@ def test_a_disc_is_where_it_belongs_to_a_fiftieth_of_a_pixel(u: float, v: float)
 
 
 # Whole sixteenths: nothing is lost when 40 is added.
-@settings(deadline=None, derandomize=True)
 @given(u=st.integers(-320, 960).map(lambda n: n / 16), v=st.integers(-320, 960).map(lambda n: n / 16))
 def test_what_lies_outside_is_cut_off(u: float, v: float) -> None:
     image = np.zeros((41, 41), np.uint8)
@@ -47,7 +45,7 @@ def test_touching_discs_do_not_erase_or_add_up() -> None:
     np.testing.assert_array_equal(both, np.maximum(one, other))
 
 
-@settings(deadline=None, derandomize=True, max_examples=25)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_compiled_kernels_draw_what_plain_ones_do(seed: int) -> None:
     compiled = pytest.importorskip("drivers.simulation._paint")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from geometry import _plain, se3
@@ -334,7 +334,6 @@ def test_euler_in_batches() -> None:
     assert se3.to_euler_mm_deg(np.zeros((0, 4, 4))).shape == (0, 6)
 
 
-@settings(deadline=None)
 @given(xi=TWISTS, seed=st.integers(0, 100), size=st.sampled_from([1e-12, 1e-6, 1e-3, 0.05]))
 def test_project_finds_the_nearest_rotation(xi: Array, seed: int, size: float) -> None:
     T = se3.exp(xi)

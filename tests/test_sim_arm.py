@@ -90,7 +90,7 @@ def test_twists_along_tool_axes_follow_the_tool() -> None:
     assert arm.tcp().value.T_base_tcp[0, 3] == pytest.approx(0.4)
 
 
-@settings(deadline=None, derandomize=True, max_examples=30)
+@settings(max_examples=30)
 @given(
     twist=st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6),
     ttl_s=st.floats(0.02, 0.3),
