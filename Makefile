@@ -2,7 +2,7 @@
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
 BIN := .venv/bin
-SOURCES := pyproject.toml setup.py $(wildcard geometry/*.c geometry/*.h)
+SOURCES := pyproject.toml setup.py $(wildcard geometry/*.[ch] perception/*.[ch] drivers/simulation/*.[ch])
 
 .PHONY: demo test check fast stress clean
 
@@ -42,4 +42,4 @@ check: .venv/dev
 	touch $@
 
 clean:
-	rm -rf .venv build *.egg-info geometry/*.so
+	rm -rf .venv build *.egg-info geometry/*.so perception/*.so

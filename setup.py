@@ -1,4 +1,4 @@
-"""The one part of the build that pyproject.toml cannot say: where numpy's C headers are."""
+"""The parts of the build that pyproject.toml cannot say: the C extensions, and where numpy's headers are."""
 
 import numpy
 from setuptools import Extension, setup
@@ -14,6 +14,21 @@ setup(
             extra_compile_args=["-O3", "-ffp-contract=off"],
             # Without a compiler the plain kernels serve.
             optional=True,
-        )
+        ),
+        Extension(
+            "perception._kernelsc",
+            sources=["perception/_kernelsc.c"],
+            depends=["perception/_image_kernels.h", "perception/_matching_kernels.h"],
+            extra_compile_args=["-O3", "-ffp-contract=off"],
+            # Without a compiler image networks serve, and marker estimators say what is missing.
+            optional=True,
+        ),
+        Extension(
+            "drivers.simulation._paint",
+            sources=["drivers/simulation/_paint.c"],
+            include_dirs=[numpy.get_include()],
+            extra_compile_args=["-O3"],
+            optional=True,
+        ),
     ]
 )

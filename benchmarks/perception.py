@@ -217,7 +217,7 @@ def write_simulated(folder: Path, images: int, seed: int = 0) -> None:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """What a person reads of the measured rows."""
-    return "\n".join([*_error_lines(rows), "", *_cost_lines(rows)])
+    return "\n".join([*_error_lines(rows), "", *_cost_lines(rows), *_stage_lines(rows)])
 
 
 def _error_lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -257,6 +257,16 @@ def _cost_lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     yield "again: the same frame once more, CPU; start: from a fresh process to its first estimate, wall and CPU;"
     yield "apart: largest difference from the xi of the estimator's first runtime, m or rad;"
     yield "training: CPU time of all epochs, where the model file tells it; decoding and matching come on top"
+
+
+def _stage_lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    names = list(dict.fromkeys(name for row in rows for name in row["stages_ms"]))
+    yield "\nby stage, frames unlike the ones before; ms CPU, median and p99"
+    yield f"{'':<22}{'runtime':<13}" + "".join(f"{name:>16}" for name in names)
+    for row in rows:
+        stages = row["stages_ms"]
+        cells = (f"{stages[n]['median']:>9.2f}{stages[n]['p99']:>7.2f}" if n in stages else f"{'-':>16}" for n in names)
+        yield f"{row['estimator']:<22}{row['runtime']:<13}" + "".join(cells)
 
 
 def _turn_lines(turns: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Iterator[str]:

@@ -10,18 +10,21 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 
 from geometry.types import ImageArray
 from perception.estimators import ContactEstimator, estimator_of
-from perception.inference import Prediction
+from perception.inference import ContactModel, Prediction
+from perception.marker_estimator import MarkerEstimator
 from perception.model_file import Model, load_model
 from perception.preprocessing import AdaptiveThreshold, Crop, Preprocessing
+
+T = TypeVar("T")
 
 FRAME_SIZE = (480, 640)
 """(height, width) px of a camera's frame."""
@@ -76,6 +79,7 @@ def main(arguments: list[str]) -> None:
         return
     other, again = _latency(estimator, frames)
     figures |= {"memory_mb": _memory_mb("VmRSS"), "peak_mb": _memory_mb("VmHWM")}
+    figures["stages_ms"] = _stages(estimator, frames)
     served = [estimator.predict(frames.read(i)) for i in range(frames.count)]
 
     from drivers.tactile_data import read_split
@@ -115,7 +119,6 @@ def _estimator(model: Model, runtime: str) -> ContactEstimator:
     if runtime == OWN:
         return estimator_of(model)
     from benchmarks.perception_runtimes import RUNTIMES
-    from perception.inference import ContactModel
 
     return ContactModel(model, RUNTIMES[runtime](model))
 
@@ -130,6 +133,33 @@ def _latency(estimator: ContactEstimator, frames: _Frames) -> tuple[np.ndarray, 
             estimator.predict(image)
             row.append((time.perf_counter_ns() - wall_ns, time.process_time_ns() - cpu_ns))
     return np.array(times[0]), np.array(times[1])
+
+
+def _stages(estimator: ContactEstimator, frames: _Frames) -> dict[str, dict[str, float]]:
+    """Milliseconds of CPU time, median and p99, of the steps that ``predict`` is made of, for frames unlike the ones
+    before."""
+    times: dict[str, list[int]] = {}
+
+    def timed(name: str, step: Callable[..., T], *arguments: Any) -> T:
+        start_ns = time.process_time_ns()
+        result = step(*arguments)
+        times.setdefault(name, []).append(time.process_time_ns() - start_ns)
+        return result
+
+    for i in range(frames.count):
+        reduced = timed("preprocessing", estimator.reduce, frames.read(i))
+        if isinstance(estimator, MarkerEstimator):
+            discs = timed("discs", estimator.find, reduced)
+            field = timed("matching", estimator.match, discs)
+            mean, sigma = timed("network", estimator.infer, field)
+            timed("Gaussian", estimator.decode, field, mean, sigma)
+        elif isinstance(estimator, ContactModel):
+            outputs = timed("network", estimator.infer, reduced)
+            timed("Gaussian", estimator.decode, outputs)
+    return {
+        name: {"median": float(np.median(row)) * 1e-6, "p99": float(np.percentile(row, 99)) * 1e-6}
+        for name, row in times.items()
+    }
 
 
 def _memory_mb(field: str) -> float:

@@ -214,7 +214,8 @@ class CellFile(_Section):
     """A whole cell file.
 
     ``on_trip: end`` ends a run that has tripped; ``wait_for_reset`` keeps it up, with the arms stopped and watched,
-    until a person has reset it and lets the task start again.
+    until a person has reset it and lets the task start again. ``emulated_scene`` is what `touchcell emulate cell` puts
+    around the cell's arms and cameras; nothing else looks at it.
     """
 
     schema_: Literal[1] = Field(alias="schema")
@@ -225,6 +226,7 @@ class CellFile(_Section):
     seed: int = 0
     max_duration_s: PositiveFloat = 3600.0
     scene: dict[str, Any] | None = None
+    emulated_scene: dict[str, Any] | None = None
     obstacles: dict[str, BoxSection] = {}
     arms: dict[str, ArmSection] = {}
     sensors: dict[str, SensorSection] = {}
@@ -352,6 +354,8 @@ class _Planner:
     def _require_scene_fits(self, cell: CellFile) -> None:
         if cell.scene is not None:
             self._validated(self._scene_model, cell.scene, ("scene",))
+        if cell.emulated_scene is not None:
+            self._validated(self._scene_model, cell.emulated_scene, ("emulated_scene",))
 
     def _task(self, cell: CellFile) -> tuple[TaskSpec | None, TaskConfig | None]:
         try:

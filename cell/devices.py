@@ -15,6 +15,7 @@ from drivers.abilities import FrameSource, HealthSource, JointSource, TcpSource
 from drivers.device import Device
 from drivers.discovery import Found
 from drivers.errors import DeviceError, LifecycleError
+from geometry import se3
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +90,8 @@ def _probe(device: Device, driver: str) -> Probe:
 def _tcp(device: Device) -> list[tuple[str, str]]:
     if not isinstance(device, TcpSource):
         return []
-    T = device.tcp().value.T_base_tcp
-    return [("tool at", f"{np.round(1e3 * T[:3, 3], 2).tolist()} mm, tool axis {np.round(T[:3, 2], 3).tolist()}")]
+    pose = np.round(se3.to_euler_mm_deg(device.tcp().value.T_base_tcp), 2).tolist()
+    return [("tool at", f"{pose} mm, deg")]
 
 
 def _joints(device: Device) -> list[tuple[str, str]]:

@@ -60,7 +60,7 @@ class Trial:
                 if not isinstance(section.get(word), dict):
                     raise ConfigError("no such section", file=self.cell, key=key, hint=suggest(word, list(section)))
                 section = section[word]
-            section[leaf] = value
+            section[leaf] = copy.deepcopy(value)
         return data
 
 
@@ -115,8 +115,7 @@ class Perform:
         cell = compose(plan_cell(folder / "cell.yaml"))
         with Recorder(folder / "run.mcap") as recorder, cell:
             result = RunLoop(cell, recorder).run()
-        left = RunFolder(folder)
-        measures = self.measure(left) if result.cycles else {}
+        measures = self.measure(RunFolder(folder)) if result.cycles else {}
         record = {
             "settings": settings,
             "outcome": result.outcome.value,
@@ -127,7 +126,8 @@ class Perform:
             "measures": {name: float(value) for name, value in measures.items() if math.isfinite(value)},
         }
         _write_whole(marker, json.dumps(record, indent=1))
-        return _finished(trial, left, record)
+        # A folder of its own: the one that was measured holds its whole recording in memory.
+        return _finished(trial, RunFolder(folder), record)
 
     def kept(self, trial: Trial) -> Finished | None:
         """The trial as an earlier run of the experiment left it, if it had the same settings."""

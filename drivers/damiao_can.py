@@ -10,8 +10,7 @@ position and then, after its own timeout, letting go. **An arm without brakes si
 
 from __future__ import annotations
 
-import threading
-from collections import deque
+from collections.abc import Sequence
 from functools import partial
 from typing import Annotated, Any, Literal, Self
 
@@ -20,13 +19,12 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers import damiao_codec as codec
 from drivers.abilities import StopCategory
-from drivers.arm import LimitsConfig
+from drivers.bus_arm import BusArm, BusArmConfig
 from drivers.clock import Clock
 from drivers.damiao_bus import Address, Answer, MotorBus
 from drivers.damiao_codec import MitCommand, Register
-from drivers.device import DeactivatePolicy, Lifecycle, OperatorToken
+from drivers.device import Lifecycle, OperatorToken
 from drivers.errors import (
-    CommandRejected,
     ConfigError,
     ConnectError,
     DeviceError,
@@ -34,24 +32,15 @@ from drivers.errors import (
     DeviceGone,
     FaultClass,
     LifecycleError,
-    Rejection,
     Remedy,
     TransportTimeout,
 )
-from drivers.joint_arm import JointArm
-from drivers.joint_limits import JointLimitsConfig
-from drivers.joint_setpoint import JointSetpoint
-from drivers.kinematics import GRAVITY_M_S2, ChainDescription, DifferentialIk, SerialChain, Tool, Vector3
-from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
+from drivers.kinematics import GRAVITY_M_S2, ChainDescription, SerialChain, Vector3
+from drivers.registry import Capabilities, DriverContext, DriverSpec
 from drivers.samples import JointState, Stamped
 from geometry.types import Array
 
-Positive = Annotated[float, Field(gt=0.0)]
-
 _MAX_BUS_LOAD = 0.8
-_REST_SPEED_RAD_S = 0.03
-_FIRST_SAMPLE_S = 1.0
-_MISS_WINDOW = 100
 _PLAUSIBLE_JUMP_RAD = 0.1
 
 _DOES_NOT_ENABLE = codec.StatusCode(
@@ -75,11 +64,11 @@ class MotorConfig(BaseModel):
     kd_n_m_s_rad: Annotated[float, Field(gt=0.0, le=codec.KD_MAX)] = 1.5
 
 
-class DamiaoCanConfig(DriverConfig):
+class DamiaoCanConfig(BusArmConfig):
     """Configuration of one arm.
 
     ``interface``, ``channel`` and ``bus_options`` go to python-can; bit rates are those of the bus, which the adapter
-    or ``ip link`` sets. ``chain`` is a shipped description or a YAML file.
+    or ``ip link`` sets.
     """
 
     interface: str = "socketcan"
@@ -90,22 +79,16 @@ class DamiaoCanConfig(DriverConfig):
     data_bitrate: int = Field(default=5_000_000, gt=0)
 
     chain: str = "generic_6r"
-    tool: Tool = Tool()
     gravity_m_s2: Vector3 = GRAVITY_M_S2
     motors: tuple[MotorConfig, ...] = Field(min_length=1)
 
     rate_hz: Annotated[float, Field(ge=50.0, le=1000.0)] = 250.0
     watchdog_s: Annotated[float, Field(ge=0.02, le=0.4)] = 0.1
-    max_silence_s: Positive = 0.1
-    max_missed_fraction: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.25
-    tracking_error_deg: Positive = 8.0
 
-    limits: LimitsConfig = LimitsConfig()
-    joint_limits: JointLimitsConfig = JointLimitsConfig()
-
-    park_deg: tuple[float, ...] | None = None
-    park_tolerance_deg: Positive = 5.0
-    on_disconnect: Literal["hold", "park_then_off"] = "hold"
+    @property
+    def joint_count(self) -> int:
+        """How many motors are listed."""
+        return len(self.motors)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -120,10 +103,6 @@ class DamiaoCanConfig(DriverConfig):
             )
         if self.watchdog_s * self.rate_hz < 4:
             raise ValueError(f"watchdog_s {self.watchdog_s:g} is less than four cycles of {self.rate_hz:g} Hz")
-        if self.park_deg is not None and len(self.park_deg) != len(self.motors):
-            raise ValueError(f"park_deg has {len(self.park_deg)} angles for {len(self.motors)} motors")
-        if self.on_disconnect == "park_then_off" and self.park_deg is None:
-            raise ValueError("on_disconnect: park_then_off needs park_deg")
         return self
 
     @property
@@ -132,19 +111,17 @@ class DamiaoCanConfig(DriverConfig):
         return codec.bus_load(len(self.motors), self.rate_hz, self.bitrate, self.data_bitrate if self.fd else None)
 
     def describe(self) -> ChainDescription:
-        """The arm. Raises ConfigError if there is none or it has another number of joints."""
-        found = ChainDescription.named(self.chain)
-        if len(found.joints) != len(self.motors):
-            raise ConfigError(
-                f"chain {found.name!r} has {len(found.joints)} joints", key="motors", value=len(self.motors)
-            )
-        for joint, angle_deg in zip(found.joints, self.park_deg or (), strict=False):
-            if not joint.lower_deg <= angle_deg <= joint.upper_deg:
-                raise ConfigError(f"is outside the limits of joint {joint.name!r}", key="park_deg", value=angle_deg)
+        """The arm.
+
+        Raises:
+            ConfigError: there is none, it has another number of joints, or the park pose is outside their limits.
+        """
+        found = self.named_chain("motors")
+        self.require_park_within(found)
         return found
 
 
-class DamiaoCanArm(JointArm):
+class DamiaoCanArm(BusArm):
     """One arm; see the module for what stops it and what then happens.
 
     Args:
@@ -153,12 +130,10 @@ class DamiaoCanArm(JointArm):
         clock: real time; the loop is a thread and cannot run on a virtual clock.
     """
 
+    _config: DamiaoCanConfig
+
     def __init__(self, name: str, config: DamiaoCanConfig, clock: Clock) -> None:
-        super().__init__(name, clock, config.limits.build(), max_state_age_s=config.max_silence_s)
-        self._config = config
-        self._chain = SerialChain(config.describe(), config.tool, config.gravity_m_s2)
-        self._ik = DifferentialIk(self._chain, config.joint_limits.settings())
-        self._setpoint = JointSetpoint(self._chain, self._ik, self.limits)
+        super().__init__(name, config, clock, SerialChain(config.describe(), config.tool, config.gravity_m_s2))
         motors = config.motors
         self._direction = np.array([motor.direction for motor in motors], dtype=np.float64)
         self._offset = np.deg2rad([motor.offset_deg for motor in motors])
@@ -171,31 +146,10 @@ class DamiaoCanArm(JointArm):
             max_silence_s=config.max_silence_s,
             fd=config.fd,
         )
-        self._enabled = [False] * len(motors)
-        self._thread: threading.Thread | None = None
-        self._closing = threading.Event()
-        # Held by the loop for one cycle, and by whoever needs the bus or changes what the loop sends.
-        self._lock = threading.RLock()
-        self._forget()
 
     def _forget(self) -> None:
-        """Start without samples and without trouble."""
-        self._trouble: DeviceError | None = None
+        super()._forget()
         self._answers: list[Answer | None] = [None] * len(self._config.motors)
-        self._joints: Stamped[JointState] | None = None
-        self._seq = 0
-        self._implausible = 0
-        self._overruns = 0
-        self._latest_s = 0.0
-        self._missed: deque[bool] = deque(maxlen=_MISS_WINDOW)
-
-    def at_rest(self) -> bool:
-        """Whether setpoint and joints stand still; a joint's velocity is told in steps of up to 0.015 rad/s."""
-        sample = self._joints
-        fresh = sample is not None and sample.age_s(self._clock.now_ns()) <= self._config.max_silence_s
-        if sample is None or not fresh or self._setpoint.moving:
-            return False
-        return bool((np.abs(sample.value.dq) <= _REST_SPEED_RAD_S).all())
 
     def watchdog_s(self) -> float:
         """Silence after which the motors let go, as read back from them; the longest of them."""
@@ -211,12 +165,8 @@ class DamiaoCanArm(JointArm):
             "bus_state": self._bus.state,
             "bus_error": self._bus.last_error,
             "bus_load": self._config.bus_load,
-            "implausible": self._implausible,
-            "overruns": self._overruns,
-            "latest_cycle_s": self._latest_s,
-            "enabled": sum(self._enabled),
-            "limited_by": ", ".join(adjustment.limit for adjustment in self._setpoint.adjustments),
         }
+        readings |= super().health()
         for joint, answer in zip(self._chain.joint_names, self._answers, strict=True):
             if answer is not None:
                 readings[f"{joint}_status"] = answer.feedback.status
@@ -224,26 +174,11 @@ class DamiaoCanArm(JointArm):
                 readings[f"{joint}_rotor_c"] = answer.feedback.rotor_c
         return readings
 
-    def _open(self) -> None:
-        self._forget()
-        self._enabled = [False] * len(self._config.motors)
+    def _open_bus(self) -> None:
         self._bus.open()
-        self._closing.clear()
-        self._thread = threading.Thread(target=self._run, name=f"{self.name} motors", daemon=True)
-        self._thread.start()
-        deadline_ns = self._clock.now_ns() + round(_FIRST_SAMPLE_S * 1e9)
-        while self._joints is None:
-            if self._clock.now_ns() >= deadline_ns or not self._thread.is_alive():
-                causes = [self._trouble] if self._trouble is not None else []
-                raise ConnectError(self.name, f"no complete state within {_FIRST_SAMPLE_S:g} s", causes)
-            self._clock.sleep_until_ns(self._clock.now_ns() + 1_000_000)
 
-    def _close(self) -> None:
-        self._closing.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
-        self._power_off()
+    def _close_bus(self) -> None:
+        self._switch_off()
         self._bus.close()
 
     def _configure(self) -> None:
@@ -282,24 +217,8 @@ class DamiaoCanArm(JointArm):
             self._setpoint.reset(np.where(self._enabled, self._setpoint.q, q))
             self._enable([index for index, on in enumerate(self._enabled) if not on])
 
-    def _after_rest(self, policy: DeactivatePolicy) -> None:
-        if policy is DeactivatePolicy.HOLD:
-            return
-        if policy is DeactivatePolicy.BRAKE:
-            raise LifecycleError(
-                self.name, "brake", self.state.value, ["an arm with brakes"], hint="choose hold or park"
-            )
-        if policy is DeactivatePolicy.PARK_THEN_OFF:
-            self._park()
-        if not self._parked():
-            raise LifecycleError(
-                self.name, "switch off", self.state.value, ["its park pose"], hint="without power this arm falls"
-            )
-        self._power_off()
-
     def _recover(self, token: OperatorToken) -> None:
-        if self._thread is None or not self._thread.is_alive():
-            raise DeviceGone(self.name, "the bus has gone", hint="disconnect and connect again")
+        self._require_loop()
         with self._lock:
             answers = [self._fresh_answer(index) for index in range(len(self._enabled))]
             for index, motor in enumerate(self._config.motors):
@@ -312,17 +231,6 @@ class DamiaoCanArm(JointArm):
             self._configure()
             self._missed.clear()
             self._trouble = None
-
-    def _disconnect_policy(self) -> DeactivatePolicy:
-        return DeactivatePolicy(self._config.on_disconnect)
-
-    def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
-        if self._trouble is not None:
-            raise CommandRejected(self.name, Rejection.MODE, "device is faulted", hint=str(self._trouble))
-        self._setpoint.follow(twist_base, now_ns + round(ttl_s * 1e9))
-
-    def _begin_stop(self, category: StopCategory) -> None:
-        self._setpoint.stop()
 
     def _fresh_answer(self, index: int) -> Answer:
         """The loop's newest answer. Waiting for a silent motor here would let the others' timeouts run out."""
@@ -386,13 +294,16 @@ class DamiaoCanArm(JointArm):
                     code = codec.fault(status) or _DOES_NOT_ENABLE
                     raise _motor_fault(self.name, self._config.motors[index].esc_id, status, code)
         except DeviceError:
-            self._power_off(indices)
+            self._disable(indices)
             raise
 
-    def _power_off(self, indices: list[int] | None = None) -> None:
-        """Disable these motors, or all, as far as they can still be reached."""
+    def _switch_off(self) -> None:
+        self._disable(range(len(self._enabled)))
+
+    def _disable(self, indices: Sequence[int]) -> None:
+        """Disable these motors as far as they can still be reached."""
         with self._lock:
-            for index in range(len(self._enabled)) if indices is None else indices:
+            for index in indices:
                 if not self._enabled[index]:
                     continue
                 self._enabled[index] = False
@@ -404,52 +315,7 @@ class DamiaoCanArm(JointArm):
                     # Its own timeout disables a motor that does not hear us.
                     continue
 
-    def _park(self) -> None:
-        if self._config.park_deg is None:
-            raise LifecycleError(
-                self.name, "park", self.state.value, ["configured with park_deg"], hint="add park_deg to the cell file"
-            )
-        park = np.deg2rad(self._config.park_deg)
-        self._setpoint.go_to(park, 0.5)
-        while not (self.at_rest() and self._parked()):
-            if self._trouble is not None:
-                raise self._trouble
-            if not self._setpoint.moving and self.at_rest():
-                return
-            self._clock.sleep_until_ns(self._clock.now_ns() + 5_000_000)
-
-    def _parked(self) -> bool:
-        return self._is_at(self._config.park_deg, self._config.park_tolerance_deg)
-
-    def _run(self) -> None:
-        period_ns = round(1e9 / self._config.rate_hz)
-        last_ns = self._clock.now_ns() - period_ns
-        next_ns = self._clock.now_ns()
-        while not self._closing.is_set():
-            now_ns = self._clock.now_ns()
-            try:
-                with self._lock:
-                    self._cycle(now_ns, min(now_ns - last_ns, 2 * period_ns) * 1e-9, now_ns + period_ns * 3 // 4)
-            except DeviceGone as error:
-                self._latch(error)
-                return
-            except DeviceError as error:
-                self._latch(error)
-            except Exception as error:
-                self._latch(DeviceFault(self.name, f"the motor loop died: {error!r}", needs=Remedy.SERVICE))
-                return
-            last_ns = now_ns
-            next_ns += period_ns
-            late_ns = self._clock.now_ns() - next_ns
-            self._latest_s = max(self._latest_s, late_ns * 1e-9)
-            if late_ns > 0:
-                self._overruns += 1
-                next_ns += late_ns
-            self._clock.sleep_until_ns(next_ns)
-
     def _cycle(self, now_ns: int, dt_s: float, until_ns: int) -> None:
-        if self._trouble is not None:
-            self._latch(self._trouble)
         frames: list[bytes | None] = [None] * len(self._enabled)
         if any(self._enabled):
             q, dq = self._setpoint.step(now_ns, dt_s)
@@ -482,7 +348,8 @@ class DamiaoCanArm(JointArm):
         self._missed.append(any(answer is None for answer in good))
         self._check_silence()
         self._check_fences()
-        self._check_tracking()
+        if self._joints is not None:
+            self._check_tracking(self._joints.value.q, self._setpoint.q)
 
     def _plausible(self, index: int, answer: Answer | None) -> Answer | None:
         """The answer, unless the motor cannot have turned that far since the last one."""
@@ -519,33 +386,13 @@ class DamiaoCanArm(JointArm):
         for motor, answer in zip(self._config.motors, self._answers, strict=True):
             if answer is not None and (now_ns - answer.t_ns) * 1e-9 > limit_s:
                 self._latch(TransportTimeout(self.name, f"answer of motor {motor.esc_id}", limit_s))
-        full = len(self._missed) == self._missed.maxlen
-        if full and sum(self._missed) > self._config.max_missed_fraction * len(self._missed):
-            what = f"complete state in {sum(self._missed)} of {len(self._missed)} cycles"
-            self._latch(TransportTimeout(self.name, what, 1.0 / self._config.rate_hz, hint="check wiring and load"))
+        self._check_missed()
 
     def _check_fences(self) -> None:
         if self.state in (Lifecycle.READY, Lifecycle.ACTIVE):
             for index, ticks in enumerate(self._bus.timeout_ticks):
                 if ticks is not None:
                     self._check_watchdog(index, ticks)
-
-    def _check_tracking(self) -> None:
-        if self._joints is None or not all(self._enabled):
-            return
-        error = np.abs(self._joints.value.q - self._setpoint.q)
-        worst = int(np.argmax(error))
-        if error[worst] > np.deg2rad(self._config.tracking_error_deg):
-            # Hold where the arm is, so that whatever blocks it is no longer pushed against.
-            self._setpoint.reset(self._joints.value.q)
-            self._latch(
-                DeviceFault(
-                    self.name,
-                    f"joint {self._chain.joint_names[worst]} is {np.rad2deg(error[worst]):.1f} deg off its setpoint",
-                    fault_class=FaultClass.MOTION,
-                    hint="look for a collision, a wrong tool mass or a wrong offset",
-                )
-            )
 
 
 def _open_bus(device: str, config: DamiaoCanConfig) -> Any:

@@ -15,8 +15,6 @@ stands in the adjustments of ``Sent`` and in ``health``.
 from __future__ import annotations
 
 import hashlib
-import threading
-from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
@@ -27,42 +25,31 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers import feetech_codec as codec
 from drivers.abilities import StopCategory
-from drivers.arm import LimitsConfig
+from drivers.bus_arm import BusArm, BusArmConfig
 from drivers.clock import Clock
 from drivers.commands import Adjustment
-from drivers.device import DeactivatePolicy, OperatorToken
+from drivers.device import OperatorToken
 from drivers.errors import (
-    CommandRejected,
     ConfigError,
     ConnectError,
     CorruptMessage,
     DeviceError,
     DeviceFault,
-    DeviceGone,
     FaultClass,
-    LifecycleError,
-    Rejection,
     Remedy,
     TransportTimeout,
 )
 from drivers.feetech_bus import Answer, ServoBus
 from drivers.feetech_codec import FaultBit, Register, ServoState
-from drivers.joint_arm import JointArm
-from drivers.joint_limits import JointLimitsConfig
-from drivers.joint_setpoint import JointSetpoint
-from drivers.kinematics import ChainDescription, DifferentialIk, SerialChain, Tool
-from drivers.registry import Capabilities, DriverConfig, DriverContext, DriverSpec
+from drivers.kinematics import ChainDescription, SerialChain
+from drivers.registry import Capabilities, DriverContext, DriverSpec
 from drivers.samples import JointState, Quality, Stamped
 from drivers.twist_projection import followable
 from geometry.types import Array
 
-Positive = Annotated[float, Field(gt=0.0)]
 Ticks = Annotated[int, Field(ge=0, lt=codec.TICKS_PER_TURN)]
 
 _MAX_BUS_LOAD = 0.8
-_REST_SPEED_RAD_S = 0.03
-_FIRST_SAMPLE_S = 1.0
-_MISS_WINDOW = 50
 _ASKED_IN_VAIN = 3
 _UNSEEN_CYCLES = 2
 _TRIES = 3
@@ -109,30 +96,25 @@ class ServoConfig(BaseModel):
         return min(max(wanted, self.min_ticks), self.max_ticks)
 
 
-class FeetechSerialConfig(DriverConfig):
-    """Configuration of one arm. ``servos`` are in the order of the joints; ``chain`` is a shipped description or a YAML
-    file, whose joint ranges are narrowed to the calibrated ones."""
+class FeetechSerialConfig(BusArmConfig):
+    """Configuration of one arm. ``servos`` are in the order of the joints; the chain's joint ranges are narrowed to the
+    calibrated ones."""
 
     port: str
     baudrate: int = Field(default=1_000_000, gt=0)
     echo: bool = False
 
     chain: str = "so101_5r"
-    tool: Tool = Tool()
     servos: tuple[ServoConfig, ...] = Field(min_length=1)
 
     rate_hz: Annotated[float, Field(ge=10.0, le=200.0)] = 50.0
-    max_silence_s: Positive = 0.1
-    max_missed_fraction: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.25
     tracking_error_deg: Annotated[float, Field(gt=0.0, le=20.0)] = 8.0
     torque_limit_percent: Annotated[float, Field(ge=5.0, le=100.0)] = 60.0
 
-    limits: LimitsConfig = LimitsConfig()
-    joint_limits: JointLimitsConfig = JointLimitsConfig()
-
-    park_deg: tuple[float, ...] | None = None
-    park_tolerance_deg: Positive = 5.0
-    on_disconnect: Literal["hold", "park_then_off"] = "hold"
+    @property
+    def joint_count(self) -> int:
+        """How many servos are listed."""
+        return len(self.servos)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -146,10 +128,6 @@ class FeetechSerialConfig(DriverConfig):
             )
         if self.max_silence_s * self.rate_hz < _ASKED_IN_VAIN:
             raise ValueError(f"max_silence_s {self.max_silence_s:g} is less than three cycles of {self.rate_hz:g} Hz")
-        if self.park_deg is not None and len(self.park_deg) != len(self.servos):
-            raise ValueError(f"park_deg has {len(self.park_deg)} angles for {len(self.servos)} servos")
-        if self.on_disconnect == "park_then_off" and self.park_deg is None:
-            raise ValueError("on_disconnect: park_then_off needs park_deg")
         return self
 
     @property
@@ -165,11 +143,7 @@ class FeetechSerialConfig(DriverConfig):
             ConfigError: there is no such arm, it has another number of joints, a joint has no range left, or the park
                 pose is outside it.
         """
-        found = ChainDescription.named(self.chain)
-        if len(found.joints) != len(self.servos):
-            raise ConfigError(
-                f"chain {found.name!r} has {len(found.joints)} joints", key="servos", value=len(self.servos)
-            )
+        found = self.named_chain("servos")
         joints = []
         for index, (joint, servo) in enumerate(zip(found.joints, self.servos, strict=True)):
             ends = np.rad2deg(sorted((servo.angle(servo.min_ticks), servo.angle(servo.max_ticks))))
@@ -181,15 +155,13 @@ class FeetechSerialConfig(DriverConfig):
                     key=f"servos[{index}]",
                     hint="correct zero_ticks, direction, min_ticks and max_ticks",
                 )
-            if self.park_deg is not None and not lower <= self.park_deg[index] <= upper:
-                raise ConfigError(
-                    f"is outside the limits of joint {joint.name}", key=f"park_deg[{index}]", value=self.park_deg[index]
-                )
             joints.append(joint.model_copy(update={"lower_deg": lower, "upper_deg": upper}))
-        return found.model_copy(update={"joints": tuple(joints)})
+        narrowed = found.model_copy(update={"joints": tuple(joints)})
+        self.require_park_within(narrowed)
+        return narrowed
 
 
-class FeetechSerialArm(JointArm):
+class FeetechSerialArm(BusArm):
     """One arm; see the module for what stops it and what then happens.
 
     Args:
@@ -198,57 +170,27 @@ class FeetechSerialArm(JointArm):
         clock: real time; the loop is a thread and cannot run on a virtual clock.
     """
 
+    _config: FeetechSerialConfig
+
     def __init__(self, name: str, config: FeetechSerialConfig, clock: Clock) -> None:
-        super().__init__(name, clock, config.limits.build(), max_state_age_s=config.max_silence_s)
-        self._config = config
-        self._chain = SerialChain(config.describe(), config.tool)
-        self._ik = DifferentialIk(self._chain, config.joint_limits.settings())
-        self._setpoint = JointSetpoint(self._chain, self._ik, self.limits)
+        super().__init__(name, config, clock, SerialChain(config.describe(), config.tool))
         self._ids = [servo.id for servo in config.servos]
         self._bus = ServoBus(name, self._ids, partial(_open_port, name, config), clock, echo=config.echo)
-        self._thread: threading.Thread | None = None
-        self._closing = threading.Event()
-        # Held by the loop for one cycle, and by whoever needs the bus or changes what the loop sends.
-        self._lock = threading.RLock()
-        self._forget()
 
     def _forget(self) -> None:
-        """Start without samples and without trouble."""
-        self._trouble: DeviceError | None = None
-        self._answers: list[Answer | None] = [None] * len(self._ids)
-        self._enabled = [False] * len(self._ids)
+        super()._forget()
+        self._answers: list[Answer | None] = [None] * len(self._config.servos)
         # A servo holds its goal by itself: goals are sent only between activation and rest.
         self._driving = False
-        self._joints: Stamped[JointState] | None = None
-        self._seq = 0
-        self._implausible = 0
-        self._overruns = 0
-        self._latest_s = 0.0
-        self._missed: deque[bool] = deque(maxlen=_MISS_WINDOW)
-        self._in_vain = [0] * len(self._ids)
+        self._in_vain = [0] * len(self._config.servos)
         self._lost: tuple[Adjustment, ...] = ()
-        self._follows_until_ns = 0
-
-    def at_rest(self) -> bool:
-        """Whether setpoint and joints stand still."""
-        sample = self._joints
-        fresh = sample is not None and sample.age_s(self._clock.now_ns()) <= self._config.max_silence_s
-        # A twist that has just been taken over moves the setpoint in the next cycle only.
-        due = self._clock.now_ns() < self._follows_until_ns
-        if sample is None or not fresh or due or self._setpoint.moving:
-            return False
-        return bool((np.abs(sample.value.dq) <= _REST_SPEED_RAD_S).all())
 
     def health(self) -> dict[str, float | int | str | bool]:
         """Counters of the line and the loop, the calibration's hash, and what each servo tells of itself."""
         readings: dict[str, float | int | str | bool] = dict(self._bus.counters.as_dict())
+        readings |= super().health()
         readings |= {
             "calibration": self._config.calibration_hash,
-            "implausible": self._implausible,
-            "overruns": self._overruns,
-            "latest_cycle_s": self._latest_s,
-            "enabled": sum(self._enabled),
-            "limited_by": ", ".join(adjustment.limit for adjustment in self._setpoint.adjustments),
             "not_followed": ", ".join(f"{a.limit} {a.allowed:.3g} for {a.asked:.3g}" for a in self._lost),
         }
         for joint, answer in zip(self._chain.joint_names, self._answers, strict=True):
@@ -262,25 +204,11 @@ class FeetechSerialArm(JointArm):
                 readings[f"{joint}_a"] = state.current_a
         return readings
 
-    def _open(self) -> None:
-        self._forget()
+    def _open_bus(self) -> None:
         self._bus.open()
         self._enabled = [answer.state.torque_enable == codec.TORQUE_ON for _, answer in self._fresh_answers()]
-        self._closing.clear()
-        self._thread = threading.Thread(target=self._run, name=f"{self.name} servos", daemon=True)
-        self._thread.start()
-        deadline_ns = self._clock.now_ns() + round(_FIRST_SAMPLE_S * 1e9)
-        while self._joints is None:
-            if self._clock.now_ns() >= deadline_ns or not self._thread.is_alive():
-                causes = [self._trouble] if self._trouble is not None else []
-                raise ConnectError(self.name, f"no complete state within {_FIRST_SAMPLE_S:g} s", causes)
-            self._clock.sleep_until_ns(self._clock.now_ns() + 1_000_000)
 
-    def _close(self) -> None:
-        self._closing.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+    def _close_bus(self) -> None:
         self._bus.close()
 
     def _configure(self) -> None:
@@ -313,25 +241,17 @@ class FeetechSerialArm(JointArm):
             self._setpoint.reset(np.array([s.angle(goal) for s, goal in zip(self._config.servos, goals, strict=True)]))
             self._driving = True
 
-    def _after_rest(self, policy: DeactivatePolicy) -> None:
-        if policy is DeactivatePolicy.BRAKE:
-            raise LifecycleError(
-                self.name, "brake", self.state.value, ["an arm with brakes"], hint="choose hold or park"
-            )
-        if policy is DeactivatePolicy.PARK_THEN_OFF:
-            self._park()
-        if policy is not DeactivatePolicy.HOLD and not self._parked():
-            raise LifecycleError(
-                self.name, "switch off", self.state.value, ["its park pose"], hint="without power this arm falls"
-            )
+    def _hold(self) -> None:
         with self._lock:
             self._driving = False
-            if policy is not DeactivatePolicy.HOLD:
-                self._power_off(range(len(self._ids)))
+
+    def _switch_off(self) -> None:
+        with self._lock:
+            self._driving = False
+            self._power_off(range(len(self._ids)))
 
     def _recover(self, token: OperatorToken) -> None:
-        if self._thread is None or not self._thread.is_alive():
-            raise DeviceGone(self.name, "the line has gone", hint="disconnect and connect again")
+        self._require_loop()
         with self._lock:
             for servo, answer in self._fresh_answers():
                 found = codec.faults(answer.state.status)
@@ -347,23 +267,9 @@ class FeetechSerialArm(JointArm):
             self._missed.clear()
             self._trouble = None
 
-    def _disconnect_policy(self) -> DeactivatePolicy:
-        return DeactivatePolicy(self._config.on_disconnect)
-
     def _followable(self, twist_base: Array) -> tuple[Array, tuple[Adjustment, ...]]:
         twist, self._lost = followable(self._chain.jacobian(self._setpoint.q), twist_base)
         return twist, self._lost
-
-    def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
-        if self._trouble is not None:
-            raise CommandRejected(self.name, Rejection.MODE, "device is faulted", hint=str(self._trouble))
-        expires_ns = now_ns + round(ttl_s * 1e9)
-        self._setpoint.follow(twist_base, expires_ns)
-        self._follows_until_ns = expires_ns if twist_base.any() else 0
-
-    def _begin_stop(self, category: StopCategory) -> None:
-        self._follows_until_ns = 0
-        self._setpoint.stop()
 
     @property
     def _torque_limit(self) -> int:
@@ -464,49 +370,7 @@ class FeetechSerialArm(JointArm):
             silent = [servo for servo, answer in zip(self._ids, answers, strict=True) if answer is None]
         raise TransportTimeout(self.name, f"state of servos {silent}", _TRIES * _ANSWER_TIMEOUT_S)
 
-    def _park(self) -> None:
-        if self._config.park_deg is None:
-            raise LifecycleError(
-                self.name, "park", self.state.value, ["configured with park_deg"], hint="add park_deg to the cell file"
-            )
-        self._setpoint.go_to(np.deg2rad(self._config.park_deg), 0.5)
-        while self._setpoint.moving or not self.at_rest():
-            if self._trouble is not None:
-                raise self._trouble
-            self._clock.sleep_until_ns(self._clock.now_ns() + 5_000_000)
-
-    def _parked(self) -> bool:
-        return self._is_at(self._config.park_deg, self._config.park_tolerance_deg)
-
-    def _run(self) -> None:
-        period_ns = round(1e9 / self._config.rate_hz)
-        last_ns = self._clock.now_ns() - period_ns
-        next_ns = self._clock.now_ns()
-        while not self._closing.is_set():
-            try:
-                with self._lock:
-                    now_ns = self._clock.now_ns()
-                    self._cycle(now_ns, min(now_ns - last_ns, 2 * period_ns) * 1e-9, now_ns + period_ns * 3 // 4)
-            except DeviceGone as error:
-                self._latch(error)
-                return
-            except DeviceError as error:
-                self._latch(error)
-            except Exception as error:
-                self._latch(DeviceFault(self.name, f"the servo loop died: {error!r}", needs=Remedy.SERVICE))
-                return
-            last_ns = now_ns
-            next_ns += period_ns
-            late_ns = self._clock.now_ns() - next_ns
-            self._latest_s = max(self._latest_s, late_ns * 1e-9)
-            if late_ns > 0:
-                self._overruns += 1
-                next_ns += late_ns
-            self._clock.sleep_until_ns(next_ns)
-
     def _cycle(self, now_ns: int, dt_s: float, until_ns: int) -> None:
-        if self._trouble is not None:
-            self._latch(self._trouble)
         due = self._setpoint.q
         if self._driving and any(self._enabled):
             q, dq = due, np.zeros_like(due)
@@ -534,7 +398,10 @@ class FeetechSerialArm(JointArm):
         self._missed.append(len(complete) < len(good))
         self._check_silence()
         if len(complete) == len(good):
-            self._check_tracking(self._publish(complete), due)
+            q = self._publish(complete)
+            # The goals of the cycle before: those the servos have had time to reach.
+            if self._driving:
+                self._check_tracking(q, due)
 
     def _plausible(self, index: int, answer: Answer | None) -> Answer | None:
         """The answer, unless the servo cannot have turned that far since the last one."""
@@ -581,26 +448,7 @@ class FeetechSerialArm(JointArm):
             # A host that was busy elsewhere has heard nothing either: it must have asked.
             if answer is not None and asked >= _ASKED_IN_VAIN and (now_ns - answer.t_ns) * 1e-9 > limit_s:
                 self._latch(TransportTimeout(self.name, f"answer of servo {servo}", limit_s))
-        full = len(self._missed) == self._missed.maxlen
-        if full and sum(self._missed) > self._config.max_missed_fraction * len(self._missed):
-            what = f"complete state in {sum(self._missed)} of {len(self._missed)} cycles"
-            self._latch(TransportTimeout(self.name, what, 1.0 / self._config.rate_hz, hint="check plugs and supply"))
-
-    def _check_tracking(self, q: Array, due: Array) -> None:
-        """Compare ``q`` with the goals of the cycle before, which the servos have had time to reach."""
-        error = np.where(self._enabled, np.abs(q - due), 0.0)
-        worst = int(np.argmax(error))
-        if self._driving and error[worst] > np.deg2rad(self._config.tracking_error_deg):
-            # Hold where the arm is, so that whatever blocks it is no longer pushed against.
-            self._setpoint.reset(q)
-            self._latch(
-                DeviceFault(
-                    self.name,
-                    f"joint {self._chain.joint_names[worst]} is {np.rad2deg(error[worst]):.1f} deg off its setpoint",
-                    fault_class=FaultClass.MOTION,
-                    hint="look for a collision or a load that is too heavy",
-                )
-            )
+        self._check_missed()
 
 
 def _open_port(device: str, config: FeetechSerialConfig) -> Any:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from drivers.arm import Arm
 from drivers.device import Lifecycle
 from drivers.errors import CommandRejected, DeviceError, Rejection, StaleData
@@ -62,13 +60,6 @@ class JointArm(Arm):
 
     def _local_ik(self) -> LocalIk:
         return self._ik_at(self._ik, self.joints(self._max_state_age_s).value.q)
-
-    def _is_at(self, park_deg: tuple[float, ...] | None, tolerance_deg: float) -> bool:
-        """Whether every joint is within ``tolerance_deg`` of the park pose; never where there is none."""
-        if park_deg is None:
-            return False
-        away = np.abs(self.joints().value.q - np.deg2rad(park_deg))
-        return bool((away <= np.deg2rad(tolerance_deg)).all())
 
     def _latch(self, error: DeviceError) -> None:
         """Keep the first trouble, stop the setpoint, and be FAULTED."""

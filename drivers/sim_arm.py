@@ -5,7 +5,9 @@ It has no joints, no singularities and no tracking error beyond those limits; it
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,12 +40,25 @@ _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE, Lifecycle.FAU
 
 
 class SimArmConfig(DriverConfig):
-    """Where the arm stands and how fast it may be."""
+    """Where the arm stands, how fast it may be, and how late it obeys: twists only, stops reach it at once."""
 
     start_pose_mm_deg: tuple[float, float, float, float, float, float]
     base_pose_mm_deg: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     limits: LimitsConfig = LimitsConfig()
+    latency_ms: float = Field(default=0.0, ge=0.0, le=500.0)
     max_ttl_s: float = Field(default=1.0, gt=0.0, le=10.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Late:
+    """A twist that has not reached the arm yet."""
+
+    due_ns: int
+    twist_base: Array
+    expires_ns: int
+
+    def postponed(self, by_ns: int) -> _Late:
+        return replace(self, due_ns=self.due_ns + by_ns, expires_ns=self.expires_ns + by_ns)
 
 
 class SimArm(Arm):
@@ -70,6 +85,8 @@ class SimArm(Arm):
         self.T_world_base = se3.from_euler_mm_deg(config.base_pose_mm_deg)
         self._timeline = timeline or Timeline(clock)
         self._body = TwistFollower(se3.from_euler_mm_deg(config.start_pose_mm_deg), self.limits, self._timeline.step_ns)
+        self._latency_ns = round(config.latency_ms * 1e6)
+        self._on_the_way: deque[_Late] = deque()
         self._powered = False
         self._told: Stamped[TcpState] | None = None
         self._timeline.add(Phase.MOTION, self._step)
@@ -94,7 +111,7 @@ class SimArm(Arm):
     def at_rest(self) -> bool:
         """Whether it stands still and is not about to move."""
         self._timeline.advance()
-        return self._body.at_rest() and not self._velocity().any()
+        return self._body.at_rest() and not (self._on_the_way or self._velocity().any())
 
     def health(self) -> dict[str, float | int | str | bool]:
         """Speeds of the tool centre point and who commands it."""
@@ -112,17 +129,25 @@ class SimArm(Arm):
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
         self._timeline.advance()
-        self._body.follow(twist_base, now_ns + round(ttl_s * 1e9))
+        expires_ns = now_ns + round(ttl_s * 1e9)
+        if self._latency_ns:
+            self._on_the_way.append(_Late(now_ns + self._latency_ns, twist_base.copy(), expires_ns + self._latency_ns))
+        else:
+            self._body.follow(twist_base, expires_ns)
 
     def _begin_stop(self, category: StopCategory) -> None:
         self._timeline.advance()
         if self.faults.deaf:
             return
+        self._on_the_way.clear()
         self._powered = category is StopCategory.STOP_AND_HOLD
         if not (self.faults.runs_on and self._powered):
             self._body.halt()
 
     def _step(self, t_ns: int) -> None:
+        while self._on_the_way and self._on_the_way[0].due_ns <= t_ns - self._timeline.step_ns:
+            late = self._on_the_way.popleft()
+            self._body.follow(late.twist_base, late.expires_ns)
         if self.faults.runs_on and self._powered:
             self._body.prolong(t_ns)
         self._body.step(t_ns)
@@ -134,10 +159,11 @@ class SimArm(Arm):
 
     def _snapshot(self) -> Callable[[int], None]:
         """The body alone: who may command it is no matter of the simulation."""
-        powered, body = self._powered, self._body.snapshot()
+        powered, body, on_the_way = self._powered, self._body.snapshot(), tuple(self._on_the_way)
 
         def restore(later_ns: int) -> None:
             self._powered = powered
+            self._on_the_way = deque(late.postponed(later_ns) for late in on_the_way)
             body(later_ns)
 
         return restore
@@ -158,9 +184,13 @@ class SimArm(Arm):
 
     def _close(self) -> None:
         self._timeline.advance()
-        self._body.freeze()
+        self._forget()
 
     def _recover(self, token: OperatorToken) -> None:
+        self._forget()
+
+    def _forget(self) -> None:
+        self._on_the_way.clear()
         self._body.freeze()
 
 

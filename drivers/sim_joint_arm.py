@@ -6,7 +6,9 @@ touches pushes back on it. ``sim_arm`` is the one without all that.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -70,6 +72,10 @@ class SimJointArmConfig(DriverConfig):
     joint_limits: JointLimitsConfig = JointLimitsConfig()
     max_ttl_s: float = Field(default=1.0, gt=0.0, le=10.0)
     physics_step_ms: float = Field(default=1.0, ge=0.05, le=2.0)
+    menagerie: str | None = Field(
+        default=None,
+        description="checkout of MuJoCo Menagerie whose arm to use, or else $MENAGERIE_ROOT; rods where neither is set",
+    )
 
 
 class SimJointArm(JointArm):
@@ -84,7 +90,7 @@ class SimJointArm(JointArm):
         timeline: of the scene that it moves in; its own if there is none.
 
     Raises:
-        ConfigError: the start pose cannot be reached, or mujoco is not installed.
+        ConfigError: the start pose cannot be reached, mujoco is not installed, or Menagerie's arm cannot be used.
     """
 
     def __init__(self, name: str, config: SimJointArmConfig, clock: Clock, timeline: Timeline | None = None) -> None:
@@ -113,7 +119,7 @@ class SimJointArm(JointArm):
         self._setpoint.reset(q)
         # Where the setpoint was when it moved last, and how many steps of the simulation ago that was.
         self._from, self._phase = q, 0
-        self._body = _dynamics(description, tool, q, step_s / self._steps)
+        self._body = _dynamics(config, description, tool, q, step_s / self._steps)
         self._joints = self._sample()
         self._timeline.add(Phase.MOTION, self._step)
         self._timeline.keep(self._snapshot)
@@ -200,10 +206,15 @@ class SimJointArm(JointArm):
         self._setpoint.reset(self._from)
 
 
-def _dynamics(description: ChainDescription, tool: Tool, q: Array, step_s: float) -> ArmDynamics:
+def _dynamics(
+    config: SimJointArmConfig, description: ChainDescription, tool: Tool, q: Array, step_s: float
+) -> ArmDynamics:
     with physics_engine("driver", "sim_joint_arm"):
         from drivers.simulation.arm_dynamics import ArmDynamics
-    return ArmDynamics(description, tool, q, step_s)
+        from drivers.simulation.menagerie import menagerie_arm
+    root = config.menagerie or os.environ.get("MENAGERIE_ROOT")
+    links = menagerie_arm(Path(root), config.model, description) if root else None
+    return ArmDynamics(description, tool, q, step_s, links)
 
 
 def _build(name: str, config: Any, context: DriverContext) -> SimJointArm:

@@ -72,6 +72,36 @@ def adjoint(T: ArrayLike) -> Array:
     return _apply(_adjoint, _check.pose("adjoint", "T", T), 2, (6, 6))
 
 
+def from_euler_mm_deg(pose: ArrayLike) -> Array:
+    pose = _check.twist("from_euler_mm_deg", "pose", pose)
+    angles = np.radians(pose[..., 3:])
+    sines, cosines = np.sin(angles), np.cos(angles)
+    sa, sb, sc = sines[..., 0], sines[..., 1], sines[..., 2]
+    ca, cb, cc = cosines[..., 0], cosines[..., 1], cosines[..., 2]
+    T = np.zeros((*pose.shape[:-1], 4, 4))
+    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2] = cc * cb, cc * sb * sa - sc * ca, cc * sb * ca + sc * sa
+    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2] = sc * cb, sc * sb * sa + cc * ca, sc * sb * ca - cc * sa
+    T[..., 2, 0], T[..., 2, 1], T[..., 2, 2] = -sb, cb * sa, cb * ca
+    T[..., :3, 3] = pose[..., :3] * 1e-3
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def to_euler_mm_deg(T: ArrayLike) -> Array:
+    T = _check.pose("to_euler_mm_deg", "T", T)
+    R = T[..., :3, :3]
+    gamma = np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    sine, cosine = np.sin(gamma), np.cos(gamma)
+    out = np.empty((*T.shape[:-2], 6))
+    out[..., :3] = T[..., :3, 3] * 1e3
+    out[..., 3] = np.arctan2(sine * R[..., 0, 2] - cosine * R[..., 1, 2], cosine * R[..., 1, 1] - sine * R[..., 0, 1])
+    out[..., 4] = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 0, 0], R[..., 1, 0]))
+    out[..., 5] = gamma
+    np.degrees(out[..., 3:], out=out[..., 3:])
+    out += 0.0  # turns -0.0 into 0.0
+    return out
+
+
 def left_jacobian(xi: ArrayLike) -> Array:
     return _apply(_left_jacobian, _check.twist("left_jacobian", "xi", xi), 1, (6, 6))
 

@@ -10,6 +10,7 @@
 #include <string.h>
 
 #define TERMS 9
+#define PI 3.14159265358979323846
 
 static const double SERIES_A[TERMS] = {
     1.0, -1.0 / 6.0, 1.0 / 120.0, -1.0 / 5040.0, 1.0 / 362880.0, -1.0 / 39916800.0, 1.0 / 6227020800.0,
@@ -236,6 +237,29 @@ static int is_pose(const double *T)
                 T[2] * (T[4] * T[9] - T[5] * T[8]) >= 0.0;
     good &= fabs(T[12]) <= tolerance && fabs(T[13]) <= tolerance && fabs(T[14]) <= tolerance;
     return good && fabs(T[15] - 1.0) <= tolerance;
+}
+
+static void from_euler_kernel(const double *pose, double *T)
+{
+    double a = pose[3] * (PI / 180.0), b = pose[4] * (PI / 180.0), c = pose[5] * (PI / 180.0);
+    double sa = sin(a), ca = cos(a), sb = sin(b), cb = cos(b), sc = sin(c), cc = cos(c);
+    double entries[16] = {
+        cc * cb, cc * sb * sa - sc * ca, cc * sb * ca + sc * sa, pose[0] * 1e-3,
+        sc * cb, sc * sb * sa + cc * ca, sc * sb * ca - cc * sa, pose[1] * 1e-3,
+        -sb,     cb * sa,                cb * ca,                pose[2] * 1e-3,
+        0.0,     0.0,                    0.0,                    1.0};
+    memcpy(T, entries, sizeof entries);
+}
+
+static void to_euler_kernel(const double *T, double *pose)
+{
+    double gamma = atan2(T[4], T[0]), sine = sin(gamma), cosine = cos(gamma);
+    double alpha = atan2(sine * T[2] - cosine * T[6], cosine * T[5] - sine * T[1]);
+    double beta = atan2(-T[8], hypot(T[0], T[4]));
+    double entries[6] = {T[3] * 1e3,           T[7] * 1e3,          T[11] * 1e3,
+                         alpha * (180.0 / PI), beta * (180.0 / PI), gamma * (180.0 / PI)};
+    for (int i = 0; i < 6; i++)
+        pose[i] = entries[i] + 0.0; /* Turns -0.0 into 0.0. */
 }
 
 #endif

@@ -29,6 +29,10 @@ typedef struct {
 static const Operation EXP = {"exp", "xi", &check_twist, is_twist, 1, {6, 1}, exp_kernel, 2, {4, 4}};
 static const Operation LOG = {"log", "T", &check_pose, is_pose, 2, {4, 4}, log_kernel, 1, {6, 1}};
 static const Operation INVERSE = {"inverse", "T", &check_pose, is_pose, 2, {4, 4}, inverse_kernel, 2, {4, 4}};
+static const Operation FROM_EULER = {
+    "from_euler_mm_deg", "pose", &check_twist, is_twist, 1, {6, 1}, from_euler_kernel, 2, {4, 4}};
+static const Operation TO_EULER = {
+    "to_euler_mm_deg", "T", &check_pose, is_pose, 2, {4, 4}, to_euler_kernel, 1, {6, 1}};
 static const Operation ADJOINT = {"adjoint", "T", &check_pose, is_pose, 2, {4, 4}, adjoint_kernel, 2, {6, 6}};
 static const Operation LEFT_JACOBIAN = {
     "left_jacobian", "xi", &check_twist, is_twist, 1, {6, 1}, left_jacobian_kernel, 2, {6, 6}};
@@ -108,6 +112,8 @@ static PyObject *apply(const Operation *operation, PyObject *value)
 static PyObject *py_exp(PyObject *module, PyObject *xi) { return apply(&EXP, xi); }
 static PyObject *py_log(PyObject *module, PyObject *T) { return apply(&LOG, T); }
 static PyObject *py_inverse(PyObject *module, PyObject *T) { return apply(&INVERSE, T); }
+static PyObject *py_from_euler(PyObject *module, PyObject *pose) { return apply(&FROM_EULER, pose); }
+static PyObject *py_to_euler(PyObject *module, PyObject *T) { return apply(&TO_EULER, T); }
 static PyObject *py_adjoint(PyObject *module, PyObject *T) { return apply(&ADJOINT, T); }
 static PyObject *py_left_jacobian(PyObject *module, PyObject *xi) { return apply(&LEFT_JACOBIAN, xi); }
 static PyObject *py_left_jacobian_inverse(PyObject *module, PyObject *xi) { return apply(&LEFT_JACOBIAN_INVERSE, xi); }
@@ -262,6 +268,8 @@ static PyMethodDef METHODS[] = {
     {"compose", (PyCFunction)(void (*)(void))py_compose, METH_FASTCALL, NULL},
     {"inverse", py_inverse, METH_O, NULL},
     {"adjoint", py_adjoint, METH_O, NULL},
+    {"from_euler_mm_deg", py_from_euler, METH_O, NULL},
+    {"to_euler_mm_deg", py_to_euler, METH_O, NULL},
     {"left_jacobian", py_left_jacobian, METH_O, NULL},
     {"left_jacobian_inverse", py_left_jacobian_inverse, METH_O, NULL},
     {"admit", (PyCFunction)(void (*)(void))py_admit, METH_FASTCALL, NULL},

@@ -47,6 +47,8 @@ class _Kernels(Protocol):
     def compose(self, T_a_b: ArrayLike, T_b_c: ArrayLike, /) -> Array: ...
     def inverse(self, T: ArrayLike, /) -> Array: ...
     def adjoint(self, T: ArrayLike, /) -> Array: ...
+    def from_euler_mm_deg(self, pose: ArrayLike, /) -> Array: ...
+    def to_euler_mm_deg(self, T: ArrayLike, /) -> Array: ...
     def left_jacobian(self, xi: ArrayLike, /) -> Array: ...
     def left_jacobian_inverse(self, xi: ArrayLike, /) -> Array: ...
 
@@ -137,18 +139,7 @@ def from_euler_mm_deg(pose: ArrayLike) -> Array:
     Returns:
         (..., 4, 4), translation in metres.
     """
-    pose = _check.twist("from_euler_mm_deg", "pose", pose)
-    angles = np.radians(pose[..., 3:])
-    sines, cosines = np.sin(angles), np.cos(angles)
-    sa, sb, sc = sines[..., 0], sines[..., 1], sines[..., 2]
-    ca, cb, cc = cosines[..., 0], cosines[..., 1], cosines[..., 2]
-    T = np.zeros((*pose.shape[:-1], 4, 4))
-    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2] = cc * cb, cc * sb * sa - sc * ca, cc * sb * ca + sc * sa
-    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2] = sc * cb, sc * sb * sa + cc * ca, sc * sb * ca - cc * sa
-    T[..., 2, 0], T[..., 2, 1], T[..., 2, 2] = -sb, cb * sa, cb * ca
-    T[..., :3, 3] = pose[..., :3] * 1e-3
-    T[..., 3, 3] = 1.0
-    return T
+    return _kernels.from_euler_mm_deg(pose)
 
 
 def to_euler_mm_deg(T: ArrayLike) -> Array:
@@ -158,18 +149,7 @@ def to_euler_mm_deg(T: ArrayLike) -> Array:
     first column of R, zero if nothing, and alpha is measured after turning back by gamma and so makes up for it. The
     pose round-trips everywhere.
     """
-    T = _check.pose("to_euler_mm_deg", "T", T)
-    R = T[..., :3, :3]
-    gamma = np.arctan2(R[..., 1, 0], R[..., 0, 0])
-    sine, cosine = np.sin(gamma), np.cos(gamma)
-    out = np.empty((*T.shape[:-2], 6))
-    out[..., :3] = T[..., :3, 3] * 1e3
-    out[..., 3] = np.arctan2(sine * R[..., 0, 2] - cosine * R[..., 1, 2], cosine * R[..., 1, 1] - sine * R[..., 0, 1])
-    out[..., 4] = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 0, 0], R[..., 1, 0]))
-    out[..., 5] = gamma
-    np.degrees(out[..., 3:], out=out[..., 3:])
-    out += 0.0  # turns -0.0 into 0.0
-    return out
+    return _kernels.to_euler_mm_deg(T)
 
 
 def project(T: ArrayLike) -> Array:

@@ -20,6 +20,7 @@ from torch.nn import functional
 from drivers.tactile_data import read_image, read_split
 from geometry.types import Array
 from perception.camera_change import CameraChange
+from perception.displacement_network import Jitter, features_of
 from perception.errors import ModelError, TrainingError
 from perception.labels import xi_from_contact
 from perception.least_squares import robust_fit
@@ -34,8 +35,6 @@ from perception.model_file import Header, Labels, Model, load_model, save_model,
 from perception.preprocessing import Preprocessing
 from perception.zero_frame import lattice_turns, similarity
 
-_DISPLACEMENT_PX = 8.0
-_NARROWEST = 0.02
 _SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 _REFINED_WITH = 60
 _TYPICAL_ERROR = 0.05
@@ -385,18 +384,12 @@ def tune(
     tensors = {name: old.tensors[f"displacement.{name}"].astype(np.float64) for name in ("mean", "basis", "sd")}
     reference = old.tensors["lattice"].astype(np.float64)
     model = DisplacementModel(reference, tensors["mean"], tensors["basis"], tensors["sd"])
-    features = _features(model)
+    features = features_of(model)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         tuner = _Tuner(layers, features, model, settings)
         tuner.fit(torch.from_numpy(displacements), torch.from_numpy(target.astype(np.float32)))
     return tuner.layers()
-
-
-def _features(model: DisplacementModel) -> Array:
-    """(2 m, f) what first layers learn from: markers alone, and together the ways in which they move."""
-    scaled = model.basis.T / np.maximum(model.sd, _NARROWEST * model.sd[0])
-    return np.concatenate([np.eye(len(model.mean)) / _DISPLACEMENT_PX, scaled], axis=1)
 
 
 class _Tuner:
@@ -407,8 +400,7 @@ class _Tuner:
         self.old = [(torch.from_numpy(w).float(), torch.from_numpy(b).float()) for w, b in layers]
         self.features = torch.from_numpy(features).float()
         self.mean = torch.from_numpy(model.mean).float()
-        around = model.reference - model.reference.mean(axis=0)
-        self.around_middle = torch.from_numpy(around.astype(np.float32))
+        self.jitter = Jitter(model.reference, settings.shift_px, settings.turn_rad, settings.zoom)
         networks, _, units = layers[0][0].shape
         shapes = [(networks, features.shape[1], units), *(w.shape for w, _ in layers[1:])]
         self.weights = [torch.zeros(shape, requires_grad=True) for shape in shapes]
@@ -425,7 +417,7 @@ class _Tuner:
                 rise = min(1.0, (step + 1) / (0.1 * settings.steps))
                 group["lr"] = settings.learning_rate * rise * 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
             chosen = torch.randint(len(inputs), (networks, min(settings.batch_size, len(inputs))))
-            outputs = self._outputs(self._jittered(inputs[chosen]))
+            outputs = self._outputs(self.jitter(inputs[chosen]))
             off = functional.smooth_l1_loss(outputs[..., :6], targets[chosen], beta=0.02, reduction="none")
             held = sum(((w / usual) ** 2).mean() for w, usual in zip(self.weights, self.usual, strict=True))
             loss = off.sum(-1).mean() + settings.hold * held
@@ -456,16 +448,6 @@ class _Tuner:
             x = functional.dropout(functional.silu(x), self.settings.dropout)
             x = torch.baddbmm(bias + shift, x, weight + change)
         return x
-
-    def _jittered(self, displacements: Tensor) -> Tensor:
-        settings = self.settings
-        networks, n, _ = displacements.shape
-        place = self.around_middle + displacements.view(networks, n, -1, 2)
-        across = torch.stack([-place[..., 1], place[..., 0]], dim=-1)
-        moved = settings.shift_px * torch.randn(networks, n, 1, 2)
-        moved = moved + settings.turn_rad * torch.randn(networks, n, 1, 1) * across
-        moved = moved + settings.zoom * torch.randn(networks, n, 1, 1) * place
-        return displacements + moved.flatten(2)
 
 
 def _doubles(tensor: Tensor) -> Array:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from geometry.types import Array
 from perception.marker_architecture import LOG_PRECISION_BOUNDS
 from perception.marker_matching import DisplacementModel
 from perception.networks import Alignment
@@ -36,12 +37,13 @@ class DisplacementNetwork(nn.Module):
 
     def __init__(self, model: DisplacementModel, hidden: tuple[int, ...], networks: int) -> None:
         super().__init__()
-        scaled = model.basis.T / np.maximum(model.sd, _NARROWEST * model.sd[0])
+        features = features_of(model)
+        scaled = features[:, len(model.mean) :]
         self.register_buffer("mean", torch.from_numpy(model.mean.astype(np.float32)), persistent=False)
         self.register_buffer("scaled", torch.from_numpy(scaled.astype(np.float32)), persistent=False)
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
-        before = sum(scaled.shape)
+        before = features.shape[1]
         for units in (*hidden, 18):
             bound = 1.0 / math.sqrt(before)
             self.weights.append(nn.Parameter(torch.empty(networks, before, units).uniform_(-bound, bound)))
@@ -78,6 +80,35 @@ class DisplacementNetwork(nn.Module):
             tensors[f"layer{i}.weight"] = np.ascontiguousarray(weight.float().numpy())
             tensors[f"layer{i}.bias"] = np.ascontiguousarray(bias.float().numpy().reshape(len(bias), 1, -1))
         return tensors
+
+
+def features_of(model: DisplacementModel) -> Array:
+    """(2 m, f) what first layers learn from: markers alone, and together the ways in which they move."""
+    scaled = model.basis.T / np.maximum(model.sd, _NARROWEST * model.sd[0])
+    return np.concatenate([np.eye(len(model.mean)) / _DISPLACEMENT_PX, scaled], axis=1)
+
+
+class Jitter:
+    """Displacements as a camera that moved, turned and zoomed a little sees them.
+
+    Args:
+        reference: (m, 2) px, the markers at rest.
+        shift_px, turn_rad, zoom: standard deviations.
+    """
+
+    def __init__(self, reference: Array, shift_px: float, turn_rad: float, zoom: float) -> None:
+        self._around_middle = torch.from_numpy((reference - reference.mean(axis=0)).astype(np.float32))
+        self._shift_px, self._turn_rad, self._zoom = shift_px, turn_rad, zoom
+
+    def __call__(self, displacements: Tensor) -> Tensor:
+        """Displacements (networks, n, 2 m) px, each of another camera."""
+        networks, n, _ = displacements.shape
+        place = self._around_middle + displacements.view(networks, n, -1, 2)
+        across = torch.stack([-place[..., 1], place[..., 0]], dim=-1)
+        moved = self._shift_px * torch.randn(networks, n, 1, 2)
+        moved = moved + self._turn_rad * torch.randn(networks, n, 1, 1) * across
+        moved = moved + self._zoom * torch.randn(networks, n, 1, 1) * place
+        return displacements + moved.flatten(2)
 
 
 def displacement_loss(outputs: Tensor, labels: Tensor, alignment: Alignment) -> Tensor:

@@ -24,6 +24,30 @@ class ImageError(TouchcellError, ValueError):
         self.found = found
 
 
+class ArrayError(TouchcellError, ValueError):
+    """An array is not what a compiled kernel can work on.
+
+    Attributes:
+        function: the kernel that refused.
+        argument: the name of the offending argument.
+    """
+
+    def __init__(self, function: str, argument: str, reason: str, *, hint: str = "") -> None:
+        super().__init__(f"{function}: {argument} {reason}", hint=hint)
+        self.function = function
+        self.argument = argument
+
+
+class KernelsMissing(TouchcellError):
+    """The C extension that markers are found and matched with was not built."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "perception's C extension was not built",
+            hint="install a C compiler and install touchcell again; models of kind gdn and cnn do without",
+        )
+
+
 class ModelError(TouchcellError, ValueError):
     """A model file cannot be used.
 

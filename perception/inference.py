@@ -108,13 +108,18 @@ class ContactModel:
 
     def predict_reduced(self, reduced: ImageArray) -> Prediction:
         """Contact in an image that ``reduce`` made, so that a gate and a prediction share the preprocessing."""
-        return self._decode(self._run(scale(reduced)[None, None])[0])
+        return self.decode(self.infer(reduced))
+
+    def infer(self, reduced: ImageArray) -> NDArray[np.float32]:
+        """First step of ``predict_reduced``: the network's outputs."""
+        outputs: NDArray[np.float32] = self._run(scale(reduced)[None, None])[0]
+        return outputs
 
     def predict_batch(self, images: Sequence[ImageArray]) -> list[Prediction]:
         """``predict`` of several images in one run; faster per image, and the whole batch is held in memory."""
         if not images:
             return []
-        return [self._decode(row) for row in self._run(np.stack([self._preprocessing.apply(i) for i in images]))]
+        return [self.decode(row) for row in self._run(np.stack([self._preprocessing.apply(i) for i in images]))]
 
     def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:
         """``predict`` of a camera's sample; the prediction keeps the stamp, number and quality of the frame."""
@@ -122,7 +127,8 @@ class ContactModel:
             self.predict(sample.value.image), sample.t_ns, sample.seq, sample.t_device_ns, quality=sample.quality
         )
 
-    def _decode(self, output: NDArray[np.float32]) -> Prediction:
+    def decode(self, output: NDArray[np.float32]) -> Prediction:
+        """Last step of ``predict_reduced``: the outputs of the network as a Gaussian over xi."""
         mean = output[:6].astype(np.float64)
         sigma = np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else np.ones(6)
         xi, covariance = self.header.labels.xi_gaussian(mean, self.header.calibrated(sigma))

@@ -50,8 +50,8 @@ class MarkerArchitecture(BaseModel):
     guess_hidden: Count = 256
     least_score: float = Field(ge=0.0, le=1.0)
     most_rms_px: float = Field(gt=0.0, allow_inf_nan=False)
-    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (384, 384, 192)
-    networks: Count = 4
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (384, 512, 512, 256)
+    networks: Count = 2
 
     @property
     def markers(self) -> int:

@@ -1,4 +1,4 @@
-"""Contact pose and shear from the markers of one image, in a running cell: OpenCV and NumPy, nothing else."""
+"""Contact pose and shear from the markers of one image, in a running cell: NumPy and the compiled kernels alone."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from drivers.samples import Frame, Stamped
 from geometry.types import Array, ImageArray
+from perception import kernels
 from perception.errors import ModelError
 from perception.inference import RANGE_TOLERANCE, Prediction
 from perception.marker_architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture
@@ -47,19 +48,15 @@ class MarkerEstimator:
         self.change: CameraChange | None = None
         self._size = architecture.size
         self._matcher = matcher_of(model, architecture)
-        layers = range(len(architecture.hidden) + 1)
+        self._networks = architecture.networks
         self._layers = [
-            (
-                np.ascontiguousarray(model.tensors[f"layer{i}.weight"].transpose(0, 2, 1)),
-                model.tensors[f"layer{i}.bias"][:, 0],
-            )
-            for i in layers
+            (model.tensors[f"layer{i}.weight"], model.tensors[f"layer{i}.bias"][:, 0])
+            for i in range(len(architecture.hidden) + 1)
         ]
         # One long product is faster than several short ones that read the same input.
         first, bias = self._layers.pop(0)
-        self._first = first.reshape(-1, first.shape[2])
+        self._first = np.ascontiguousarray(first.transpose(1, 0, 2)).reshape(first.shape[1], -1)
         self._first_bias = bias.reshape(-1)
-        self._networks = architecture.networks
 
     @classmethod
     def load(cls, path: Path) -> MarkerEstimator:
@@ -91,15 +88,39 @@ class MarkerEstimator:
         Where the markers cannot be matched with certainty, ``in_range`` is False and sigmas are as wide as the taught
         range. Where next to nothing can be, the prediction is the middle of that range.
         """
+        field = self.match(self.find(reduced))
+        return self.decode(field, *self.infer(field))
+
+    def find(self, reduced: ImageArray) -> Discs:
+        """First step of ``predict_reduced``: the discs of an image, where the camera that taught the model saw them."""
         discs = detect_markers(reduced, self._size)
-        if self.change is not None:
-            discs = Discs(self.change.points(discs.centres), discs.areas)
-        field = self._matcher.match(discs, self.field)
-        self.field = field
+        return discs if self.change is None else Discs(self.change.points(discs.centres), discs.areas)
+
+    def match(self, discs: Discs) -> MarkerField:
+        """Second step: which disc is which marker."""
+        self.field = self._matcher.match(discs, self.field)
+        return self.field
+
+    def infer(self, field: MarkerField) -> tuple[Array, Array]:
+        """Third step: mean (6,) in label half-ranges, and standard deviations (6,) in label units, of the mixture of
+        all networks' Gaussians; the middle of the range where no marker was seen."""
+        if not field.seen.any():
+            return np.zeros(6), np.ones(6)
+        x = kernels.affine(self._first, self._first_bias, field.displacements.ravel().astype(np.float32))
+        x = x.reshape(self._networks, -1)
+        for weight, bias in self._layers:
+            # Below -80 the exponential overflows, and the product is zero to float32 anyway.
+            active = x / (1.0 + np.exp(-np.maximum(x, np.float32(-80.0))))
+            x = np.stack([kernels.affine(*each) for each in zip(weight, bias, active, strict=True)])
+        outputs = x.astype(np.float64)
+        log_precision = np.clip(outputs[:, 6:], *LOG_PRECISION_BOUNDS)
+        return mixed(outputs[:, :6], log_precision, self.header.labels)
+
+    def decode(self, field: MarkerField, mean: Array, sigma: Array) -> Prediction:
+        """Last step: what ``infer`` told, as a Gaussian over xi."""
         labels = self.header.labels
         if not field.seen.any():
-            return Prediction(*labels.xi_gaussian(np.zeros(6), np.ones(6)), in_range=False, markers=0.0)
-        mean, sigma = self._infer(field.displacements)
+            return Prediction(*labels.xi_gaussian(mean, sigma), in_range=False, markers=0.0)
         in_range = field.valid and bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
         calibrated = self.header.calibrated(sigma)
         # The networks know how sure to be of markers that were matched, and of no others.
@@ -111,19 +132,6 @@ class MarkerEstimator:
         return Stamped(
             self.predict(sample.value.image), sample.t_ns, sample.seq, sample.t_device_ns, quality=sample.quality
         )
-
-    def _infer(self, displacements: Array) -> tuple[Array, Array]:
-        """Mean (6,) in label half-ranges, and standard deviations (6,) in label units, of the mixture of all networks'
-        Gaussians."""
-        x = np.einsum("ij,j->i", self._first, displacements.ravel().astype(np.float32)) + self._first_bias
-        x = x.reshape(self._networks, -1)
-        for weight, bias in self._layers:
-            # Below -80 the exponential overflows, and the product is zero to float32 anyway.
-            x = x / (1.0 + np.exp(-np.maximum(x, -80.0)))
-            x = np.einsum("noi,ni->no", weight, x) + bias
-        outputs = x.astype(np.float64)
-        log_precision = np.clip(outputs[:, 6:], *LOG_PRECISION_BOUNDS)
-        return mixed(outputs[:, :6], log_precision, self.header.labels)
 
 
 def mixed(means: Array, log_precisions: Array, labels: Labels) -> tuple[Array, Array]:

@@ -6,8 +6,9 @@ markers with them, by turns: predict the markers, pair each with its nearest dis
 frame before) this converges in two or three turns. Without one a small network looks at where the discs are dense, and
 guesses the coefficients; when the guess leads nowhere, learned contacts whose discs lie alike are tried.
 
-Products are written as ``einsum``, which never leaves its thread: a linear algebra library would spread products of
-this size over all cores, and wait for a busy core far longer than the product takes.
+Pairing and fitting are in C (``kernels.py``); what is here decides where to begin and what to believe. Other products
+are written as ``einsum``, which never leaves its thread: a linear algebra library would spread products of this size
+over all cores, and wait for a busy core far longer than the product takes.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.types import Array
+from perception import kernels
 from perception.markers import Discs
 
 _FIT_SD_PX = 0.7
@@ -29,13 +31,12 @@ _CONVINCING = 0.965
 _COMPLETE = 0.985
 _STILL_THERE = 0.6
 _BANKED_AT_ONCE = 32
-_NEAR = 0.2  # Spacings that a first guess may be off; where it fails, it is off by 0.3 and more.
+_NEAR = 0.3  # Spacings that a first guess may be off; those that fail are off by more.
 _ALIKE = 6
 _MOST_STARTS = 2
 _RINGS_GROWN = 6
 _NEIGHBOURS = 7
 _ONWARD = 1.2
-_ROWS = 64  # Too few for a linear algebra library to spread over cores.
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,19 +167,7 @@ def disc_density(centres: Array, weights: Array, low: Array, cell_px: float, gri
     Returns:
         (b, grid * grid).
     """
-    place = (centres - low) / cell_px - 0.5
-    whole = np.floor(place)
-    part = place - whole
-    cell = whole.astype(np.intp)
-    density = np.zeros(len(centres) * grid * grid)
-    first = (np.arange(len(centres)) * grid * grid)[:, None]
-    for right in (0, 1):
-        for down in (0, 1):
-            u, v = cell[..., 0] + right, cell[..., 1] + down
-            inside = (u >= 0) & (u < grid) & (v >= 0) & (v < grid)
-            share = np.abs(1 - right - part[..., 0]) * np.abs(1 - down - part[..., 1]) * weights * inside
-            index = np.where(inside, first + v * grid + u, 0)
-            density += np.bincount(index.ravel(), share.ravel(), len(density))
+    density = kernels.density(centres, weights, low, cell_px, grid)
     return density.reshape(len(centres), -1).astype(np.float32)
 
 
@@ -212,8 +201,7 @@ class MarkerMatcher:
         self._least_score = least_score
         self._most_rms_px = most_rms_px
         self._base = model.base
-        self._basis = model.basis.astype(np.float32)
-        self._middle = model.base.reshape(-1, 2).mean(axis=0)
+        self._modes = kernels.Modes(model.base, model.basis)
         self._spacing_px = model.spacing_px
         self._reach = 0.3 * self._spacing_px
         apart = np.linalg.norm(model.reference[:, None] - model.reference[None], axis=2)
@@ -223,12 +211,11 @@ class MarkerMatcher:
         self._neighbours = np.where(is_near, nearest, len(apart))
         # Where a contact is far from those that taught it, a guess is off by more than its own standard deviation.
         self._guess_sd = np.hypot(3.0 * guess.sd, 0.1 * model.sd)
-        self._bank_density = np.empty((len(self._bank), guess.hidden_weight.shape[1]), np.float32)
         # All at once would take 100 MB for a moment, which a process does not give back.
-        for i in range(0, len(self._bank), _BANKED_AT_ONCE):
-            part = slice(i, i + _BANKED_AT_ONCE)
-            self._bank_density[part] = guess.density(model.positions(self._bank[part]))
-        self._bank_squares = (self._bank_density**2).sum(axis=1)
+        parts = range(0, len(bank), _BANKED_AT_ONCE)
+        self._bank_density = np.concatenate(
+            [_in_bytes(guess.density(model.positions(bank[i : i + _BANKED_AT_ONCE]))) for i in parts]
+        )
 
     def match(self, discs: Discs, previous: MarkerField | None = None) -> MarkerField:
         """Markers of the image in which ``discs`` were found.
@@ -240,108 +227,83 @@ class MarkerMatcher:
         if not len(self.model.reference) // 4 <= len(discs) <= 4 * len(self.model.reference):
             return self._nothing()
         centres = discs.centres
-        search = _Nearest(centres, self._middle)
-        if previous is not None and previous.valid and self._is_near(previous, search):
-            field = self._refine(previous.coefficients, centres, search, self.model.sd, near=True)
+        if previous is not None and previous.valid and self._is_near(previous, centres):
+            field = self._refine(previous.coefficients, centres, self.model.sd, near=True)
             if _convincing(field):
                 return field
         tried: list[MarkerField] = []
-        for start, prior_sd in self._starts(centres, search):
-            tried.append(self._refine(start, centres, search, prior_sd))
+        for start, prior_sd in self._starts(centres):
+            tried.append(self._refine(start, centres, prior_sd))
             # Of 2000 real images 21 scored between this and _CONVINCING; other starts gained none of them 0.01.
             if tried[-1].valid:
                 break
         return max(tried, key=quality)
 
-    def _is_near(self, previous: MarkerField, search: _Nearest) -> bool:
+    def _is_near(self, previous: MarkerField, centres: Array) -> bool:
         """Whether most markers of the frame before still have a disc close by."""
-        _, square = search(self.model.positions(previous.coefficients))
+        _, square, _ = kernels.pair(self.model.positions(previous.coefficients), centres)
         return float(np.mean(square < self._reach**2)) > _STILL_THERE
 
     def match_from(self, discs: Discs, starts: Iterable[Array]) -> MarkerField:
         """Best of the matches that begin at other contacts' coefficients (k,), far from the right ones maybe."""
-        search = _Nearest(discs.centres, self._middle)
         prior_sd = 0.4 * self.model.sd
-        return max((self._refine(start, discs.centres, search, prior_sd) for start in starts), key=quality)
+        return max((self._refine(start, discs.centres, prior_sd) for start in starts), key=quality)
 
-    def _starts(self, centres: Array, search: _Nearest) -> Iterator[tuple[Array, Array]]:
+    def _starts(self, centres: Array) -> Iterator[tuple[Array, Array]]:
         """Coefficients (k,) to start a match from, the most promising first, with their uncertainties (k,).
 
         A start is looked at once before it is followed: one that leads nowhere costs ten times as much.
         """
         density = self._guess.density(centres)
         guess = self._guess(density) * self.model.sd
-        off = self._off(guess, search)
+        off = self._off(guess, centres)
         if off < _NEAR * self._spacing_px:
             yield guess, self._guess_sd
         alike = self._alike(density)
-        offs = [self._off(start, search) for start in alike]
+        offs = [self._off(start, centres) for start in alike]
         order = np.argsort(offs)[:_MOST_STARTS]
         if _NEAR * self._spacing_px <= off <= offs[order[0]]:
             yield guess, self._guess_sd
         for i in order:
             yield alike[i], 0.4 * self.model.sd
 
-    def _off(self, coefficients: Array, search: _Nearest) -> float:
+    def _off(self, coefficients: Array, centres: Array) -> float:
         """Median distance px of the predicted markers from their nearest discs."""
-        return math.sqrt(float(np.median(search(self.model.positions(coefficients))[1])))
+        _, square, _ = kernels.pair(self.model.positions(coefficients), centres)
+        return math.sqrt(float(np.median(square)))
 
     def _alike(self, density: NDArray[np.float32]) -> Array:
         """(s, k) coefficients of the learned contacts whose discs are dense where this image's are."""
-        # The distance less what is the same for all.
-        apart = self._bank_squares - 2.0 * np.einsum("ij,j->i", self._bank_density, density)
+        apart = kernels.bytes_apart(self._bank_density, _in_bytes(density))
         return self._bank[np.argsort(apart)[:_ALIKE]]
 
-    def _refine(
-        self, start: Array, centres: Array, search: _Nearest, prior_sd: Array, *, near: bool = False
-    ) -> MarkerField:
+    def _refine(self, start: Array, centres: Array, prior_sd: Array, *, near: bool = False) -> MarkerField:
         ridge = (_FIT_SD_PX / prior_sd) ** 2
-        first_reach = self._reach if near else 2.0 * self._reach
-        coefficients = self._settle(start, start, ridge, centres, search, first_reach)
-        field = self._field(coefficients, centres, search)
+        coefficients = self._settle(start, start, ridge, centres, self._reach if near else 2.0 * self._reach)
+        field = self._field(coefficients, centres)
         if near or field.score >= _COMPLETE or field.seen.mean() < 0.5:
             return field
         # Where a part of the rim is off by half a spacing, the part that is right leads on to it.
-        grown = self._grow(coefficients, start, ridge, centres, search)
-        again = self._field(self._settle(grown, start, ridge, centres, search, self._reach), centres, search)
+        grown = self._grow(coefficients, start, ridge, centres)
+        again = self._field(self._settle(grown, start, ridge, centres, self._reach), centres)
         return max(field, again, key=quality)
 
-    def _settle(
-        self, coefficients: Array, start: Array, ridge: Array, centres: Array, search: _Nearest, reach: float
-    ) -> Array:
-        """Pair and fit by turns until nothing moves."""
-        predicted = self.model.positions(coefficients)
-        for _ in range(_TURNS):
-            partner, square = search(predicted)
-            paired = _own(partner, square, len(centres)) & (square < reach * reach)
-            if paired.sum() < len(start):
-                break
-            # A disc far from where its marker should be may be a neighbour's, and counts less.
-            weight = paired / (1.0 + square / (0.35 * reach) ** 2)
-            change = self._change(weight, centres[partner] - predicted, start - coefficients, ridge)
-            coefficients = coefficients + change
-            shift = np.einsum("k,kj->j", change, self.model.basis).reshape(-1, 2)
-            predicted = predicted + shift
-            if reach <= self._reach and float(np.abs(shift).max()) < _SETTLED_PX:
-                break
-            typical_px = math.sqrt(float(np.median(square[paired])))
-            reach = max(self._reach, min(0.8 * reach, 4.0 * typical_px))
-        return coefficients
+    def _settle(self, coefficients: Array, start: Array, ridge: Array, centres: Array, reach: float) -> Array:
+        return self._modes.settle(
+            coefficients,
+            start,
+            ridge,
+            centres,
+            reach_px=reach,
+            least_reach_px=self._reach,
+            settled_px=_SETTLED_PX,
+            turns=_TURNS,
+        )
 
-    def _change(self, weight: Array, off: Array, from_start: Array, ridge: Array) -> Array:
-        """(k,) change of coefficients that brings markers nearest to discs ``off`` (m, 2) away, and not far from
-        the start."""
-        weighted = self._basis * np.repeat(weight, 2).astype(np.float32)
-        moments = np.einsum("kj,lj->kl", weighted, self._basis).astype(np.float64)
-        moments[np.diag_indices(len(moments))] += ridge
-        toward = np.einsum("kj,j->k", weighted, off.ravel().astype(np.float32))
-        return np.linalg.solve(moments, toward + ridge * from_start).astype(np.float64)
-
-    def _grow(self, coefficients: Array, start: Array, ridge: Array, centres: Array, search: _Nearest) -> Array:
+    def _grow(self, coefficients: Array, start: Array, ridge: Array, centres: Array) -> Array:
         """Coefficients after markers without a disc were looked for where their neighbours' discs point."""
         predicted = self.model.positions(coefficients)
-        partner, square = search(predicted)
-        paired = _own(partner, square, len(centres)) & (square < self._reach**2)
+        partner, paired = pair(predicted, centres, self._reach)
         off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
         nobody = np.zeros((1, 2))
         for _ in range(_RINGS_GROWN):
@@ -350,27 +312,25 @@ class MarkerMatcher:
                 np.concatenate([off, nobody])[self._neighbours].sum(axis=1) / np.maximum(near_by, 1.0)[:, None]
             )
             corrected = predicted + np.where(paired[:, None], off, _ONWARD * expected)
-            partner, square = search(corrected)
             before = int(paired.sum())
-            paired = _own(partner, square, len(centres)) & (square < (1.3 * self._reach) ** 2)
+            partner, paired = pair(corrected, centres, 1.3 * self._reach)
             paired &= near_by >= 2
             off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
             if int(paired.sum()) <= before:
                 break
-        return coefficients + self._change(paired.astype(np.float64), off, start - coefficients, ridge)
+        return coefficients + self._modes.fit(paired.astype(np.float64), off, start - coefficients, ridge)
 
-    def _field(self, coefficients: Array, centres: Array, search: _Nearest) -> MarkerField:
+    def _field(self, coefficients: Array, centres: Array) -> MarkerField:
         predicted = self.model.positions(coefficients)
-        partner, square = search(predicted)
-        paired = _own(partner, square, len(centres)) & (square < self._reach**2)
-        positions = predicted.copy()
-        positions[paired] = centres[partner[paired]]
+        partner, square, own = kernels.pair(predicted, centres)
+        paired = own & (square < self._reach**2)
+        positions = np.where(paired[:, None], centres[partner], predicted)
         left_over = np.ones(len(centres), bool)
         left_over[partner[paired]] = False
         among = 0
         if left_over.any():
-            apart = centres[left_over][:, None] - predicted[None]
-            among = int(((apart**2).sum(axis=2).min(axis=1) < self._spacing_px**2).sum())
+            _, apart, _ = kernels.pair(centres[left_over], predicted)
+            among = int((apart < self._spacing_px**2).sum())
         margin = 0.5 * self._spacing_px
         in_view = ((predicted >= margin) & (predicted <= self._size - 1.0 - margin)).all(axis=1)
         found = int(paired.sum())
@@ -394,6 +354,12 @@ class MarkerMatcher:
         return MarkerField(positions.copy(), shift, np.zeros(len(shift), bool), coefficients, 0.0, np.inf, False)
 
 
+def _in_bytes(density: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Densities to a hundredth of a disc, in a quarter of the memory."""
+    rounded: NDArray[np.uint8] = np.minimum(100.0 * density + 0.5, 255.0).astype(np.uint8)
+    return rounded
+
+
 def _convincing(field: MarkerField) -> bool:
     return field.valid and field.score >= _CONVINCING
 
@@ -403,39 +369,7 @@ def quality(field: MarkerField) -> tuple[bool, float]:
     return field.valid, field.score - 0.05 * min(field.rms_px, 20.0)
 
 
-class _Nearest:
-    """Nearest of some points, by one small matrix product: a tree takes longer to build."""
-
-    def __init__(self, points: Array, middle: Array) -> None:
-        # Near the origin, float32 keeps distances to a hundredth of a pixel.
-        self._middle = middle
-        from_middle = (points - middle).astype(np.float32)
-        self._points = np.column_stack([-2.0 * from_middle, (from_middle**2).sum(axis=1)]).T.astype(np.float32)
-        self._work: NDArray[np.float32] | None = None
-
-    def __call__(self, places: Array) -> tuple[NDArray[np.intp], Array]:
-        """(m,) index of the point nearest to each place (m, 2), and the squared distance."""
-        if self._work is None:
-            self._work = np.empty((len(places), self._points.shape[1]), np.float32)
-        from_middle = (places - self._middle).astype(np.float32)
-        rows = np.column_stack([from_middle, np.ones(len(places), np.float32)])
-        for i in range(0, len(rows), _ROWS):
-            np.matmul(rows[i : i + _ROWS], self._points, out=self._work[i : i + _ROWS])
-        nearest = self._work.argmin(axis=1)
-        square = self._work[np.arange(len(places)), nearest] + (from_middle**2).sum(axis=1)
-        return nearest, np.maximum(square, 0.0).astype(np.float64)
-
-
-def _own(partner: NDArray[np.intp], square: Array, points: int) -> NDArray[np.bool_]:
-    """(m,) whether each place is, of all that have the same nearest point, the nearest to it."""
-    order = np.argsort(-square)
-    owner = np.full(points, -1)
-    owner[partner[order]] = order
-    own: NDArray[np.bool_] = owner[partner] == np.arange(len(partner))
-    return own
-
-
-def pair(places: Array, points: Array, reach: float) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def pair(places: Array, points: Array, reach: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """(m,) point nearest to each place, and whether it is within reach and nearest to no other place.
 
     Args:
@@ -443,5 +377,5 @@ def pair(places: Array, points: Array, reach: float) -> tuple[NDArray[np.intp], 
         points: (n, 2) px.
         reach: px.
     """
-    nearest, square = _Nearest(points, points.mean(axis=0))(places)
-    return nearest, _own(nearest, square, len(points)) & (square < reach * reach)
+    nearest, square, own = kernels.pair(places, points)
+    return nearest, own & (square < reach * reach)

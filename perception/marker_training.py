@@ -23,12 +23,10 @@ from torch import Tensor
 
 from drivers.tactile_data import Split, read_rest, read_split
 from geometry.types import Array, ImageArray
-from perception.calibration import calibrate
 from perception.checkpoint import EpochRecord, Progress, delete_checkpoint, load_checkpoint, save_checkpoint
 from perception.dataset import cache_key, default_cache, label_range
-from perception.displacement_network import DisplacementNetwork, displacement_loss
+from perception.displacement_network import DisplacementNetwork, Jitter, displacement_loss
 from perception.errors import TrainingError
-from perception.figures import write_curves, write_predictions
 from perception.labels import CONTACT_NAMES, contact_from_xi, xi_from_contact
 from perception.marker_architecture import MarkerArchitecture
 from perception.marker_estimator import mixed
@@ -36,12 +34,14 @@ from perception.marker_figures import write_markers
 from perception.marker_learning import GRID, GUESS_HIDDEN, Learned, learn_markers, match_all, stacked
 from perception.marker_matching import DisplacementModel
 from perception.markers import Discs, MarkerSize, detect_markers, typical_size
-from perception.model_file import Header, Labels, Model, save_model, touchcell_version
+from perception.model_file import Labels, Model
 from perception.networks import Alignment
 from perception.preprocessing import AdaptiveThreshold, Preprocessing
 from perception.training_display import Display, Observer
+from perception.training_end import write_trained
 
 _LEAST_SCORE_TAUGHT = 0.9
+_LEAST_BATCHES = 16
 _MATCHING = 2  # Counts the ways of matching there have been, so that no other way's result is taken from the cache.
 
 
@@ -50,7 +50,7 @@ class MarkerSettings:
     """How to train. The figures that chose the defaults are in docs/decisions/0006-markers.md.
 
     Attributes:
-        epochs: passes over the training set.
+        epochs: passes over the training set; over few images, as many passes each as make 16 batches.
         seed: of everything random.
         rings: of the sensor's lattice.
         modes: in which its markers move together.
@@ -70,8 +70,8 @@ class MarkerSettings:
     rings: int = 10
     modes: int = 24
     guess_steps: int = 1200
-    hidden: tuple[int, ...] = (384, 384, 192)
-    networks: int = 4
+    hidden: tuple[int, ...] = (384, 512, 512, 256)
+    networks: int = 2
     batch_size: int = 64
     learning_rate: float = 1e-3
     weight_decay: float = 0.01
@@ -227,42 +227,25 @@ def train_on_discs(
         run = _Run(settings, labels, matched, training.xi, validation.xi, observer)
         run.fit(out, recipe, resume=resume)
     mean, sigma = run.predict()
-    scale, power = calibrate(labels.aligned(labels.targets(validation.xi) - mean, mean), sigma)
-    best = run.progress.history[run.progress.best_epoch - 1]
-    model = Model(
-        Header(
-            touchcell_version=touchcell_version(),
-            architecture=architecture,
-            preprocessing=preprocessing,
-            labels=labels,
-            sigma_scale=tuple(scale.tolist()),
-            sigma_power=tuple(power.tolist()),
-            training_data=training_data,
-            training={
-                **{key: list(value) if isinstance(value, tuple) else value for key, value in asdict(settings).items()},
-                "images": len(training.frames),
-                "images_matched": int(matched.taught.sum()),
-                "epochs_run": len(run.progress.history),
-                "best_epoch": run.progress.best_epoch,
-                "epochs_cpu_s": round(run.progress.cpu_s, 1),
-                "validation_loss": run.progress.best_loss,
-                "validation_mae": list(best.mae.values()),
-            },
-        ),
-        {**matched.tensors, **run.average.folded()},
-        reference,
+    model = write_trained(
+        out,
+        architecture=architecture,
+        preprocessing=preprocessing,
+        labels=labels,
+        tensors={**matched.tensors, **run.average.folded()},
+        reference=reference,
+        training_data=training_data,
+        told={
+            **asdict(settings),
+            "images": len(training.frames),
+            "images_matched": int(matched.taught.sum()),
+        },
+        progress=run.progress,
+        mean=mean,
+        sigma=sigma,
+        validation_xi=validation.xi,
     )
-    save_model(model, out)
-    xi, covariance = labels.xi_gaussian(mean, model.header.calibrated(sigma))
-    write_predictions(
-        out.with_name(f"{out.stem}_predictions.png"),
-        truth=contact_from_xi(validation.xi),
-        predicted=contact_from_xi(xi),
-        sigma=np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)),
-    )
-    write_curves(out.with_name(f"{out.stem}_curves.png"), run.progress.history)
     _write_examples(out.with_name(f"{out.stem}_markers.png"), run.model, matched.validation, preprocessing.output_size)
-    delete_checkpoint(out)
     return model
 
 
@@ -390,14 +373,13 @@ class _Run:
         self.average = copy.deepcopy(self.network).eval()
         self.alignment = Alignment(self.labels)
         self.optimizer = torch.optim.AdamW(
-            self.network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
+            self.network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True
         )
         self.inputs = torch.from_numpy(self.matched.training[self.matched.taught])
         self.targets = self._normalised(self.training_xi[self.matched.taught])
         self.validation_inputs = torch.from_numpy(self.matched.validation)
         self.validation_targets = self._normalised(self.validation_xi)
-        around = model.reference - model.reference.mean(axis=0)
-        self.around_middle = torch.from_numpy(around.astype(np.float32))
+        self.jitter = Jitter(model.reference, settings.shift_px, settings.turn_rad, settings.zoom)
 
     def fit(self, out: Path, recipe: dict[str, Any], *, resume: bool) -> None:
         """Run all epochs that are left and leave the best epoch's tensors in the average."""
@@ -442,15 +424,18 @@ class _Run:
         torch.manual_seed(int(np.random.SeedSequence((self.settings.seed, epoch)).generate_state(1)[0]))
         settings = self.settings
         self.network.train()
-        order = torch.stack([torch.randperm(len(self.inputs)) for _ in range(settings.networks)])
-        batches = max(1, len(self.inputs) // settings.batch_size)
+        # Of few images, an epoch sees each several times: eighty steps would not teach a network to its end.
+        passes = math.ceil(_LEAST_BATCHES * settings.batch_size / len(self.inputs))
+        n, networks = len(self.inputs), range(settings.networks)
+        order = torch.cat([torch.stack([torch.randperm(n) for _ in networks]) for _ in range(passes)], dim=1)
+        batches = order.shape[1] // settings.batch_size
         total = 0.0
         for i in range(batches):
             step = (epoch - 1) * batches + i
             for group in self.optimizer.param_groups:
                 group["lr"] = _cosine(step, batches * settings.epochs, settings.learning_rate)
             chosen = order[:, i * settings.batch_size : (i + 1) * settings.batch_size]
-            outputs = self.network(self._jittered(self.inputs[chosen]), settings.noise)
+            outputs = self.network(self.jitter(self.inputs[chosen]), settings.noise)
             loss = displacement_loss(outputs, self.targets[chosen], self.alignment)
             if not torch.isfinite(loss):
                 raise TrainingError("the loss is no number", epoch=epoch, hint="lower the learning rate")
@@ -469,17 +454,6 @@ class _Run:
         share = max(1.0 - self.settings.memory, 9.0 / (10.0 + step))
         for kept, new in zip(self.average.parameters(), self.network.parameters(), strict=True):
             kept.lerp_(new, share)
-
-    def _jittered(self, displacements: Tensor) -> Tensor:
-        """Displacements (networks, n, 2 m) as a camera moved, turned and zoomed a little sees them."""
-        settings = self.settings
-        networks, n, _ = displacements.shape
-        place = self.around_middle + displacements.view(networks, n, -1, 2)
-        across = torch.stack([-place[..., 1], place[..., 0]], dim=-1)
-        moved = settings.shift_px * torch.randn(networks, n, 1, 2)
-        moved = moved + settings.turn_rad * torch.randn(networks, n, 1, 1) * across
-        moved = moved + settings.zoom * torch.randn(networks, n, 1, 1) * place
-        return displacements + moved.flatten(2)
 
     def _normalised(self, xi: Array) -> Tensor:
         return torch.from_numpy(self.labels.targets(xi).astype(np.float32))

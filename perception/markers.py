@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from geometry.types import Array, ImageArray
+from perception import kernels
 from perception.errors import ImageError
 
-_MOST_COMPONENTS = 20_000
 _WORTH_A_LOOK_PX = 20
 
 
@@ -81,18 +80,9 @@ def detect_markers(image: ImageArray, size: MarkerSize) -> Discs:
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 2:
         found = (getattr(image, "dtype", type(image)), getattr(image, "shape", None))
         raise ImageError("kind", "uint8 (height, width)", found)
-    # Labels of 16 bits take half the time; no two components share a block of 2x2 pixels.
-    kind = cv2.CV_16U if image.size < 4 * 60_000 else cv2.CV_32S
-    _, _, stats, centroids = cv2.connectedComponentsWithStats(image, connectivity=8, ltype=kind)
-    if len(stats) > _MOST_COMPONENTS:
+    if not image.size:
         return Discs(np.empty((0, 2)), np.empty(0))
-    area = stats[:, cv2.CC_STAT_AREA]
-    fits = (area >= size.smallest_px) & (area <= size.largest_px)
-    fits &= (stats[:, cv2.CC_STAT_WIDTH] <= size.longest_side_px) & (
-        stats[:, cv2.CC_STAT_HEIGHT] <= size.longest_side_px
-    )
-    fits[0] = False  # The background.
-    return Discs(centroids[fits], area[fits].astype(np.float64))
+    return Discs(*kernels.discs(image, size.smallest_px, size.largest_px, size.longest_side_px))
 
 
 def typical_size(image: ImageArray) -> MarkerSize:

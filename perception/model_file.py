@@ -6,6 +6,7 @@ import json
 import os
 import tempfile
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Literal
@@ -75,20 +76,17 @@ class Labels(BaseModel):
     @property
     def centre(self) -> Array:
         """(6,) middle of the range."""
-        return 0.5 * np.add(self.low, self.high, dtype=np.float64)
+        return _ranges(self.low, self.high)[0]
 
     @property
     def half_range(self) -> Array:
         """(6,) half of the range."""
-        return 0.5 * np.subtract(self.high, self.low, dtype=np.float64)
+        return _ranges(self.low, self.high)[1]
 
     @property
     def sigma_unit(self) -> Array:
         """(6,) what a standard deviation of one stands for: the half range, one for both directions of shear."""
-        unit = self.half_range
-        if self.are_contacts:
-            unit[:2] = unit[:2].mean()
-        return unit
+        return _ranges(self.low, self.high)[2 if self.are_contacts else 1]
 
     def targets(self, xi: Array) -> Array:
         """(n, 6) what a network should answer for contacts with exponential coordinates (n, 6), m and rad."""
@@ -125,6 +123,18 @@ class Labels(BaseModel):
         covariance[..., 1, 1] = v**2 * along + u**2 * across
         covariance[..., 0, 1] = covariance[..., 1, 0] = u * v * (along - across)
         return xi_gaussian(values, covariance)
+
+
+@lru_cache(maxsize=8)
+def _ranges(low: Six, high: Six) -> tuple[Array, Array, Array]:
+    """Middle, half range, and the half range with one for both directions of shear; read-only, as every frame asks."""
+    half = 0.5 * np.subtract(high, low, dtype=np.float64)
+    shared = half.copy()
+    shared[:2] = half[:2].mean()
+    ranges = 0.5 * np.add(low, high, dtype=np.float64), half, shared
+    for each in ranges:
+        each.setflags(write=False)
+    return ranges
 
 
 class Header(BaseModel):

@@ -90,7 +90,9 @@ class MovingSurfaceFilter:
         Raises:
             ValueError: no observation yet, or ``t_ns`` lies before the state's time.
         """
-        return self._moved(T_base_sensor, t_ns)[0]
+        way = self._way(T_base_sensor, t_ns)
+        P = way.of_pose @ way.before.covariance @ way.of_pose.T
+        return self._belief(way, P)
 
     def update(self, observation: PoseGaussian, T_base_sensor: Array, t_ns: int) -> FilterState:
         """Fuse an observation made at ``t_ns`` with the sensor at ``T_base_sensor``; returns the new state.
@@ -112,6 +114,20 @@ class MovingSurfaceFilter:
         return self._state
 
     def _moved(self, T_base_sensor: Array, t_ns: int) -> tuple[PoseGaussian, SurfaceMotion]:
+        way = self._way(T_base_sensor, t_ns)
+        F = np.zeros((12, 12))
+        F[:6], F[6:, 6:] = way.of_pose, way.Ad_U
+        P = F @ way.before.covariance @ F.T
+        W, dt = self._twist_noise_density, way.dt_s
+        belief = self._belief(way, P[:6, :6])
+        P[:6, :6] = belief.covariance
+        P[:6, 6:] += W * (dt**2 / 2.0)
+        P[6:, :6] = P[:6, 6:].T
+        P[6:, 6:] += W * dt
+        P[6:, 6:] = 0.5 * (P[6:, 6:] + P[6:, 6:].T)
+        return belief, SurfaceMotion(way.Ad_U @ way.before.twist, P)
+
+    def _way(self, T_base_sensor: Array, t_ns: int) -> _Way:
         state, motion = self._state, self._motion
         if state is None or motion is None:
             raise ValueError("predict before the first observation")
@@ -121,19 +137,33 @@ class MovingSurfaceFilter:
         U = se3.compose(se3.inverse(T_base_sensor), state.T_base_sensor)
         UE = se3.compose(U, se3.exp(motion.twist * dt))
         Ad_U = se3.adjoint(U)
-        F = np.zeros((12, 12))
-        F[:6, :6] = se3.adjoint(UE)
-        F[:6, 6:] = dt * (Ad_U @ se3.left_jacobian(motion.twist * dt))
-        F[6:, 6:] = Ad_U
-        covariance = F @ motion.covariance @ F.T
-        W = self._twist_noise_density
-        covariance[:6, :6] += self._noise_density * dt + W * (dt**3 / 3.0)
-        covariance[:6, 6:] += W * (dt**2 / 2.0)
-        covariance[6:, :6] += W * (dt**2 / 2.0)
-        covariance[6:, 6:] += W * dt
-        covariance = 0.5 * (covariance + covariance.T)
-        belief = PoseGaussian(se3.compose(UE, state.belief.mean), covariance[:6, :6].copy())
-        return belief, SurfaceMotion(Ad_U @ motion.twist, covariance)
+        of_pose = np.empty((6, 12))
+        of_pose[:, :6] = se3.adjoint(UE)
+        of_pose[:, 6:] = dt * (Ad_U @ se3.left_jacobian(motion.twist * dt))
+        return _Way(dt, se3.compose(UE, state.belief.mean), Ad_U, of_pose, motion)
+
+    def _belief(self, way: _Way, P: Array) -> PoseGaussian:
+        P = P + self._noise_density * way.dt_s + self._twist_noise_density * (way.dt_s**3 / 3.0)
+        return PoseGaussian(way.T_s_f, 0.5 * (P + P.T))
+
+
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """From the state to a later time, to first order.
+
+    Attributes:
+        dt_s: how much later.
+        T_s_f: (4, 4) mean of the pose then.
+        Ad_U: (6, 6) carries twists to the sensor frame then.
+        of_pose: (6, 12) pose perturbation then from that of pose and twist now.
+        before: motion at the state.
+    """
+
+    dt_s: float
+    T_s_f: Array
+    Ad_U: Array
+    of_pose: Array
+    before: SurfaceMotion
 
 
 def _corrected(motion: SurfaceMotion, prior: PoseGaussian, fused: PoseGaussian) -> SurfaceMotion:
@@ -148,5 +178,7 @@ def _corrected(motion: SurfaceMotion, prior: PoseGaussian, fused: PoseGaussian) 
     S = fused.covariance
     KS = K @ S
     rest = N @ N.T + KS @ K.T
-    covariance = np.block([[S, KS.T], [KS, 0.5 * (rest + rest.T)]])
+    covariance = np.empty((12, 12))
+    covariance[:6, :6], covariance[:6, 6:], covariance[6:, :6] = S, KS.T, KS
+    covariance[6:, 6:] = 0.5 * (rest + rest.T)
     return SurfaceMotion(motion.twist + G @ e, covariance)

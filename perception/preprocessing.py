@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from geometry.types import ImageArray
+from perception import kernels
 from perception.errors import ImageError
 
-_INTERPOLATIONS = {"area": cv2.INTER_AREA, "linear": cv2.INTER_LINEAR, "nearest": cv2.INTER_NEAREST}
+_INTERPOLATIONS = {"linear": cv2.INTER_LINEAR, "nearest": cv2.INTER_NEAREST}
 
 
 class Crop(NamedTuple):
@@ -108,28 +109,22 @@ class Preprocessing(BaseModel):
             image = image[self.crop.top : self.crop.bottom, self.crop.left : self.crop.right]
         if image.ndim == 3:
             image = cast(ImageArray, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)) if image.shape[2] == 3 else image[:, :, 0]
-        if self.median_px is not None:
-            image = cast(ImageArray, cv2.medianBlur(np.ascontiguousarray(image), self.median_px))
         if self.threshold is not None:
-            image = cast(
-                ImageArray,
-                cv2.adaptiveThreshold(
-                    np.ascontiguousarray(image),
-                    255,
-                    cv2.ADAPTIVE_THRESH_MEAN_C,
-                    cv2.THRESH_BINARY,
-                    self.threshold.block_px,
-                    self.threshold.offset,
-                ),
+            if self.median_px not in (None, 5):
+                image = _median(image, self.median_px)
+            image = kernels.threshold(
+                image, self.threshold.block_px, self.threshold.offset, of_median_5=self.median_px == 5
             )
+        elif self.median_px is not None:
+            image = _median(image, self.median_px)
         if self.mask_radius_px is not None:
             image = image * _disc(image.shape[0], image.shape[1], self.mask_radius_px)
+        if image.shape == self.output_size:
+            return image
+        if self.interpolation == "area":
+            return kernels.area_means(image, self.output_size)
         height, width = self.output_size
-        if image.shape != (height, width):
-            image = cast(
-                ImageArray, cv2.resize(image, (width, height), interpolation=_INTERPOLATIONS[self.interpolation])
-            )
-        return image
+        return cast(ImageArray, cv2.resize(image, (width, height), interpolation=_INTERPOLATIONS[self.interpolation]))
 
     def apply(self, image: ImageArray) -> NDArray[np.float32]:
         """What the network sees: float32 (1, height, width) in [0, 1]. Raises as ``reduce``."""
@@ -152,6 +147,12 @@ class Preprocessing(BaseModel):
                 image.shape[:2],
                 hint="set the camera to the (height, width) that the model was trained for, or train a model for it",
             )
+
+
+def _median(image: ImageArray, side_px: int) -> ImageArray:
+    if side_px == 5:
+        return kernels.median_5(image)
+    return cast(ImageArray, cv2.medianBlur(np.ascontiguousarray(image), side_px))
 
 
 def scale(reduced: ImageArray) -> NDArray[np.float32]:

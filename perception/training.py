@@ -20,19 +20,19 @@ from torch.nn import functional
 from drivers.tactile_data import read_rest, read_split
 from geometry.types import Array, ImageArray
 from perception.architecture import Architecture
-from perception.calibration import calibrate
 from perception.checkpoint import EpochRecord, Progress, delete_checkpoint, load_checkpoint, save_checkpoint
 from perception.dataset import LabelledImages, default_cache, label_range, load_reduced
 from perception.errors import TrainingError
-from perception.figures import write_curves, write_predictions
 from perception.labels import CONTACT_NAMES, contact_from_xi, xi_from_contact
-from perception.model_file import Header, Labels, Model, save_model, touchcell_version
+from perception.model_file import Labels, Model
 from perception.networks import Alignment, ContactNetwork, gaussian_loss, weighted_absolute_loss, weighted_square_loss
 from perception.preprocessing import Crop, Preprocessing, scale
 from perception.training_display import Display, Observer
+from perception.training_end import write_trained
 
 _EVALUATION_BATCH = 100
 _SHORT_SIDE_PX = 100
+_LEAST_SIDE_PX = 32
 
 
 @dataclass(frozen=True)
@@ -95,6 +95,7 @@ def train(
     kind: Literal["gdn", "cnn", "markers"] = "gdn",
     epochs: int | None = None,
     networks: int | None = None,
+    short_side_px: int | None = None,
     seed: int = 0,
     resume: bool = True,
     cache: Path | None = None,
@@ -111,6 +112,7 @@ def train(
         kind: gdn predicts a Gaussian, cnn means alone; markers as ``marker_training``.
         epochs: None for the default of ``Settings`` or ``MarkerSettings``.
         networks: of a marker estimator; None for the default of ``MarkerSettings``.
+        short_side_px: least of the images that a gdn or cnn sees, see ``preprocessing_for``; None for its default.
         seed: of everything random; the same seed on the same machine gives the same file, but for the time it took.
         resume: go on with an interrupted training; False begins anew.
         cache: folder for preprocessed images; None for ``dataset.default_cache()``.
@@ -129,6 +131,7 @@ def train(
                 kind=kind,
                 epochs=epochs,
                 networks=networks,
+                short_side_px=short_side_px,
                 seed=seed,
                 resume=resume,
                 cache=cache,
@@ -138,6 +141,8 @@ def train(
     if kind == "markers":
         from perception.marker_training import MarkerSettings, train_markers
 
+        if short_side_px is not None:
+            raise TrainingError("markers are looked for in all pixels", hint="a short side is for --kind gdn or cnn")
         marker_settings = MarkerSettings(seed=seed)
         if epochs is not None:
             marker_settings = replace(marker_settings, epochs=epochs)
@@ -148,7 +153,8 @@ def train(
     if networks is not None:
         raise TrainingError(f"a {kind} is one network", hint="the number of networks is for --kind markers")
     splits = {name: read_split(data, name) for name in ("train", "val")}
-    preprocessing = preprocessing_for(next(splits["train"].read()))
+    first = next(splits["train"].read())
+    preprocessing = preprocessing_for(first, _SHORT_SIDE_PX if short_side_px is None else short_side_px)
     sets = {
         name: LabelledImages(
             load_reduced(
@@ -174,14 +180,19 @@ def train(
     )
 
 
-def preprocessing_for(image: ImageArray) -> Preprocessing:
-    """Whole pixels averaged into one, to a short side of 100 to 199.
+def preprocessing_for(image: ImageArray, short_side_px: int = _SHORT_SIDE_PX) -> Preprocessing:
+    """Whole pixels averaged into one, as many as leave the short side ``short_side_px`` or more.
 
     OpenCV shrinks by whole numbers three times as fast as to the paper's 128x128. What is left over at the border is
     cut off.
+
+    Raises:
+        TrainingError: a short side of less than 32, of which a network's five halvings leave nothing.
     """
+    if short_side_px < _LEAST_SIDE_PX:
+        raise TrainingError(f"a short side of {short_side_px} px is less than {_LEAST_SIDE_PX}")
     height, width = image.shape[:2]
-    factor = max(1, min(height, width) // _SHORT_SIDE_PX)
+    factor = max(1, min(height, width) // short_side_px)
     rows, columns = height // factor, width // factor
     left, top = (width - columns * factor) // 2, (height - rows * factor) // 2
     crop = Crop(left, top, left + columns * factor, top + rows * factor)
@@ -240,40 +251,20 @@ def train_on_arrays(
         run = _Run(network, settings, labels, training, validation, observer)
         run.fit(out, recipe, resume=resume)
     mean, sigma = run.predict()
-    scale, power = calibrate(labels.aligned(labels.targets(validation.xi) - mean, mean), sigma)
-    model = Model(
-        Header(
-            touchcell_version=touchcell_version(),
-            architecture=architecture,
-            preprocessing=preprocessing,
-            labels=labels,
-            sigma_scale=tuple(scale.tolist()),
-            sigma_power=tuple(power.tolist()),
-            training_data=training_data,
-            training={
-                **{key: list(value) if isinstance(value, tuple) else value for key, value in asdict(settings).items()},
-                "images": len(training),
-                "epochs_run": len(run.progress.history),
-                "best_epoch": run.progress.best_epoch,
-                "epochs_cpu_s": round(run.progress.cpu_s, 1),
-                "validation_loss": run.progress.best_loss,
-                "validation_mae": list(run.progress.history[run.progress.best_epoch - 1].mae.values()),
-            },
-        ),
-        run.average.folded(),
-        reference,
+    return write_trained(
+        out,
+        architecture=architecture,
+        preprocessing=preprocessing,
+        labels=labels,
+        tensors=run.average.folded(),
+        reference=reference,
+        training_data=training_data,
+        told={**asdict(settings), "images": len(training)},
+        progress=run.progress,
+        mean=mean,
+        sigma=sigma,
+        validation_xi=validation.xi,
     )
-    save_model(model, out)
-    xi, covariance = labels.xi_gaussian(mean, model.header.calibrated(sigma))
-    write_predictions(
-        out.with_name(f"{out.stem}_predictions.png"),
-        truth=contact_from_xi(validation.xi),
-        predicted=contact_from_xi(xi),
-        sigma=np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)),
-    )
-    write_curves(out.with_name(f"{out.stem}_curves.png"), run.progress.history)
-    delete_checkpoint(out)
-    return model
 
 
 @dataclass

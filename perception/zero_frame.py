@@ -31,7 +31,8 @@ def find_change(
     """What has changed between the camera that taught a model and one that took images of the tip out of contact.
 
     Args:
-        model: its lattice, or its image out of contact, is what is compared with.
+        model: its image out of contact is what is compared with, or else its lattice, which lies over the least
+            deformed contact that it was taught.
         frames: camera images out of contact; the medians over them count.
         taught: such images of the sensor that taught the model, in place of what the model holds.
         rings: of the lattice, where the model does not say.
@@ -49,9 +50,6 @@ def find_change(
         there = np.median([_nearest_turn(_lattice(each, preprocessing, rings), rings, None) for each in taught], axis=0)
     else:
         there = _taught_lattice(model, rings)
-        if model.header.camera is not None:
-            matrix = model.header.camera.matrix
-            there = (there - matrix[:, 2]) @ np.linalg.inv(matrix[:, :2]).T
     found = []
     for frame in frames:
         here = _nearest_turn(_lattice(frame, preprocessing, rings), rings, there)
@@ -104,14 +102,17 @@ def _taught_lattice(model: Model, rings: int) -> Array:
     """(m, 2) px in the camera's image."""
     preprocessing = model.header.preprocessing
     corner = np.array(preprocessing.crop[:2] if preprocessing.crop else (0, 0), dtype=np.float64)
-    if "lattice" in model.tensors:
-        taught: Array = model.tensors["lattice"].astype(np.float64) + corner
-        return taught
     if model.reference is None:
-        raise TrainingError(
-            "the model holds no image out of contact to compare with",
-            hint="give some of the sensor that it was trained on with --reference",
-        )
+        if "lattice" not in model.tensors:
+            raise TrainingError(
+                "the model holds no image out of contact to compare with",
+                hint="give some of the sensor that it was trained on with --reference",
+            )
+        taught: Array = model.tensors["lattice"].astype(np.float64) + corner
+        if model.header.camera is not None:
+            matrix = model.header.camera.matrix
+            taught = (taught - matrix[:, 2]) @ np.linalg.inv(matrix[:, :2]).T
+        return taught
     height, width = model.reference.shape
     large = cv2.resize(model.reference, (_UPSCALED * width, _UPSCALED * height), interpolation=cv2.INTER_CUBIC)
     image = np.where(large > 127, np.uint8(255), np.uint8(0))

@@ -169,7 +169,7 @@ def test_folded_layers_do_what_the_model_file_does(model: Model) -> None:
 
     estimator = MarkerEstimator(model)
     for field, expected in zip(fields, mean, strict=True):
-        np.testing.assert_allclose(estimator._infer(field.displacements)[0], expected, atol=1e-3)
+        np.testing.assert_allclose(estimator.infer(field)[0], expected, atol=1e-3)
 
 
 def test_what_cannot_be_adapted_is_refused(model: Model, tmp_path: Path) -> None:

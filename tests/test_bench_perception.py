@@ -43,6 +43,8 @@ def test_without_data_the_shipped_model_sees_simulated_frames(
     assert 0.0 < turns["onnxruntime"]["median"] <= turns["onnxruntime"]["p99"]
     assert 40.0 < row["memory_mb"] <= row["peak_mb"] < 400.0
     assert 0.0 < row["latency_ms"]["cpu"]["median"] <= row["latency_ms"]["cpu"]["p99"]
+    assert list(row["stages_ms"]) == ["preprocessing", "network", "Gaussian"]
+    assert all(0.0 < stage["median"] <= stage["p99"] for stage in row["stages_ms"].values())
     assert 0.0 < row["start_cpu_s"] < 60.0
     for name in ("perception.png", "perception_reliability.png", "perception_sim_gdn.png"):
         assert (tmp_path / name).stat().st_size > 10_000
@@ -124,6 +126,7 @@ def test_table_leaves_out_what_there_is_nothing_of() -> None:
         "runtime": "own",
         "latency_ms": quantiles,
         "again_ms": quantiles,
+        "stages_ms": {"network": {"median": 0.25, "p99": 0.5}},
         **dict.fromkeys(("start_s", "start_cpu_s", "memory_mb", "peak_mb", "apart_from_first_runtime"), 1.0),
         "training_s": None,
         "all": scored,
@@ -131,5 +134,9 @@ def test_table_leaves_out_what_there_is_nothing_of() -> None:
         "slipping": {"n": 0},
         "camera": {"n": 0},
     }
-    lines = table([row]).splitlines()
+    lines = table(
+        [row, {**row, "estimator": "b", "stages_ms": {"matching": {"median": 0.75, "p99": 1.0}}}]
+    ).splitlines()
+    assert lines[-2].split() == ["a", "own", "0.25", "0.50", "-"]
+    assert lines[-1].split() == ["b", "own", "-", "0.75", "1.00"]
     assert sum(line.startswith("  a ") for line in lines) == 2

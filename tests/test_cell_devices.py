@@ -36,7 +36,7 @@ def test_probe_tells_state_and_health_of_every_device(capsys: pytest.CaptureFixt
     assert main(["probe", str(CONFIGS / "surface_follow_sim.yaml")]) == EXIT_OK
     told = capsys.readouterr().out
     assert "arm (sim_arm): passive, answers" in told
-    assert "tool at          [-80.0, 0.0, 25.0] mm" in told
+    assert "tool at          [-80.0, 0.0, 25.0, 180.0, 0.0, 0.0] mm, deg" in told
     assert "sensor (sim_tactip): passive, answers" in told
 
 

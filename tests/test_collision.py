@@ -19,7 +19,7 @@ def brute_force(a0, a1, distance_to, steps=2001):
 
 
 @given(a0=points, a1=points, b0=points, b1=points)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_segments_are_as_far_apart_as_brute_force_finds(a0, a1, b0, b1):
     def to_other(p):
         v = b1 - b0
@@ -33,7 +33,7 @@ def test_segments_are_as_far_apart_as_brute_force_finds(a0, a1, b0, b1):
 
 
 @given(a0=points, a1=points, pose=st.lists(st.floats(-90, 90), min_size=6, max_size=6), half=points)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_a_segment_is_as_far_from_a_box_as_brute_force_finds(a0, a1, pose, half):
     T = se3.from_euler_mm_deg(np.array(pose) * [5, 5, 5, 1, 1, 1])
     half = 0.05 + 0.3 * np.abs(half)

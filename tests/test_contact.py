@@ -3,7 +3,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.simulation.contact import ContactLaw, ContactModel, ContactState, contact_at
@@ -42,7 +42,6 @@ def run(
     return state
 
 
-@settings(deadline=None, derandomize=True)
 @given(
     x=st.floats(-0.004, 0.004),
     y=st.floats(-0.004, 0.004),
@@ -203,7 +202,6 @@ def test_another_surface_is_another_contact() -> None:
     np.testing.assert_allclose(state.T_f_s[:2, 3], [0, 0], atol=1e-12)
 
 
-@settings(deadline=None, derandomize=True)
 @given(
     x=st.floats(-0.005, 0.005),
     y=st.floats(-0.005, 0.005),

@@ -480,7 +480,7 @@ def test_can_fd_works_as_well(channel: Path, emulator: EmulatorProcess) -> None:
         ({"limits": {"tcp_speed_m_s": float("nan")}}, "tcp_speed_m_s"),
         ({"park_deg": [0.0]}, "park_deg"),
         ({"park_deg": None, "on_disconnect": "park_then_off"}, "needs park_deg"),
-        ({"motors": [{"esc_id": 1, "mst_id": 17}] * 2}, "share one esc_id"),
+        ({"motors": [{"esc_id": 1, "mst_id": 17}] * 2, "park_deg": None}, "share one esc_id"),
         ({"motors": [{"esc_id": 1, "mst_id": 17, "kp_n_m_rad": 501.0}]}, "kp_n_m_rad"),
         ({"speed": 1}, "speed"),
     ],

@@ -156,7 +156,7 @@ def test_a_stop_withdraws_the_sensor(state):
     assert plant.sensor_in_surface()[2, 3] == pytest.approx(-0.003, abs=1e-4) or state in ("lift", "tilt")
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.floats(-0.3, 0.3), min_size=12, max_size=12))
 def test_reaching_ends_at_the_goal_within_its_limits(numbers):
     reach = Reach(8.0, 0.05, 0.5)

@@ -51,7 +51,7 @@ def norms(vector: Array) -> tuple[float, float]:
 
 
 @given(asked=st.lists(st.tuples(wanted, st.integers(1, 12)), min_size=1, max_size=6))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_speed_acceleration_and_jerk_hold_whatever_is_asked(asked: list[tuple[Array, int]]) -> None:
     bench = Bench()
     bench.send(np.zeros(6))
@@ -71,7 +71,7 @@ def test_speed_acceleration_and_jerk_hold_whatever_is_asked(asked: list[tuple[Ar
 
 
 @given(first=wanted, second=wanted)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_a_twist_that_stays_is_reached_exactly_and_stays(first: Array, second: Array) -> None:
     bench = Bench()
     for _ in range(20):

@@ -7,7 +7,7 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from geometry import _plain_gaussian, gaussian, se3
@@ -205,7 +205,6 @@ def test_fusion_matches_importance_sampling(backend: str) -> None:
     assert relative(fused.covariance, (e - mean).T @ ((e - mean) * weight[:, None])) < 1.5e-2
 
 
-@settings(deadline=None)
 @given(seed=SEEDS, sigma=st.sampled_from([0.01, 0.1, 0.3]))
 def test_fusion_is_symmetric_and_tightens(seed: int, sigma: float) -> None:
     rng = np.random.default_rng(seed)

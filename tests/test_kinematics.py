@@ -71,7 +71,7 @@ def test_the_generic_arm_holds_its_tool_down_where_its_description_says() -> Non
 
 
 @given(q=angles(ARM))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_jacobian_is_the_derivative_of_the_pose(q: Array) -> None:
     step = 1e-6
     J = ARM.jacobian(q)
@@ -138,7 +138,7 @@ def test_every_answer_is_finite_and_within_the_speeds(chain: SerialChain) -> Non
     ik = DifferentialIk(chain)
 
     @given(q=angles(chain), twist=twists)
-    @settings(max_examples=100, deadline=None)
+    @settings(max_examples=100)
     def check(q: Array, twist: Array) -> None:
         motion = ik.solve(q, 10.0 * twist)
         assert np.isfinite(motion.dq).all()

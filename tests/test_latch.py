@@ -151,4 +151,4 @@ class LatchAgainstModel(RuleBasedStateMachine):
 
 
 TestLatchAgainstModel = LatchAgainstModel.TestCase
-TestLatchAgainstModel.settings = settings(max_examples=60, stateful_step_count=30, deadline=None)
+TestLatchAgainstModel.settings = settings(max_examples=60, stateful_step_count=30)

@@ -23,7 +23,7 @@ from perception.estimators import load_estimator  # noqa: E402
 from perception.evaluate import evaluate  # noqa: E402
 from perception.inference import ContactModel  # noqa: E402
 from perception.marker_estimator import MarkerEstimator, mixed  # noqa: E402
-from perception.marker_matching import DisplacementModel  # noqa: E402
+from perception.marker_matching import DisplacementModel, MarkerField  # noqa: E402
 from perception.marker_training import MarkerSettings, preprocessing_for, train_markers  # noqa: E402
 from perception.model_file import Labels, Model, load_model, save_model  # noqa: E402
 from perception.networks import Alignment  # noqa: E402
@@ -38,6 +38,7 @@ class Recorder:
     def __init__(self, interrupt_after: int = 0) -> None:
         self.records: list[EpochRecord] = []
         self.told: dict[str, tuple[int, int]] = {}
+        self.batches = 0
         self._interrupt_after = interrupt_after
 
     def images(self, split: str, done: int, total: int) -> None:
@@ -46,6 +47,7 @@ class Recorder:
     def batch(self, epoch: int, epochs: int, done: int, total: int, loss: float) -> None:
         if self._interrupt_after and epoch > self._interrupt_after:
             raise KeyboardInterrupt
+        self.batches = total
 
     def epoch(self, record: EpochRecord, *, best: bool) -> None:
         self.records.append(record)
@@ -67,6 +69,8 @@ def trained(data: Path) -> Path:
     assert recorder.told["train"] == (160, 160)
     assert recorder.told["matched"][0] == recorder.told["matched"][1]
     assert len(recorder.records) == 8
+    # Ten batches hold all images once.
+    assert recorder.batches >= 16
     return out
 
 
@@ -205,7 +209,10 @@ def test_numpy_and_torch_say_the_same(trained: Path) -> None:
             inputs = torch.from_numpy(displacements.ravel().astype(np.float32))
             outputs = network(inputs.expand(QUICK.networks, 1, -1)).numpy()[:, 0].astype(np.float64)
         mean, sigma = mixed(outputs[:, :6], outputs[:, 12:], model.header.labels)
-        found = estimator._infer(displacements)
+        field = MarkerField(
+            displacements, displacements, np.ones(331, bool), np.zeros(QUICK.modes), score=1.0, rms_px=0.1, valid=True
+        )
+        found = estimator.infer(field)
         np.testing.assert_allclose(found[0], mean, atol=1e-4)
         np.testing.assert_allclose(found[1], sigma, rtol=1e-3)
 

@@ -178,7 +178,7 @@ def test_it_says_how_sure_it_is() -> None:
     assert abs(np.mean(nis) - 6.0) < 0.25
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 10_000))
 def test_the_choice_of_the_base_frame_does_not_matter(seed: int) -> None:
     rng = np.random.default_rng(seed)

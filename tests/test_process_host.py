@@ -207,7 +207,7 @@ def test_the_stop_word_stops_both_arms_in_that_cycle_and_for_good(bench: Bench) 
 
 
 @given(silent_after=st.integers(1, 20))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_a_silent_watchdog_is_found_within_its_time(silent_after: int) -> None:
     bench = Bench()
     try:

@@ -105,7 +105,7 @@ def _images(records: list[bytes]) -> list[bytes]:
     steps=st.lists(st.integers(0, 60), min_size=1, max_size=40),
     length=st.integers(9, 64),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_no_interleaving_tears_a_record(fills: list[int], steps: list[int], length: int) -> None:
     """The writer goes on by a drawn number of steps at each line of the reader."""
     records = [bytes([fill]) * length for fill in fills]
@@ -138,7 +138,7 @@ def test_no_interleaving_tears_a_record(fills: list[int], steps: list[int], leng
 
 
 @given(after=st.integers(0, 200), count=st.integers(SLOTS, 3 * SLOTS))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_a_writer_that_dies_leaves_its_last_complete_record(after: int, count: int) -> None:
     records = [bytes([k]) * 32 for k in range(1, count + 1)]
     images = _images(records)

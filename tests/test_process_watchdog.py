@@ -52,7 +52,7 @@ def regular(start_ns: int, count: int, late: dict[int, int] | None = None) -> li
     return [start_ns + k * 10 * MS + (late or {}).get(k, 0) for k in range(1, count + 1)]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.lists(st.integers(0, 4 * MS), min_size=150, max_size=300))
 def test_a_task_that_keeps_its_time_is_let_be(jitter: list[int]) -> None:
     """Up to 4 ms late in a period of 10 ms."""
@@ -60,7 +60,6 @@ def test_a_task_that_keeps_its_time_is_let_be(jitter: list[int]) -> None:
     assert scene.run(regular(scene.now_ns, len(jitter), dict(enumerate(jitter, start=1)))) is None
 
 
-@settings(deadline=None)
 @given(good=st.integers(0, 50))
 def test_a_silent_task_is_found_within_two_missed_beats(good: int) -> None:
     scene = Scene()

@@ -73,7 +73,7 @@ def test_a_mistake_in_a_program_arrives_too() -> None:
     assert "ZeroDivisionError" in str(arrived)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.text(max_size=3000), st.integers(200, 2048))
 def test_a_note_fits(text: str, longest: int) -> None:
     note = wire.error_note(CommandRejected("left", Rejection.LIMIT, text, value=text), longest)
@@ -81,7 +81,6 @@ def test_a_note_fits(text: str, longest: int) -> None:
     assert type(wire.decode_note(note, "left")) is CommandRejected
 
 
-@settings(deadline=None)
 @given(
     st.lists(
         st.builds(Adjustment, st.text(max_size=30), st.floats(allow_nan=False), st.floats(allow_nan=False)), max_size=4
@@ -120,7 +119,6 @@ def plain(value: Any) -> Any:
     return wire._living(json.loads(json.dumps(wire._plain(value))))
 
 
-@settings(deadline=None)
 @given(
     st.recursive(
         st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text() | st.sampled_from(Rejection),

@@ -46,7 +46,7 @@ def test_turning_round_on_the_spot_takes_three_arcs():
 POSES = st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-math.pi, math.pi))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(goal=POSES)
 def test_ways_are_smooth_and_end_at_the_goal(goal):
     if math.hypot(goal[0], goal[1]) < 0.02:

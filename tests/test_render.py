@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.simulation import _plain_paint
 from drivers.simulation.render import PUBLIC_CROP, FrameRenderer, Lighting, Stamps
 from drivers.simulation.tip import Tip
 from geometry import se3
@@ -18,7 +19,6 @@ def centroid(image: np.ndarray) -> np.ndarray:
     return np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum()
 
 
-@settings(deadline=None, derandomize=True)
 @given(u=st.floats(8, 32), v=st.floats(8, 32))
 def test_a_disc_is_where_it_belongs_to_a_fiftieth_of_a_pixel(u: float, v: float) -> None:
     image = np.zeros((41, 41), np.uint8)
@@ -28,7 +28,6 @@ def test_a_disc_is_where_it_belongs_to_a_fiftieth_of_a_pixel(u: float, v: float)
 
 
 # Whole sixteenths: nothing is lost when 40 is added.
-@settings(deadline=None, derandomize=True)
 @given(u=st.integers(-320, 960).map(lambda n: n / 16), v=st.integers(-320, 960).map(lambda n: n / 16))
 def test_what_lies_outside_is_cut_off(u: float, v: float) -> None:
     image = np.zeros((41, 41), np.uint8)
@@ -44,6 +43,39 @@ def test_touching_discs_do_not_erase_or_add_up() -> None:
     STAMPS.paint(other, np.array([[22.3, 20.4]]))
     STAMPS.paint(both, np.array([[15.0, 20.0], [22.3, 20.4]]))
     np.testing.assert_array_equal(both, np.maximum(one, other))
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_compiled_kernels_draw_what_plain_ones_do(seed: int) -> None:
+    compiled = pytest.importorskip("drivers.simulation._paint")
+    rng = np.random.default_rng(seed)
+    centres = rng.uniform(-30.0, 110.0, (60, 2))
+    centres[:4] = [[np.nan, 5.0], [np.inf, 5.0], [5.0, -1e300], [80.0, 60.0]]
+    covers = []
+    for kernels in (compiled, _plain_paint):
+        covers.append(np.zeros((60, 80), np.uint8))
+        kernels.paint(covers[-1], centres, STAMPS.stamps)
+    np.testing.assert_array_equal(*covers)
+    assert covers[0].max() == 255
+    contrast, background = rng.integers(0, 256, (2, 60, 80), np.uint8)
+    noise = rng.integers(-128, 128, (64, 90), np.int8)
+    layers = (rng.integers(0, 256, (60, 80), np.uint8), contrast, background, noise, 4, 10)
+    np.testing.assert_array_equal(compiled.expose(*layers), _plain_paint.expose(*layers))
+
+
+def test_compiled_kernels_refuse_what_they_cannot_read() -> None:
+    compiled = pytest.importorskip("drivers.simulation._paint")
+    image = np.zeros((60, 80), np.uint8)
+    frozen = image.copy()
+    frozen.flags.writeable = False
+    for wrong in (frozen, image[:, ::2], image.astype(np.float64)):
+        with pytest.raises(TypeError, match="paint takes"):
+            compiled.paint(wrong, np.zeros((1, 2)), STAMPS.stamps)
+    with pytest.raises(TypeError, match="of one shape"):
+        compiled.expose(image, image, image[1:], np.zeros((64, 90), np.int8), 0, 0)
+    with pytest.raises(ValueError, match="leaves the noise"):
+        compiled.expose(image, image, image, np.zeros((64, 90), np.int8), 5, 0)
 
 
 def test_the_same_seed_draws_the_same_frames() -> None:

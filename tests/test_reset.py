@@ -356,7 +356,7 @@ class Impatient(RuleBasedStateMachine):
 
 
 TestImpatient = Impatient.TestCase
-TestImpatient.settings = settings(max_examples=8, stateful_step_count=15, deadline=None)
+TestImpatient.settings = settings(max_examples=8, stateful_step_count=15)
 
 
 def two_arms(folder: Path, **pair: Any) -> Run:

@@ -185,4 +185,4 @@ class SafetyWalk(RuleBasedStateMachine):
 
 
 TestSafetyWalk = SafetyWalk.TestCase
-TestSafetyWalk.settings = settings(max_examples=20 * LONGER, stateful_step_count=15, deadline=None)
+TestSafetyWalk.settings = settings(max_examples=20 * LONGER, stateful_step_count=15)

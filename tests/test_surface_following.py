@@ -222,7 +222,7 @@ def test_a_fault_is_told_with_its_reason():
 SWITCHES = ("frames", "states", "touching", "in_range", "frozen", "broken", "operator_stop")
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     walk=st.lists(
         st.tuples(st.integers(1, 60), st.sampled_from((*SWITCHES, "nothing", "trip")), st.booleans()), max_size=12

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import ConfigError
@@ -21,7 +21,6 @@ def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> np
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-@settings(deadline=None, derandomize=True)
 @given(x=coordinate, y=coordinate, lift=st.floats(0.001, 0.03))
 def test_nearest_point_is_on_the_surface_and_along_the_normal(shape: Shape, x: float, y: float, lift: float) -> None:
     on_surface = shape.nearest(np.array([x, y, 0.08])).point
@@ -35,7 +34,6 @@ def test_nearest_point_is_on_the_surface_and_along_the_normal(shape: Shape, x: f
 
 
 @pytest.mark.parametrize("shape", [Ramp(0.06, 0.5), Ramp(0.06, -0.5), Dome(0.05)], ids=str)
-@settings(deadline=None, derandomize=True)
 @given(x=coordinate, lift=st.floats(0.002, 0.03))
 def test_nearest_point_beats_a_dense_search(shape: Shape, x: float, lift: float) -> None:
     p = shape.nearest(np.array([x, 0.0, 0.08])).point + np.array([0.0, 0.0, lift])

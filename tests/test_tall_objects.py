@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from cell.experiment import Scale
 from cell.experiments.pushing import Pushed
-from cell.experiments.tall_objects import OBJECTS, held_with_mm, pushed_at_mm
+from cell.experiments.tall_objects import OBJECTS, SPEC, WITH, held_with_mm, pushed_at_mm
 
 _MDF = 0.3
 _SHEAR_N_MM = 0.4
@@ -25,3 +26,17 @@ def test_a_push_topples_all_but_the_tin_and_two_tips_hold_them(pushed: Pushed) -
     assert push - tips < weight
     # Nor do the tips tip it backwards before it is pushed.
     assert tips < weight
+
+
+def test_the_follower_goes_along_light_round_objects_and_gives_way_to_flat_sides_slowly() -> None:
+    gains = {
+        trial.row.partition(",")[0]: (follower["kp_per_s"][1], follower["ki_per_s2"][1], follower.get("active", False))
+        for trial in SPEC.trials(Scale(trials=1))
+        if f", {WITH}," in trial.row
+        for follower in [trial.cell_data()["task"]["follower"]]
+    }
+    slow = {name for name, found in gains.items() if found == (2, 0, False)}
+    assert slow == {"tall large square", "tall small square", "tall hexagonal"}
+    # Friction holds the glass bottle with 1.9 N, more than the 1.8 N of the squeeze.
+    assert gains["glass bottle"] == (10, 25, False)
+    assert {gains[name] for name in gains.keys() - slow - {"glass bottle"}} == {(10, 25, True)}

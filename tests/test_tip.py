@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.simulation.tip import Tip, TipParameters
@@ -35,7 +35,6 @@ def test_undeformed_rings_lie_where_the_public_images_have_them() -> None:
         start += 6 * k
 
 
-@settings(deadline=None, derandomize=True)
 @given(
     x=st.floats(-5, 5),
     y=st.floats(-5, 5),

@@ -250,6 +250,16 @@ def test_images_shrink_by_whole_numbers(
     assert preprocessing.output_size == reduced
 
 
+def test_a_short_side_shrinks_further(tmp_path: Path) -> None:
+    image = np.zeros((440, 445), np.uint8)
+    assert preprocessing_for(image, 70).output_size == (73, 74)
+    assert preprocessing_for(image, 440).output_size == (440, 445)
+    with pytest.raises(TrainingError):
+        preprocessing_for(image, 31)
+    with pytest.raises(TrainingError):
+        train(tmp_path, tmp_path / "m.safetensors", kind="markers", short_side_px=70, observer=Recorder())
+
+
 def test_number_of_networks_is_for_markers_alone(tmp_path: Path) -> None:
     with pytest.raises(TrainingError):
         train(tmp_path, tmp_path / "m.safetensors", kind="gdn", networks=2, observer=Recorder())

@@ -63,6 +63,16 @@ def test_what_a_model_holds_is_enough() -> None:
     np.testing.assert_allclose(found.points(seen_through(CHANGE, REST)), REST, atol=0.5)
 
 
+def test_an_image_out_of_contact_is_believed_before_a_lattice_that_was_pressed() -> None:
+    preprocessing = Preprocessing(input_size=SIZE, output_size=SIZE)
+    header = model_of(None).header.model_copy(update={"preprocessing": preprocessing})
+    pressed = {"lattice": (1.01 * REST).astype(np.float32)}
+    assert find_change(Model(header, pressed), [image(REST)]).zoom == pytest.approx(1.01, abs=1e-3)
+    held = find_change(Model(header, pressed, image(REST)), [image(REST)])
+    assert held.zoom == pytest.approx(1.0, abs=1e-6)
+    np.testing.assert_allclose(held.shift_px, 0.0, atol=0.01)
+
+
 def test_without_anything_to_compare_with_it_says_what_to_give() -> None:
     with pytest.raises(TrainingError, match="--reference"):
         find_change(model_of(None), [image(REST)])

@@ -7,14 +7,17 @@ one density: squares of 80 and 60 mm, a circle of 80 mm and a hexagon of 70 mm a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from cell.experiment import ExperimentSpec, Scale
 from cell.run_folder import Poses, RunFolder, object_poses, scene_time, sensor_poses, true_contacts
 from cell.trial_table import Column
+from cell.trials import Finished, Trial
 from geometry import se3
 from geometry.types import Array
 
@@ -74,55 +77,137 @@ PRISMS = (
 )
 
 
-def starts(count: int) -> Iterator[tuple[int, list[float]]]:
-    """(seed, pose_mm_deg) of an object in each of ``count`` trials: near the origin, a little aside and turned."""
+@dataclass(frozen=True, slots=True)
+class Arms:
+    """Who pushes.
+
+    Attributes:
+        name: in a row of a table.
+        cell: the cell file.
+        leader: the arm that pushes.
+        sensors: all of them, the leader's first.
+    """
+
+    name: str
+    cell: str
+    leader: str
+    sensors: tuple[str, ...]
+
+    def around(self, pushed: Pushed, surface: str, height_mm: float) -> dict[str, Any]:
+        """Keys of the cell in which they stand about an object, at that height, 5 mm from touching it."""
+        x_mm = -(pushed.reach_mm + _TIP_MM + _GAP_MM)
+        changes: dict[str, Any] = {
+            "scene.physics": "dynamic",
+            "scene.table": {"friction": surface},
+            f"arms.{self.leader}.start_pose_mm_deg": [x_mm, 0, height_mm, 180, 0, 0],
+            "task.middle_mm": pushed.reach_mm + _TIP_MM,
+        }
+        if len(self.sensors) > 1:
+            # The follower's base is a metre away and turned round.
+            changes["arms.follower.start_pose_mm_deg"] = [1000 + x_mm, 0, height_mm, 180, 0, 0]
+        return changes
+
+    def estimating(self, estimator: str) -> dict[str, Any]:
+        """Keys that give every sensor one of ``ESTIMATORS``."""
+        section = ESTIMATORS[estimator]
+        return {} if section is None else {f"sensors.{sensor}.estimator": dict(section) for sensor in self.sensors}
+
+
+ONE_ARM = Arms("one arm", "single_push_sim.yaml", "arm", ("sensor",))
+TWO_ARMS = Arms("two arms", "dual_push_sim.yaml", "leader", ("leader_sensor", "follower_sensor"))
+
+
+def row_trials(row: str, cell: str, pushed: Pushed, changes: Mapping[str, Any], count: int) -> list[Trial]:
+    """``count`` trials of a row, each from another start near the origin, a little aside and turned.
+
+    Args:
+        row: its name.
+        cell: the cell file.
+        pushed: the object.
+        changes: keys of the cell, the same for all; they may change the object's as well.
+        count: how many.
+    """
+    return [
+        Trial(f"{_slug(row)}_{seed}", row, cell, {"scene.objects": {OBJECT: section}} | dict(changes) | {"seed": seed})
+        for seed, section in _placed(pushed, count)
+    ]
+
+
+def _placed(pushed: Pushed, count: int) -> Iterator[tuple[int, dict[str, Any]]]:
     for seed in range(1, count + 1):
         rng = np.random.default_rng((20241, seed))
         y_mm, gamma_deg = rng.uniform(-_OFFSET_MM, _OFFSET_MM), rng.uniform(-_TURN_DEG, _TURN_DEG)
-        yield seed, [0.0, round(float(y_mm), 3), 0.0, 0.0, 0.0, round(float(gamma_deg), 3)]
+        pose_mm_deg = [0.0, round(float(y_mm), 3), 0.0, 0.0, 0.0, round(float(gamma_deg), 3)]
+        yield seed, {"shape": dict(pushed.shape), "mass_g": pushed.mass_g, "pose_mm_deg": pose_mm_deg}
 
 
-def leader_changes(pushed: Pushed, surface: str, arm: str, height_mm: float) -> dict[str, Any]:
-    """Keys of a cell in which ``arm`` stands before an object, ``height_mm`` above the table, and looks along x."""
-    x_mm = -(pushed.reach_mm + _TIP_MM + _GAP_MM)
-    return {
-        "scene.physics": "dynamic",
-        "scene.table": {"friction": surface},
-        f"arms.{arm}.start_pose_mm_deg": [x_mm, 0, height_mm, 180, 0, 0],
-        "task.middle_mm": pushed.reach_mm + _TIP_MM,
-    }
+def _slug(row: str) -> str:
+    words = row.translate({ord("+"): "more", ord("-"): "less", ord("/"): "by", ord("%"): "", ord(","): ""}).split()
+    return "_".join(words)
 
 
-def follower_changes(pushed: Pushed, height_mm: float) -> dict[str, Any]:
-    """Keys of a cell in which the follower stands on the other side, its base a metre away and turned round."""
-    start = [1000 - (pushed.reach_mm + _TIP_MM + _GAP_MM), 0, height_mm, 180, 0, 0]
-    return {"arms.follower.start_pose_mm_deg": start}
+def prism_experiment(name: str, summary: str, arms: Arms, paper: Mapping[str, str]) -> ExperimentSpec:
+    """The paper's four prisms over two surfaces, five trials each.
+
+    Args:
+        name: of the experiment.
+        summary: one line.
+        arms: who pushes.
+        paper: its figure, by prism.
+    """
+
+    def trials(scale: Scale) -> list[Trial]:
+        """Every prism on every surface with both estimators."""
+        return [
+            trial
+            for estimator in ESTIMATORS
+            for surface in SURFACES
+            for pushed in (PRISMS[:1] if scale.quick and estimator != "learned" else PRISMS)
+            for trial in row_trials(
+                f"{pushed.name}, {surface}, {estimator}",
+                arms.cell,
+                pushed,
+                arms.around(pushed, surface, PUSH_HEIGHT_MM) | arms.estimating(estimator),
+                scale.repetitions(5),
+            )
+        ]
+
+    return ExperimentSpec(
+        name=name,
+        summary=summary,
+        trials=trials,
+        measure=push_measures,
+        columns=COLUMNS,
+        draw=_draw,
+        paper={f"{p.name}, {surface}, {e}": paper[p.name] for p in PRISMS for surface in SURFACES for e in ESTIMATORS},
+        notes=(ERROR_NOTE,),
+    )
 
 
-def estimator_changes(estimator: str, sensors: Iterable[str]) -> dict[str, Any]:
-    """Keys that give every sensor the estimator."""
-    section = ESTIMATORS[estimator]
-    return {} if section is None else {f"sensors.{sensor}.estimator": dict(section) for sensor in sensors}
+def _draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
+    """The paper's figures 18 and 19, and every trial's error."""
+    from cell.experiments.pushing_plots import plot_errors, plot_pushes
+
+    return [
+        plot_pushes([each for each in finished if "learned_1" in each.trial.name], folder / "pushes.png"),
+        plot_errors(finished, folder / "errors.png", aim_mm=2.0),
+    ]
 
 
-def object_changes(pushed: Pushed, pose_mm_deg: list[float]) -> dict[str, Any]:
-    """Keys that put the object there."""
-    section = {"shape": dict(pushed.shape), "mass_g": pushed.mass_g, "pose_mm_deg": pose_mm_deg}
-    return {"scene.objects": {OBJECT: section}}
-
-
-def push_measures(run: RunFolder, sensor: str) -> dict[str, float]:
+def push_measures(run: RunFolder) -> dict[str, float]:
     """Where the object and the contact normal were to the target when the push ended, and how far the object leant.
 
-    ``error_mm`` is the paper's: the distance from the target to the true line of the contact normal, from above. A push
-    that never arrived has none.
+    The sensor is the one that pushes: with two arms the leader's. ``error_mm`` is the paper's: the distance from the
+    target to the true line of the contact normal, from above. A push that never arrived has none.
     """
     found = {"lean_max_deg": float(np.max(lean_deg(run)))}
     found["toppled"] = float(found["lean_max_deg"] > 45.0)
     end_s = pushed_until_s(run)
     if end_s is None or not any(event.data.get("event") == "finished" for event in run.recording.events):
         return found
-    point, direction = contact_normal(run, sensor, end_s)
+    sensors = run.plan.sensor_roles
+    pushing = TWO_ARMS.sensors[0] if TWO_ARMS.sensors[0] in sensors else next(iter(sensors))
+    point, direction = contact_normal(run, pushing, end_s)
     target = target_mm(run)
     away = target - point
     middle = 1e3 * object_poses(run)[OBJECT].at(np.array([end_s]))[0, :2, 3]

@@ -2,7 +2,8 @@
 
 Faithful where libfranka looks: handshake, model, motions and their outcomes, modes, reflexes, recovery, lost packets.
 Not emulated: dynamics, contact, the braking of a reflex (it stops at once), Desk, the gripper. While this process
-oversleeps its clock stands still, so that a busy machine slows the robot down and does not make it jump.
+oversleeps its clock stands still, and goes a third faster afterwards: a busy machine slows the robot down for a moment
+and does not make it jump.
 """
 
 from __future__ import annotations

@@ -11,6 +11,8 @@ import os
 import time
 from collections.abc import Callable
 
+_MADE_UP_FOR = 50
+
 
 class _Timespec(ctypes.Structure):
     _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
@@ -23,7 +25,8 @@ class _Itimerspec(ctypes.Structure):
 class Ticker:
     """Calls ``on_tick(late)`` from the running loop each period.
 
-    A late tick shifts the ones after it, so that two are never closer than three quarters of a period.
+    Two ticks are never closer than three quarters of a period. So those that are late are made up for at four thirds of
+    the rate, unless there are more than fifty of them: then what was missed stays missed.
 
     Args:
         period_ns: below one second.
@@ -37,7 +40,8 @@ class Ticker:
         self._fd: int = self._libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if self._fd < 0:
             raise OSError(ctypes.get_errno(), "timerfd_create")
-        self._arm()
+        self._due_ns = time.monotonic_ns() + period_ns
+        self._arm(period_ns)
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._fd, self._expired)
 
@@ -46,20 +50,20 @@ class Ticker:
         self._loop.remove_reader(self._fd)
         os.close(self._fd)
 
-    def _arm(self) -> None:
-        period = _Timespec(0, self._period_ns)
-        if self._libc.timerfd_settime(self._fd, 0, ctypes.byref(_Itimerspec(period, period)), None):
+    def _arm(self, in_ns: int) -> None:
+        once = _Itimerspec(_Timespec(0, 0), _Timespec(0, in_ns))
+        if self._libc.timerfd_settime(self._fd, 0, ctypes.byref(once), None):
             raise OSError(ctypes.get_errno(), "timerfd_settime")
-        self._due_ns = time.monotonic_ns() + self._period_ns
 
     def _expired(self) -> None:
         try:
             os.read(self._fd, 8)
         except BlockingIOError:
             return
-        late = time.monotonic_ns() - self._due_ns > self._period_ns // 4
-        if late:
-            self._arm()
-        else:
-            self._due_ns += self._period_ns
-        self._on_tick(late)
+        now_ns = time.monotonic_ns()
+        late_ns = now_ns - self._due_ns
+        if late_ns > _MADE_UP_FOR * self._period_ns:
+            self._due_ns = now_ns
+        self._due_ns += self._period_ns
+        self._arm(max(self._due_ns - now_ns, 3 * self._period_ns // 4))
+        self._on_tick(late_ns > self._period_ns // 4)

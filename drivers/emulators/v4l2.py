@@ -17,7 +17,7 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -27,6 +27,7 @@ from drivers.emulators import v4l2_picture as picture
 from drivers.emulators.base import Emulator
 from drivers.emulators.v4l2_device import SLOT_BYTES, CameraModel, Handle
 from drivers.emulators.v4l2_shim import environment
+from geometry.types import ImageArray
 
 _MAX_MESSAGE = 8192
 _LATE_PERIODS = 10
@@ -66,6 +67,8 @@ class V4l2Emulator(Emulator):
         folder: where its sockets and its sysfs entry live.
         minor: number N of its /dev/videoN.
         images: folder of images to show instead of the synthetic ones.
+        show: gives the grey picture (height, width) of what is before the camera now, for a frame's number, in place of
+            either.
     """
 
     faults: ClassVar = {
@@ -83,8 +86,15 @@ class V4l2Emulator(Emulator):
         "restart": "seconds for which the camera is gone before it comes back by itself",
     }
 
-    def __init__(self, folder: Path, minor: int = 0, images: Path | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        minor: int = 0,
+        images: Path | None = None,
+        show: Callable[[int], ImageArray] | None = None,
+    ) -> None:
         super().__init__()
+        self._show = show
         self._folder = folder
         self._minor = minor
         self._files: Sequence[Path] = picture.files(images) if images else ()
@@ -114,8 +124,6 @@ class V4l2Emulator(Emulator):
         entry.mkdir(parents=True, exist_ok=True)
         (entry / "uevent").write_text(f"MAJOR=81\nMINOR={self._minor}\nDEVNAME={self.name}\n")
         self._plug()
-        preload = environment(self._folder)
-        print(" ".join(f"{key}={value}" for key, value in preload.items()), "PROGRAM", file=sys.stderr)
 
     async def stop(self) -> None:
         """Unplug the camera for good."""
@@ -290,6 +298,10 @@ class V4l2Emulator(Emulator):
         if "freeze_frame" in self.active and self._shown:
             return self._shown
         model = self.model
+        if self._show is not None:
+            seen = picture.brightened(self._show(self._sequence), self._light())
+            self._shown = picture.encoded(picture.resized(seen, model.width, model.height), model.pixel_format)
+            return self._shown
         number = self._sequence % (len(self._files) or picture.PICTURES)
         self._shown = _frame(
             self._files[number] if self._files else number,
@@ -326,5 +338,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def build(arguments: argparse.Namespace) -> Emulator:
-    """Make the emulator, not yet started."""
+    """Make the emulator, not yet started, and tell how a program sees it."""
+    print(
+        " ".join(f"{key}={value}" for key, value in environment(arguments.folder).items()), "PROGRAM", file=sys.stderr
+    )
     return V4l2Emulator(arguments.folder, arguments.minor, arguments.images)

@@ -48,7 +48,14 @@ def from_file(path: Path, width: int, height: int) -> ImageArray:
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise ConfigError("is no image", file=str(path), key="images", value=str(path))
-    return np.asarray(cv2.resize(image, (width, height)), np.uint8)
+    return resized(np.asarray(image, np.uint8), width, height)
+
+
+def resized(image: ImageArray, width: int, height: int) -> ImageArray:
+    """The picture in (height, width)."""
+    import cv2
+
+    return image if image.shape == (height, width) else np.asarray(cv2.resize(image, (width, height)), np.uint8)
 
 
 def files(folder: Path) -> Sequence[Path]:
@@ -61,7 +68,7 @@ def files(folder: Path) -> Sequence[Path]:
 
 def brightened(image: ImageArray, factor: float) -> ImageArray:
     """The picture under ``factor`` times the light."""
-    return np.asarray(np.clip(image * factor, 0.0, 255.0), np.uint8)
+    return image if factor == 1.0 else np.asarray(np.clip(image * factor, 0.0, 255.0), np.uint8)
 
 
 def encoded(image: ImageArray, pixel_format: str) -> bytes:

@@ -1,5 +1,7 @@
 """Dynamics of one described arm by MuJoCo: links as rods, joints under a position servo with velocity feed-forward.
 
+Links may also come from MuJoCo Menagerie (``menagerie.py``).
+
 The arm is a model of its own, without contacts: what its tool touches is felt as the force that the scene tells it, one
 step of the scene late. That is stable because a tip is soft (1.5 N/mm against some 5 kg at the tool: 3 rad/s per
 step of 2 ms), and lets every arm work in every scene. Imported only where such an arm is asked for.
@@ -34,10 +36,20 @@ class ArmDynamics:
         tool: what the flange carries.
         q: (n,) rad where it stands at first.
         step_s: time step of the physics.
+        links: an MjSpec of joints and links without motors, its last link, and where the flange is on that (4, 4); rods
+            along the chain unless given.
     """
 
-    def __init__(self, description: ChainDescription, tool: Tool, q: Array, step_s: float) -> None:
-        self._model = _build(description, tool, step_s)
+    def __init__(
+        self,
+        description: ChainDescription,
+        tool: Tool,
+        q: Array,
+        step_s: float,
+        links: tuple[Any, Any, Array] | None = None,
+    ) -> None:
+        spec, last, T_last_flange = links or _rods(description)
+        self._model = _build(spec, last, T_last_flange, description, tool, step_s)
         self._data = mujoco.MjData(self._model)
         self._data.qpos[:] = q
         self._last = self._model.nbody - 1
@@ -92,11 +104,8 @@ class ArmDynamics:
         return restore
 
 
-def _build(description: ChainDescription, tool: Tool, step_s: float) -> Any:
+def _rods(description: ChainDescription) -> tuple[Any, Any, Array]:
     spec = mujoco.MjSpec()
-    spec.option.timestep = step_s
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
-    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     spec.compiler.degree = False
     body = spec.worldbody
     ends = [np.array(joint.origin_mm) * 1e-3 for joint in description.joints[1:]]
@@ -121,10 +130,19 @@ def _build(description: ChainDescription, tool: Tool, step_s: float) -> Any:
             range=np.deg2rad([joint.lower_deg, joint.upper_deg]),
             armature=_ROTOR_KG_M2,
         )
+    return spec, body, description.flange.pose()
+
+
+def _build(spec: Any, last: Any, T_last_flange: Array, description: ChainDescription, tool: Tool, step_s: float) -> Any:
+    """The model with motors and tool."""
+    spec.option.timestep = step_s
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    for hinge, joint in zip(spec.joints, description.joints, strict=True):
         gain = _GAIN_PER_RAD * joint.torque_n_m
         spec.add_actuator(
-            name=joint.name,
-            target=joint.name,
+            name=hinge.name,
+            target=hinge.name,
             trntype=mujoco.mjtTrn.mjTRN_JOINT,
             gaintype=mujoco.mjtGain.mjGAIN_FIXED,
             gainprm=_padded(gain),
@@ -133,12 +151,11 @@ def _build(description: ChainDescription, tool: Tool, step_s: float) -> Any:
             forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
             forcerange=[-joint.torque_n_m, joint.torque_n_m],
         )
-    flange = description.flange.pose()
     mass_kg = max(tool.mass_kg, 0.01)
-    body = body.add_body(
+    body = last.add_body(
         name="tool",
-        pos=flange[:3, 3],
-        quat=quaternion(flange[:3, :3]),
+        pos=T_last_flange[:3, 3],
+        quat=quaternion(T_last_flange[:3, :3]),
         gravcomp=1.0,
         mass=mass_kg,
         ipos=np.array(tool.com_mm) * 1e-3,

@@ -218,7 +218,7 @@ def contact_at(T_f_s: Array, law: ContactLaw) -> ContactState:
 def tilt_of(inward_in_s: Array) -> Array:
     """Tilt (3, 3) of a sensor: the Ry(beta) Rx(alpha) that takes ``inward_in_s`` (3,), the inward normal in {s}, to the
     z axis of {f}."""
-    x, y, z = (float(value) for value in inward_in_s)
+    x, y, z = inward_in_s.tolist()
     # The inverse rotation takes z to (-sin beta, sin alpha cos beta, cos alpha cos beta).
     cos_beta = math.hypot(y, z)
     # With the normal along the sensor's x axis alpha is free.
@@ -241,9 +241,8 @@ def about_z(angle: float) -> Array:
 
 def _transport(R: Array, z: Array) -> Array:
     """Axes ``R`` (3, 3) turned by the smallest rotation that brings their z axis to the unit vector ``z`` (3,)."""
-    x0, x1, x2 = (float(value) for value in R[:, 0])
-    a0, a1, a2 = (float(value) for value in R[:, 2])
-    b0, b1, b2 = (float(value) for value in z)
+    (x0, _, a0), (x1, _, a1), (x2, _, a2) = R.tolist()
+    b0, b1, b2 = z.tolist()
     # x + v x x + v x (v x x) / (1 + a.b) with v = a x b; x is normal to a, so it is x - (a + b) (b.x) / (1 + a.b).
     scale = (b0 * x0 + b1 * x1 + b2 * x2) / (1.0 + a0 * b0 + a1 * b1 + a2 * b2)
     x0, x1, x2 = x0 - (a0 + b0) * scale, x1 - (a1 + b1) * scale, x2 - (a2 + b2) * scale

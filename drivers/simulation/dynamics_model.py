@@ -21,8 +21,13 @@ FEET = 8
 _FOOT_RADIUS_M = 0.002
 # Low enough that an object leans by 0.3 deg before its own edge carries it.
 _FOOT_HEIGHT_M = 0.05e-3
-# So heavy that contact forces do not move it: lighter ones let friction creep, by 30 um/s at 1000 kg.
-_CARRIAGE_KG = 1e6
+# So heavy that contact forces do not move it: a lighter one lets friction creep, by 30 um/s at 1000 kg.
+_PATCH_KG = 1e6
+_PATCH_KG_M2 = 1e4
+# Likewise against the turning of a tip about axes along the surface.
+_SWING_KG_M2 = 1e3
+# What an iteration of the solver must still improve, kg m^2/s^4: MuJoCo's own is relative to the mean inertia.
+_SOLVER_TOLERANCE = 5e-5
 # Time constant (s) and damping ratio. Contact damping presses those feet harder that slide faster: at a ratio of 1 an
 # object pushed off centre at 20 mm/s turns 12 % too little, at 0.5 it turns as the limit surface says.
 _TABLE_SOLREF = (0.004, 0.5)
@@ -67,6 +72,16 @@ class TipMechanics:
         """Critical, along the normal."""
         return 2.0 * math.sqrt(self.stiffness_n_m * self.mass_kg)
 
+    @property
+    def shear_damping_n_s_m(self) -> float:
+        """Critical, across the normal."""
+        return 2.0 * math.sqrt(self.shear_stiffness_n_m * self.mass_kg)
+
+    @property
+    def torsion_damping_n_m_s(self) -> float:
+        """Critical, about the normal."""
+        return 2.0 * math.sqrt(self.torsion_stiffness_n_m_rad * self.inertia_kg_m2)
+
 
 @dataclass(frozen=True, slots=True)
 class Address:
@@ -81,21 +96,35 @@ class Address:
 
 
 @dataclass(frozen=True, slots=True)
+class TipAddress:
+    """Where a tip's six coordinates begin: along x, y, z and about x, y, z of its carriage.
+
+    Attributes:
+        qpos, qvel: index of the first one.
+        servo: index of the first of four actuators, which are the springs along x, y, z and about z.
+        body: its body, whose frame in the world is the carriage's.
+    """
+
+    qpos: int
+    qvel: int
+    servo: int
+    body: int
+
+
+@dataclass(frozen=True, slots=True)
 class SceneModel:
     """A compiled model, and where in it things are.
 
     Attributes:
         model: mujoco.MjModel.
         objects: free joint of each object.
-        carriages: free joint of each sensor's carriage.
-        tips: of each sensor's tip, the first of three slides and then the hinge about the normal.
+        tips: of each sensor's tip.
         patches: free joint of the piece of surface before each sensor; empty without surfaces.
     """
 
     model: Any
     objects: Mapping[str, Address]
-    carriages: Mapping[str, Address]
-    tips: Mapping[str, Address]
+    tips: Mapping[str, TipAddress]
     patches: Mapping[str, Address]
 
 
@@ -125,8 +154,6 @@ def build_model(
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = 1000.0
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    # Relative to the mean inertia, which the carriages make large: 1e-8 leaves contacts rattling.
-    option.tolerance = 1e-10
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     # It would hide a state that is not finite by starting anew.
     option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -145,6 +172,7 @@ def build_model(
         if patches:
             _add_patch(spec, f"patch/{sensor}", own_bit)
     model = spec.compile()
+    model.opt.tolerance = _SOLVER_TOLERANCE / (model.stat.meaninertia * max(model.nv, 1))
 
     def address(joint: str) -> Address:
         found = model.joint(joint)
@@ -153,38 +181,61 @@ def build_model(
     return SceneModel(
         model,
         {name: address(f"object/{name}") for name in objects},
-        {sensor: address(f"carriage/{sensor}") for sensor in sensors},
-        {sensor: address(f"tip/{sensor}/0") for sensor in sensors},
+        {sensor: _tip_address(model, sensor) for sensor in sensors},
         {sensor: address(f"patch/{sensor}") for sensor in sensors} if patches else {},
     )
 
 
+def _tip_address(model: Any, sensor: str) -> TipAddress:
+    first = model.joint(f"tip/{sensor}/x")
+    servo = int(model.actuator(f"tip/{sensor}/x").id)
+    return TipAddress(int(first.qposadr[0]), int(first.dofadr[0]), servo, int(model.body(f"tip/{sensor}").id))
+
+
 def _add_tip(spec: Any, sensor: str, tip: TipMechanics, own_bit: int) -> None:
-    # A light body that is moved by hand has no velocity for friction to see, and a mocap body never has: it coasts.
-    carriage = _heavy_body(spec, f"carriage/{sensor}")
-    body = carriage.add_body(
+    body = spec.worldbody.add_body(
         name=f"tip/{sensor}",
         gravcomp=1.0,
         mass=tip.mass_kg,
         inertia=[tip.inertia_kg_m2] * 3,
         explicitinertial=True,
     )
-    stiffness = (tip.shear_stiffness_n_m, tip.shear_stiffness_n_m, tip.stiffness_n_m)
-    for axis, k in enumerate(stiffness):
+    springs = {
+        "x": (tip.shear_stiffness_n_m, tip.shear_damping_n_s_m),
+        "y": (tip.shear_stiffness_n_m, tip.shear_damping_n_s_m),
+        "z": (tip.stiffness_n_m, tip.damping_n_s_m),
+        "turn": (tip.torsion_stiffness_n_m_rad, tip.torsion_damping_n_m_s),
+    }
+    along, about = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    # A tip turns about x and y with its carriage alone: it coasts, because friction sees no velocity of what is placed.
+    for name, kind, axis, armature in (
+        ("x", along, 0, 0.0),
+        ("y", along, 1, 0.0),
+        ("z", along, 2, 0.0),
+        ("roll", about, 0, _SWING_KG_M2),
+        ("pitch", about, 1, _SWING_KG_M2),
+        ("turn", about, 2, 0.0),
+    ):
+        joint = f"tip/{sensor}/{name}"
+        stiffness, damping = springs.get(name, (0.0, 0.0))
         body.add_joint(
-            name=f"tip/{sensor}/{axis}",
-            type=mujoco.mjtJoint.mjJNT_SLIDE,
+            name=joint,
+            type=kind,
             axis=np.eye(3)[axis],
-            stiffness=[k, 0.0, 0.0],
-            damping=[2.0 * math.sqrt(k * tip.mass_kg), 0.0, 0.0],
+            stiffness=[stiffness, 0.0, 0.0],
+            damping=[damping, 0.0, 0.0],
+            armature=armature,
         )
-    body.add_joint(
-        name=f"tip/{sensor}/3",
-        type=mujoco.mjtJoint.mjJNT_HINGE,
-        axis=[0.0, 0.0, 1.0],
-        stiffness=[tip.torsion_stiffness_n_m_rad, 0.0, 0.0],
-        damping=[2.0 * math.sqrt(tip.torsion_stiffness_n_m_rad * tip.inertia_kg_m2), 0.0, 0.0],
-    )
+        if name in springs:
+            # What it is told is the speed of the spring's other end, which so moves evenly over the physics' steps.
+            servo = spec.add_actuator(
+                name=joint,
+                target=joint,
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                dyntype=mujoco.mjtDyn.mjDYN_INTEGRATOR,
+                actearly=True,
+            )
+            servo.gainprm[0] = stiffness
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_SPHERE,
         size=[tip.radius_m, 0.0, 0.0],
@@ -199,7 +250,10 @@ def _add_tip(spec: Any, sensor: str, tip: TipMechanics, own_bit: int) -> None:
 
 
 def _add_patch(spec: Any, name: str, own_bit: int) -> None:
-    body = _heavy_body(spec, name)
+    body = spec.worldbody.add_body(
+        name=name, gravcomp=1.0, mass=_PATCH_KG, inertia=[_PATCH_KG_M2] * 3, explicitinertial=True
+    )
+    body.add_freejoint(name=name)
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_BOX,
         size=list(_PATCH_HALF_M),
@@ -208,12 +262,6 @@ def _add_patch(spec: Any, name: str, own_bit: int) -> None:
         conaffinity=own_bit,
         mass=0.0,
     )
-
-
-def _heavy_body(spec: Any, name: str) -> Any:
-    body = spec.worldbody.add_body(name=name, gravcomp=1.0, mass=_CARRIAGE_KG, inertia=[1e4] * 3, explicitinertial=True)
-    body.add_freejoint(name=name)
-    return body
 
 
 def _add_object(spec: Any, name: str, thing: FreeObject) -> None:

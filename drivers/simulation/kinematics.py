@@ -71,24 +71,25 @@ class TwistFollower:
         if self.at_rest():
             return
         dt_s = self._step_ns * 1e-9
-        change = self._target - self.velocity
-        velocity = self.velocity + np.concatenate(
-            [
-                _shorten(change[:3], self._limits.accel_m_s2 * dt_s),
-                _shorten(change[3:], self._limits.rot_accel_rad_s2 * dt_s),
-            ]
-        )
-        way = 0.5 * (self.velocity + velocity) * dt_s
+        before, goal = self.velocity.tolist(), self._target.tolist()
+        if before != goal:
+            linear = _towards(before[:3], goal[:3], self._limits.accel_m_s2 * dt_s)
+            self.velocity = np.array(linear + _towards(before[3:], goal[3:], self._limits.rot_accel_rad_s2 * dt_s))
+            goal = self.velocity.tolist()
+        x, y, z, *turn = (0.5 * (old + new) * dt_s for old, new in zip(before, goal, strict=True))
         T = self.T_base_tcp.copy()
-        T[:3, 3] += way[:3]
-        way[:3] = 0.0
-        R = se3.exp(way)[:3, :3] @ T[:3, :3]
-        # One Newton-Schulz step takes off this step's rounding, so that none adds up; se3.project iterates for more.
-        T[:3, :3] = R @ (_THREE_HALVES - 0.5 * (R.T @ R))
+        T[:3, 3] += (x, y, z)
+        if any(turn):
+            R = se3.exp(np.array([0.0, 0.0, 0.0, *turn]))[:3, :3] @ T[:3, :3]
+            # One Newton-Schulz step takes off this step's rounding, so that none adds up; se3.project iterates more.
+            T[:3, :3] = R @ (_THREE_HALVES - 0.5 * (R.T @ R))
         self.T_base_tcp = T
-        self.velocity = velocity
 
 
-def _shorten(vector: Array, longest: float) -> Array:
-    length = math.sqrt(float(vector @ vector))
-    return vector if length <= longest else vector * (longest / length)
+def _towards(start: list[float], goal: list[float], longest: float) -> list[float]:
+    """As far from ``start`` to ``goal`` as ``longest`` allows."""
+    way = [b - a for a, b in zip(start, goal, strict=True)]
+    length = math.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
+    if length <= longest:
+        return goal
+    return [a + each * (longest / length) for a, each in zip(start, way, strict=True)]

@@ -24,6 +24,7 @@ from drivers.simulation.objects import Ball, FreeObject
 from drivers.simulation.solids import friction_radius_m, shape_of
 from drivers.simulation.surfaces import Surface
 from drivers.simulation.timeline import Restore
+from drivers.simulation.world import Feeling, known
 from geometry.types import Array
 
 GRAVITY_M_S2: Final = 9.81
@@ -129,7 +130,7 @@ class QuasiStaticWorld:
         model = self._models[sensor] = ContactModel(self.law)
         return model.step(T_world_s, self._nearest(T_world_s, t_s), t_s)
 
-    def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, ContactState]:
+    def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, Feeling]:
         """Let the tips push the objects until friction holds; returns what each sensor feels then."""
         dt_s, self._t_s = t_s - self._t_s, t_s
         touched = {sensor: self._nearest(pose, t_s) for sensor, pose in T_world_s.items()}
@@ -140,7 +141,9 @@ class QuasiStaticWorld:
                 if surface is slider.surface
             ]
             slider.move(_settle(slider, tips, self.law), dt_s)
-        return {sensor: self._models[sensor].step(pose, touched[sensor], t_s) for sensor, pose in T_world_s.items()}
+        return {
+            sensor: known(self._models[sensor].step(pose, touched[sensor], t_s)) for sensor, pose in T_world_s.items()
+        }
 
     def objects(self) -> Mapping[str, Array]:
         """T_world_object (4, 4) of every free object at the last step."""

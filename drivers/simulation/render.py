@@ -11,6 +11,11 @@ from numpy.typing import NDArray
 
 from geometry.types import Array, ImageArray
 
+try:
+    from drivers.simulation import _paint as _kernels
+except ImportError:
+    from drivers.simulation import _plain_paint as _kernels  # type: ignore[no-redef]
+
 Seed = int | tuple[int, ...]
 
 FRAME_SIZE = (640, 480)
@@ -41,29 +46,11 @@ class Stamps:
             across = u[None, :, None, :]
             coverage += np.clip(np.minimum(across + 0.5, half) - np.maximum(across - 0.5, -half), 0.0, 1.0)
         coverage *= 255.0 / _ROWS
-        self._stamps = np.round(coverage).astype(np.uint8).reshape(phases * phases, grid.size, grid.size)
-
-    def _chosen(self, centres: Array) -> tuple[list[list[int]], list[ImageArray]]:
-        """Whole-pixel centres [[u, v], ...] and the stamps for ``centres`` (n, 2) px."""
-        whole = np.floor(centres + 0.5)
-        phase = np.minimum(((centres - whole + 0.5) * self._phases).astype(np.int64), self._phases - 1)
-        chosen = phase[:, 1] * self._phases + phase[:, 0]
-        return whole.astype(np.int64).tolist(), [self._stamps[i] for i in chosen.tolist()]
+        self.stamps = np.round(coverage).astype(np.uint8)
 
     def paint(self, image: ImageArray, centres: Array) -> None:
         """Draw white discs at ``centres`` (n, 2) px into a grey ``image``; what lies outside is cut off."""
-        height, width = image.shape
-        reach = self.reach
-        whole, stamps = self._chosen(centres)
-        maximum = np.maximum
-        for (u, v), stamp in zip(whole, stamps, strict=True):
-            left, top, right, bottom = u - reach, v - reach, u + reach + 1, v + reach + 1
-            if left < 0 or top < 0 or right > width or bottom > height:
-                stamp = stamp[max(-top, 0) : max(height - top, 0), max(-left, 0) : max(width - left, 0)]
-                left, top = max(left, 0), max(top, 0)
-                right, bottom = max(right, 0), max(bottom, 0)
-            area = image[top:bottom, left:right]
-            maximum(area, stamp, out=area)
+        _kernels.paint(image, np.ascontiguousarray(centres, dtype=np.float64), self.stamps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,12 +105,12 @@ class FrameRenderer:
         width, height = FRAME_SIZE
         cover = np.zeros((height, width), np.uint8)
         self._stamps.paint(cover, pixels)
-        clean = cv2.add(cv2.multiply(cover, self._contrast, scale=1.0 / 255.0), self._background)
-        if self._blur_px:
-            clean = cv2.GaussianBlur(clean, (0, 0), self._blur_px)
-        top, left = np.random.default_rng((*self._seed, frame)).integers(0, 65, 2)
-        noise: NDArray[np.int8] = np.ascontiguousarray(self._noise[top : top + height, left : left + width])
-        return np.asarray(cv2.add(clean, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+        top, left = np.random.default_rng((*self._seed, frame)).integers(0, 65, 2).tolist()
+        if not self._blur_px:
+            return _kernels.expose(cover, self._contrast, self._background, self._noise, top, left)
+        lit = _kernels.expose(cover, self._contrast, self._background, np.zeros_like(self._noise), 0, 0)
+        grain: NDArray[np.int8] = np.ascontiguousarray(self._noise[top : top + height, left : left + width])
+        return np.asarray(cv2.add(cv2.GaussianBlur(lit, (0, 0), self._blur_px), grain, dtype=cv2.CV_8U), dtype=np.uint8)
 
     def processed(self, pixels: Array) -> ImageArray:
         """Binary image (440, 445) as in the public data: cropped by PUBLIC_CROP and thresholded."""

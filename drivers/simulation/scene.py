@@ -20,7 +20,7 @@ from drivers.simulation.objects import ObjectConfig, PoseMmDeg, TableConfig
 from drivers.simulation.quasi_static import QuasiStaticWorld
 from drivers.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
 from drivers.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeline
-from drivers.simulation.world import KinematicWorld, World
+from drivers.simulation.world import Feeling, KinematicWorld, World, known
 from geometry import se3
 from geometry.errors import TouchcellError
 from geometry.types import Array
@@ -122,7 +122,7 @@ class Scene:
         self._poses: dict[str, Callable[[], Array]] = {}
         self._bearers: dict[str, Callable[[Array, Array], None]] = {}
         # The last one is of the timeline's present step, the one before it of the step before.
-        self._felt: dict[str, deque[ContactState]] = {}
+        self._felt: dict[str, deque[Feeling]] = {}
         self._kept = round(HISTORY_S * 1e9 / self.timeline.step_ns)
         self.timeline.add(Phase.CONTACT, self._step)
         self.timeline.keep(self._snapshot)
@@ -143,7 +143,7 @@ class Scene:
         self._poses[sensor] = pose
         if bear is not None:
             self._bearers[sensor] = bear
-        self._felt[sensor] = deque([state], maxlen=self._kept)
+        self._felt[sensor] = deque([known(state)], maxlen=self._kept)
 
     def has(self, sensor: str) -> bool:
         """Whether ``sensor`` is mounted."""
@@ -164,7 +164,7 @@ class Scene:
         seq = newest if t_ns is None else t_ns // step_ns
         if not 0 <= newest - seq < len(felt):
             raise ContactNotKept(seq * step_ns, (newest - len(felt) + 1) * step_ns, now_ns)
-        return Stamped(felt[seq - newest - 1], seq * step_ns, seq)
+        return Stamped(felt[seq - newest - 1](), seq * step_ns, seq)
 
     def objects(self) -> Stamped[Mapping[str, Array]]:
         """T_world_object (4, 4) of every free object now."""
@@ -188,20 +188,20 @@ class Scene:
 
     def _step(self, t_ns: int) -> None:
         poses = {sensor: pose() for sensor, pose in self._poses.items()}
-        for sensor, state in self.world.step(poses, self.seconds(t_ns)).items():
-            self._felt[sensor].append(state)
+        for sensor, felt in self.world.step(poses, self.seconds(t_ns)).items():
+            self._felt[sensor].append(felt)
             if sensor in self._bearers:
-                self._bearers[sensor](state.force_world_n, poses[sensor][:3, 3])
+                self._bearers[sensor](felt().force_world_n, poses[sensor][:3, 3])
 
     def _snapshot(self) -> Callable[[int], None]:
         start_ns, world = self._start_ns, self.world.snapshot()
-        felt = {sensor: states.copy() for sensor, states in self._felt.items()}
+        felt = {sensor: kept.copy() for sensor, kept in self._felt.items()}
 
         def restore(later_ns: int) -> None:
             if felt.keys() != self._felt.keys():
                 raise ConfigError("a sensor was mounted after the snapshot was taken", key="scene")
             self._start_ns = start_ns + later_ns
-            self._felt = {sensor: states.copy() for sensor, states in felt.items()}
+            self._felt = {sensor: kept.copy() for sensor, kept in felt.items()}
             world()
 
         return restore

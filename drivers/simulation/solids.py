@@ -29,7 +29,7 @@ def shape_of(solid: Solid) -> Shape:
     """The solid's outside, in its own frame; exact for points outside."""
     match solid:
         case Prism():
-            return _PrismShape(_edges(solid.outline_m), solid.height_m)
+            return _PrismShape(_sides(solid.outline_m), solid.height_m)
         case Turned():
             return _TurnedShape(_sections(solid))
         case Ball():
@@ -93,6 +93,15 @@ def _edges(outline_m: Array) -> tuple[tuple[_Point, _Point], ...]:
     return tuple(zip(corners, [*corners[1:], corners[0]], strict=True))
 
 
+def _sides(outline_m: Array) -> tuple[tuple[float, float, float, float, float], ...]:
+    """(x, y) of each corner, unit vector (x, y) to the next, and how far it is."""
+    sides = []
+    for (ax, ay), (bx, by) in _edges(outline_m):
+        length = math.hypot(bx - ax, by - ay)
+        sides.append((ax, ay, (bx - ax) / length, (by - ay) / length, length))
+    return tuple(sides)
+
+
 def _sections(solid: Turned) -> tuple[tuple[float, float, float], ...]:
     """(bottom, top, radius) of each."""
     sections, bottom = [], 0.0
@@ -112,27 +121,28 @@ def _second_moments(outline_m: Array) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class _PrismShape:
-    edges: tuple[tuple[_Point, _Point], ...]
+    sides: tuple[tuple[float, float, float, float, float], ...]
     height_m: float
 
     def nearest(self, p: Array) -> SurfacePoint:
-        x, y, z = (float(value) for value in p)
-        outside, best_sq, foot, out, face = False, math.inf, (0.0, 0.0), (1.0, 0.0), (1.0, 0.0)
-        deepest = -math.inf
-        for (ax, ay), (bx, by) in self.edges:
-            ex, ey = bx - ax, by - ay
-            length = math.hypot(ex, ey)
-            beyond = ((x - ax) * ey - (y - ay) * ex) / length
+        x, y, z = p.tolist()
+        outside, best_sq, foot, face = False, math.inf, (0.0, 0.0), (1.0, 0.0)
+        deepest, out = -math.inf, (1.0, 0.0)
+        for ax, ay, tx, ty, length in self.sides:
+            dx, dy = x - ax, y - ay
+            beyond, along = dx * ty - dy * tx, dx * tx + dy * ty
             outside = outside or beyond > 0.0
             if beyond > deepest:
-                deepest, out = beyond, (ey / length, -ex / length)
-            u = min(max(((x - ax) * ex + (y - ay) * ey) / length**2, 0.0), 1.0)
-            px, py = ax + u * ex, ay + u * ey
+                deepest, out = beyond, (ty, -tx)
+            if 0.0 < along < length:
+                # Near a face its normal is exact, where the way to its nearest point is only rounding.
+                normal_here = (ty, -tx)
+            else:
+                normal_here, along = (0.0, 0.0), min(max(along, 0.0), length)
+            px, py = ax + along * tx, ay + along * ty
             distance_sq = (x - px) ** 2 + (y - py) ** 2
             if distance_sq < best_sq:
-                best_sq, foot = distance_sq, (px, py)
-                # Near a face its normal is exact, where the way to its nearest point is only rounding.
-                face = (ey / length, -ex / length) if 0.0 < u < 1.0 else (0.0, 0.0)
+                best_sq, foot, face = distance_sq, (px, py), normal_here
         if outside:
             beyond = math.sqrt(best_sq)
             if face == (0.0, 0.0):
@@ -150,7 +160,7 @@ class _TurnedShape:
     sections: tuple[tuple[float, float, float], ...]
 
     def nearest(self, p: Array) -> SurfacePoint:
-        x, y, z = (float(value) for value in p)
+        x, y, z = p.tolist()
         off_axis = math.hypot(x, y)
         ux, uy = (x / off_axis, y / off_axis) if off_axis > 0.0 else (1.0, 0.0)
         found: SurfacePoint | None = None

@@ -90,7 +90,7 @@ class Ramp:
 
     def nearest(self, p: Array) -> SurfacePoint:
         """Nearest surface point to ``p`` (3,) m; exact within ``bend_radius_m`` above the surface."""
-        x, y, z = (float(value) for value in p)
+        x, y, z = p.tolist()
         if x <= 0.0:
             return Plane().nearest(p)
         R, angle = self.bend_radius_m, self.incline_rad

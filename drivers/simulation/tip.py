@@ -158,7 +158,7 @@ class Tip:
         moved: Array = self._rest - dent[..., None] * axis[..., None, :]
         moved += (p.follow * grip)[..., None] * shear[..., None, :]
         moved += (bulge + p.pin_lever_m * slope)[..., None] * outward
-        moved -= (p.torsion_follow * torsion * grip)[..., None] * np.cross(axis[..., None, :], self._rest)
+        moved -= (p.torsion_follow * torsion * grip)[..., None] * (self._rest @ _turning(axis))
         sunk = depth * (1.0 + p.sink_growth_per_m * (depth - _MIDDLING_DEPTH_M))
         body = -sunk * axis * np.array([p.lean_follow, p.lean_follow, p.sink_follow])
         moved += (0.5 + 0.5 * self._direction[:, 2])[:, None] * body[..., None, :]
@@ -188,6 +188,16 @@ def _tilt(alpha: float, beta: float) -> Array:
     return np.array(
         [[cos_b, sin_b * sin_a, sin_b * cos_a], [0.0, cos_a, -sin_a], [-sin_b, cos_b * sin_a, cos_b * cos_a]]
     )
+
+
+def _turning(axis: Array) -> Array:
+    """(..., 3, 3) with ``points @ turning`` the cross product of ``axis`` (..., 3) and each of the points (n, 3)."""
+    turning = np.zeros((*axis.shape, 3))
+    x, y, z = axis[..., 0], axis[..., 1], axis[..., 2]
+    turning[..., 1, 0], turning[..., 2, 0] = -z, y
+    turning[..., 0, 1], turning[..., 2, 1] = z, -x
+    turning[..., 0, 2], turning[..., 1, 2] = -y, x
+    return turning
 
 
 def _torsion(R: Array) -> Array:

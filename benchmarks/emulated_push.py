@@ -1,0 +1,406 @@
+"""``touchcell bench emulated-push``: a push through real drivers on emulators, against the same on simulated devices.
+
+``configs/dual_push_emulated.yaml`` runs as `touchcell run` runs it, on two emulated arms and two emulated cameras
+around one scene. Then the same cell with simulated arms and sensors, once without any latency and once with what was
+measured: from exposure to command, and from command to motion. What is true is asked of the emulators, and of the
+simulator.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, astuple, dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+
+from benchmarks.provenance import provenance
+from cell.cli import find_cell
+from cell.compose import compose
+from cell.config import plan_cell
+from cell.loop import Outcome, RunLoop
+from cell.recording import RECORDING, Recorder
+from cell.report import tip_points
+from cell.run_folder import RunFolder, object_poses, scene_time, sensor_poses, true_contacts
+from drivers.emulators.process import EmulatorProcess
+from drivers.emulators.v4l2_shim import environment
+from drivers.errors import DeviceError
+from geometry import se3
+from geometry.types import Array
+
+CELL: Final = "dual_push_emulated.yaml"
+LEADER, FOLLOWER = "leader", "follower"
+_SENSORS: Final = {LEADER: "leader_sensor", FOLLOWER: "follower_sensor"}
+_OBJECT: Final = "prism"
+_ASKED_EVERY_S = 0.02
+_START_S = 60.0
+_RUN_S = 180.0
+_DELAYS_S = np.arange(0.0, 0.2, 0.001)
+_GRID_S = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """Of one arm and its sensor, on average over a push.
+
+    Attributes:
+        sensing_s: from the exposure of a frame to a command that used it, waiting for the next cycle included.
+        obeying_s: from a command to the motion.
+    """
+
+    sensing_s: float
+    obeying_s: float
+
+    def beyond(self, own: Latency) -> Latency:
+        """What is left of it when ``own`` is there anyway."""
+        return Latency(max(0.0, self.sensing_s - own.sensing_s), max(0.0, self.obeying_s - own.obeying_s))
+
+
+@dataclass(frozen=True, eq=False)
+class Push:
+    """One push, from when both contacts have settled until the leader has arrived.
+
+    Attributes:
+        outcome: how the run ended.
+        t_s: (n,) since the push began.
+        object_mm_deg: (n, 3) x, y and heading of the object.
+        error_mm: from the target to the true contact normal at the end, from above.
+        latency: by arm.
+    """
+
+    outcome: str
+    t_s: Array
+    object_mm_deg: Array
+    error_mm: float
+    latency: Mapping[str, Latency]
+
+    @property
+    def duration_s(self) -> float:
+        """How long it took."""
+        return float(self.t_s[-1])
+
+
+@dataclass(frozen=True)
+class _Truth:
+    t_s: Array
+    T_world_object: Array
+    T_world_f: Array
+
+
+def cell_file(number: int) -> dict[str, Any]:
+    """The shipped cell, with emulators at addresses of their own, so that it runs beside another."""
+    data: dict[str, Any] = yaml.safe_load(find_cell(Path(CELL)).read_text())
+    for last, arm in enumerate(data["arms"].values(), start=2):
+        arm["host"] = f"127.98.{number}.{last}"
+    return data
+
+
+def emulated(data: Mapping[str, Any], folder: Path) -> Push:
+    """Run the cell ``data`` by `touchcell run` beside `touchcell emulate cell`; its run folder is ``folder``/run."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "emulated.yaml"
+    path.write_text(yaml.safe_dump(dict(data)))
+    cameras = folder / "cameras"
+    cameras.mkdir(exist_ok=True)
+    command = [sys.executable, "-m", "cell.cli", "run", str(path), "--out", str(folder / "run"), "--quiet"]
+    with EmulatorProcess("cell", str(path), "--folder", str(cameras), timeout_s=_START_S) as emulator:
+        witness = _Witness(emulator)
+        try:
+            run = subprocess.run(
+                command,
+                env=os.environ | environment(cameras),
+                timeout=_RUN_S,
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+        finally:
+            witness.close()
+    result = json.loads((folder / "run" / "result.json").read_text()) if run.returncode in (0, 1, 3) else {}
+    if not result:
+        raise DeviceError("emulated cell", f"did not run:\n{run.stderr}")
+    return _push(RunFolder(folder / "run"), f"{result['outcome']}: {result['reason']}", witness.truth())
+
+
+def simulated(
+    data: Mapping[str, Any], folder: Path, *, like: Path, late: Mapping[str, Latency] | None = None, seed: int = 1
+) -> Push:
+    """The same cell with simulated devices, its arms where those of the run ``like`` began.
+
+    Args:
+        data: the emulated cell.
+        folder: for the recording.
+        like: run folder of the emulated cell.
+        late: latency to add, by arm; None for none.
+        seed: of the camera's noise.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    before = RunFolder(like)
+    cell = {**data, "time": "simulated", "seed": seed, "scene": data["emulated_scene"]}
+    del cell["emulated_scene"]
+    cell["arms"], cell["sensors"] = {}, {}
+    for role, sensor in _SENSORS.items():
+        series = before.recording.series(f"/arms/{role}/tcp")
+        assert series is not None
+        added = Latency(0.0, 0.0) if late is None else late[role]
+        cell["arms"][role] = {
+            "driver": "sim_arm",
+            "deactivate": "hold",
+            "start_pose_mm_deg": series.poses()[0].tolist(),
+            "latency_ms": 1e3 * added.obeying_s,
+            **{key: data["arms"][role][key] for key in ("base_pose_mm_deg", "limits") if key in data["arms"][role]},
+        }
+        given = data["sensors"][sensor]
+        cell["sensors"][sensor] = {
+            "driver": "sim_tactip",
+            "latency_ms": 1e3 * added.sensing_s,
+            **{key: given[key] for key in ("mounted_on", "tcp_to_sensor_mm_deg", "rate_hz", "estimator")},
+        }
+    (folder / "cell.yaml").write_text(yaml.safe_dump(cell))
+    with compose(plan_cell(folder / "cell.yaml")) as built, Recorder(folder / RECORDING) as recorder:
+        result = RunLoop(built, recorder).run()
+    run = RunFolder(folder)
+    told = object_poses(run)[_OBJECT]
+    series, contacts = true_contacts(run, _SENSORS[LEADER])
+    t_s = scene_time(run, series)
+    T_f_s = np.asarray(se3.from_euler_mm_deg(np.nan_to_num(contacts)))
+    T_world_f = se3.compose(sensor_poses(run, _SENSORS[LEADER]).at(t_s), se3.inverse(T_f_s))
+    truth = _Truth(t_s, told.at(t_s), T_world_f)
+    return _push(run, f"{result.outcome.value}: {result.reason}", truth)
+
+
+class _Witness:
+    """Asks the emulated cell what is true, again and again, in a thread of its own until it is closed."""
+
+    def __init__(self, emulator: EmulatorProcess) -> None:
+        self._emulator = emulator
+        self._done = threading.Event()
+        self._seen: list[tuple[float, Any, Any]] = []
+        self._thread = threading.Thread(target=self._look, name="witness")
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._done.set()
+        self._thread.join()
+
+    def truth(self) -> _Truth:
+        """What was seen."""
+        return _Truth(*(np.array([each[i] for each in self._seen]) for i in range(3)))
+
+    def _look(self) -> None:
+        while not self._done.wait(_ASKED_EVERY_S):
+            state = self._emulator.state()
+            leader = _SENSORS[LEADER]
+            if state["contacts"][leader] is not None:
+                T_world_s, T_f_s = np.array(state["sensors"][leader]), np.array(state["contacts"][leader])
+                T_world_f = se3.compose(T_world_s, se3.inverse(T_f_s))
+                self._seen.append((1e-9 * state["t_ns"], state["objects"][_OBJECT], T_world_f))
+
+
+def _push(run: RunFolder, outcome: str, truth: _Truth) -> Push:
+    task = run.recording.series("/task")
+    assert task is not None
+    pushing = np.flatnonzero([row.get("state") == "run" for row in task.rows])
+    if not len(pushing):
+        raise DeviceError("push", f"never began: {outcome}")
+    times = scene_time(run, task)[pushing]
+    t_s = np.arange(0.0, times[-1] - times[0], _GRID_S)
+    heading_deg = np.degrees(np.unwrap(np.arctan2(truth.T_world_object[:, 1, 0], truth.T_world_object[:, 0, 0])))
+    columns = (*(1e3 * truth.T_world_object[:, :2, 3].T), heading_deg)
+    at_end = min(int(np.searchsorted(truth.t_s, times[-1])), len(truth.t_s) - 1)
+    return Push(
+        outcome,
+        t_s,
+        np.stack([np.interp(t_s + times[0], truth.t_s, column) for column in columns], axis=1),
+        _error_mm(truth.T_world_f[at_end], np.array(run.plan.task_config.model_dump()["target_mm"])),
+        {role: Latency(_sensing_s(run, role), _obeying_s(run, role)) for role in _SENSORS},
+    )
+
+
+def _error_mm(T_world_f: Array, target_mm: Array) -> float:
+    away = target_mm - 1e3 * T_world_f[:2, 3]
+    direction = T_world_f[:2, 2] / np.linalg.norm(T_world_f[:2, 2])
+    return float(abs(direction[0] * away[1] - direction[1] * away[0]))
+
+
+def _sensing_s(run: RunFolder, role: str) -> float:
+    series = run.recording.series(f"/arms/{role}/command")
+    assert series is not None
+    return float(1e-3 * np.nanmedian(series.column("sensor_to_command_ms")))
+
+
+def _obeying_s(run: RunFolder, role: str) -> float:
+    """By how much the commands, added up, have to be shifted to fit best how the tool has moved."""
+    series, told = run.recording.series(f"/arms/{role}/command"), run.recording.series(f"/arms/{role}/tcp")
+    assert series is not None
+    assert told is not None
+    inside = np.searchsorted(told.t_s, series.t_s, side="right") - 1
+    T_base_tcp = tip_points(told)[np.clip(inside, 0, None)]
+    velocity = np.array([row["twist"][:3] for row in series.rows])
+    in_tool = np.array([row["frame"] != "base" for row in series.rows])
+    velocity[in_tool] = np.einsum("nij,nj->ni", T_base_tcp[in_tool, :3, :3], velocity[in_tool])
+    way = np.concatenate([np.zeros((1, 3)), np.cumsum(velocity[:-1] * np.diff(series.t_s)[:, None], axis=0)])
+    moved = tip_points(told)[:, :3, 3]
+    within = (told.t_s > series.t_s[0] + _DELAYS_S[-1]) & (told.t_s < series.t_s[-1])
+
+    def misfit(delay_s: float) -> float:
+        expected = np.stack([np.interp(told.t_s[within] - delay_s, series.t_s, axis) for axis in way.T], axis=1)
+        off = moved[within] - expected
+        return float(np.sum((off - off.mean(axis=0)) ** 2))
+
+    return float(min(_DELAYS_S, key=misfit))
+
+
+def median_way_mm(pushes: Sequence[Push]) -> Array:
+    """(n, 2) where the object's middle was in the median, every _GRID_S, for as long as the shortest push took.
+
+    The median, because a machine that is busy elsewhere for a tenth of a second makes one push unlike the others.
+    """
+    n = min(len(push.t_s) for push in pushes)
+    median: Array = np.median([push.object_mm_deg[:n, :2] for push in pushes], axis=0)
+    return median
+
+
+def differences_mm(push: Push, way_mm: Array) -> tuple[Array, Array]:
+    """(n,) each: how far the object's middle was from where ``way_mm`` (n, 2) is then, and from the nearest of it."""
+    points = push.object_mm_deg[: len(way_mm), :2]
+    then = _then(points, way_mm)
+    aside: Array = np.linalg.norm(points[:, None] - way_mm[None], axis=2).min(axis=1)
+    return then, aside
+
+
+def _then(points_mm: Array, way_mm: Array) -> Array:
+    n = min(len(points_mm), len(way_mm))
+    away: Array = np.linalg.norm(points_mm[:n] - way_mm[:n], axis=1)
+    return away
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def run(arguments: Sequence[str], out: Path) -> None:
+    """Print the table; writes ``emulated-push.json`` and ``emulated-push.png`` into ``out``."""
+    parser = argparse.ArgumentParser(prog="touchcell bench emulated-push", description=__doc__.partition("\n")[0])
+    parser.add_argument("--runs", type=int, default=3, help="of each kind: emulated ones differ as time is real")
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory(prefix="touchcell-push-") as name:
+        folder = Path(name)
+        data = cell_file(1)
+        done, failed = [], []
+        for i in range(options.runs):
+            try:
+                push = emulated(data, folder / f"emulated_{i}")
+            except DeviceError as error:
+                failed.append(str(error))
+                continue
+            if push.outcome.startswith(Outcome.DONE.value):
+                done.append(push)
+                like = folder / f"emulated_{i}" / "run"
+            else:
+                failed.append(push.outcome)
+        if not done:
+            raise DeviceError("emulated cell", "no push came to its end:\n" + "\n".join(failed))
+        seeds = range(1, options.runs + 1)
+        prompt = [simulated(data, folder / f"prompt_{seed}", like=like, seed=seed) for seed in seeds]
+        added = {role: _median(done, role).beyond(_median(prompt, role)) for role in _SENSORS}
+        late = [simulated(data, folder / f"late_{seed}", like=like, late=added, seed=seed) for seed in seeds]
+    kinds = {"emulated": done, "simulated": prompt, "simulated, latency added": late}
+    pushes = {f"{kind}, {i}": push for kind, runs in kinds.items() for i, push in enumerate(runs, start=1)}
+    way_mm = median_way_mm(done)
+    medians = {kind: median_way_mm(runs) for kind, runs in kinds.items()}
+    apart_mm = {
+        f"'{left}' and '{right}'": _rms(_then(medians[left], medians[right]))
+        for left, right in combinations(medians, 2)
+    }
+    words = "; ".join(
+        f"{role} {1e3 * each.sensing_s:.0f} ms of sensing, {1e3 * each.obeying_s:.0f} ms of obeying"
+        for role, each in added.items()
+    )
+    lines = [f"medians apart, RMS: {pair} {distance_mm:.2f} mm" for pair, distance_mm in apart_mm.items()]
+    lines += [f"did not come to its end: {reason}" for reason in failed]
+    print("\n".join([table(pushes, way_mm), f"added: {words}", *lines]))
+    _plot(pushes, way_mm, out / "emulated-push.png")
+    report = {
+        **provenance(),
+        "added": {role: asdict(each) for role, each in added.items()},
+        "medians_apart_mm": apart_mm,
+        "pushes": {title: _figures(push, way_mm) for title, push in pushes.items()},
+    }
+    (out / "emulated-push.json").write_text(json.dumps(report, indent=1) + "\n")
+
+
+def table(pushes: Mapping[str, Push], way_mm: Array) -> str:
+    """Every push, its latencies (leader / follower), and how far its object was from ``way_mm`` (n, 2)."""
+    heads = (
+        ("", "error", "push", "frame to", "command to", "from the emulated median", "aside from its way"),
+        ("", "mm", "s", "command, ms", "motion, ms", "RMS mm    worst", "RMS mm    worst"),
+    )
+    lines = [_line(head) for head in heads]
+    for title, push in pushes.items():
+        found = _figures(push, way_mm)
+        latencies = [push.latency[role] for role in _SENSORS]
+        cells = [title, f"{push.error_mm:.2f}", f"{push.duration_s:.2f}"]
+        cells.append(" / ".join(f"{1e3 * each.sensing_s:.0f}" for each in latencies))
+        cells.append(" / ".join(f"{1e3 * each.obeying_s:.0f}" for each in latencies))
+        cells += [f"{found[f'{kind}_rms_mm']:.2f}{found[f'{kind}_worst_mm']:>9.2f}" for kind in ("then", "aside")]
+        lines.append(_line(cells))
+    return "\n".join(lines)
+
+
+def _line(cells: Sequence[str]) -> str:
+    widths = (31, 7, 7, 14, 13, 30, 22)
+    first, *others = cells
+    return first.ljust(widths[0]) + "".join(f"{cell:>{width}}" for cell, width in zip(others, widths[1:], strict=True))
+
+
+def _figures(push: Push, way_mm: Array) -> dict[str, Any]:
+    then, aside = differences_mm(push, way_mm)
+    return {
+        "outcome": push.outcome,
+        "error_mm": push.error_mm,
+        "duration_s": push.duration_s,
+        "latency": {role: asdict(each) for role, each in push.latency.items()},
+        "then_rms_mm": _rms(then),
+        "then_worst_mm": float(then.max()),
+        "aside_rms_mm": _rms(aside),
+        "aside_worst_mm": float(aside.max()),
+    }
+
+
+def _median(pushes: Sequence[Push], role: str) -> Latency:
+    sensing_s, obeying_s = np.median([astuple(push.latency[role]) for push in pushes], axis=0)
+    return Latency(float(sensing_s), float(obeying_s))
+
+
+_COLOURS: Final = {"emulated": "#1f77b4", "simulated": "#ff7f0e", "simulated, latency added": "#2ca02c"}
+
+
+def _plot(pushes: Mapping[str, Push], way_mm: Array, path: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    figure, (above, away) = plt.subplots(1, 2, figsize=(11, 3.8), layout="constrained")
+    for title, push in pushes.items():
+        kind, _, number = title.rpartition(", ")
+        style = {"color": _COLOURS[kind], "lw": 1.0, "label": kind if number == "1" else None}
+        above.plot(push.object_mm_deg[:, 0], push.object_mm_deg[:, 1], **style)
+        then, _ = differences_mm(push, way_mm)
+        away.plot(push.t_s[: len(then)], then, **style)
+    above.set(xlabel="x (mm)", ylabel="y (mm)", title="object's middle, from above")
+    away.set(xlabel="time since the push began (s)", ylabel="mm", title="from the emulated median at the same time")
+    above.legend(fontsize=8)
+    for axis in (above, away):
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=90)
+    plt.close(figure)

@@ -1,0 +1,424 @@
+/* Images: the median of 5x5 pixels, the threshold at a neighbourhood's mean, and the white discs of what comes of it.
+ *
+ * Plain C99 without any Python. All numbers are whole, so nothing depends on the processor.
+ */
+#ifndef TOUCHCELL_IMAGE_KERNELS_H
+#define TOUCHCELL_IMAGE_KERNELS_H
+
+#include <stddef.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+/* Two versions of a function where the processor is asked at load time which one it can run. */
+#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
+#define WIDE_VECTORS __attribute__((target_clones("avx2", "default")))
+#else
+#define WIDE_VECTORS
+#endif
+
+static inline ptrdiff_t clamp(ptrdiff_t i, ptrdiff_t end) { return i < 0 ? 0 : i >= end ? end - 1 : i; }
+
+static inline int lowest_bit(uint64_t bits)
+{
+#if defined(__GNUC__)
+    return __builtin_ctzll(bits);
+#else
+    int at = 0;
+    for (; !(bits & 1); bits >>= 1)
+        at++;
+    return at;
+#endif
+}
+
+#define ORDER(a, b)                       \
+    do {                                  \
+        uint8_t least = (a) < (b) ? a : b; \
+        b = (a) < (b) ? b : a;             \
+        a = least;                        \
+    } while (0)
+
+/* The shortest network that sorts five. */
+#define SORT_5(a, b, c, d, e) \
+    do {                      \
+        ORDER(a, d);          \
+        ORDER(b, e);          \
+        ORDER(a, c);          \
+        ORDER(b, d);          \
+        ORDER(a, b);          \
+        ORDER(c, e);          \
+        ORDER(b, c);          \
+        ORDER(d, e);          \
+        ORDER(c, d);          \
+    } while (0)
+
+/* Each column of five rows by itself, into rows of `to` that lie `stride` apart. */
+WIDE_VECTORS static void sort_columns(const uint8_t *const rows[5], ptrdiff_t width, uint8_t *restrict to,
+                                      ptrdiff_t stride)
+{
+    const uint8_t *r0 = rows[0], *r1 = rows[1], *r2 = rows[2], *r3 = rows[3], *r4 = rows[4];
+    for (ptrdiff_t x = 0; x < width; x++) {
+        uint8_t a = r0[x], b = r1[x], c = r2[x], d = r3[x], e = r4[x];
+        SORT_5(a, b, c, d, e);
+        to[x] = a;
+        to[x + stride] = b;
+        to[x + 2 * stride] = c;
+        to[x + 3 * stride] = d;
+        to[x + 4 * stride] = e;
+    }
+}
+
+/* Medians of the 5x5 values whose columns are sorted.
+ *
+ * With the rows sorted too, 13 of the 25 can still be the median, along the rising diagonal. The last 18 exchanges leave
+ * it in the middle: found by a search, and checked for all 6^5 columns of zeros and ones, which proves it for all numbers
+ * (the zero-one principle, Knuth vol. 3, 5.3.4).
+ */
+WIDE_VECTORS static void median_of_columns(const uint8_t *restrict sorted, ptrdiff_t stride, ptrdiff_t width,
+                                           uint8_t *restrict to)
+{
+    const uint8_t *s0 = sorted, *s1 = s0 + stride, *s2 = s1 + stride, *s3 = s2 + stride, *s4 = s3 + stride;
+    for (ptrdiff_t x = 0; x < width; x++) {
+        uint8_t a0 = s0[x], a1 = s0[x + 1], a2 = s0[x + 2], a3 = s0[x + 3], a4 = s0[x + 4];
+        uint8_t b0 = s1[x], b1 = s1[x + 1], b2 = s1[x + 2], b3 = s1[x + 3], b4 = s1[x + 4];
+        uint8_t c0 = s2[x], c1 = s2[x + 1], c2 = s2[x + 2], c3 = s2[x + 3], c4 = s2[x + 4];
+        uint8_t d0 = s3[x], d1 = s3[x + 1], d2 = s3[x + 2], d3 = s3[x + 3], d4 = s3[x + 4];
+        uint8_t e0 = s4[x], e1 = s4[x + 1], e2 = s4[x + 2], e3 = s4[x + 3], e4 = s4[x + 4];
+        SORT_5(a0, a1, a2, a3, a4);
+        SORT_5(b0, b1, b2, b3, b4);
+        SORT_5(c0, c1, c2, c3, c4);
+        SORT_5(d0, d1, d2, d3, d4);
+        SORT_5(e0, e1, e2, e3, e4);
+        ORDER(a3, d1);
+        ORDER(b3, d0);
+        ORDER(b2, d1);
+        ORDER(c3, e0);
+        ORDER(b4, d1);
+        ORDER(b4, c2);
+        ORDER(d0, e1);
+        ORDER(b4, d0);
+        ORDER(d0, d2);
+        ORDER(c2, d0);
+        ORDER(c2, c3);
+        ORDER(c3, d0);
+        ORDER(b2, c2);
+        ORDER(a4, c3);
+        ORDER(a4, c2);
+        ORDER(c1, c2);
+        ORDER(c2, c3);
+        ORDER(b4, c2);
+        to[x] = c2;
+    }
+}
+
+/* Rows of a grey image, or their medians of 5x5, which are made one after the other and kept for `kept` rows. What lies
+ * beyond a border repeats it. */
+typedef struct {
+    const uint8_t *image;
+    ptrdiff_t row_bytes, height, width;
+    uint8_t *medians, *sorted;
+    ptrdiff_t whole, kept, made;
+} Rows;
+
+static int open_rows(Rows *rows, const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width,
+                     int with_median, ptrdiff_t kept)
+{
+    /* Whole vectors: what lies behind the last pixel is computed too, and not looked at. */
+    ptrdiff_t whole = (width + 31) / 32 * 32;
+    *rows = (Rows){.image = image, .row_bytes = row_bytes, .height = height, .width = width, .whole = whole, .kept = kept};
+    if (!with_median)
+        return 1;
+    rows->medians = calloc((size_t)(kept * whole + 5 * (whole + 4)), 1);
+    rows->sorted = rows->medians + kept * whole;
+    return rows->medians != NULL;
+}
+
+static void close_rows(Rows *rows) { free(rows->medians); }
+
+static void make_median_row(Rows *rows)
+{
+    const uint8_t *five[5];
+    ptrdiff_t y = rows->made++, stride = rows->whole + 4;
+    for (ptrdiff_t i = 0; i < 5; i++)
+        five[i] = rows->image + clamp(y + i - 2, rows->height) * rows->row_bytes;
+    sort_columns(five, rows->width, rows->sorted + 2, stride);
+    for (uint8_t *row = rows->sorted; row < rows->sorted + 5 * stride; row += stride) {
+        row[0] = row[1] = row[2];
+        row[rows->width + 2] = row[rows->width + 3] = row[rows->width + 1];
+    }
+    median_of_columns(rows->sorted, stride, rows->whole, rows->medians + y % rows->kept * rows->whole);
+}
+
+/* Row y, or the one at the border; not further back than `kept`. */
+static const uint8_t *row_at(Rows *rows, ptrdiff_t y)
+{
+    y = clamp(y, rows->height);
+    if (!rows->medians)
+        return rows->image + y * rows->row_bytes;
+    while (rows->made <= y)
+        make_median_row(rows);
+    return rows->medians + y % rows->kept * rows->whole;
+}
+
+/* 0: out of memory. */
+static int median_5(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width, uint8_t *to)
+{
+    Rows rows;
+    if (!open_rows(&rows, image, row_bytes, height, width, 1, 1))
+        return 0;
+    for (ptrdiff_t y = 0; y < height; y++)
+        memcpy(to + y * width, row_at(&rows, y), (size_t)width);
+    close_rows(&rows);
+    return 1;
+}
+
+/* Column sums that take one row in and give one up. */
+WIDE_VECTORS static void roll_columns(uint16_t *restrict sums, const uint8_t *in, const uint8_t *out, ptrdiff_t width)
+{
+    for (ptrdiff_t x = 0; x < width; x++)
+        sums[x] = (uint16_t)(sums[x] + in[x] - out[x]);
+}
+
+/* before[i]: the sum of the first i numbers. */
+static void add_up(const uint16_t *restrict numbers, ptrdiff_t count, uint32_t *restrict before)
+{
+    uint32_t total = 0;
+    for (ptrdiff_t i = 0; i < count; i++) {
+        before[i] = total;
+        total += numbers[i];
+    }
+    before[count] = total;
+}
+
+/* White where a pixel exceeds the rounded mean of its neighbourhood less the offset, in whole numbers throughout. */
+WIDE_VECTORS static void above_mean(const uint8_t *pixels, const uint32_t *before, ptrdiff_t block, int32_t offset,
+                                    ptrdiff_t width, uint8_t *restrict to)
+{
+    int32_t area = (int32_t)(block * block), half = (area - 1) / 2;
+    for (ptrdiff_t x = 0; x < width; x++) {
+        int32_t sum = (int32_t)(before[x + block] - before[x]);
+        to[x] = sum + half < area * ((int32_t)pixels[x] + offset) ? 255 : 0;
+    }
+}
+
+/* Adaptive threshold of an image or of its medians; the border is repeated outwards. 0: out of memory.
+ *
+ * The same as OpenCV's adaptiveThreshold with ADAPTIVE_THRESH_MEAN_C and THRESH_BINARY, which rounds the mean to 8 bits
+ * before it compares. A block of an odd side has no mean half way between two numbers, so there is one way to round.
+ */
+static int threshold(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width, int with_median,
+                     ptrdiff_t block, int32_t offset, uint8_t *to)
+{
+    Rows rows;
+    ptrdiff_t half = block / 2, padded = width + block - 1;
+    uint16_t *columns = calloc((size_t)padded, sizeof *columns);
+    uint32_t *before = malloc((size_t)(padded + 1) * sizeof *before);
+    int done = columns && before && open_rows(&rows, image, row_bytes, height, width, with_median, block + 1);
+    if (done) {
+        uint16_t *middle = columns + half;
+        for (ptrdiff_t y = -half - 1; y < half; y++) {
+            const uint8_t *row = row_at(&rows, y);
+            for (ptrdiff_t x = 0; x < width; x++)
+                middle[x] = (uint16_t)(middle[x] + row[x]);
+        }
+        for (ptrdiff_t y = 0; y < height; y++) {
+            const uint8_t *in = row_at(&rows, y + half);
+            roll_columns(middle, in, row_at(&rows, y - half - 1), width);
+            for (ptrdiff_t x = 0; x < half; x++) {
+                columns[x] = middle[0];
+                middle[width + x] = middle[width - 1];
+            }
+            add_up(columns, padded, before);
+            above_mean(row_at(&rows, y), before, block, offset, width, to + y * width);
+        }
+        close_rows(&rows);
+    }
+    free(before);
+    free(columns);
+    return done;
+}
+
+/* Means of squares of `factor` pixels, a power of two up to 64, rounded to the nearest and to even where two are as near:
+ * what OpenCV's resize with INTER_AREA gives for these factors but 2. `to` is (height / factor, width / factor).
+ * 0: out of memory. */
+WIDE_VECTORS static int shrink(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width, ptrdiff_t factor,
+                  uint8_t *to)
+{
+    ptrdiff_t rows = height / factor, columns = width / factor;
+    uint32_t area = (uint32_t)(factor * factor);
+    int bits = lowest_bit(area);
+    uint16_t *sums = malloc((size_t)width * sizeof *sums);
+    if (!sums)
+        return 0;
+    for (ptrdiff_t y = 0; y < rows; y++) {
+        memset(sums, 0, (size_t)width * sizeof *sums);
+        for (ptrdiff_t i = 0; i < factor; i++) {
+            const uint8_t *row = image + (y * factor + i) * row_bytes;
+            for (ptrdiff_t x = 0; x < width; x++)
+                sums[x] = (uint16_t)(sums[x] + row[x]);
+        }
+        for (ptrdiff_t x = 0; x < columns; x++) {
+            uint32_t sum = 0;
+            for (ptrdiff_t i = 0; i < factor; i++)
+                sum += sums[x * factor + i];
+            uint32_t mean = sum >> bits, rest = sum - mean * area;
+            to[y * columns + x] = (uint8_t)(mean + (2 * rest + mean % 2 > area));
+        }
+    }
+    free(sums);
+    return 1;
+}
+
+/* A run of white pixels in one row, its end exclusive, and the component that it belongs to. */
+typedef struct {
+    int32_t begin, end, component;
+} Run;
+
+/* What touches, also by a corner. `parent` leads to the component that it was joined with. */
+typedef struct {
+    int64_t sum_u, sum_v;
+    int32_t parent, area, left, right, top, bottom;
+} Component;
+
+typedef struct {
+    int32_t smallest_px, largest_px, longest_side_px;
+} DiscSize;
+
+static int32_t root_of(Component *components, int32_t i)
+{
+    while (components[i].parent != i)
+        i = components[i].parent = components[components[i].parent].parent;
+    return i;
+}
+
+/* The one that was found first keeps its number. */
+static int32_t join(Component *components, int32_t a, int32_t b)
+{
+    a = root_of(components, a);
+    b = root_of(components, b);
+    if (a == b)
+        return a;
+    int32_t first = a < b ? a : b, other = a < b ? b : a;
+    Component *to = &components[first], *from = &components[other];
+    to->sum_u += from->sum_u;
+    to->sum_v += from->sum_v;
+    to->area += from->area;
+    to->left = from->left < to->left ? from->left : to->left;
+    to->right = from->right > to->right ? from->right : to->right;
+    to->top = from->top < to->top ? from->top : to->top;
+    to->bottom = from->bottom > to->bottom ? from->bottom : to->bottom;
+    from->parent = first;
+    return first;
+}
+
+/* One bit for each of eight pixels, the first the lowest: whether it is white. */
+static inline uint64_t white_bits(const uint8_t *pixels)
+{
+    uint64_t eight = 0, low = 0x7f7f7f7f7f7f7f7fu;
+    for (int i = 0; i < 8; i++)
+        eight |= (uint64_t)pixels[i] << (8 * i);
+    /* The highest bit of each byte, then all of them side by side. */
+    eight = (((eight & low) + low) | eight) >> 7 & 0x0101010101010101u;
+    return eight * 0x0102040810204080u >> 56;
+}
+
+/* Runs of one row. Where white begins or ends is read from 64 pixels at once, which are mostly black. */
+static int32_t runs_of(const uint8_t *row, int32_t width, Run *runs)
+{
+    int32_t edges = 0;
+    uint64_t last = 0;
+    for (int32_t x = 0; x < width; x += 64) {
+        uint64_t white = 0;
+        int32_t here = width - x < 64 ? width - x : 64, i = 0;
+        for (; i + 8 <= here; i += 8)
+            white |= white_bits(row + x + i) << i;
+        for (; i < here; i++)
+            white |= (uint64_t)(row[x + i] != 0) << i;
+        for (uint64_t edge = white ^ (white << 1 | last); edge; edge &= edge - 1, edges++) {
+            int32_t at = x + lowest_bit(edge);
+            if (edges % 2)
+                runs[edges / 2].end = at;
+            else
+                runs[edges / 2].begin = at;
+        }
+        last = white >> 63;
+    }
+    if (edges % 2)
+        runs[edges++ / 2].end = width;
+    return edges / 2;
+}
+
+/* Connected white components, 8 neighbours, in the order of their first pixels. -1: out of memory. */
+static int32_t find_components(const uint8_t *image, ptrdiff_t row_bytes, int32_t height, int32_t width,
+                               Component **found)
+{
+    size_t room = 1024;
+    int32_t count = 0, above_count = 0;
+    Component *components = malloc(room * sizeof *components);
+    Run *above = malloc(((size_t)width + 1) * sizeof *above), *here = above ? above + width / 2 + 1 : NULL;
+    Run *rows = above;
+    *found = NULL;
+    if (!components || !rows)
+        goto failed;
+    for (int32_t y = 0; y < height; y++) {
+        int32_t here_count = runs_of(image + y * row_bytes, width, here);
+        if ((size_t)(count + here_count) > room) {
+            room = 2 * room + (size_t)here_count;
+            Component *larger = realloc(components, room * sizeof *components);
+            if (!larger)
+                goto failed;
+            components = larger;
+        }
+        for (int32_t i = 0, j = 0; i < here_count; i++) {
+            Run *run = &here[i];
+            int32_t length = run->end - run->begin;
+            run->component = -1;
+            while (j < above_count && above[j].end < run->begin)
+                j++;
+            for (int32_t k = j; k < above_count && above[k].begin <= run->end; k++)
+                run->component = run->component < 0 ? root_of(components, above[k].component)
+                                                    : join(components, run->component, above[k].component);
+            if (run->component < 0) {
+                run->component = count;
+                components[count++] = (Component){.parent = run->component,
+                                                  .left = run->begin,
+                                                  .right = run->end,
+                                                  .top = y,
+                                                  .bottom = y + 1};
+            }
+            Component *component = &components[run->component];
+            component->area += length;
+            component->sum_u += (int64_t)length * (run->begin + run->end - 1) / 2;
+            component->sum_v += (int64_t)length * y;
+            component->left = run->begin < component->left ? run->begin : component->left;
+            component->right = run->end > component->right ? run->end : component->right;
+            component->bottom = y + 1;
+        }
+        Run *swapped = above;
+        above = here;
+        here = swapped;
+        above_count = here_count;
+    }
+    free(rows);
+    *found = components;
+    return count;
+failed:
+    free(components);
+    free(rows);
+    return -1;
+}
+
+/* Moves the components that are discs to the front; their number. */
+static int32_t keep_discs(Component *components, int32_t count, DiscSize size)
+{
+    int32_t kept = 0;
+    for (int32_t i = 0; i < count; i++) {
+        Component *each = &components[i];
+        if (each->parent == i && each->area >= size.smallest_px && each->area <= size.largest_px &&
+            each->right - each->left <= size.longest_side_px && each->bottom - each->top <= size.longest_side_px)
+            components[kept++] = *each;
+    }
+    return kept;
+}
+
+#endif
