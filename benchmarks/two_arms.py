@@ -119,8 +119,18 @@ def pushing_plan(folder: Path, rate_hz: float) -> CellPlan:
     data |= {"processes": "separate", "rate_hz": rate_hz}
     for arm, host in json.loads((folder / EMULATORS).read_text()).items():
         data["arms"][arm]["host"] = host
-    for sensor in data["sensors"].values():
-        sensor["estimator"] = {"kind": "true_contact"}
+    # Pictures would keep this machine from being told apart from what is done to the cell.
+    data["scene"] = data.pop("emulated_scene")
+    data["sensors"] = {
+        name: {
+            "driver": "sim_tactip",
+            "mounted_on": sensor["mounted_on"],
+            "tcp_to_sensor_mm_deg": sensor["tcp_to_sensor_mm_deg"],
+            "rate_hz": 30,
+            "estimator": {"kind": "true_contact"},
+        }
+        for name, sensor in data["sensors"].items()
+    }
     path = folder / "cell.yaml"
     path.write_text(yaml.safe_dump(data))
     return plan_cell(path)

@@ -186,6 +186,9 @@ class RunLoop:
                     self._write(f"/sensors/{role}/preprocessing", self._cell.clock.now_ns(), about)
             for role, arm in self._arms.items():
                 self._leases[role] = arm.acquire(self._cell.task_name)
+            if self._cell.scene is not None:
+                # In real time it has to catch up with all that happened since it was made.
+                self._cell.scene.objects()
             self._cell.watch.begin()
         except TouchcellError as error:
             self._error = error

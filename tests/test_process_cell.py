@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 from benchmarks.process_faults import FAULTS, ProcessCase, ProcessFault, TooBusy, run_fault
-from benchmarks.two_arms import SPEED_M_S, two_arm_plan
+from benchmarks.two_arms import EMULATORS, SPEED_M_S, pushing_plan, two_arm_plan
 from cell.cli import main
 from cell.compose import Cell, compose
 from cell.config import plan_cell
@@ -401,10 +401,8 @@ def test_the_truth_of_a_scene_in_a_host_is_told_and_recorded(tmp_path: Path) -> 
 
 def test_a_scene_without_a_simulated_arm_stays_in_the_tasks_process(tmp_path: Path) -> None:
     """So that real arms have hosts of their own, and one may die while another goes on."""
-    data = yaml.safe_load((SHIPPED.parent / "dual_push_emulated.yaml").read_text()) | {"processes": "separate"}
-    path = tmp_path / "cell.yaml"
-    path.write_text(yaml.safe_dump(data))
-    plan = plan_cell(path)
+    (tmp_path / EMULATORS).write_text(json.dumps({"leader": "127.99.0.2", "follower": "127.99.0.3"}))
+    plan = pushing_plan(tmp_path, 12.5)
     assert {group.name: group.scene for group in hosted_groups(plan)} == {"leader": None, "follower": None}
     assert isinstance(compose(plan).scene, Scene)
 
