@@ -93,12 +93,22 @@ def _rig_of(plan: CellPlan, device: DevicePlan) -> RigFunction:
             build=lambda clock: build_devices(plan, plan.devices, clock)[device.name],
             energising=None,
             position=None,
-            state_rate_hz=getattr(device.config, "rate_hz", None),
+            state_rate_hz=getattr(device.config, "rate_hz", None) or _scene_rate_hz(plan, device),
             clock=VirtualClock if plan.cell.time == "simulated" else MonotonicClock,
             process=False,
         )
 
     return rig
+
+
+def _scene_rate_hz(plan: CellPlan, device: DevicePlan) -> float | None:
+    """Of an arm that is sampled in the steps of the cell's scene."""
+    able = device.spec.capabilities
+    if plan.cell.scene is None or able.kind != "arm" or not able.virtual_time:
+        return None
+    from drivers.simulation.scene import SceneConfig
+
+    return 1e3 / SceneConfig.model_validate(plan.cell.scene).step_ms
 
 
 def _ask(config: pytest.Config, device: str) -> None:
