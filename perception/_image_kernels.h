@@ -269,6 +269,112 @@ WIDE_VECTORS static int shrink(const uint8_t *image, ptrdiff_t row_bytes, ptrdif
     return 1;
 }
 
+/* The pixels that a new pixel covers along one side, and the share of each in its mean; how many. `scale` pixels become
+ * one. What covers less than a thousandth of a pixel counts for nothing, as in OpenCV. */
+static int covered(ptrdiff_t at, double scale, ptrdiff_t size, ptrdiff_t *first, float *shares)
+{
+    double begin = (double)at * scale, end = begin + scale;
+    double length = scale < (double)size - begin ? scale : (double)size - begin;
+    ptrdiff_t from = (ptrdiff_t)begin, to = (ptrdiff_t)end;
+    int count = 0;
+    from += (double)from < begin;
+    to = to < size - 1 ? to : size - 1;
+    from = from < to ? from : to;
+    *first = from;
+    if ((double)from - begin > 1e-3) {
+        --*first;
+        shares[count++] = (float)(((double)from - begin) / length);
+    }
+    for (ptrdiff_t i = from; i < to; i++)
+        shares[count++] = (float)(1.0 / length);
+    if (end - (double)to > 1e-3) {
+        double rest = end - (double)to < 1.0 ? end - (double)to : 1.0;
+        shares[count++] = (float)((rest < length ? rest : length) / length);
+    }
+    return count;
+}
+
+/* Weighted sums of `most` numbers each, from `first` on; the first shares of all sums lie before the second ones. */
+static void gather(const float *restrict row, const int32_t *restrict first, const float *restrict shares,
+                                ptrdiff_t most, ptrdiff_t columns, float *restrict to)
+{
+    for (ptrdiff_t x = 0; x < columns; x++)
+        to[x] = row[first[x]] * shares[x];
+    for (ptrdiff_t i = 1; i < most; i++) {
+        const float *from = row + i, *share = shares + i * columns;
+        for (ptrdiff_t x = 0; x < columns; x++)
+            to[x] += from[first[x]] * share[x];
+    }
+}
+
+WIDE_VECTORS static void add_row(const float *restrict row, float share, ptrdiff_t columns, float *restrict sums)
+{
+    for (ptrdiff_t x = 0; x < columns; x++)
+        sums[x] += share * row[x];
+}
+
+WIDE_VECTORS static void to_floats(const uint8_t *restrict row, ptrdiff_t width, float *restrict to)
+{
+    for (ptrdiff_t x = 0; x < width; x++)
+        to[x] = row[x];
+}
+
+/* To the nearest number of 8 bits and to even where two are as near: the last bit of this float is worth one. */
+WIDE_VECTORS static void to_bytes(const float *restrict sums, ptrdiff_t columns, uint8_t *restrict to)
+{
+    for (ptrdiff_t x = 0; x < columns; x++) {
+        float shifted = sums[x] + 12582912.0f;
+        int32_t bits;
+        memcpy(&bits, &shifted, sizeof bits);
+        bits -= 0x4b400000;
+        to[x] = (uint8_t)(bits < 255 ? bits : 255);
+    }
+}
+
+/* Means over the area of each new pixel, by rows first, in single precision and in the order of OpenCV's resize with
+ * INTER_AREA, whose results are the same to the bit unless both sides shrink by a whole factor. `to` is (rows, columns),
+ * neither more than the image has. 0: out of memory. */
+static int area_means(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width, ptrdiff_t rows,
+                      ptrdiff_t columns, uint8_t *to)
+{
+    double across = 1.0 / ((double)columns / (double)width), down = 1.0 / ((double)rows / (double)height);
+    ptrdiff_t room = (ptrdiff_t)(across > down ? across : down) + 3, most = 0, made = -1;
+    int32_t *first = malloc((size_t)columns * sizeof *first);
+    float *floats = calloc((size_t)((room + 2) * columns + 2 * room + width), sizeof *floats);
+    if (!first || !floats) {
+        free(first);
+        free(floats);
+        return 0;
+    }
+    float *shares = floats, *one = shares + room * columns, *means = one + room, *sums = means + columns;
+    float *row = sums + columns;
+    for (ptrdiff_t x = 0; x < columns; x++) {
+        ptrdiff_t from;
+        int count = covered(x, across, width, &from, one);
+        for (int i = 0; i < count; i++)
+            shares[i * columns + x] = one[i];
+        first[x] = (int32_t)from;
+        most = count > most ? count : most;
+    }
+    for (ptrdiff_t y = 0; y < rows; y++) {
+        ptrdiff_t from;
+        int count = covered(y, down, height, &from, one);
+        memset(sums, 0, (size_t)columns * sizeof *sums);
+        for (int i = 0; i < count; i++) {
+            if (from + i != made) {
+                made = from + i;
+                to_floats(image + made * row_bytes, width, row);
+                gather(row, first, shares, most, columns, means);
+            }
+            add_row(means, one[i], columns, sums);
+        }
+        to_bytes(sums, columns, to + y * columns);
+    }
+    free(first);
+    free(floats);
+    return 1;
+}
+
 /* A run of white pixels in one row, its end exclusive, and the component that it belongs to. */
 typedef struct {
     int32_t begin, end, component;

@@ -184,6 +184,26 @@ static PyObject *py_shrink(PyObject *module, PyObject *const *arguments, Py_ssiz
     return ended(&call, shrink(image->buf, image->strides[0], image->shape[0], image->shape[1], (ptrdiff_t)factor, to->buf));
 }
 
+static PyObject *py_area_means(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "area_means"};
+    Py_buffer *image, *to;
+    if (!takes(&call, count, 2) || !(image = take_image(&call, arguments[0])) ||
+        !(to = take(&call, "to", arguments[1], 'B', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, (Py_ssize_t)ANY,
+                    (Py_ssize_t)ANY)))
+        return finish(&call, NULL);
+    if (to->shape[0] < 1 || to->shape[1] < 1 || to->shape[0] > image->shape[0] || to->shape[1] > image->shape[1]) {
+        refuse(&call, "to", "is empty or larger than the image");
+        return finish(&call, NULL);
+    }
+    int done;
+    Py_BEGIN_ALLOW_THREADS;
+    done = area_means(image->buf, image->strides[0], image->shape[0], image->shape[1], to->shape[0], to->shape[1],
+                      to->buf);
+    Py_END_ALLOW_THREADS;
+    return ended(&call, done);
+}
+
 static PyObject *py_discs(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
 {
     Call call = {.function = "discs"};
@@ -387,7 +407,7 @@ static PyObject *py_bytes_apart(PyObject *module, PyObject *const *arguments, Py
 
 #define FAST(name) {#name, (PyCFunction)(void (*)(void))py_##name, METH_FASTCALL, NULL}
 
-static PyMethodDef METHODS[] = {FAST(median_5), FAST(threshold), FAST(shrink),  FAST(discs),  FAST(pair), FAST(fit),
+static PyMethodDef METHODS[] = {FAST(median_5), FAST(threshold), FAST(shrink),  FAST(area_means),  FAST(discs),  FAST(pair), FAST(fit),
                                 FAST(settle),   FAST(density),   FAST(bytes_apart), FAST(affine), {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "perception._kernelsc",

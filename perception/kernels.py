@@ -78,11 +78,17 @@ def area_means(image: ImageArray, size: tuple[int, int]) -> ImageArray:
         image: uint8 (height, width).
         size: (height, width) of the result.
     """
-    factor = image.shape[0] // size[0]
-    if _FOUND is None or factor not in _FACTORS or image.shape != (factor * size[0], factor * size[1]):
+    (height, width), (rows, columns) = image.shape, size
+    factor = height // rows
+    whole = height % rows == 0 and width % columns == 0
+    known = factor in _FACTORS and image.shape == (factor * rows, factor * columns) if whole else True
+    if _FOUND is None or not known or rows > height or columns > width:
         return np.asarray(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA), np.uint8)
     means = np.empty(size, np.uint8)
-    _FOUND.shrink(_in_rows(image), factor, means)
+    if whole:
+        _FOUND.shrink(_in_rows(image), factor, means)
+    else:
+        _FOUND.area_means(_in_rows(image), means)
     return means
 
 

@@ -81,6 +81,27 @@ def test_area_means_are_opencvs(image: ImageArray, factor: int) -> None:
     np.testing.assert_array_equal(kernels.area_means(whole, size), expected.reshape(size))
 
 
+@given(images(200), st.floats(0.02, 1.0), st.floats(0.02, 1.0), st.booleans())
+@settings(max_examples=150)
+def test_area_means_of_any_size_are_opencvs(image: ImageArray, down: float, across: float, binary: bool) -> None:
+    if binary:
+        image = np.where(image > 127, np.uint8(255), np.uint8(0))
+    size = (max(1, round(down * image.shape[0])), max(1, round(across * image.shape[1])))
+    expected = cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
+    np.testing.assert_array_equal(kernels.area_means(image, size), expected.reshape(size))
+
+
+@pytest.mark.parametrize(
+    ("shape", "size"), [((440, 440), (128, 128)), ((440, 445), (128, 128)), ((430, 430), (99, 101))]
+)
+def test_area_means_of_frames_are_opencvs(shape: tuple[int, int], size: tuple[int, int]) -> None:
+    noise = np.random.default_rng(1).integers(0, 256, (480, 640)).astype(np.uint8)[3:, 5:]
+    frame = noise[: shape[0], : shape[1]]
+    for image in (frame, np.where(frame > 200, np.uint8(255), np.uint8(0))):
+        expected = cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
+        np.testing.assert_array_equal(kernels.area_means(image, size), expected)
+
+
 def test_area_means_round_halves_to_even() -> None:
     squares = np.zeros((5, 16), np.uint8)
     squares[:, 0] = [8, 24, 40, 7, 9]
@@ -242,6 +263,7 @@ GOOD: dict[Callable[..., object], tuple[object, ...]] = {
     _kernelsc.median_5: (np.zeros((4, 5), np.uint8), np.zeros((4, 5), np.uint8)),
     _kernelsc.threshold: (np.zeros((4, 5), np.uint8), True, 3, 0.0, np.zeros((4, 5), np.uint8)),
     _kernelsc.shrink: (np.zeros((8, 12), np.uint8), 4, np.zeros((2, 3), np.uint8)),
+    _kernelsc.area_means: (np.zeros((8, 12), np.uint8), np.zeros((3, 5), np.uint8)),
     _kernelsc.discs: (np.zeros((4, 5), np.uint8), 1, 9, 9),
     _kernelsc.pair: (np.zeros((3, 2)), np.zeros((4, 2)), np.zeros(3, np.int64), np.zeros(3), np.zeros(3, bool)),
     _kernelsc.fit: (np.ones((6, 8)), np.ones(3), np.zeros((3, 2)), np.zeros(2), np.ones(2), np.zeros(2)),

@@ -5,6 +5,13 @@
 #include <math.h>
 #include <numpy/arrayobject.h>
 
+/* Two versions of a function where the processor is asked at load time which one it can run. */
+#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
+#define WIDE_VECTORS __attribute__((target_clones("avx2", "default")))
+#else
+#define WIDE_VECTORS
+#endif
+
 static PyArrayObject *array_of(PyObject *value, int type, int rank)
 {
     if (!PyArray_Check(value))
@@ -72,6 +79,14 @@ static inline unsigned char lit(unsigned char cover, unsigned char contrast, uns
     return (unsigned char)(value > 255 ? 255 : value);
 }
 
+WIDE_VECTORS static void lit_row(const unsigned char *restrict cover, const unsigned char *restrict contrast,
+                                 const unsigned char *restrict background, const signed char *restrict grain,
+                                 npy_intp width, unsigned char *restrict to)
+{
+    for (npy_intp u = 0; u < width; u++)
+        to[u] = lit(cover[u], contrast[u], background[u], grain[u]);
+}
+
 /* background + contrast * cover / 255, rounded and clipped; then the window of the noise at (top, left), clipped again. */
 static PyObject *expose(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
 {
@@ -94,14 +109,13 @@ static PyObject *expose(PyObject *module, PyObject *const *arguments, Py_ssize_t
     PyObject *frame = PyArray_SimpleNew(2, PyArray_DIMS(layers[0]), NPY_UBYTE);
     if (!frame)
         return NULL;
+    const unsigned char *cover = PyArray_DATA(layers[0]), *contrast = PyArray_DATA(layers[1]);
+    const unsigned char *background = PyArray_DATA(layers[2]);
+    const signed char *grain = (const signed char *)PyArray_DATA(noise) + top * stride + left;
+    unsigned char *pixels = PyArray_DATA((PyArrayObject *)frame);
     for (npy_intp v = 0; v < height; v++) {
-        const unsigned char *restrict cover = (unsigned char *)PyArray_DATA(layers[0]) + v * width;
-        const unsigned char *restrict contrast = (unsigned char *)PyArray_DATA(layers[1]) + v * width;
-        const unsigned char *restrict background = (unsigned char *)PyArray_DATA(layers[2]) + v * width;
-        const signed char *restrict grain = (signed char *)PyArray_DATA(noise) + (top + v) * stride + left;
-        unsigned char *restrict row = (unsigned char *)PyArray_DATA((PyArrayObject *)frame) + v * width;
-        for (npy_intp u = 0; u < width; u++)
-            row[u] = lit(cover[u], contrast[u], background[u], grain[u]);
+        npy_intp at = v * width;
+        lit_row(cover + at, contrast + at, background + at, grain + v * stride, width, pixels + at);
     }
     return frame;
 }

@@ -21,7 +21,7 @@ import numpy as np
 from drivers.errors import ConfigError
 from drivers.simulation.contact import ContactLaw, ContactModel, ContactState
 from drivers.simulation.objects import Ball, FreeObject
-from drivers.simulation.solids import friction_radius_m, shape_of
+from drivers.simulation.solids import friction_radius_m, plain_shape_of
 from drivers.simulation.surfaces import Surface
 from drivers.simulation.timeline import Restore
 from drivers.simulation.world import Feeling, known
@@ -30,6 +30,8 @@ from geometry.types import Array
 GRAVITY_M_S2: Final = 9.81
 
 _Three = tuple[float, float, float]
+_Matrix = tuple[float, float, float, float, float, float, float, float, float]
+"""3 x 3, by rows."""
 
 _MAX_ITERATIONS: Final = 30
 _TOLERANCE_M: Final = 1e-10
@@ -58,7 +60,8 @@ class _Slider:
                 key=f"scene.objects.{name}.pose_mm_deg",
                 hint="turn it about z only",
             )
-        self.surface = Surface(shape_of(solid), self)
+        self.shape = plain_shape_of(solid)
+        self.surface = Surface(self.shape, self)
         self.radius_m = friction_radius_m(solid)
         self.friction = body.friction
         self.own_weight_n = body.mass_kg * GRAVITY_M_S2
@@ -184,54 +187,65 @@ def _settle(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw) -> _Three:
     ``shift = way f / limit`` and ``|f| = limit``.
     """
     slider.weight_n = slider.own_weight_n
-    shift: _Three = (0.0, 0.0, 0.0)
-    f, K, down = _force(slider, tips, law, shift)
+    f, K, down = _force(slider, tips, law, (0.0, 0.0, 0.0))
     slider.weight_n = max(slider.own_weight_n + down, 0.0)
     limit = max(slider.limit_n, 1e-9)
     size = math.hypot(*f)
+    x = y = turn = way = 0.0
     if size <= limit:
-        return shift
-    way = 0.0
+        return x, y, turn
     for _ in range(_MAX_ITERATIONS):
-        unmoved = [way / limit * f[i] - shift[i] for i in range(3)]
-        excess = size / limit - 1.0
-        if max(map(abs, unmoved)) < _TOLERANCE_M and abs(excess) < _TOLERANCE:
+        fx, fy, ft = f
+        scale, excess = way / limit, size / limit - 1.0
+        unmoved = scale * fx - x, scale * fy - y, scale * ft - turn
+        if abs(excess) < _TOLERANCE and max(map(abs, unmoved)) < _TOLERANCE_M:
             break
-        inverse = _inverse(way / limit, K)
+        inverse = _inverse(scale, K)
         resting = _times(inverse, unmoved)
-        moving = _times(inverse, [each / limit for each in f])
-        falls = [(f[0] * K[i] + f[1] * K[3 + i] + f[2] * K[6 + i]) / (size * limit) for i in range(3)]
+        moving = _times(inverse, (fx / limit, fy / limit, ft / limit))
+        per_n = size * limit
+        falls = (
+            (fx * K[0] + fy * K[3] + ft * K[6]) / per_n,
+            (fx * K[1] + fy * K[4] + ft * K[7]) / per_n,
+            (fx * K[2] + fy * K[5] + ft * K[8]) / per_n,
+        )
         further = (excess - _dot(falls, resting)) / _dot(falls, moving)
         part = 1.0
         while True:
-            goes = [part * (resting[i] + further * moving[i]) for i in range(3)]
-            trial = shift[0] + goes[0], shift[1] + goes[1], shift[2] + goes[2]
-            f_trial, K_trial, _ = _force(slider, tips, law, trial)
-            size_trial = math.hypot(*f_trial)
+            trial = (
+                x + part * (resting[0] + further * moving[0]),
+                y + part * (resting[1] + further * moving[1]),
+                turn + part * (resting[2] + further * moving[2]),
+            )
+            f, K, _ = _force(slider, tips, law, trial)
+            size = math.hypot(*f)
             # A step that lets go of the object has gone too far: there the force has no direction.
-            if size_trial > 0.1 * limit or part < 1e-3:
+            if size > 0.1 * limit or part < 1e-3:
                 break
             part *= 0.5
-        shift, way = trial, max(way + part * further, 0.0)
-        f, K, size = f_trial, K_trial, size_trial
+        x, y, turn = trial
+        way = max(way + part * further, 0.0)
         if size == 0.0:
             break
-    return shift
+    return x, y, turn
 
 
-def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+def _dot(a: _Three, b: _Three) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _times(M: Sequence[float], v: Sequence[float]) -> _Three:
-    return _dot(M[0:3], v), _dot(M[3:6], v), _dot(M[6:9], v)
+def _times(M: _Matrix, v: _Three) -> _Three:
+    a, b, c, d, e, f, g, h, i = M
+    x, y, z = v
+    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
-def _inverse(scale: float, K: Sequence[float]) -> tuple[float, ...]:
-    """Of the matrix 1 + scale K, by rows."""
-    a, b, c = 1.0 + scale * K[0], scale * K[1], scale * K[2]
-    d, e, f = scale * K[3], 1.0 + scale * K[4], scale * K[5]
-    g, h, i = scale * K[6], scale * K[7], 1.0 + scale * K[8]
+def _inverse(scale: float, K: _Matrix) -> _Matrix:
+    """Of the matrix 1 + scale K."""
+    a, b, c, d, e, f, g, h, i = K
+    a, b, c = 1.0 + scale * a, scale * b, scale * c
+    d, e, f = scale * d, 1.0 + scale * e, scale * f
+    g, h, i = scale * g, scale * h, 1.0 + scale * i
     p, q, r = e * i - f * h, f * g - d * i, d * h - e * g
     over = 1.0 / (a * p + b * q + c * r)
     return (
@@ -247,27 +261,23 @@ def _inverse(scale: float, K: Sequence[float]) -> tuple[float, ...]:
     )
 
 
-def _force(
-    slider: _Slider, tips: Sequence[_Tip], law: ContactLaw, shift: Sequence[float]
-) -> tuple[_Three, Sequence[float], float]:
+def _force(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw, shift: _Three) -> tuple[_Three, _Matrix, float]:
     """Force of all tips on the object moved by ``shift``, in its coordinates; how it falls with the shift to first
-    order, 3 x 3 by rows; and how hard the tips press down, N."""
-    radius = slider.radius_m
+    order; and how hard the tips press down, N."""
+    radius, stiff_n, nearest = slider.radius_m, law.stiffness_n_m, slider.shape.nearest_numbers
     x, y, yaw = slider.x + shift[0], slider.y + shift[1], slider.yaw + shift[2] / radius
     sin, cos = math.sin(yaw), math.cos(yaw)
     force_x = force_y = force_turn = down = 0.0
-    K = [0.0] * 9
+    xx = xy = xt = yx = yy = yt = tx = ty = tt = 0.0
     for tip in tips:
         cx, cy, cz = tip.centre[0] - x, tip.centre[1] - y, tip.centre[2] - slider.z
         # From here on in the object's frame.
         bx, by = cos * cx + sin * cy, cos * cy - sin * cx
-        near = slider.surface.shape.nearest(np.array([bx, by, cz]))
-        depth = law.tip_radius_m - near.distance_m
+        distance, nx, ny, nz, px, py, pz = nearest(bx, by, cz)
+        depth = law.tip_radius_m - distance
         if depth <= 0.0:
             continue
-        nx, ny, nz = near.normal.tolist()
-        px, py, pz = near.point.tolist()
-        stiff_n, stiff_t = law.stiffness_n_m, 0.0
+        stiff_t = 0.0
         push = -stiff_n * depth
         fx, fy = push * nx, push * ny
         down -= push * nz
@@ -289,8 +299,8 @@ def _force(
         for stiff, ux, uy in ((stiff_n, nx, ny), (stiff_t, -ny, nx)):
             wx, wy = cos * ux - sin * uy, sin * ux + cos * uy
             felt = (bx * uy - by * ux) / radius
-            for row, pushed in enumerate((stiff * wx, stiff * wy, stiff * (px * uy - py * ux) / radius)):
-                K[3 * row] += pushed * wx
-                K[3 * row + 1] += pushed * wy
-                K[3 * row + 2] += pushed * felt
-    return (force_x, force_y, force_turn), K, down
+            pushed_x, pushed_y, turned = stiff * wx, stiff * wy, stiff * (px * uy - py * ux) / radius
+            xx, xy, xt = xx + pushed_x * wx, xy + pushed_x * wy, xt + pushed_x * felt
+            yx, yy, yt = yx + pushed_y * wx, yy + pushed_y * wy, yt + pushed_y * felt
+            tx, ty, tt = tx + turned * wx, ty + turned * wy, tt + turned * felt
+    return (force_x, force_y, force_turn), (xx, xy, xt, yx, yy, yt, tx, ty, tt), down

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -25,15 +26,28 @@ class MassProperties:
     inertia_per_kg_m2: Array
 
 
+Nearest = tuple[float, float, float, float, float, float, float]
+"""What a ``SurfacePoint`` holds, in plain numbers: distance, normal x, y, z and point x, y, z."""
+
+
+class PlainShape(Shape, Protocol):
+    """A shape whose nearest points can be had in plain numbers: NumPy takes several times as long for so few."""
+
+    def nearest_numbers(self, x: float, y: float, z: float) -> Nearest:
+        """Nearest surface point to (x, y, z) m."""
+        ...
+
+
 def shape_of(solid: Solid) -> Shape:
     """The solid's outside, in its own frame; exact for points outside."""
-    match solid:
-        case Prism():
-            return _PrismShape(_sides(solid.outline_m), solid.height_m)
-        case Turned():
-            return _TurnedShape(_sections(solid))
-        case Ball():
-            return Sphere(solid.radius_m)
+    return Sphere(solid.radius_m) if isinstance(solid, Ball) else plain_shape_of(solid)
+
+
+def plain_shape_of(solid: Prism | Turned) -> PlainShape:
+    """The same of a solid that stands."""
+    if isinstance(solid, Prism):
+        return _PrismShape(_sides(solid.outline_m), solid.height_m)
+    return _TurnedShape(_sections(solid))
 
 
 def mass_properties(solid: Solid) -> MassProperties:
@@ -125,33 +139,40 @@ class _PrismShape:
     height_m: float
 
     def nearest(self, p: Array) -> SurfacePoint:
-        x, y, z = p.tolist()
-        outside, best_sq, foot, face = False, math.inf, (0.0, 0.0), (1.0, 0.0)
-        deepest, out = -math.inf, (1.0, 0.0)
+        return _in_arrays(self.nearest_numbers(*p.tolist()))
+
+    def nearest_numbers(self, x: float, y: float, z: float) -> Nearest:
+        outside, best_sq, foot_x, foot_y = False, math.inf, 0.0, 0.0
+        face_x, face_y = 1.0, 0.0
+        deepest, out_x, out_y = -math.inf, 1.0, 0.0
         for ax, ay, tx, ty, length in self.sides:
             dx, dy = x - ax, y - ay
             beyond, along = dx * ty - dy * tx, dx * tx + dy * ty
-            outside = outside or beyond > 0.0
+            if beyond > 0.0:
+                outside = True
             if beyond > deepest:
-                deepest, out = beyond, (ty, -tx)
+                deepest, out_x, out_y = beyond, ty, -tx
             if 0.0 < along < length:
                 # Near a face its normal is exact, where the way to its nearest point is only rounding.
-                normal_here = (ty, -tx)
+                here_x, here_y = ty, -tx
             else:
-                normal_here, along = (0.0, 0.0), min(max(along, 0.0), length)
+                here_x, here_y = 0.0, 0.0
+                along = 0.0 if along <= 0.0 else length
             px, py = ax + along * tx, ay + along * ty
             distance_sq = (x - px) ** 2 + (y - py) ** 2
             if distance_sq < best_sq:
-                best_sq, foot, face = distance_sq, (px, py), normal_here
+                best_sq, foot_x, foot_y, face_x, face_y = distance_sq, px, py, here_x, here_y
         if outside:
             beyond = math.sqrt(best_sq)
-            if face == (0.0, 0.0):
-                face = ((x - foot[0]) / beyond, (y - foot[1]) / beyond) if beyond > 0.0 else out
-            return _off_a_rim(z, foot, face, beyond, self.height_m)
+            if face_x == 0.0 and face_y == 0.0:
+                if beyond > 0.0:
+                    face_x, face_y = (x - foot_x) / beyond, (y - foot_y) / beyond
+                else:
+                    face_x, face_y = out_x, out_y
+            return _off_a_rim(z, foot_x, foot_y, face_x, face_y, beyond, self.height_m)
         over, under = z - self.height_m, -z
         if deepest >= max(over, under):
-            normal = np.array([out[0], out[1], 0.0])
-            return SurfacePoint(deepest, normal, np.array([x, y, z]) - deepest * normal)
+            return deepest, out_x, out_y, 0.0, x - deepest * out_x, y - deepest * out_y, z
         return _off_an_end(x, y, self.height_m, over, under)
 
 
@@ -160,38 +181,53 @@ class _TurnedShape:
     sections: tuple[tuple[float, float, float], ...]
 
     def nearest(self, p: Array) -> SurfacePoint:
-        x, y, z = p.tolist()
+        return _in_arrays(self.nearest_numbers(*p.tolist()))
+
+    def nearest_numbers(self, x: float, y: float, z: float) -> Nearest:
         off_axis = math.hypot(x, y)
         ux, uy = (x / off_axis, y / off_axis) if off_axis > 0.0 else (1.0, 0.0)
-        found: SurfacePoint | None = None
+        found: Nearest | None = None
         for bottom, top, radius in self.sections:
             beyond, height = off_axis - radius, top - bottom
             over, under = z - top, bottom - z
             if beyond > 0.0:
-                point = _off_a_rim(z - bottom, (ux * radius, uy * radius), (ux, uy), beyond, height)
+                here = _off_a_rim(z - bottom, ux * radius, uy * radius, ux, uy, beyond, height)
             elif beyond >= max(over, under):
-                point = SurfacePoint(beyond, np.array([ux, uy, 0.0]), np.array([ux * radius, uy * radius, z - bottom]))
+                here = (beyond, ux, uy, 0.0, ux * radius, uy * radius, z - bottom)
             else:
-                point = _off_an_end(x, y, height, over, under)
-            if found is None or point.distance_m < found.distance_m:
-                point.point[2] += bottom
-                found = point
+                here = _off_an_end(x, y, height, over, under)
+            if found is None or here[0] < found[0]:
+                found = (*here[:6], here[6] + bottom)
         assert found is not None
         return found
 
 
-def _off_a_rim(z: float, foot: _Point, out: _Point, beyond: float, height: float) -> SurfacePoint:
+def _in_arrays(found: Nearest) -> SurfacePoint:
+    distance, nx, ny, nz, px, py, pz = found
+    return SurfacePoint(distance, np.array([nx, ny, nz]), np.array([px, py, pz]))
+
+
+def _off_a_rim(
+    z: float, foot_x: float, foot_y: float, out_x: float, out_y: float, beyond: float, height: float
+) -> Nearest:
     """Nearest point to one that is ``beyond`` the outline along the unit vector ``out``, its nearest point ``foot``."""
     on_z = min(max(z, 0.0), height)
     distance = math.hypot(beyond, z - on_z)
-    point = np.array([foot[0], foot[1], on_z])
     if distance == 0.0:
-        return SurfacePoint(0.0, np.array([out[0], out[1], 0.0]), point)
-    return SurfacePoint(distance, np.array([out[0] * beyond, out[1] * beyond, z - on_z]) / distance, point)
+        return 0.0, out_x, out_y, 0.0, foot_x, foot_y, on_z
+    return (
+        distance,
+        out_x * beyond / distance,
+        out_y * beyond / distance,
+        (z - on_z) / distance,
+        foot_x,
+        foot_y,
+        on_z,
+    )
 
 
-def _off_an_end(x: float, y: float, height: float, over: float, under: float) -> SurfacePoint:
+def _off_an_end(x: float, y: float, height: float, over: float, under: float) -> Nearest:
     """Nearest point of the top or the bottom to one within the outline."""
     if over >= under:
-        return SurfacePoint(over, np.array([0.0, 0.0, 1.0]), np.array([x, y, height]))
-    return SurfacePoint(under, np.array([0.0, 0.0, -1.0]), np.array([x, y, 0.0]))
+        return over, 0.0, 0.0, 1.0, x, y, height
+    return under, 0.0, 0.0, -1.0, x, y, 0.0
