@@ -14,8 +14,6 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, Protocol, cast
 
-import numpy as np
-
 from cell.collection import Collection
 from cell.compose import Cell, Sensor
 from cell.desk import OperatorDesk
@@ -36,6 +34,7 @@ from drivers.lease import Lease
 from drivers.samples import JointState, Stamped, TcpState
 from geometry import se3
 from geometry.errors import TouchcellError
+from geometry.finite import all_finite
 from geometry.types import Array
 from perception.estimate import ContactEstimate
 from tasks.interface import Action, Observation, TransitionRecord
@@ -411,7 +410,7 @@ class RunLoop:
             if sensor.arm_role is not None:
                 state = states[sensor.arm_role]
                 # A pose that is not finite is for the supervisor to see, not for the filter.
-                if np.isfinite(state.value.T_base_tcp).all():
+                if all_finite(state.value.T_base_tcp):
                     T_base_sensor = se3.compose(state.value.T_base_tcp, sensor.T_tcp_sensor)
                     sensor.source.record_pose(state.t_ns, T_base_sensor)
             if (estimate := sensor.source.update(cell.clock.now_ns())) is not None:

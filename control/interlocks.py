@@ -37,6 +37,7 @@ from control.timed import TimedInterlock
 from control.view import CellView
 from control.violation import Severity, Violation
 from drivers.errors import ConfigError
+from geometry.finite import all_finite
 from geometry.types import Array
 
 
@@ -67,8 +68,7 @@ class Finite:
 
     def check(self, view: CellView) -> Violation | None:
         for role, frame_seq, what, value in self._numbers(view):
-            # NumPy takes several times as long for one number.
-            if not (math.isfinite(value) if isinstance(value, float) else np.isfinite(value).all()):
+            if not (math.isfinite(value) if isinstance(value, float) else all_finite(np.asarray(value))):
                 reason = f"{what} is not finite"
                 return Violation(self.name, self.severity, role, reason, view.now_ns, frame_seq=frame_seq)
         return None

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from control.errors import ControlError
+from geometry.finite import all_finite
 from geometry.types import Array, ArrayLike
 
 SMOOTHING: Final = 0.5
@@ -97,7 +98,7 @@ class Pid:
             near = np.where(np.abs(e) <= gains.integral_zone, e, 0.0)
             integral = _clipped(self._integral + gains.ki @ near * dt_s, gains.integral_limit)
             output = V_ff + gains.kp @ e + integral + gains.kd @ ((smoothed - before) / dt_s)
-        if not _all_finite(output):
+        if not all_finite(output):
             raise ControlError("e", "is so large that the output overflows", e)
         self._smoothed = smoothed
         self._integral = integral
@@ -108,14 +109,9 @@ def _finite(name: str, value: ArrayLike, *shapes: tuple[int, ...]) -> Array:
     array = np.array(value, dtype=np.float64)
     if array.shape not in shapes:
         raise ControlError(name, f"has shape {array.shape}, not {' or '.join(map(str, shapes))}", value)
-    if not _all_finite(array):
+    if not all_finite(array):
         raise ControlError(name, "is not finite", value)
     return array
-
-
-def _all_finite(array: Array) -> bool:
-    # NumPy takes several times as long for numbers this few.
-    return all(map(math.isfinite, array.ravel().tolist()))
 
 
 def _clipped(array: Array, limit: Array) -> Array:

@@ -25,6 +25,7 @@ from drivers.kinematics import DifferentialIk, LocalIk
 from drivers.lease import Lease, LeaseDesk
 from drivers.registry import DriverConfig
 from drivers.samples import Stamped, TcpState
+from geometry.finite import all_finite
 from geometry.types import Array
 
 _REST_POLL_NS = 5_000_000
@@ -269,6 +270,6 @@ class Arm(Device):
         if self.state is not Lifecycle.ACTIVE or command.frame is not TwistFrame.TCP:
             return np.eye(4)
         T_base_tcp = self.tcp(self._max_state_age_s).value.T_base_tcp
-        if not np.isfinite(T_base_tcp).all():
+        if not all_finite(T_base_tcp):
             raise CommandRejected(self.name, Rejection.NON_FINITE, "the arm's own pose is not finite", value=T_base_tcp)
         return T_base_tcp

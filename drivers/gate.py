@@ -19,6 +19,7 @@ from drivers.device import Lifecycle
 from drivers.errors import CommandRejected, Rejection
 from drivers.kinematics import LocalIk
 from drivers.lease import Lease, LeaseDesk
+from geometry.finite import all_finite
 from geometry.types import Array
 
 
@@ -155,7 +156,7 @@ class TwistGate:
 
     def _check(self, command: TwistCommand, lease: Lease, state: Lifecycle, now_ns: int) -> None:
         twist = np.asarray(command.twist, dtype=np.float64)
-        if not (np.isfinite(twist).all() and math.isfinite(command.ttl_s)):
+        if not (all_finite(twist) and math.isfinite(command.ttl_s)):
             raise self._rejected(Rejection.NON_FINITE, "twist or time-to-live is not finite", command.twist)
         if twist.shape != (6,):
             raise self._rejected(Rejection.SHAPE, f"twist has shape {twist.shape}, not (6,)", twist.shape, (6,))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Protocol
 
@@ -213,11 +214,10 @@ class Hand:
             told["frame_age_ms"] = 1e-6 * (observation.now_ns - contact.t_frame_ns)
         if not (servoing and self.servo.active):
             return told
-        errors, references = _UNITS * self.servo.latest_error, self.servo.reference_mm_deg
+        errors, references = (_UNITS * self.servo.latest_error).tolist(), self.servo.reference_mm_deg.tolist()
         for name, error, reference in zip(_COMPONENTS, errors, references, strict=True):
-            if np.isfinite(reference):
-                told[f"error_{name}"] = float(error)
-                told[f"reference_{name}"] = float(reference)
+            if math.isfinite(reference):
+                told[f"error_{name}"], told[f"reference_{name}"] = error, reference
         return {**told, **self.run.telemetry()}
 
 

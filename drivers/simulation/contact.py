@@ -7,6 +7,7 @@ inward normal and its origin one tip radius outside the surface, so that {f} = {
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -133,6 +134,10 @@ class ContactModel:
 
     def step(self, T_world_s: Array, surface: Surface, t_s: float) -> ContactState:
         """Bring the contact to time ``t_s`` with the sensor at ``T_world_s`` (4, 4)."""
+        return self.advance(T_world_s, surface, t_s)()
+
+    def advance(self, T_world_s: Array, surface: Surface, t_s: float) -> Callable[[], ContactState]:
+        """The same, with its state worked out only when it is asked for."""
         T_world_b = surface.motion.pose(t_s)
         R_world_b = T_world_b[:3, :3]
         R_b_s = R_world_b.T @ T_world_s[:3, :3]
@@ -144,7 +149,7 @@ class ContactModel:
         if depth <= 0.0:
             self._anchor = None
             R_b_f = R_b_s @ R_tilt.T
-            return self._state(T_world_s, R_world_b @ R_b_f, R_tilt, (0.0, 0.0, depth), slipping=False)
+            return lambda: self._state(T_world_s, R_world_b @ R_b_f, R_tilt, (0.0, 0.0, depth), slipping=False)
 
         anchor = self._anchor
         if anchor is None or anchor.surface is not surface:
@@ -172,8 +177,8 @@ class ContactModel:
             anchor.R = anchor.R @ about_z(torsion - held_torsion)
             R_b_f = R_b_f @ about_z(torsion - held_torsion)
             torsion = held_torsion
-        R_f_s = about_z(torsion) @ R_tilt
-        return self._state(T_world_s, R_world_b @ R_b_f, R_f_s, (shear[0], shear[1], depth), slipping=slipping)
+        position = shear[0], shear[1], depth
+        return lambda: self._state(T_world_s, R_world_b @ R_b_f, about_z(torsion) @ R_tilt, position, slipping=slipping)
 
     def snapshot(self) -> Restore:
         """What brings the contact back as it is now."""

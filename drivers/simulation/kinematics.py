@@ -74,13 +74,13 @@ class TwistFollower:
         before, goal = self.velocity.tolist(), self._target.tolist()
         if before != goal:
             linear = _towards(before[:3], goal[:3], self._limits.accel_m_s2 * dt_s)
-            self.velocity = np.array(linear + _towards(before[3:], goal[3:], self._limits.rot_accel_rad_s2 * dt_s))
-            goal = self.velocity.tolist()
-        x, y, z, *turn = (0.5 * (old + new) * dt_s for old, new in zip(before, goal, strict=True))
+            goal = linear + _towards(before[3:], goal[3:], self._limits.rot_accel_rad_s2 * dt_s)
+            self.velocity = np.array(goal)
+        x, y, z, a, b, c = [0.5 * (old + new) * dt_s for old, new in zip(before, goal, strict=True)]
         T = self.T_base_tcp.copy()
         T[:3, 3] += (x, y, z)
-        if any(turn):
-            R = se3.exp(np.array([0.0, 0.0, 0.0, *turn]))[:3, :3] @ T[:3, :3]
+        if a or b or c:
+            R = se3.exp(np.array([0.0, 0.0, 0.0, a, b, c]))[:3, :3] @ T[:3, :3]
             # One Newton-Schulz step takes off this step's rounding, so that none adds up; se3.project iterates more.
             T[:3, :3] = R @ (_THREE_HALVES - 0.5 * (R.T @ R))
         self.T_base_tcp = T
@@ -88,8 +88,10 @@ class TwistFollower:
 
 def _towards(start: list[float], goal: list[float], longest: float) -> list[float]:
     """As far from ``start`` to ``goal`` as ``longest`` allows."""
-    way = [b - a for a, b in zip(start, goal, strict=True)]
-    length = math.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
+    (x0, y0, z0), (x1, y1, z1) = start, goal
+    x, y, z = x1 - x0, y1 - y0, z1 - z0
+    length = math.sqrt(x * x + y * y + z * z)
     if length <= longest:
         return goal
-    return [a + each * (longest / length) for a, each in zip(start, way, strict=True)]
+    share = longest / length
+    return [x0 + x * share, y0 + y * share, z0 + z * share]

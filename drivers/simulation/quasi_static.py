@@ -24,7 +24,7 @@ from drivers.simulation.objects import Ball, FreeObject
 from drivers.simulation.solids import friction_radius_m, plain_shape_of
 from drivers.simulation.surfaces import Surface
 from drivers.simulation.timeline import Restore
-from drivers.simulation.world import Feeling, known
+from drivers.simulation.world import Feeling
 from geometry.types import Array
 
 GRAVITY_M_S2: Final = 9.81
@@ -144,9 +144,7 @@ class QuasiStaticWorld:
                 if surface is slider.surface
             ]
             slider.move(_settle(slider, tips, self.law), dt_s)
-        return {
-            sensor: known(self._models[sensor].step(pose, touched[sensor], t_s)) for sensor, pose in T_world_s.items()
-        }
+        return {sensor: self._models[sensor].advance(pose, touched[sensor], t_s) for sensor, pose in T_world_s.items()}
 
     def objects(self) -> Mapping[str, Array]:
         """T_world_object (4, 4) of every free object at the last step."""

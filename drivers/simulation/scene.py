@@ -164,7 +164,10 @@ class Scene:
         seq = newest if t_ns is None else t_ns // step_ns
         if not 0 <= newest - seq < len(felt):
             raise ContactNotKept(seq * step_ns, (newest - len(felt) + 1) * step_ns, now_ns)
-        return Stamped(felt[seq - newest - 1](), seq * step_ns, seq)
+        at = seq - newest - 1
+        state = felt[at]()
+        felt[at] = known(state)
+        return Stamped(state, seq * step_ns, seq)
 
     def objects(self) -> Stamped[Mapping[str, Array]]:
         """T_world_object (4, 4) of every free object now."""

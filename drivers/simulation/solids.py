@@ -26,6 +26,8 @@ class MassProperties:
     inertia_per_kg_m2: Array
 
 
+_CLEAR_M = 1e-5
+
 Nearest = tuple[float, float, float, float, float, float, float]
 """What a ``SurfacePoint`` holds, in plain numbers: distance, normal x, y, z and point x, y, z."""
 
@@ -149,6 +151,11 @@ class _PrismShape:
             dx, dy = x - ax, y - ay
             beyond, along = dx * ty - dy * tx, dx * tx + dy * ty
             if beyond > 0.0:
+                if _CLEAR_M < along < length - _CLEAR_M:
+                    # Before a face of a convex outline, by more than rounding: no other is nearer.
+                    px, py = ax + along * tx, ay + along * ty
+                    distance = math.sqrt((x - px) ** 2 + (y - py) ** 2)
+                    return _off_a_rim(z, px, py, ty, -tx, distance, self.height_m)
                 outside = True
             if beyond > deepest:
                 deepest, out_x, out_y = beyond, ty, -tx

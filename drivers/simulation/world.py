@@ -61,11 +61,11 @@ class KinematicWorld:
     def mount(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
         """Let ``sensor`` feel; returns what it feels at ``T_world_s`` (4, 4) at ``t_s``."""
         self._models[sensor] = ContactModel(self.law)
-        return self._feel(sensor, T_world_s, t_s)
+        return self._feel(sensor, T_world_s, t_s)()
 
     def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, Feeling]:
         """What each sensor feels at ``t_s``."""
-        return {sensor: known(self._feel(sensor, pose, t_s)) for sensor, pose in T_world_s.items()}
+        return {sensor: self._feel(sensor, pose, t_s) for sensor, pose in T_world_s.items()}
 
     def objects(self) -> Mapping[str, Array]:
         """Nothing is free here."""
@@ -81,9 +81,9 @@ class KinematicWorld:
 
         return restore
 
-    def _feel(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
+    def _feel(self, sensor: str, T_world_s: Array, t_s: float) -> Feeling:
         surfaces = list(self.surfaces.values())
         surface = surfaces[0]
         if len(surfaces) > 1:
             surface = min(surfaces, key=lambda each: each.nearest(T_world_s[:3, 3], t_s).distance_m)
-        return self._models[sensor].step(T_world_s, surface, t_s)
+        return self._models[sensor].advance(T_world_s, surface, t_s)
