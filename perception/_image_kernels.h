@@ -296,7 +296,7 @@ static int covered(ptrdiff_t at, double scale, ptrdiff_t size, ptrdiff_t *first,
 
 /* Weighted sums of `most` numbers each, from `first` on; the first shares of all sums lie before the second ones. */
 static void gather(const float *restrict row, const int32_t *restrict first, const float *restrict shares,
-                                ptrdiff_t most, ptrdiff_t columns, float *restrict to)
+                   ptrdiff_t most, ptrdiff_t columns, float *restrict to)
 {
     for (ptrdiff_t x = 0; x < columns; x++)
         to[x] = row[first[x]] * shares[x];

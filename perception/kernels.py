@@ -81,8 +81,8 @@ def area_means(image: ImageArray, size: tuple[int, int]) -> ImageArray:
     (height, width), (rows, columns) = image.shape, size
     factor = height // rows
     whole = height % rows == 0 and width % columns == 0
-    known = factor in _FACTORS and image.shape == (factor * rows, factor * columns) if whole else True
-    if _FOUND is None or not known or rows > height or columns > width:
+    other = whole and not (factor in _FACTORS and width == factor * columns)
+    if _FOUND is None or other or rows > height or columns > width:
         return np.asarray(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA), np.uint8)
     means = np.empty(size, np.uint8)
     if whole:

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.simulation import solids
 from drivers.simulation.objects import Ball, BoxShape, HexagonShape, Prism, Solid, Turned
-from drivers.simulation.solids import friction_radius_m, mass_properties, shape_of
+from drivers.simulation.solids import friction_radius_m, mass_properties, plain_shape_of, shape_of
 
 SQUARE = BoxShape(kind="box", size_mm=(80, 80, 60)).build()
 SLAB = BoxShape(kind="box", size_mm=(120, 30, 50)).build()
@@ -64,6 +65,16 @@ def test_the_nearest_point_lies_on_the_solid_along_the_normal(solid: Solid, x: f
     np.testing.assert_allclose(found.point + found.distance_m * found.normal, p, atol=1e-12)
     if found.distance_m > 1e-6:
         assert abs(shape.nearest(found.point).distance_m) < 1e-9
+
+
+@pytest.mark.parametrize("solid", [SQUARE, SLAB, HEXAGON], ids=["square", "slab", "hexagon"])
+@given(x=metres, y=metres, z=metres)
+def test_the_face_before_a_point_is_the_nearest_of_all(solid: Prism, x: float, y: float, z: float) -> None:
+    shape = plain_shape_of(solid)
+    found = shape.nearest_numbers(x, y, z)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(solids, "_CLEAR_M", math.inf)
+        assert found == shape.nearest_numbers(x, y, z)
 
 
 def test_mujoco_finds_the_same_distances() -> None:

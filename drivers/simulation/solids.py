@@ -26,6 +26,7 @@ class MassProperties:
     inertia_per_kg_m2: Array
 
 
+# Closer to a corner than this, rounding may tell which of two faces is nearer.
 _CLEAR_M = 1e-5
 
 Nearest = tuple[float, float, float, float, float, float, float]
@@ -152,7 +153,7 @@ class _PrismShape:
             beyond, along = dx * ty - dy * tx, dx * tx + dy * ty
             if beyond > 0.0:
                 if _CLEAR_M < along < length - _CLEAR_M:
-                    # Before a face of a convex outline, by more than rounding: no other is nearer.
+                    # Before one face of a convex outline no other is nearer.
                     px, py = ax + along * tx, ay + along * ty
                     distance = math.sqrt((x - px) ** 2 + (y - py) ** 2)
                     return _off_a_rim(z, px, py, ty, -tx, distance, self.height_m)
