@@ -1,6 +1,7 @@
-/* Images: the median of 5x5 pixels, the threshold at a neighbourhood's mean, and the white discs of what comes of it.
+/* Images: the median of 5x5 pixels, the threshold at a neighbourhood's mean, means over areas, and the white discs.
  *
- * Plain C99 without any Python. All numbers are whole, so nothing depends on the processor.
+ * Plain C99 without any Python. All numbers are whole but in means over areas, which add in one order; so nothing depends
+ * on the processor.
  */
 #ifndef TOUCHCELL_IMAGE_KERNELS_H
 #define TOUCHCELL_IMAGE_KERNELS_H

@@ -26,7 +26,7 @@ from perception.labels import xi_from_contact
 from perception.least_squares import robust_fit
 from perception.marked_data import evenly
 from perception.marker_architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture
-from perception.marker_estimator import matcher_of, mixed
+from perception.marker_estimator import displacement_model_of, matcher_of, mixed
 from perception.marker_learning import fit_lattice
 from perception.marker_matching import DisplacementModel, MarkerMatcher
 from perception.marker_training import preprocessing_for
@@ -381,9 +381,7 @@ def tune(
     Raises:
         TrainingError: the loss is no number.
     """
-    tensors = {name: old.tensors[f"displacement.{name}"].astype(np.float64) for name in ("mean", "basis", "sd")}
-    reference = old.tensors["lattice"].astype(np.float64)
-    model = DisplacementModel(reference, tensors["mean"], tensors["basis"], tensors["sd"])
+    model = displacement_model_of(old)
     features = features_of(model)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
@@ -432,12 +430,7 @@ class _Tuner:
         found: Layers = []
         for i, ((weight, bias), change, shift) in enumerate(zip(self.old, self.weights, self.biases, strict=True)):
             moved = self.features @ change if i == 0 else change
-            found.append(
-                (
-                    (weight + moved).detach().numpy().astype(np.float64),
-                    (bias + shift).detach().numpy().astype(np.float64),
-                )
-            )
+            found.append((_doubles(weight + moved), _doubles(bias + shift)))
         return found
 
     def _outputs(self, displacements: Tensor) -> Tensor:

@@ -69,7 +69,5 @@ def turned(prediction: Prediction, angle_deg: float) -> Prediction:
 
 def in_crop(change: CameraChange, preprocessing: Preprocessing) -> CameraChange:
     """The same change in the pixels of the crop."""
-    if preprocessing.crop is None:
-        return change
     u, v = change.centre_px
-    return change.model_copy(update={"centre_px": (u - preprocessing.crop.left, v - preprocessing.crop.top)})
+    return change.model_copy(update={"centre_px": (u - preprocessing.region.left, v - preprocessing.region.top)})

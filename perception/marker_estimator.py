@@ -151,16 +151,19 @@ def mixed(means: Array, log_precisions: Array, labels: Labels) -> tuple[Array, A
     return mean, np.sqrt(variance)
 
 
+def displacement_model_of(model: Model) -> DisplacementModel:
+    """How the markers of a marker model move."""
+    reference, mean, basis, sd = (
+        model.tensors[name].astype(np.float64)
+        for name in ("lattice", "displacement.mean", "displacement.basis", "displacement.sd")
+    )
+    return DisplacementModel(reference, mean, basis, sd)
+
+
 def matcher_of(model: Model, architecture: MarkerArchitecture) -> MarkerMatcher:
     """The matcher that a marker model describes."""
-    tensors = {name: tensor.astype(np.float64) for name, tensor in model.tensors.items() if "layer" not in name}
     return MarkerMatcher(
-        DisplacementModel(
-            reference=tensors["lattice"],
-            mean=tensors["displacement.mean"],
-            basis=tensors["displacement.basis"],
-            sd=tensors["displacement.sd"],
-        ),
+        displacement_model_of(model),
         FirstGuess(
             low=np.array(architecture.guess_low_px),
             cell_px=architecture.guess_cell_px,
@@ -168,10 +171,10 @@ def matcher_of(model: Model, architecture: MarkerArchitecture) -> MarkerMatcher:
             hidden_bias=model.tensors["guess.hidden.bias"],
             weight=model.tensors["guess.output.weight"],
             bias=model.tensors["guess.output.bias"],
-            sd=tensors["guess.sd"],
+            sd=model.tensors["guess.sd"].astype(np.float64),
         ),
         architecture.input_size,
-        bank=tensors["bank"],
+        bank=model.tensors["bank"].astype(np.float64),
         least_score=architecture.least_score,
         most_rms_px=architecture.most_rms_px,
     )

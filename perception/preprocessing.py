@@ -87,9 +87,14 @@ class Preprocessing(BaseModel):
                 raise ValueError(f"crop {tuple(self.crop)} does not lie within an image of {width}x{height}")
         return self
 
+    @property
+    def region(self) -> Crop:
+        """What is kept of the image, all of it without a crop."""
+        return self.crop or Crop(0, 0, self.input_size[1], self.input_size[0])
+
     def in_full_resolution(self) -> Preprocessing:
         """The same steps but for the resize: what markers are looked for in."""
-        left, top, right, bottom = self.crop or (0, 0, self.input_size[1], self.input_size[0])
+        left, top, right, bottom = self.region
         return self.model_copy(update={"output_size": (bottom - top, right - left)})
 
     def reduce(self, image: ImageArray) -> ImageArray:

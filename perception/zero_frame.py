@@ -101,7 +101,7 @@ def _nearest_turn(points: Array, rings: int, there: Array | None) -> Array:
 def _taught_lattice(model: Model, rings: int) -> Array:
     """(m, 2) px in the camera's image."""
     preprocessing = model.header.preprocessing
-    corner = np.array(preprocessing.crop[:2] if preprocessing.crop else (0, 0), dtype=np.float64)
+    corner = np.array(preprocessing.region[:2], dtype=np.float64)
     if model.reference is None:
         if "lattice" not in model.tensors:
             raise TrainingError(
@@ -117,7 +117,7 @@ def _taught_lattice(model: Model, rings: int) -> Array:
     large = cv2.resize(model.reference, (_UPSCALED * width, _UPSCALED * height), interpolation=cv2.INTER_CUBIC)
     image = np.where(large > 127, np.uint8(255), np.uint8(0))
     points = _fitted(detect_markers(image, typical_size(image)), rings)
-    rows, columns = _crop_size(preprocessing)
+    rows, columns = preprocessing.in_full_resolution().output_size
     scale = np.array([columns / (_UPSCALED * width), rows / (_UPSCALED * height)])
     placed: Array = (points + 0.5) * scale - 0.5 + corner
     return placed
@@ -125,10 +125,9 @@ def _taught_lattice(model: Model, rings: int) -> Array:
 
 def _lattice(frame: ImageArray, preprocessing: Preprocessing, rings: int) -> Array:
     """(m, 2) px in the camera's image."""
-    whole = preprocessing.model_copy(update={"output_size": _crop_size(preprocessing), "mask_radius_px": None})
-    image = whole.reduce(frame)
-    corner = preprocessing.crop[:2] if preprocessing.crop else (0, 0)
-    points: Array = _fitted(detect_markers(image, typical_size(image)), rings) + np.array(corner, dtype=np.float64)
+    image = preprocessing.in_full_resolution().model_copy(update={"mask_radius_px": None}).reduce(frame)
+    corner = np.array(preprocessing.region[:2], dtype=np.float64)
+    points: Array = _fitted(detect_markers(image, typical_size(image)), rings) + corner
     return points
 
 
@@ -137,8 +136,3 @@ def _fitted(discs: Discs, rings: int) -> Array:
     if not np.isfinite(rms):
         raise TrainingError(f"an image shows no lattice of {rings} rings", hint="is the tip out of contact?")
     return points
-
-
-def _crop_size(preprocessing: Preprocessing) -> tuple[int, int]:
-    crop = preprocessing.crop
-    return preprocessing.input_size if crop is None else (crop.bottom - crop.top, crop.right - crop.left)
