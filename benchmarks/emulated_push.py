@@ -28,6 +28,7 @@ from benchmarks.provenance import provenance
 from cell.cli import find_cell
 from cell.compose import compose
 from cell.config import plan_cell
+from cell.experiments.pushing import off_normal_mm, target_mm
 from cell.loop import Outcome, RunLoop
 from cell.recording import RECORDING, Recorder
 from cell.report import tip_points
@@ -223,15 +224,9 @@ def _push(run: RunFolder, outcome: str, truth: _Truth) -> Push:
         outcome,
         t_s,
         np.stack([np.interp(t_s + times[0], truth.t_s, column) for column in columns], axis=1),
-        _error_mm(truth.T_world_f[at_end], np.array(run.plan.task_config.model_dump()["target_mm"])),
+        off_normal_mm(truth.T_world_f[at_end], target_mm(run)),
         {role: Latency(_sensing_s(run, role), _obeying_s(run, role)) for role in _SENSORS},
     )
-
-
-def _error_mm(T_world_f: Array, target_mm: Array) -> float:
-    away = target_mm - 1e3 * T_world_f[:2, 3]
-    direction = T_world_f[:2, 2] / np.linalg.norm(T_world_f[:2, 2])
-    return float(abs(direction[0] * away[1] - direction[1] * away[0]))
 
 
 def _sensing_s(run: RunFolder, role: str) -> float:

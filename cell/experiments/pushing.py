@@ -207,12 +207,10 @@ def push_measures(run: RunFolder) -> dict[str, float]:
         return found
     sensors = run.plan.sensor_roles
     pushing = TWO_ARMS.sensors[0] if TWO_ARMS.sensors[0] in sensors else next(iter(sensors))
-    point, direction = contact_normal(run, pushing, end_s)
     target = target_mm(run)
-    away = target - point
     middle = 1e3 * object_poses(run)[OBJECT].at(np.array([end_s]))[0, :2, 3]
     return found | {
-        "error_mm": float(abs(direction[0] * away[1] - direction[1] * away[0])),
+        "error_mm": off_normal_mm(_surface_pose(run, pushing, end_s), target),
         "middle_mm": float(np.linalg.norm(target - middle)),
     }
 
@@ -231,14 +229,19 @@ def pushed_until_s(run: RunFolder) -> float | None:
     return float(scene_time(run, task)[running[-1]]) if len(running) else None
 
 
-def contact_normal(run: RunFolder, sensor: str, t_s: float) -> tuple[Array, Array]:
-    """A point (2,) mm on the line of the true contact normal, and its direction (2,), from above."""
+def off_normal_mm(T_world_f: Array, target_mm: Array) -> float:
+    """Distance, from above, of a target (2,) from the line of the contact normal of a surface frame (4, 4)."""
+    x, y = target_mm - 1e3 * T_world_f[:2, 3]
+    along_x, along_y = T_world_f[:2, 2] / math.hypot(*T_world_f[:2, 2])
+    return float(abs(along_x * y - along_y * x))
+
+
+def _surface_pose(run: RunFolder, sensor: str, t_s: float) -> Array:
+    """T_world_f (4, 4) of the true contact."""
     T_world_s = sensor_poses(run, sensor).at(np.array([t_s]))[0]
     series, contacts = true_contacts(run, sensor)
     felt = Poses(scene_time(run, series), np.asarray(se3.from_euler_mm_deg(np.nan_to_num(contacts))))
-    T_world_f = se3.compose(T_world_s, se3.inverse(felt.at(np.array([t_s]))[0]))
-    direction = T_world_f[:2, 2] / math.hypot(*T_world_f[:2, 2])
-    return 1e3 * T_world_f[:2, 3], direction
+    return se3.compose(T_world_s, se3.inverse(felt.at(np.array([t_s]))[0]))
 
 
 def lean_deg(run: RunFolder) -> Array:
