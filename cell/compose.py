@@ -288,7 +288,7 @@ def build_devices(
     devices: dict[str, Device] = dict(present or {})
     if scene is None and wanted:
         scene = _scene(plan, clock)
-    bases = {name: se3.from_euler_mm_deg(np.array(arm.base_pose_mm_deg)) for name, arm in plan.cell.arms.items()}
+    bases = {name: arm.T_world_base for name, arm in plan.cell.arms.items()}
     context = DriverContext(clock, devices, scene, plan.cell.seed, bases)
     for name, device in wanted.items():
         devices[name] = device.spec.build(name, device.config, context)
@@ -339,7 +339,7 @@ def _sensor(
     plan: CellPlan, name: str, devices: Mapping[str, Device], scene: SceneTruth | None, arm_of: Mapping[str, str]
 ) -> Sensor:
     section = plan.cell.sensors[name]
-    T_tcp_sensor = se3.from_euler_mm_deg(np.array(section.tcp_to_sensor_mm_deg))
+    T_tcp_sensor = section.T_tcp_sensor
     truth = _truth(name, devices.get(section.mounted_on or ""), scene, T_tcp_sensor)
     source: ContactSource
     if isinstance(section.estimator, NetworkEstimator):

@@ -30,6 +30,8 @@ from drivers.arm import LimitsConfig
 from drivers.device import DeactivatePolicy
 from drivers.errors import ConfigError, suggest
 from drivers.registry import DriverConfig, DriverSpec
+from geometry import se3
+from geometry.types import Array
 from tasks import registry as task_registry
 from tasks.interface import TaskConfig, TaskSpec
 
@@ -165,6 +167,11 @@ class ArmSection(_OpenSection):
     base_pose_mm_deg: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     body: tuple[CapsuleSection, ...] = ()
 
+    @property
+    def T_world_base(self) -> Array:  # noqa: N802  the field's own name
+        """(4, 4) where it stands."""
+        return se3.from_euler_mm_deg(self.base_pose_mm_deg)
+
 
 class SensorSection(_OpenSection):
     """A tactile sensor: its camera's driver, where it sits, and how frames become contacts."""
@@ -173,6 +180,11 @@ class SensorSection(_OpenSection):
     mounted_on: str | None = None
     tcp_to_sensor_mm_deg: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     estimator: EstimatorSection
+
+    @property
+    def T_tcp_sensor(self) -> Array:  # noqa: N802  the field's own name
+        """(4, 4) where it sits on the tool."""
+        return se3.from_euler_mm_deg(self.tcp_to_sensor_mm_deg)
 
 
 class TaskSection(_OpenSection):

@@ -166,7 +166,7 @@ class CellEmulator(Emulator):
             self._arm_processes[name],
             _FLANGES[device.spec.name],
             None if tool is None else se3.from_euler_mm_deg(tool),
-            se3.from_euler_mm_deg(np.array(section.base_pose_mm_deg)),
+            section.T_world_base,
         )
 
     def _camera(self, name: str, folder: Path) -> V4l2Emulator:
@@ -188,8 +188,7 @@ class CellEmulator(Emulator):
 
     def _sensor_pose(self, name: str) -> Callable[[], Array]:
         section = self._plan.cell.sensors[name]
-        T_tcp_s = se3.from_euler_mm_deg(np.array(section.tcp_to_sensor_mm_deg))
-        arm = self._arms[section.mounted_on or ""]
+        arm, T_tcp_s = self._arms[section.mounted_on or ""], section.T_tcp_sensor
         return lambda: arm.T_world_tcp() @ T_tcp_s
 
     def _picture(self, name: str, number: int) -> ImageArray:

@@ -139,12 +139,10 @@ def _mounts(folder: Path) -> dict[str, tuple[Array, Array]]:
         plan = RunFolder(folder).plan
     except (ConfigError, OSError):
         return {}
-    sits = {
-        section.mounted_on: se3.from_euler_mm_deg(np.array(section.tcp_to_sensor_mm_deg))
-        for section in plan.cell.sensors.values()
+    sits = {section.mounted_on: section.T_tcp_sensor for section in plan.cell.sensors.values()}
+    return {
+        role: (plan.cell.arms[name].T_world_base, sits.get(name, np.eye(4))) for role, name in plan.arm_roles.items()
     }
-    stands = {name: se3.from_euler_mm_deg(np.array(arm.base_pose_mm_deg)) for name, arm in plan.cell.arms.items()}
-    return {role: (stands[name], sits.get(name, np.eye(4))) for role, name in plan.arm_roles.items()}
 
 
 def _stages_ms(run: Run) -> dict[str, Array]:

@@ -14,7 +14,6 @@ from cell.config import CellPlan, plan_cell
 from cell.report import Run, Series, load_run, tip_points
 from drivers.simulation.scene import SceneConfig
 from drivers.simulation.surfaces import Surface
-from geometry import se3
 from geometry.types import Array
 
 
@@ -63,9 +62,8 @@ def sensor_poses(run: RunFolder, role: str) -> Poses:
     arm_role = next((each for each, name in plan.arm_roles.items() if name == arm), arm)
     series = run.recording.series(f"/arms/{arm_role}/tcp")
     assert series is not None
-    T_world_base = se3.from_euler_mm_deg(np.array(plan.cell.arms[arm].base_pose_mm_deg))
-    T_tcp_sensor = se3.from_euler_mm_deg(np.array(section.tcp_to_sensor_mm_deg))
-    return Poses(scene_time(run, series), T_world_base @ tip_points(series) @ T_tcp_sensor)
+    T_world_base = plan.cell.arms[arm].T_world_base
+    return Poses(scene_time(run, series), T_world_base @ tip_points(series) @ section.T_tcp_sensor)
 
 
 def during(run: RunFolder, series: Series, state: str = "run") -> NDArray[np.bool_]:

@@ -30,7 +30,7 @@ def build_surroundings(plan: CellPlan, arms: Mapping[str, Any], names: Mapping[s
         ConfigError: an arm has no capsule at all.
     """
     sections = {role: plan.cell.arms[names[role]] for role in arms}
-    placed = {role: se3.from_euler_mm_deg(np.array(each.base_pose_mm_deg)) for role, each in sections.items()}
+    placed = {role: each.T_world_base for role, each in sections.items()}
     if not any(isinstance(entry, ClearanceConfig) for entry in plan.cell.interlocks.values()):
         return Surroundings(placed)
     bodies = {
