@@ -42,4 +42,4 @@ check: .venv/dev
 	touch $@
 
 clean:
-	rm -rf .venv build *.egg-info geometry/*.so perception/*.so
+	rm -rf .venv build *.egg-info geometry/*.so perception/*.so drivers/simulation/*.so

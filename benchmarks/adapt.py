@@ -59,6 +59,11 @@ class Case:
     size: MarkerSize
     best: tuple[str, Array] | None = None
 
+    def some(self, count: int) -> FewContacts:
+        """So many of the images to adapt with, evenly chosen."""
+        chosen = evenly(len(self.few.frames), count)
+        return FewContacts([self.few.frames[i] for i in chosen], self.few.xi[chosen])
+
 
 def run(arguments: Sequence[str], out: Path) -> None:
     """Measure, print, and write ``adapt.md``."""
@@ -106,15 +111,12 @@ def _rows(case: Case, counts: Sequence[int]) -> Iterator[tuple[str, Array, float
 
 
 def _adapted(case: Case, count: int) -> Model:
-    chosen = evenly(len(case.few.frames), count)
-    few = FewContacts([case.few.frames[i] for i in chosen], case.few.xi[chosen])
-    return adapt_to(case.model, few, preprocessing=case.model.header.preprocessing, size=case.size)
+    return adapt_to(case.model, case.some(count), preprocessing=case.model.header.preprocessing, size=case.size)
 
 
 def _scratch(case: Case, adapted: Model, count: int) -> Model:
     """Networks that begin anew; camera and matching are given to them."""
-    chosen = evenly(len(case.few.frames), count)
-    few = FewContacts([case.few.frames[i] for i in chosen], case.few.xi[chosen])
+    few = case.some(count)
     brought = bring(case.model, few)
     rng = np.random.default_rng(0)
     layers = []

@@ -27,6 +27,7 @@ from benchmarks import perception_figures
 from benchmarks.perception_runtimes import by_turns, installed
 from benchmarks.perception_serving import FRAME_SIZE, OWN, from_camera
 from benchmarks.provenance import as_installed, provenance
+from benchmarks.quantiles import median_and_p99
 from drivers.simulation.render import FrameRenderer, Lighting
 from drivers.simulation.samples import Variation, contacts
 from drivers.tactile_data import IMAGE_COLUMN, IMAGE_FOLDER, LABEL_COLUMNS, LABEL_FILES, read_split
@@ -66,9 +67,9 @@ def run(arguments: Sequence[str], out: Path) -> None:
             about = f"{options.data}, split {options.split}"
         rows, scores = _measured(options, Path(scratch))
     turns = {
-        path.stem: by_turns(load_model(path), options.runtimes, options.frames)
+        path.stem: by_turns(model, options.runtimes, options.frames)
         for path in options.models
-        if isinstance(load_model(path).header.architecture, Architecture)
+        if isinstance((model := load_model(path)).header.architecture, Architecture)
     }
     text = "\n".join([about, table(rows), *_turn_lines(turns)])
     print(text)
@@ -168,13 +169,7 @@ def _scored(scores: Scores) -> dict[str, Any]:
 
 
 def _quantiles(times_ns: np.ndarray) -> dict[str, dict[str, float]]:
-    return {
-        clock: {
-            "median": float(np.median(times_ns[:, column])) * 1e-6,
-            "p99": float(np.percentile(times_ns[:, column], 99)) * 1e-6,
-        }
-        for column, clock in enumerate(("wall", "cpu"))
-    }
+    return {clock: median_and_p99(times_ns[:, column], 1e-6) for column, clock in enumerate(("wall", "cpu"))}
 
 
 def _frames(options: argparse.Namespace, headers: Mapping[Path, Header]) -> tuple[list[ImageArray], list[int]]:

@@ -13,6 +13,7 @@ from importlib.util import find_spec
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.quantiles import median_and_p99
 from perception.architecture import Architecture
 from perception.graph import onnx_model
 from perception.inference import Runner, onnx_runtime
@@ -120,10 +121,7 @@ def by_turns(model: Model, runtimes: Sequence[str], rounds: int) -> dict[str, di
             start_ns = time.process_time_ns()
             runner(image)
             times_ns[name].append(time.process_time_ns() - start_ns)
-    return {
-        name: {"median": 1e-6 * float(np.median(row)), "p99": 1e-6 * float(np.percentile(row, 99))}
-        for name, row in times_ns.items()
-    }
+    return {name: median_and_p99(row, 1e-6) for name, row in times_ns.items()}
 
 
 def installed() -> list[str]:

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 
+from benchmarks.quantiles import median_and_p99
 from geometry.types import ImageArray
 from perception.estimators import ContactEstimator, estimator_of
 from perception.inference import ContactModel, Prediction
@@ -45,7 +46,7 @@ def from_camera(preprocessing: Preprocessing) -> Preprocessing:
     if preprocessing.input_size == FRAME_SIZE or height > FRAME_SIZE[0] or width > FRAME_SIZE[1]:
         return preprocessing
     top, left = (FRAME_SIZE[0] - height) // 2, (FRAME_SIZE[1] - width) // 2
-    own = preprocessing.crop or Crop(0, 0, width, height)
+    own = preprocessing.region
     return preprocessing.model_copy(
         update={
             "input_size": FRAME_SIZE,
@@ -156,10 +157,7 @@ def _stages(estimator: ContactEstimator, frames: _Frames) -> dict[str, dict[str,
         elif isinstance(estimator, ContactModel):
             outputs = timed("network", estimator.infer, reduced)
             timed("Gaussian", estimator.decode, outputs)
-    return {
-        name: {"median": float(np.median(row)) * 1e-6, "p99": float(np.percentile(row, 99)) * 1e-6}
-        for name, row in times.items()
-    }
+    return {name: median_and_p99(row, 1e-6) for name, row in times.items()}
 
 
 def _memory_mb(field: str) -> float:

@@ -23,6 +23,7 @@ import numpy as np
 import yaml
 
 from benchmarks.provenance import provenance
+from benchmarks.quantiles import median_and_p99
 from cell.compose import Cell, Sensor, compose
 from cell.config import plan_cell
 from cell.loop import Progress, RunLoop, StopRequest
@@ -101,9 +102,9 @@ def measure(frames: Path, sensors: int, rate_hz: float, seconds: float, model: s
         "rate_hz": rate_hz,
         "workers": workers,
         "estimates_per_s": min(len(times) for times in fresh.values()) / measured_s,
-        "new_age_ms": _quantiles(fresh[worst]),
-        "age_ms": _quantiles(ages[worst]),
-        "cycle_ms": _quantiles(cycles_ms),
+        "new_age_ms": median_and_p99(fresh[worst]),
+        "age_ms": median_and_p99(ages[worst]),
+        "cycle_ms": median_and_p99(cycles_ms),
         "late": float((cycles_ms > 10.0).mean()),
         "cpu": cpu_s / result.duration_s,
     }
@@ -117,10 +118,6 @@ def _line(row: dict[str, Any]) -> str:
         f"{new['p99']:>7.1f}{age['median']:>7.1f}{age['p99']:>7.1f}{cycle['median']:>10.2f}{cycle['p99']:>7.2f}"
         f"{100 * row['late']:>6.1f} %{100 * row['cpu']:>5.0f} %"
     )
-
-
-def _quantiles(values: Sequence[float] | np.ndarray) -> dict[str, float]:
-    return {"median": float(np.median(values)), "p99": float(np.percentile(values, 99))}
 
 
 def _write_frames(folder: Path, n: int) -> None:
