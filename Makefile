@@ -2,7 +2,7 @@
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
 BIN := .venv/bin
-SOURCES := pyproject.toml setup.py $(wildcard geometry/*.[ch] perception/*.[ch] drivers/simulation/*.[ch])
+SOURCES := pyproject.toml setup.py $(wildcard touchcell/*/*.[ch] touchcell/*/*/*.[ch])
 
 .PHONY: demo test check fast stress clean
 
@@ -21,7 +21,7 @@ fast: .venv/dev
 STEPS ?= 10000000
 stress: .venv/dev
 	OMP_NUM_THREADS=1 STRESS_STEPS=$(STEPS) $(BIN)/python -m pytest -vv --durations=10 -m "stress or not stress" \
-		tests/test_stress_*.py
+		tests/perception/test_stress_*.py
 
 check: .venv/dev
 	$(BIN)/ruff check .
@@ -42,4 +42,4 @@ check: .venv/dev
 	touch $@
 
 clean:
-	rm -rf .venv build *.egg-info geometry/*.so perception/*.so drivers/simulation/*.so
+	rm -rf .venv build *.egg-info touchcell/*/*.so touchcell/*/*/*.so

@@ -6,9 +6,9 @@ from setuptools import Extension, setup
 setup(
     ext_modules=[
         Extension(
-            "geometry._se3c",
-            sources=["geometry/_se3c.c"],
-            depends=["geometry/_se3_kernels.h", "geometry/_gaussian_kernels.h"],
+            "touchcell.geometry._se3c",
+            sources=["touchcell/geometry/_se3c.c"],
+            depends=["touchcell/geometry/_se3_kernels.h", "touchcell/geometry/_gaussian_kernels.h"],
             include_dirs=[numpy.get_include()],
             # Contracted multiply-adds would make results depend on the machine.
             extra_compile_args=["-O3", "-ffp-contract=off"],
@@ -16,16 +16,19 @@ setup(
             optional=True,
         ),
         Extension(
-            "perception._kernelsc",
-            sources=["perception/_kernelsc.c"],
-            depends=["perception/_image_kernels.h", "perception/_matching_kernels.h"],
+            "touchcell.perception.runtime._kernelsc",
+            sources=["touchcell/perception/runtime/_kernelsc.c"],
+            depends=[
+                "touchcell/perception/runtime/_image_kernels.h",
+                "touchcell/perception/runtime/_matching_kernels.h",
+            ],
             extra_compile_args=["-O3", "-ffp-contract=off"],
             # Without a compiler image networks serve, and marker estimators say what is missing.
             optional=True,
         ),
         Extension(
-            "drivers.simulation._paint",
-            sources=["drivers/simulation/_paint.c"],
+            "touchcell.simulation._paint",
+            sources=["touchcell/simulation/_paint.c"],
             include_dirs=[numpy.get_include()],
             extra_compile_args=["-O3"],
             optional=True,

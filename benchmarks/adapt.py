@@ -17,20 +17,29 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.calibration import changed
-from drivers.simulation.rig import Rig
-from drivers.simulation.samples import Variation, contacts
-from drivers.simulation.tip import TipParameters
-from drivers.simulation.tip_file import load_tip
-from drivers.tactile_data import read_image, read_split
-from geometry import se3
-from geometry.types import Array
-from perception.adaptation import AdaptSettings, FewContacts, about_z, adapt_to, bring, layers_of, outputs_of, tune
-from perception.labels import contact_from_xi, xi_from_contact
-from perception.marked_data import evenly
-from perception.marker_architecture import MarkerArchitecture
-from perception.marker_estimator import matcher_of
-from perception.markers import Discs, MarkerSize, detect_markers
-from perception.model_file import Model, load_model
+from touchcell.drivers.replay.dataset import read_image, read_split
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+from touchcell.perception.calibration.adaptation import (
+    AdaptSettings,
+    FewContacts,
+    about_z,
+    adapt_to,
+    bring,
+    layers_of,
+    outputs_of,
+    tune,
+)
+from touchcell.perception.calibration.marked_data import evenly
+from touchcell.perception.markers.architecture import MarkerArchitecture
+from touchcell.perception.markers.detection import Discs, MarkerSize, detect_markers
+from touchcell.perception.markers.estimator import matcher_of
+from touchcell.perception.runtime.labels import contact_from_xi, xi_from_contact
+from touchcell.perception.runtime.model_file import Model, load_model
+from touchcell.simulation.mount import Rig
+from touchcell.simulation.samples import Variation, contacts
+from touchcell.simulation.tip import TipParameters
+from touchcell.simulation.tip_file import load_tip
 
 COUNTS = (20, 50, 100, 200)
 _ORDER = (2, 3, 4, 0, 1, 5)

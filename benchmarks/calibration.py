@@ -15,14 +15,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from drivers.tactile_data import read_image, read_split
-from geometry.types import Array, ImageArray
-from perception.calibrated_estimator import CalibratedEstimator
-from perception.errors import TrainingError
-from perception.estimators import ContactEstimator, load_estimator
-from perception.labels import contact_from_xi
-from perception.model_file import load_model
-from perception.zero_frame import find_change
+from touchcell.drivers.replay.dataset import read_image, read_split
+from touchcell.geometry.types import Array, ImageArray
+from touchcell.perception.calibration.zero_frame import find_change
+from touchcell.perception.errors import TrainingError
+from touchcell.perception.runtime.calibrated_estimator import CalibratedEstimator
+from touchcell.perception.runtime.estimators import ContactEstimator, load_estimator
+from touchcell.perception.runtime.labels import contact_from_xi
+from touchcell.perception.runtime.model_file import load_model
 
 _CHANGES = {
     "none": (1.0, 0.0, 0.0),

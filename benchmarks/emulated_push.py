@@ -24,20 +24,20 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
-from benchmarks.provenance import provenance
-from cell.cli import find_cell
-from cell.compose import compose
-from cell.config import plan_cell
-from cell.experiments.pushing import off_normal_mm, target_mm
-from cell.loop import Outcome, RunLoop
-from cell.recording import RECORDING, Recorder
-from cell.report import tip_points
-from cell.run_folder import RunFolder, object_poses, scene_time, sensor_poses, true_contacts
-from drivers.emulators.process import EmulatorProcess
-from drivers.emulators.v4l2_shim import environment
-from drivers.errors import DeviceError
-from geometry import se3
-from geometry.types import Array
+from touchcell.cell.analysis.report import tip_points
+from touchcell.cell.analysis.run_folder import RunFolder, object_poses, scene_time, sensor_poses, true_contacts
+from touchcell.cell.bench.provenance import provenance
+from touchcell.cell.cli.main import find_cell
+from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.experiments.pushing import off_normal_mm, target_mm
+from touchcell.cell.recording.mcap import RECORDING, Recorder
+from touchcell.cell.runtime.compose import compose
+from touchcell.cell.runtime.loop import Outcome, RunLoop
+from touchcell.drivers.core.errors import DeviceError
+from touchcell.drivers.v4l2.emulator.shim import environment
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+from touchcell.testing.emulation.process import EmulatorProcess
 
 CELL: Final = "dual_push_emulated.yaml"
 LEADER, FOLLOWER = "leader", "follower"
@@ -113,7 +113,7 @@ def emulated(data: Mapping[str, Any], folder: Path) -> Push:
     path.write_text(yaml.safe_dump(dict(data)))
     cameras = folder / "cameras"
     cameras.mkdir(exist_ok=True)
-    command = [sys.executable, "-m", "cell.cli", "run", str(path), "--out", str(folder / "run"), "--quiet"]
+    command = [sys.executable, "-m", "touchcell", "run", str(path), "--out", str(folder / "run"), "--quiet"]
     with EmulatorProcess("cell", str(path), "--folder", str(cameras), timeout_s=_START_S) as emulator:
         witness = _Witness(emulator)
         try:

@@ -24,10 +24,10 @@ import numpy as np
 from benchmarks import filter_steps, filter_tracking
 from benchmarks.filter_rivals import SlipFilter, StudentFilter
 from benchmarks.filter_sequences import ContactSequence, Track, filtered, labelled, single_frames, summary, synthetic
-from benchmarks.provenance import provenance
-from geometry import se3
-from perception.figures import write_predictions
-from perception.filter import PoseFilter
+from touchcell.cell.bench.provenance import provenance
+from touchcell.geometry import se3
+from touchcell.perception.networks.figures import write_predictions
+from touchcell.perception.runtime.filter import PoseFilter
 
 LEVELS = (1.0, 0.3, 0.1, 0.03)
 """Standard deviations of the dynamics noise per contact, mm and degrees alike."""

@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from geometry import gaussian, se3
-from geometry.gaussian import PoseGaussian
-from geometry.types import Array
-from perception.filter import FilterState, PoseFilter
+from touchcell.geometry import gaussian, se3
+from touchcell.geometry.gaussian import PoseGaussian
+from touchcell.geometry.types import Array
+from touchcell.perception.runtime.filter import FilterState, PoseFilter
 
 
 def gauss_newton(prior: PoseGaussian, observation: PoseGaussian) -> PoseGaussian:

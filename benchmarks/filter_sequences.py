@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.simulation.samples import random_poses
-from drivers.tactile_data import natural_order, read_split
-from geometry import gaussian, se3
-from geometry.gaussian import PoseGaussian, mahalanobis_squared
-from geometry.types import Array
-from perception.estimators import load_estimator
-from perception.filter import FilterState, PoseFilter
-from perception.inference import Prediction
-from perception.labels import CONTACT_NAMES, XI_UNITS, contact_from_xi
+from touchcell.drivers.replay.dataset import natural_order, read_split
+from touchcell.geometry import gaussian, se3
+from touchcell.geometry.gaussian import PoseGaussian, mahalanobis_squared
+from touchcell.geometry.types import Array
+from touchcell.perception.runtime.estimators import load_estimator
+from touchcell.perception.runtime.filter import FilterState, PoseFilter
+from touchcell.perception.runtime.inference import Prediction
+from touchcell.perception.runtime.labels import CONTACT_NAMES, XI_UNITS, contact_from_xi
+from touchcell.simulation.samples import random_poses
 
 STEP_NS = 1_000_000_000
 """Between two contacts, so that a noise density per second is one per contact."""
@@ -86,7 +86,7 @@ def labelled(
         torn_every: of so many images, one arrives with its lower half black; 0 for none.
 
     Raises:
-        DataError, ModelError, ImageError: as ``perception.evaluate.evaluate``.
+        DataError, ModelError, ImageError: as ``touchcell.perception.networks.evaluate.evaluate``.
     """
     split_data = read_split(data, split)
     estimator = load_estimator(model)
@@ -98,7 +98,7 @@ def labelled(
         predictions.append(estimator.predict(image))
         progress(len(predictions), len(split_data.images))
     order = sorted(range(len(predictions)), key=lambda i: natural_order(split_data.images[i]))
-    # The base is the surface frame, as in drivers.replay_arm.
+    # The base is the surface frame, as in touchcell.drivers.replay.arm.
     T_f_s = se3.from_euler_mm_deg(split_data.contact_mm_deg[order])
     return _sequence(T_f_s, se3.inverse(T_f_s), [predictions[i] for i in order])
 
@@ -151,7 +151,8 @@ def filtered(
     Args:
         level: standard deviation of the dynamics noise per contact, in mm and degrees.
         make: builds the filter from its noise density.
-        out_of_range_too: fuse even what the estimator says it was not taught, which ``perception.pipeline`` does not.
+        out_of_range_too: fuse even what the estimator says it was not taught, which
+        ``touchcell.perception.runtime.pipeline`` does not.
     """
     pose_filter = make(np.diag((level * XI_UNITS) ** 2))
     states: list[FilterState] = []

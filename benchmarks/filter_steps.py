@@ -10,11 +10,11 @@ from typing import Any, Literal
 import numpy as np
 
 from benchmarks import filter_rivals
-from geometry import gaussian, se3
-from geometry.gaussian import PoseGaussian, mahalanobis_squared
-from geometry.types import Array
-from perception.filter import ContactFilter, PoseFilter, isotropic_noise
-from perception.moving_surface import MovingSurfaceFilter
+from touchcell.geometry import gaussian, se3
+from touchcell.geometry.gaussian import PoseGaussian, mahalanobis_squared
+from touchcell.geometry.types import Array
+from touchcell.perception.runtime.filter import ContactFilter, PoseFilter, isotropic_noise
+from touchcell.perception.runtime.moving_surface import MovingSurfaceFilter
 
 SIGMAS_RAD = (0.02, 0.05, 0.1, 0.2, 0.35)
 LEVER_M = 0.02

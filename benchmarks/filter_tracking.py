@@ -12,20 +12,20 @@ import numpy as np
 import yaml
 from pydantic import TypeAdapter
 
-from cell.cli import find_cell
-from cell.compose import build_filter, compose
-from cell.config import FilterSection, plan_cell
-from cell.loop import RunLoop
-from cell.recording import Recorder
-from cell.report import load_run, summarise
-from control.interlocks import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH
-from geometry import gaussian, se3
-from geometry.types import Array
-from perception.estimate import ContactEstimate
-from perception.filter import ContactFilter
-from perception.labels import XI_UNITS
-from perception.motion import PoseHistory
-from perception.pipeline import ContactSource
+from touchcell.cell.analysis.report import load_run, summarise
+from touchcell.cell.cli.main import find_cell
+from touchcell.cell.config.schema import FilterSection, plan_cell
+from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.runtime.compose import build_filter, compose
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH
+from touchcell.geometry import gaussian, se3
+from touchcell.geometry.types import Array
+from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.perception.runtime.filter import ContactFilter
+from touchcell.perception.runtime.labels import XI_UNITS
+from touchcell.perception.runtime.motion import PoseHistory
+from touchcell.perception.runtime.pipeline import ContactSource
 
 SENSOR_SIGMA = np.array([0.1, 0.1, 0.1, 0.9, 0.9, 0.35]) * XI_UNITS
 """Of xi: about the shipped network's errors on its own simulated validation images, as standard deviations."""

@@ -16,14 +16,14 @@ from typing import Literal
 
 import numpy as np
 
-from benchmarks.provenance import provenance
-from drivers.tactile_data import read_split
-from geometry.types import Array
-from perception.architecture import Architecture
-from perception.dataset import LabelledImages, default_cache, load_reduced
-from perception.labels import xi_from_contact
-from perception.preprocessing import Preprocessing
-from perception.scores import SCORE_NAMES, Scores
+from touchcell.cell.bench.provenance import provenance
+from touchcell.drivers.replay.dataset import read_split
+from touchcell.geometry.types import Array
+from touchcell.perception.networks.dataset import LabelledImages, default_cache, load_reduced
+from touchcell.perception.networks.scores import SCORE_NAMES, Scores
+from touchcell.perception.runtime.architecture import Architecture
+from touchcell.perception.runtime.labels import xi_from_contact
+from touchcell.perception.runtime.preprocessing import Preprocessing
 
 KINDS: tuple[Literal["gdn", "cnn"], ...] = ("gdn", "cnn")
 
@@ -102,7 +102,7 @@ def _train(
 ) -> None:
     import torch
 
-    from perception.training import Settings, train_on_arrays
+    from touchcell.perception.networks.training import Settings, train_on_arrays
 
     torch.set_num_threads(1)
     # The jitter is the same in millimetres of the sensor.
@@ -117,8 +117,8 @@ def _train(
 
 
 def _scores(model: Path, validation: LabelledImages) -> dict[str, float]:
-    from perception.inference import ContactModel
-    from perception.labels import contact_from_xi
+    from touchcell.perception.runtime.inference import ContactModel
+    from touchcell.perception.runtime.labels import contact_from_xi
 
     network = ContactModel.load(model)
     predictions = [network.predict_reduced(image) for image in validation.images]

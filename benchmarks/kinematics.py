@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.provenance import provenance
-from drivers.arm import LimitsConfig
-from drivers.joint_setpoint import JointSetpoint
-from drivers.kinematics import ChainDescription, DifferentialIk, SerialChain, Tool
-from geometry.types import Array
+from touchcell.cell.bench.provenance import provenance
+from touchcell.drivers.core.arm import LimitsConfig
+from touchcell.drivers.core.joint_setpoint import JointSetpoint
+from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain, Tool
+from touchcell.geometry.types import Array
 
 _CALLS = 5000
 _RATE_HZ = 250.0

@@ -20,11 +20,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from benchmarks.provenance import provenance
 from benchmarks.se3_reference import Library, errors, points, reference
-from geometry import _plain, se3
-from geometry.gaussian import PoseGaussian, compound, fuse
-from geometry.types import Array
+from touchcell.cell.bench.provenance import provenance
+from touchcell.geometry import _plain, se3
+from touchcell.geometry.gaussian import PoseGaussian, compound, fuse
+from touchcell.geometry.types import Array
 
 BATCH = 100_000
 OPERATIONS = ("exp", "log", "compose", "inverse", "adjoint", "left_jacobian", "left_jacobian_inverse")

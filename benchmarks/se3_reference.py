@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import mpmath
 import numpy as np
 
-from geometry.types import Array
+from touchcell.geometry.types import Array
 
 DIGITS = 150
 ANGLES = (

@@ -21,15 +21,16 @@ import numpy as np
 import yaml
 
 from benchmarks.cpu_shares import cpu_shares
-from benchmarks.provenance import provenance
 from benchmarks.simulation_checks import Check, checks
 from benchmarks.simulation_scripts import SCRIPTS, Script, Trace, perform
-from cell.compose import compose
-from cell.config import plan_cell
-from cell.loop import Progress, RunLoop, StopRequest
-from drivers.sim_tactip import SimTactip
-from drivers.simulation.scene import SceneConfig
-from geometry import se3
+from touchcell.cell.bench.provenance import provenance
+from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.runtime.compose import compose
+from touchcell.cell.runtime.loop import Progress, RunLoop, StopRequest
+from touchcell.geometry import se3
+from touchcell.paths import CONFIGS
+from touchcell.simulation.devices.tactip import SimTactip
+from touchcell.simulation.scene import SceneConfig
 
 _FINEST_MS = 0.1
 _DYNAMIC_GRID_MS = 5.0
@@ -41,19 +42,18 @@ _CELLS = (
     "dual_push_tall_sim",
 )
 _PARTS = {
-    "drivers/simulation/render": "images",
-    "drivers/simulation/tip.py": "images",
-    "drivers/sim_tactip": "images",
-    "drivers/simulation/arm_dynamics": "arms",
-    "drivers/sim_joint_arm": "arms",
-    "drivers/sim_arm": "arms",
-    "drivers/joint_": "arms",
-    "drivers/kinematics": "arms",
-    "drivers/simulation/kinematics": "arms",
-    "drivers/simulation/": "physics",
-    "perception/": "perception",
-    "control/": "control and interlocks",
-    "tasks/": "control and interlocks",
+    "touchcell/simulation/render": "images",
+    "touchcell/simulation/tip.py": "images",
+    "touchcell/simulation/devices/tactip": "images",
+    "touchcell/simulation/arm_dynamics": "arms",
+    "touchcell/simulation/devices/": "arms",
+    "touchcell/drivers/core/joint_": "arms",
+    "touchcell/drivers/kinematics/": "arms",
+    "touchcell/simulation/kinematics": "arms",
+    "touchcell/simulation/": "physics",
+    "touchcell/perception/": "perception",
+    "touchcell/control/": "control and interlocks",
+    "touchcell/tasks/": "control and interlocks",
 }
 
 
@@ -176,7 +176,7 @@ def _fits(physics: str, scene: Mapping[str, Any]) -> bool:
 
 
 def _cell_file(name: str) -> Path:
-    return Path(__file__).parent.parent / "configs" / f"{name}.yaml"
+    return CONFIGS / f"{name}.yaml"
 
 
 def _speed(cell_file: Mapping[str, Any], physics: str, *, images: bool, out: Path, longest_s: float = 10.0) -> Any:

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.clock import VirtualClock
-from drivers.simulation.contact import ContactState
-from drivers.simulation.scene import SceneConfig
-from geometry import se3
-from geometry.types import Array
+from touchcell.drivers.core.clock import VirtualClock
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+from touchcell.simulation.contact import ContactState
+from touchcell.simulation.scene import SceneConfig
 
 GRAVITY_M_S2 = 9.81
 _SI = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)

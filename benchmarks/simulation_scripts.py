@@ -9,17 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from drivers import sim_arm, sim_joint_arm
-from drivers.arm import Arm
-from drivers.clock import VirtualClock
-from drivers.commands import TwistCommand, TwistFrame
-from drivers.lease import Lease
-from drivers.registry import DriverContext
-from drivers.sim_arm import SimArm
-from drivers.sim_joint_arm import SimJointArm
-from drivers.simulation.scene import Scene, SceneConfig
-from geometry import se3
-from geometry.types import Array
+from touchcell.drivers.core.arm import Arm
+from touchcell.drivers.core.clock import VirtualClock
+from touchcell.drivers.core.commands import TwistCommand, TwistFrame
+from touchcell.drivers.core.lease import Lease
+from touchcell.drivers.core.spec import DriverContext
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+from touchcell.simulation.devices import arm as sim_arm
+from touchcell.simulation.devices import joint_arm as sim_joint_arm
+from touchcell.simulation.devices.arm import SimArm
+from touchcell.simulation.devices.joint_arm import SimJointArm
+from touchcell.simulation.scene import Scene, SceneConfig
 
 _CYCLE_S = 0.01
 _SI = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)

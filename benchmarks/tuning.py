@@ -18,18 +18,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.provenance import provenance
-from control.alignment import TargetAlignment
-from control.servo import TactileServo
-from drivers.simulation.objects import BoxShape
-from drivers.simulation.solids import friction_radius_m
-from geometry import se3
-from geometry.types import Array
-from tasks.dual_arm_pushing import FollowerConfig
-from tasks.hand import HandConfig
-from tasks.object_tracking import ObjectTrackingConfig
-from tasks.single_arm_pushing import PushConfig, SingleArmPushingConfig
-from tasks.surface_following import SurfaceFollowingConfig
+from touchcell.cell.bench.provenance import provenance
+from touchcell.control.alignment import TargetAlignment
+from touchcell.control.servo import TactileServo
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+from touchcell.simulation.objects import BoxShape
+from touchcell.simulation.solids import friction_radius_m
+from touchcell.tasks.contact_servo import HandConfig
+from touchcell.tasks.dual_arm_pushing import FollowerConfig
+from touchcell.tasks.object_tracking import ObjectTrackingConfig
+from touchcell.tasks.single_arm_pushing import PushConfig, SingleArmPushingConfig
+from touchcell.tasks.surface_following import SurfaceFollowingConfig
 
 PERIOD_S: Final = 0.01
 FRAME_RATES_HZ: Final = (15.0, 30.0, 60.0)

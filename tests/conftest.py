@@ -7,6 +7,8 @@ run one after another (`-m emulated`), the others on all cores.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from hypothesis import settings
 
@@ -14,25 +16,12 @@ from hypothesis import settings
 settings.register_profile("touchcell", deadline=None, derandomize=True)
 settings.load_profile("touchcell")
 
-_BESIDE_EMULATORS = (
-    "test_cell_devices",
-    "test_conformance",
-    "test_damiao",
-    "test_emulated_matrix",
-    "test_emulated_push",
-    "test_emulator_",
-    "test_feetech",
-    "test_franka",
-    "test_opencv_camera",
-    "test_process_cell",
-    "test_ur",
-    "test_v4l2",
-)
+_EMULATED = Path(__file__).parent / "emulated"
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
-        if item.path.name.startswith(_BESIDE_EMULATORS):
+        if item.path.is_relative_to(_EMULATED):
             item.add_marker(pytest.mark.emulated)
             item.add_marker(pytest.mark.flaky(reruns=2))

@@ -1,0 +1,42 @@
+"""``python -m benchmarks NAME [ARGUMENT ...]``: benchmarks that are for developers, and stay in the checkout.
+
+``touchcell bench NAME`` starts the same where touchcell is installed from a checkout.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from pathlib import Path
+
+BENCHMARKS = {
+    "adapt": "benchmarks.adapt",
+    "calibration": "benchmarks.calibration",
+    "emulated-push": "benchmarks.emulated_push",
+    "faults": "tests.fault_injection.faults",
+    "filter": "benchmarks.filter",
+    "gdn-vs-cnn": "benchmarks.gdn_vs_cnn",
+    "kinematics": "benchmarks.kinematics",
+    "safety": "tests.fault_injection.safety",
+    "se3": "benchmarks.se3",
+    "simulation": "benchmarks.simulation",
+    "soak": "tests.fault_injection.soak",
+    "tuning": "benchmarks.tuning",
+}
+
+
+def main() -> int:
+    """Run one benchmark, with the arguments behind its name."""
+    parser = argparse.ArgumentParser("python -m benchmarks", description=__doc__.partition("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path("bench"), help="folder for tables and figures")
+    parser.add_argument("name", choices=BENCHMARKS)
+    parser.add_argument("rest", nargs=argparse.REMAINDER, help="passed on")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    importlib.import_module(BENCHMARKS[options.name]).run(options.rest, options.out)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,1 +1,0 @@
-"""Descriptions of arms for ``drivers.kinematics``."""

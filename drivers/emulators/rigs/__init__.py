@@ -1,1 +1,0 @@
-"""One rig per driver."""

@@ -1,0 +1,30 @@
+"""``touchcell bench sensors``: two sensors in one real-time cell, perceived in the loop's thread and in workers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from touchcell.cell.bench.sensors import measure
+from touchcell.cell.cli.main import EXIT_OK, main
+
+
+def test_every_sensor_is_heard(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--", "--sensors", "2", "--rates", "30", "--seconds", "1.2"]
+    assert main(["bench", "sensors", "--out", str(tmp_path), *words]) == EXIT_OK
+    rows = json.loads((tmp_path / "sensors.json").read_text())["rows"]
+    assert [(row["sensors"], row["workers"]) for row in rows] == [(2, False), (2, True)]
+    for row in rows:
+        # Of the sensor that was heard least.
+        assert row["estimates_per_s"] > 0.0
+        assert 0.0 < row["new_age_ms"]["median"] <= row["new_age_ms"]["p99"]
+    assert "worker threads" in capsys.readouterr().out
+
+
+def test_a_worker_that_fails_is_no_silence(tmp_path: Path) -> None:
+    (tmp_path / "frame_0.jpg").write_bytes(b"no image")
+    for workers in (False, True):
+        with pytest.raises(Exception, match="truncated"):
+            measure(tmp_path, 1, 30.0, 1.0, "builtin:sim_gdn", workers=workers)

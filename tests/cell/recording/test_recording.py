@@ -1,0 +1,102 @@
+"""Recordings are complete, readable after a kill, and fail safely on a full disk."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from touchcell.cell.errors import RecordingError
+from touchcell.cell.recording.mcap import CHUNK_BYTES, Recorder, read
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path) as recorder:
+        for i in range(1000):
+            recorder.write("/arm/tcp", i, {"i": i, "pose": np.eye(4) * i})
+            recorder.write("/task", i, {"state": "run"})
+    messages = list(read(path))
+    assert len(messages) == 2000
+    assert [m.data["i"] for m in messages if m.topic == "/arm/tcp"] == list(range(1000))
+    assert messages[-2].data["pose"][3][3] == 999.0
+
+
+def test_what_is_not_finite_becomes_null(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        recorder.write("/x", 0, {"a": float("nan"), "b": np.array([1.0, np.inf]), "c": np.float64("-inf")})
+    (message,) = read(tmp_path / "run.mcap")
+    assert message.data == {"a": None, "b": [1.0, None], "c": None}
+
+
+def test_kill_minus_nine_loses_at_most_the_open_chunk(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    program = (
+        "import os, signal, pathlib\n"
+        "from touchcell.cell.recording.mcap import Recorder\n"
+        f"recorder = Recorder(pathlib.Path({str(path)!r}))\n"
+        "for i in range(2000):\n"
+        "    recorder.write('/x', i, {'i': i, 'pad': 'p' * 80})\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=False)
+    numbers = [message.data["i"] for message in read(path)]
+    assert numbers == list(range(len(numbers)))
+    assert len(numbers) >= 2000 - CHUNK_BYTES // 80
+
+
+def test_a_file_cut_anywhere_is_readable_up_to_the_cut(tmp_path: Path) -> None:
+    whole = tmp_path / "whole.mcap"
+    with Recorder(whole) as recorder:
+        for i in range(1500):
+            recorder.write("/x", i, {"i": i, "noise": os.urandom(20).hex()})
+    content = whole.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    counts = []
+    for fraction in (0.1, 0.37, 0.5, 0.77, 0.99):
+        cut.write_bytes(content[: int(len(content) * fraction)])
+        numbers = [message.data["i"] for message in read(cut)]
+        assert numbers == list(range(len(numbers)))
+        counts.append(len(numbers))
+    assert counts == sorted(counts)
+    assert counts[2] > 300
+
+
+class _FullDisk(io.BytesIO):
+    """Refuses to grow beyond a size, as a full disk does."""
+
+    def write(self, data: object) -> int:
+        if self.tell() > 40_000:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return super().write(data)  # type: ignore[arg-type]
+
+
+def test_full_disk_is_a_typed_error_and_keeps_what_was_written(tmp_path: Path) -> None:
+    disk = _FullDisk()
+    recorder = Recorder(tmp_path / "run.mcap", stream=disk)
+
+    def write_for_ever() -> None:
+        for i in range(100_000):
+            recorder.write("/x", i, {"i": i, "noise": os.urandom(40).hex()})
+
+    with pytest.raises(RecordingError) as caught:
+        write_for_ever()
+    assert "No space left" in str(caught.value)
+    recorder.close()
+    path = tmp_path / "kept.mcap"
+    path.write_bytes(disk.getvalue())
+    assert len(list(read(path))) > 100
+
+
+def test_refuses_what_is_no_recording(tmp_path: Path) -> None:
+    (tmp_path / "x").write_bytes(b"something else")
+    with pytest.raises(RecordingError, match="no MCAP"):
+        list(read(tmp_path / "x"))
+    with pytest.raises(RecordingError, match="cannot be read"):
+        list(read(tmp_path / "missing"))

@@ -1,0 +1,473 @@
+"""A run that has tripped waits for a person: refused with a reason, reset once per trip, and never a motion by it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from tests.fault_injection.fault_matrix import cells
+from touchcell.cell.cli.main import EXIT_BAD_INPUT, EXIT_OK, EXIT_TASK_FAILED, main
+from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.yaml_file import InvalidCell
+from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
+from touchcell.cell.runtime.operator_channel import Ask, OperatorDesk, Request, ask_run, is_waiting
+from touchcell.cell.runtime.watchdog import OneProcess
+from touchcell.control.latch import LatchState
+from touchcell.drivers.core.device import Lifecycle
+from touchcell.drivers.core.errors import DeviceFault
+from touchcell.geometry.types import Array
+from touchcell.simulation.devices.arm import SimArm
+
+DEADLINE_S = 60.0
+
+
+def data(**changes: Any) -> dict[str, Any]:
+    cell = cells()["surface_following"]
+    cell["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    cell["on_trip"] = "wait_for_reset"
+    cell["task"]["distance_mm"] = 4
+    return {**cell, **changes}
+
+
+class Run:
+    """A cell whose operator is the test."""
+
+    def __init__(self, folder: Path, cell: dict[str, Any] | None = None, *, desk: bool = True) -> None:
+        path = folder / "cell.yaml"
+        path.write_text(yaml.safe_dump(cell or data()))
+        self.cell: Cell = compose(plan_cell(path))
+        self.desk = OperatorDesk()
+        self.stop = StopRequest()
+        self.trips: list[RunResult] = []
+        self.waiting = ""
+        self.loop = RunLoop(
+            self.cell,
+            None,
+            stop=self.stop,
+            on_cycle=self._note,
+            desk=self.desk if desk else None,
+            on_trip=self.trips.append,
+        )
+        self.cell.__enter__()
+        arm = self.cell.arms["arm"]
+        assert isinstance(arm, SimArm)
+        self.arm = arm
+        self.going = True
+        self.loop.begin()
+
+    def _note(self, progress: Progress) -> None:
+        self.waiting = progress.waiting
+
+    def go(self, cycles: int) -> None:
+        for _ in range(cycles):
+            self.going = self.going and self.loop.step()
+
+    def until(self, state: str) -> None:
+        for _ in range(2000):
+            if self.cell.task.state == state:
+                return
+            self.go(1)
+        raise AssertionError(f"still {self.cell.task.state}")
+
+    def fault(self, **changes: Any) -> None:
+        self.arm.faults = replace(self.arm.faults, **changes)
+
+    def ask(self, ask: Ask) -> str:
+        self.desk.said = ""
+        self.desk.ask(ask, "ada")
+        self.go(1)
+        return self.desk.said
+
+    def end(self) -> RunResult:
+        result = self.loop.end()
+        self.cell.__exit__(None, None, None)
+        return result
+
+    def pose(self) -> Array:
+        return self.arm.T_world_tcp().copy()
+
+
+def tripped(folder: Path, **changes: Any) -> Run:
+    """A run whose arm stopped telling its state in the middle of its work."""
+    run = Run(folder, data(**changes))
+    run.until("run")
+    run.go(20)
+    run.fault(stale=True)
+    run.until("tripped")
+    return run
+
+
+def test_reset_then_resume_starts_the_task_from_its_first_state_and_it_ends_well(tmp_path: Path) -> None:
+    run = tripped(tmp_path)
+    assert [trip.outcome for trip in run.trips] == [Outcome.TRIPPED]
+    assert run.trips[0].stops["arm"].kept
+    run.go(5)
+    assert "cause is still there" in run.waiting
+    assert run.ask(Ask.RESET) == "refused: a cause is still present"
+    run.fault(stale=False)
+    run.go(2)
+    assert run.cell.supervisor.latch.state is LatchState.CAUSE_GONE
+    assert "r resets" in run.waiting
+    assert run.ask(Ask.RESUME) == "refused: reset first"
+    stood = run.pose()
+    assert run.ask(Ask.RESET).startswith("reset; nothing moves")
+    assert run.ask(Ask.RESET) == "refused: nothing is latched"
+    run.go(200)
+    np.testing.assert_array_equal(run.pose(), stood)
+    assert run.cell.task.state == "tripped"
+    first = run.cell.task
+    assert "starts again" in run.ask(Ask.RESUME)
+    assert run.cell.task is not first
+    assert run.cell.task.state == "prepare"
+    run.go(2000)
+    result = run.end()
+    assert result.outcome is Outcome.DONE
+    assert [(reset.operator, reset.causes[0].interlock) for reset in result.resets] == [("ada", "stale_arm")]
+
+
+def test_without_the_key_in_the_file_a_trip_ends_the_run_as_ever(tmp_path: Path) -> None:
+    run = Run(tmp_path, data(on_trip="end"))
+    run.until("run")
+    run.fault(stale=True)
+    run.go(50)
+    assert not run.going
+    assert run.end().outcome is Outcome.TRIPPED
+    assert run.trips == []
+
+
+def test_without_anybody_to_ask_a_trip_ends_the_run(tmp_path: Path) -> None:
+    run = Run(tmp_path, desk=False)
+    run.until("run")
+    run.fault(stale=True)
+    run.go(50)
+    assert not run.going
+    assert run.end().outcome is Outcome.TRIPPED
+
+
+def test_what_was_asked_before_the_trip_counts_for_nothing(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    run.until("run")
+    run.desk.ask(Ask.RESET, "ada")
+    run.desk.ask(Ask.RESUME, "ada")
+    run.fault(stale=True)
+    run.until("tripped")
+    run.fault(stale=False)
+    run.go(50)
+    assert run.cell.supervisor.latch.state is LatchState.CAUSE_GONE
+    assert run.cell.task.state == "tripped"
+    assert run.end().outcome is Outcome.TRIPPED
+
+
+def test_an_arm_that_moves_while_it_waits_is_stopped_again_by_stronger_means(tmp_path: Path) -> None:
+    run = tripped(tmp_path)
+    run.fault(stale=False)
+    run.go(2)
+    run.fault(drift_m_s=0.005)
+    # Told to stand it sinks; stopped by its strongest category it closes its brakes.
+    run.go(2)
+    assert run.arm.state is Lifecycle.READY
+    assert [cause.interlock for cause in run.cell.supervisor.latch.causes] == ["stale_arm", "stop"]
+    stood = run.pose()
+    run.go(50)
+    np.testing.assert_array_equal(run.pose(), stood)
+    run.fault(drift_m_s=0.0)
+    run.go(5)
+    assert run.ask(Ask.RESET).startswith("reset")
+    assert "starts again" in run.ask(Ask.RESUME)
+    assert run.arm.state is Lifecycle.ACTIVE
+    run.go(2000)
+    assert run.end().outcome is Outcome.DONE
+
+
+def test_category_1_takes_the_power_and_resume_gives_it_back(tmp_path: Path) -> None:
+    cell = data()
+    cell["arms"]["arm"]["stop_category"] = 1
+    run = Run(tmp_path, cell)
+    run.until("run")
+    run.fault(stale=True)
+    run.until("tripped")
+    assert run.arm.state is Lifecycle.READY
+    run.fault(stale=False)
+    run.go(2)
+    assert run.ask(Ask.RESET).startswith("reset")
+    assert run.arm.state is Lifecycle.READY
+    assert "starts again" in run.ask(Ask.RESUME)
+    assert run.arm.state is Lifecycle.ACTIVE
+    run.go(2000)
+    assert run.end().outcome is Outcome.DONE
+
+
+def test_a_device_fault_waits_too_and_a_reset_recovers_the_device(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    run.until("run")
+    run.arm._to_faulted(DeviceFault("arm", "it complains"))
+    run.until("tripped")
+    causes = run.cell.supervisor.latch.causes
+    assert [(cause.interlock, cause.subject) for cause in causes] == [("device", "arm")]
+    run.go(3)
+    assert run.arm.state is Lifecycle.FAULTED
+    assert run.ask(Ask.RESET).startswith("reset")
+    assert run.arm.state is Lifecycle.READY
+    assert "starts again" in run.ask(Ask.RESUME)
+    run.go(2000)
+    assert run.end().outcome is Outcome.DONE
+
+
+def test_a_second_trip_needs_a_second_reset(tmp_path: Path) -> None:
+    run = tripped(tmp_path)
+    run.fault(stale=False)
+    run.go(2)
+    run.ask(Ask.RESET)
+    run.fault(stale=True)
+    run.go(20)
+    assert run.cell.supervisor.latch.state is LatchState.TRIPPED
+    assert run.ask(Ask.RESUME) == "refused: reset first"
+    run.fault(stale=False)
+    run.go(2)
+    assert run.ask(Ask.RESET).startswith("reset")
+    run.ask(Ask.RESUME)
+    run.go(2000)
+    result = run.end()
+    assert (result.outcome, len(result.resets)) == (Outcome.DONE, 2)
+
+
+def test_a_stop_ends_the_waiting_and_time_spent_in_it_does_not_count(tmp_path: Path) -> None:
+    run = tripped(tmp_path, max_duration_s=6.0)
+    run.fault(stale=False)
+    run.go(600)
+    run.ask(Ask.RESET)
+    run.ask(Ask.RESUME)
+    run.go(50)
+    assert run.going
+    run.fault(stale=True)
+    run.until("tripped")
+    run.stop.ask()
+    run.go(1)
+    assert not run.going
+    assert run.end().outcome is Outcome.TRIPPED
+
+
+class NotedWatch(OneProcess):
+    """Writes down when it is told to guard and when not."""
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+
+    def begin(self) -> None:
+        self.told.append("begin")
+
+    def end(self) -> None:
+        self.told.append("end")
+
+
+def test_nobody_guards_while_it_waits_so_that_no_arm_obeys(tmp_path: Path) -> None:
+    run = tripped(tmp_path)
+    watch = run.cell.watch = NotedWatch()
+    run.fault(stale=False)
+    run.go(2)
+    run.ask(Ask.RESET)
+    assert watch.told == []
+    run.ask(Ask.RESUME)
+    assert watch.told == ["begin"]
+    run.go(5)
+    run.fault(stale=True)
+    run.until("tripped")
+    assert watch.told == ["begin", "end"]
+    run.end()
+
+
+class Impatient(RuleBasedStateMachine):
+    """Any order of faults, resets and resumes: between a trip and a resume after its reset, nothing is commanded."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder = tempfile.TemporaryDirectory()
+
+    @initialize(category=st.sampled_from([1, 2]))
+    def start(self, category: int) -> None:
+        cell = data(max_duration_s=100.0)
+        cell["arms"]["arm"]["stop_category"] = category
+        cell["task"]["distance_mm"] = 1000
+        self.run = Run(Path(self.folder.name), cell)
+        self.allowed = True
+        follow = self.run.arm._body.follow
+
+        def watched(twist: Array, expires_ns: int) -> None:
+            assert self.allowed, "a command between trip and resume"
+            follow(twist, expires_ns)
+
+        self.run.arm._body.follow = watched  # type: ignore[method-assign]
+
+    @rule(cycles=st.integers(1, 25))
+    def go(self, cycles: int) -> None:
+        for _ in range(cycles):
+            self.run.go(1)
+            self.allowed = self.run.cell.supervisor.latch.first_cause is None and self.run.cell.task.state != "tripped"
+
+    @rule(stale=st.booleans())
+    def fault(self, stale: bool) -> None:
+        self.run.fault(stale=stale)
+
+    @rule(asks=st.lists(st.sampled_from(Ask), min_size=1, max_size=3))
+    def press(self, asks: list[Ask]) -> None:
+        latch = self.run.cell.supervisor.latch
+        before, present = latch.first_cause, latch.state in (LatchState.TRIPPED, LatchState.FAULTED)
+        waits = self.run.cell.task.state == "tripped"
+        for ask in asks:
+            self.run.desk.ask(ask, "ada")
+        resets = len(self.run.loop._resets)
+        self.run.go(1)
+        cleared = len(self.run.loop._resets) - resets
+        assert cleared <= 1
+        if cleared:
+            assert waits
+            assert before is not None
+            assert not present or not self.run.arm.faults.stale
+        restarted = waits and self.run.cell.task.state != "tripped"
+        if restarted:
+            # Only a reset clears, and only what came after it goes on.
+            assert before is None or (cleared and asks.index(Ask.RESET) < len(asks) - 1 - asks[::-1].index(Ask.RESUME))
+        self.allowed = latch.first_cause is None and self.run.cell.task.state != "tripped"
+
+    @invariant()
+    def latched_runs_do_not_work(self) -> None:
+        if hasattr(self, "run") and self.run.cell.supervisor.latch.first_cause is not None:
+            assert self.run.cell.task.finished
+
+    def teardown(self) -> None:
+        if hasattr(self, "run"):
+            self.run.end()
+        self.folder.cleanup()
+
+
+TestImpatient = Impatient.TestCase
+TestImpatient.settings = settings(max_examples=8, stateful_step_count=15)
+
+
+def two_arms(folder: Path, **pair: Any) -> Run:
+    """The arm of the task, and another that carries its sensor and holds something for it."""
+    cell = data(on_trip="end")
+    cell["arms"]["arm"]["stop_category"] = 1
+    cell["arms"]["other"] = {**cell["arms"]["arm"]}
+    cell["sensors"]["sensor"]["mounted_on"] = "other"
+    cell["interlocks"] = {name: entry for name, entry in cell["interlocks"].items() if name not in ("contact_lost",)}
+    cell["pairs"] = [{"leader": "arm", "follower": "other", **pair}]
+    return Run(folder, cell)
+
+
+@pytest.mark.parametrize(
+    ("pair", "faulty", "categories"),
+    [
+        ({}, "arm", {"arm": 1, "other": 2}),
+        ({}, "other", {"arm": 1, "other": 1}),
+        ({"on_stop": "same"}, "arm", {"arm": 1, "other": 1}),
+    ],
+)
+def test_a_fault_of_the_leader_leaves_the_follower_its_power(
+    tmp_path: Path, pair: dict[str, str], faulty: str, categories: dict[str, int]
+) -> None:
+    run = two_arms(tmp_path, **pair)
+    run.go(20)
+    arm = run.cell.arms[faulty]
+    arm.faults = replace(arm.faults, nan_state=True)
+    run.go(3)
+    result = run.end()
+    assert [(cause.interlock, cause.subject) for cause in result.causes[:1]] == [("finite", faulty)]
+    assert {role: int(report.category) for role, report in result.stops.items()} == categories
+
+
+def test_an_orderly_end_leaves_both_their_power(tmp_path: Path) -> None:
+    run = two_arms(tmp_path)
+    run.go(20)
+    run.stop.ask_at_once()
+    run.go(1)
+    assert {int(report.category) for report in run.end().stops.values()} == {2}
+
+
+@pytest.mark.parametrize("pair", [{"leader": "arm", "follower": "nobody"}, {"leader": "arm", "follower": "arm"}])
+def test_a_pair_of_what_is_not_there_is_refused(tmp_path: Path, pair: dict[str, str]) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text(yaml.safe_dump(data(pairs=[pair])))
+    with pytest.raises(InvalidCell) as caught:
+        plan_cell(path)
+    assert caught.value.problems[0].key.startswith("pairs.0")
+
+
+def test_requests_come_from_keys_and_files_in_order_and_are_answered(tmp_path: Path) -> None:
+    desk = OperatorDesk(tmp_path)
+    desk.ask(Ask.RESET, "ada")
+    assert desk.take() is None
+    desk.open()
+    assert is_waiting(tmp_path)
+    told: list[tuple[bool, str]] = []
+    other = threading.Thread(target=lambda: told.append(ask_run(tmp_path, Ask.RESUME, "bob", DEADLINE_S)))
+    other.start()
+    desk.ask(Ask.RESET, "ada")
+    taken: list[Request] = []
+    deadline_s = time.monotonic() + DEADLINE_S
+    while len(taken) < 2:
+        assert time.monotonic() < deadline_s
+        if (request := desk.take()) is not None:
+            taken.append(request)
+            desk.answer(request, request.ask is Ask.RESUME, f"to {request.operator}")
+    other.join()
+    assert told == [(True, "to bob")]
+    assert {(request.ask, request.operator) for request in taken} == {(Ask.RESET, "ada"), (Ask.RESUME, "bob")}
+    desk.close()
+    assert not is_waiting(tmp_path)
+
+
+def test_a_run_that_does_not_answer_is_told(tmp_path: Path) -> None:
+    done, words = ask_run(tmp_path, Ask.RESET, "ada", wait_s=0.0)
+    assert not done
+    assert "no answer" in words
+    assert not (tmp_path / "request.json").exists()
+
+
+def test_reset_without_a_run_that_waits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["reset"]) == EXIT_BAD_INPUT
+    assert "no run waits for a reset" in capsys.readouterr().err
+
+
+def test_reset_and_resume_from_another_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cell = data()
+    # It trips by itself: pressed in deeper than allowed by the task's own depth.
+    cell["interlocks"]["indentation"]["limit_mm"] = 1.0
+    path, folder = tmp_path / "cell.yaml", tmp_path / "run"
+    path.write_text(yaml.safe_dump(cell))
+    command = [sys.executable, "-m", "touchcell", "run", str(path), "--out", str(folder), "--quiet"]
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
+    deadline_s = time.monotonic() + DEADLINE_S
+    while not is_waiting(folder):
+        assert time.monotonic() < deadline_s
+        assert process.poll() is None
+        time.sleep(0.02)
+    assert main(["resume", str(folder)]) == EXIT_TASK_FAILED
+    assert "refused: reset first" in capsys.readouterr().out
+    assert main(["reset", str(folder)]) == EXIT_TASK_FAILED
+    assert "refused: a cause is still present" in capsys.readouterr().out
+    # Black box and reason are there while it waits.
+    assert json.loads((folder / "blackbox.json").read_text())["causes"][0]["interlock"] == "indentation"
+    assert main(["stop", str(folder)]) == EXIT_OK
+    told, _ = process.communicate(timeout=DEADLINE_S)
+    assert "tripped: indentation" in told
+    assert process.returncode == 3
+    assert not is_waiting(folder)

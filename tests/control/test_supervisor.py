@@ -1,0 +1,150 @@
+"""The supervisor: order of the checks, the latch behind them, and what a reset does and does not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from touchcell.control.errors import SafetyTrip
+from touchcell.control.interlocks.config import Depth, TcpSpeed
+from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
+from touchcell.control.interlocks.violation import Severity, Violation
+from touchcell.control.latch import Latch, LatchState, Refusal, ResetDone, ResetRefused
+from touchcell.control.supervisor import Supervisor
+from touchcell.drivers.core.commands import TwistCommand, TwistFrame
+from touchcell.drivers.core.device import OperatorToken
+from touchcell.drivers.core.samples import Stamped, TcpState
+from touchcell.geometry.errors import TouchcellError
+
+DEPTH = Depth("depth", Severity.TRIP, 0.006)
+SPEED = TcpSpeed("speed", Severity.TRIP, 0.1, 1.0)
+MOVE = np.array([0.01, 0, 0, 0, 0, 0])
+
+
+def view(now_ns=100, depth_m=0.003, measured=None, command=None) -> CellView:
+    twist = np.zeros(6) if measured is None else measured
+    wanted = None if command is None else TwistCommand(command, TwistFrame.TCP, now_ns, 0.03)
+    return CellView(
+        now_ns,
+        {"arm": ArmView(Stamped(TcpState(np.eye(4), twist), now_ns, 1), wanted)},
+        {"sensor": SensorView(now_ns, 42, True, depth_m)},
+    )
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A rule with a bug."""
+
+    name: str = "broken"
+    severity: Severity = Severity.TRIP
+
+    def check(self, view: CellView) -> Violation | None:
+        return view.arms["no such arm"]  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Warned:
+    """A rule that only limits."""
+
+    name: str = "warned"
+    severity: Severity = Severity.LIMIT
+
+    def check(self, view: CellView) -> Violation | None:
+        return Violation(self.name, self.severity, "arm", "slow down", view.now_ns)
+
+
+def test_allows_what_breaks_no_rule():
+    verdict = Supervisor([DEPTH, SPEED], Latch()).review(view(command=MOVE))
+    assert verdict.allow
+    assert verdict.violations == ()
+    assert verdict.trip is None
+
+
+def test_a_violation_stops_and_stays():
+    supervisor = Supervisor([DEPTH, SPEED], Latch())
+    verdict = supervisor.review(view(now_ns=100, depth_m=0.0065, command=MOVE))
+    assert not verdict.allow
+    assert isinstance(verdict.trip, SafetyTrip)
+    assert isinstance(verdict.trip, TouchcellError)
+    trip = verdict.trip
+    assert (trip.interlock, trip.subject, trip.value, trip.limit) == ("depth", "sensor", 0.0065, 0.006)
+    assert (trip.unit, trip.t_ns, trip.frame_seq) == ("m", 100, 42)
+    later = supervisor.review(view(now_ns=200, command=MOVE))
+    assert not later.allow
+    assert later.violations == ()
+    assert later.trip.t_ns == 100
+
+
+def test_not_finite_is_asked_first_and_alone():
+    verdict = Supervisor([Broken(), DEPTH], Latch()).review(view(depth_m=0.01, command=np.full(6, np.nan)))
+    assert [v.interlock for v in verdict.violations] == ["finite"]
+    assert not verdict.allow
+
+
+def test_finite_is_always_on():
+    assert not Supervisor([], Latch()).review(view(depth_m=float("nan"))).allow
+
+
+def test_a_rule_that_raises_is_a_fault():
+    latch = Latch()
+    verdict = Supervisor([Broken()], latch).review(view())
+    assert not verdict.allow
+    assert latch.state is LatchState.FAULTED
+    assert "no such arm" in verdict.trip.reason
+
+
+def test_a_limit_is_reported_and_motion_goes_on():
+    verdict = Supervisor([Warned()], Latch()).review(view(command=MOVE))
+    assert verdict.allow
+    assert [v.interlock for v in verdict.violations] == ["warned"]
+
+
+def test_all_violations_of_a_cycle_are_listed():
+    fast = np.array([0.2, 0, 0, 0, 0, 0])
+    verdict = Supervisor([DEPTH, SPEED], Latch()).review(view(depth_m=0.01, command=fast))
+    assert [v.interlock for v in verdict.violations] == ["depth", "speed"]
+
+
+@pytest.mark.parametrize(
+    ("now", "reason"),
+    [
+        ({"depth_m": 0.007}, Refusal.CAUSE_PRESENT),
+        ({"measured": 0.5 * MOVE}, Refusal.NOT_AT_REST),
+        ({"measured": np.array([0, 0, 0, 0, 0, 0.02])}, Refusal.NOT_AT_REST),
+        ({"command": MOVE}, Refusal.MOTION_COMMANDED),
+    ],
+)
+def test_reset_is_judged_on_the_present_view(now, reason):
+    supervisor = Supervisor([DEPTH, SPEED], Latch())
+    supervisor.review(view(depth_m=0.007))
+    assert supervisor.reset(OperatorToken("ada", 500), view(now_ns=400, **now)) == ResetRefused(reason)
+    assert not supervisor.review(view(now_ns=600)).allow
+
+
+def test_reset_clears():
+    supervisor = Supervisor([DEPTH], Latch())
+    supervisor.review(view(depth_m=0.007))
+    assert isinstance(supervisor.reset(OperatorToken("ada", 500), view(now_ns=400)), ResetDone)
+    verdict = supervisor.review(view(now_ns=600))
+    assert verdict.allow
+    assert verdict.trip is None
+
+
+@given(st.lists(st.tuples(st.floats(0, 0.012), st.booleans()), max_size=30))
+def test_nothing_is_allowed_between_a_trip_and_a_reset(cycles):
+    supervisor = Supervisor([DEPTH], Latch())
+    latched = False
+    for k, (depth_m, ask_reset) in enumerate(cycles):
+        now_ns = 10 * k
+        if ask_reset:
+            latched = not isinstance(
+                supervisor.reset(OperatorToken("ada", now_ns), view(now_ns, depth_m)), ResetDone
+            ) and (latched or depth_m > 0.006)
+        verdict = supervisor.review(view(now_ns, depth_m, command=MOVE))
+        latched = latched or depth_m > 0.006
+        assert verdict.allow == (not latched)
+        assert (verdict.trip is None) == (not latched)

@@ -1,0 +1,77 @@
+"""Faults that a driver's own thread latches, devices that are gone, and refusals that are no faults."""
+
+from __future__ import annotations
+
+import pytest
+
+from touchcell.drivers.core.clock import VirtualClock
+from touchcell.drivers.core.device import DeactivatePolicy, Device, Lifecycle
+from touchcell.drivers.core.errors import CommandRejected, DeviceError, DeviceFault, DeviceGone, Rejection
+
+
+class Gadget(Device):
+    """Does what each test tells it to."""
+
+    def __init__(self) -> None:
+        super().__init__("gadget", VirtualClock())
+        self.latch_on_the_way: DeviceError | None = None
+        self.raise_at_rest: DeviceError | None = None
+
+    def _open(self) -> None: ...
+
+    def _close(self) -> None: ...
+
+    def _activate(self) -> None:
+        if self.latch_on_the_way is not None:
+            self._to_faulted(self.latch_on_the_way)
+
+    def _deactivate(self, policy: DeactivatePolicy) -> None:
+        if self.raise_at_rest is not None:
+            raise self.raise_at_rest
+
+    def attempt(self, error: DeviceError) -> None:
+        def step() -> None:
+            raise error
+
+        self._attempt(step)
+
+
+@pytest.fixture
+def gadget() -> Gadget:
+    """A gadget in READY."""
+    made = Gadget()
+    made.connect()
+    made.configure()
+    return made
+
+
+def test_a_fault_latched_during_activation_is_not_overwritten(gadget: Gadget) -> None:
+    gadget.latch_on_the_way = DeviceFault("gadget", "hot")
+    with pytest.raises(DeviceFault, match="hot"):
+        gadget.activate()
+    assert gadget.state is Lifecycle.FAULTED
+    assert gadget.fault is gadget.latch_on_the_way
+
+
+def test_disconnecting_a_device_that_is_gone_does_not_raise(gadget: Gadget) -> None:
+    gadget.activate()
+    gadget.raise_at_rest = DeviceGone("gadget", "cable")
+    gadget.disconnect()
+    assert gadget.state is Lifecycle.DISCONNECTED
+
+
+def test_disconnecting_a_device_that_does_not_come_to_rest_raises(gadget: Gadget) -> None:
+    gadget.activate()
+    gadget.raise_at_rest = DeviceFault("gadget", "still moving")
+    with pytest.raises(DeviceFault, match="still moving"):
+        gadget.disconnect()
+    assert gadget.state is Lifecycle.DISCONNECTED
+
+
+def test_a_refused_command_is_no_fault_but_a_lost_device_is(gadget: Gadget) -> None:
+    with pytest.raises(CommandRejected):
+        gadget.attempt(CommandRejected("gadget", Rejection.MODE, "busy"))
+    assert gadget.state is Lifecycle.READY
+    with pytest.raises(DeviceGone):
+        gadget.attempt(DeviceGone("gadget", "cable"))
+    assert gadget.state is Lifecycle.FAULTED

@@ -1,0 +1,211 @@
+"""The gate's limits: speed, acceleration and jerk by one factor for the whole twist, joints and singularities."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from touchcell.drivers.core.clock import VirtualClock
+from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
+from touchcell.drivers.core.device import Lifecycle
+from touchcell.drivers.core.gate import TwistGate, TwistLimits
+from touchcell.drivers.core.lease import LeaseDesk
+from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain
+from touchcell.drivers.kinematics.joint_limits import IkSettings, JointLimitsConfig
+from touchcell.geometry.types import Array
+
+LIMITS = TwistLimits(0.1, 0.5, 0.5, 2.5, 20.0, 100.0)
+FREE = TwistLimits(10.0, 1e6, 10.0, 1e6, 1e12, 1e12)
+DT_S = 0.004
+CHAIN = SerialChain(ChainDescription.shipped("generic_6r"))
+WORKING = np.deg2rad([10.0, 40.0, 90.0, 5.0, 50.0, 20.0])
+
+
+class Bench:
+    """A gate asked once in each ``DT_S``; ``q`` is where the joints are, if it is to know."""
+
+    def __init__(self, limits: TwistLimits = LIMITS, ik: DifferentialIk | None = None) -> None:
+        self.clock = VirtualClock(10**9)
+        desk = LeaseDesk("arm")
+        self.gate = TwistGate("arm", limits, desk, self.clock)
+        self.lease = desk.acquire("test")
+        self.ik = ik
+        self.q = WORKING.copy()
+
+    def send(self, twist: Array, dt_s: float = DT_S) -> Sent[TwistCommand]:
+        self.clock.advance_s(dt_s)
+        command = TwistCommand(twist, TwistFrame.BASE, self.clock.now_ns(), 0.1)
+        joints = (lambda: None) if self.ik is None else (lambda: self.ik.at(self.q))
+        return self.gate.admit(command, self.lease, Lifecycle.ACTIVE, np.eye(4), joints=joints)
+
+
+wanted = st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6).map(np.array)
+
+
+def norms(vector: Array) -> tuple[float, float]:
+    return float(np.linalg.norm(vector[:3])), float(np.linalg.norm(vector[3:]))
+
+
+@given(asked=st.lists(st.tuples(wanted, st.integers(1, 12)), min_size=1, max_size=6))
+@settings(max_examples=60)
+def test_speed_acceleration_and_jerk_hold_whatever_is_asked(asked: list[tuple[Array, int]]) -> None:
+    bench = Bench()
+    bench.send(np.zeros(6))
+    last, accel = np.zeros(6), np.zeros(6)
+    for twist, cycles in asked:
+        for _ in range(cycles):
+            sent = bench.send(twist).command.twist
+            now = (sent - last) / DT_S
+            jerk = (now - accel) / DT_S
+            # Where the jerk carries the twist over the speed limit, speed has the last word.
+            at_speed = norms(sent)[0] > 0.1 - 1e-9 or norms(sent)[1] > 0.5 - 1e-9
+            for k, (most, most_accel, most_jerk) in enumerate(((0.1, 0.5, 20.0), (0.5, 2.5, 100.0))):
+                assert norms(sent)[k] <= most * (1 + 1e-9)
+                assert norms(now)[k] <= most_accel * (1 + 1e-9) or at_speed
+                assert norms(jerk)[k] <= most_jerk * (1 + 1e-6) or at_speed
+            last, accel = sent, now
+
+
+@given(first=wanted, second=wanted)
+@settings(max_examples=60)
+def test_a_twist_that_stays_is_reached_exactly_and_stays(first: Array, second: Array) -> None:
+    bench = Bench()
+    for _ in range(20):
+        bench.send(0.08 * first)
+    target = np.concatenate([0.05 * second[:3], 0.25 * second[3:]])
+    for _ in range(200):
+        sent = bench.send(target)
+    np.testing.assert_array_equal(sent.command.twist, target)
+    assert not sent.limited
+
+
+def test_from_rest_the_twist_keeps_its_direction_and_never_overshoots() -> None:
+    bench = Bench()
+    bench.send(np.zeros(6))
+    target = np.array([0.06, -0.02, 0.0, 0.3, 0.0, -0.1])
+    share = 0.0
+    for _ in range(150):
+        sent = bench.send(target).command.twist
+        now = float(sent @ target / (target @ target))
+        np.testing.assert_allclose(sent, now * target, atol=1e-12)
+        assert share - 1e-12 <= now <= 1.0 + 1e-12
+        share = now
+    assert share == 1.0
+
+
+def test_the_first_step_from_rest_is_the_jerks_and_is_named_with_value_and_limit() -> None:
+    bench = Bench()
+    bench.send(np.zeros(6))
+    sent = bench.send(np.array([0.05, 0, 0, 0, 0, 0]))
+    assert sent.command.twist[0] == pytest.approx(20.0 * DT_S**2)
+    told = {a.limit: (a.asked, a.allowed) for a in sent.adjustments}
+    assert told["tcp linear acceleration"] == (pytest.approx(0.05 / DT_S), 0.5)
+    assert told["tcp linear jerk"] == (pytest.approx(0.5 / DT_S), 20.0)
+    assert set(told) == {"tcp linear acceleration", "tcp linear jerk"}
+
+
+def test_what_is_left_in_the_last_cycle_before_is_taken_off_smoothly() -> None:
+    bench = Bench()
+    bench.send(np.zeros(6))
+    accel = []
+    last = 0.0
+    while last < 0.05:
+        now = bench.send(np.array([0.05, 0, 0, 0, 0, 0])).command.twist[0]
+        accel.append((now - last) / DT_S)
+        last = now
+    assert max(accel) == pytest.approx(0.5)
+    assert accel[-1] <= 20.0 * DT_S * (1 + 1e-9)
+
+
+def test_after_a_silence_it_starts_from_rest() -> None:
+    bench = Bench()
+    for _ in range(100):
+        bench.send(np.array([0.1, 0, 0, 0, 0, 0]))
+    assert bench.send(np.array([0.1, 0, 0, 0, 0, 0]), dt_s=0.2).command.twist[0] == pytest.approx(0.5 * 0.1)
+
+
+def free_bench(**changes: float) -> Bench:
+    return Bench(FREE, DifferentialIk(CHAIN, replace(IkSettings(), **changes)))
+
+
+def test_a_joint_near_its_limit_slows_the_whole_twist_outwards_and_nothing_inwards() -> None:
+    bench = free_bench()
+    bench.q[5] = CHAIN.upper[5] - np.deg2rad(1.0)
+    mixed = CHAIN.jacobian(bench.q) @ np.array([0.1, 0, 0, 0, 0, 1.0])
+    for _ in range(100):
+        sent = bench.send(mixed)
+    share = (CHAIN.speed[5] / 5.0) / 1.0
+    np.testing.assert_allclose(sent.command.twist, share * mixed, rtol=1e-9)
+    (found,) = sent.adjustments
+    assert (found.limit, found.asked, found.allowed) == ("joint tool", pytest.approx(1.0), pytest.approx(share))
+    for _ in range(100):
+        back = bench.send(-mixed)
+    np.testing.assert_array_equal(back.command.twist, -mixed)
+
+
+def test_beyond_a_joints_limit_only_the_way_back_is_open() -> None:
+    bench = free_bench()
+    bench.q[5] = CHAIN.upper[5] + 0.01
+    outwards = CHAIN.jacobian(bench.q)[:, 5]
+    assert not bench.send(outwards).command.twist.any()
+    for _ in range(100):
+        back = bench.send(-0.5 * outwards)
+    np.testing.assert_array_equal(back.command.twist, -0.5 * outwards)
+
+
+def test_joint_speed_and_acceleration_hold_for_the_whole_twist() -> None:
+    bench = free_bench()
+    fast = CHAIN.jacobian(bench.q) @ np.array([0.0, 4.0, 0, 0, 0, 0.5])
+    bench.send(np.zeros(6))
+    before = np.zeros(6)
+    inverse = np.linalg.inv(CHAIN.jacobian(bench.q))
+    for k in range(200):
+        sent = bench.send(fast)
+        dq = inverse @ sent.command.twist
+        assert (np.abs(dq - before) <= CHAIN.accel * DT_S * (1 + 1e-9)).all()
+        assert (np.abs(dq) <= CHAIN.speed * (1 + 1e-9)).all()
+        if k == 0:
+            told = {a.limit: (a.asked, a.allowed) for a in sent.adjustments}
+            assert told == {
+                "joint shoulder": (pytest.approx(4.0), pytest.approx(CHAIN.speed[1])),
+                "joint shoulder acceleration": (pytest.approx(CHAIN.speed[1] / DT_S), pytest.approx(CHAIN.accel[1])),
+            }
+        before = dq
+    np.testing.assert_allclose(sent.command.twist, CHAIN.speed[1] / 4.0 * fast, rtol=1e-9)
+
+
+def test_a_singularity_is_approached_ever_slower_and_left() -> None:
+    bench = free_bench()
+    outwards = np.array([0.1, 0, 0, 0, 0, 0.0])
+    for _ in range(3000):
+        sent = bench.send(outwards)
+        bench.q = bench.q + bench.ik.solve(bench.q, sent.command.twist).dq * DT_S
+    at = bench.ik.solve(bench.q, np.zeros(6)).smallest_singular_value
+    assert at == pytest.approx(0.02, abs=1e-3)
+    assert np.linalg.norm(sent.command.twist) < 0.002
+    assert any(a.limit == "singularity" for a in sent.adjustments)
+    for _ in range(100):
+        back = bench.send(-outwards)
+    assert np.linalg.norm(back.command.twist) > 0.05
+
+
+def test_below_the_floor_leaving_is_allowed_at_a_tenth_of_the_joint_speeds() -> None:
+    # Almost straight up: nearly singular, and the elbow's bending leads out of it.
+    q = np.deg2rad([0.0, 5.0, 2.0, 0.0, 40.0, 0.0])
+    ik = DifferentialIk(CHAIN, JointLimitsConfig().settings(own_controller=True))
+    assert ik.solve(q, np.zeros(6)).smallest_singular_value < 0.02
+    leaving = CHAIN.jacobian(q) @ np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
+    motion = ik.solve(q, leaving)
+    assert np.max(np.abs(motion.dq) / CHAIN.speed) == pytest.approx(0.1)
+    np.testing.assert_allclose(motion.twist, motion.scale * leaving, atol=1e-9)
+    assert motion.adjustments[-1].limit == "leaving a singularity"
+    assert ik.solve(q, -leaving).scale == 0.0
+
+
+def test_a_floor_above_the_threshold_is_refused() -> None:
+    with pytest.raises(ValueError, match="singular_floor_mm 50 is not below"):
+        JointLimitsConfig(singular_floor_mm=50.0)

@@ -1,0 +1,316 @@
+"""A device host, cycle by cycle on virtual time: when it obeys and when it stops. No process is started."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from touchcell.drivers.core.clock import VirtualClock
+from touchcell.drivers.core.device import Lifecycle
+from touchcell.drivers.core.errors import CommandRejected, LifecycleError, Rejection, TouchcellError
+from touchcell.drivers.hosting.host import Host
+from touchcell.drivers.hosting.layouts import (
+    ANSWER,
+    ARM,
+    COMMAND,
+    HOST,
+    WATCH,
+    Cause,
+    Reason,
+    RecordReader,
+    RecordWriter,
+    cause_of,
+    close_fd,
+    new_block,
+    put_cause,
+)
+from touchcell.drivers.hosting.wire import decode_note
+from touchcell.simulation.devices.arm import SimArm
+
+PERIOD_S = 0.02
+STEP_NS = 2_000_000
+
+
+class Bench:
+    """A host with two simulated arms, and all blocks in the hands of the test."""
+
+    def __init__(self, categories: tuple[int, int] = (2, 2)) -> None:
+        self.fds: list[int] = []
+        self.clock = VirtualClock(1_000_000_000)
+        arms = {
+            name: {
+                kind: self.block(dtype) for kind, dtype in (("command", COMMAND), ("answer", ANSWER), ("state", ARM))
+            }
+            for name in ("left", "right")
+        }
+        wake, answered = os.eventfd(0, os.EFD_NONBLOCK), os.eventfd(0, os.EFD_NONBLOCK)
+        watch, beat = self.block(WATCH), self.block(HOST)
+        self.fds += [wake, answered]
+        self.ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.theirs = theirs
+        config = {"start_pose_mm_deg": (0, 0, 200, 180, 0, 0)}
+        spec = {
+            "period_s": PERIOD_S,
+            "rate_hz": 500.0,
+            "seed": 0,
+            "scene": None,
+            "devices": [
+                {"name": name, "driver": "sim_arm", "config": config, "category": category, "policy": "hold"}
+                for name, category in zip(arms, categories, strict=True)
+            ],
+            "fds": {"wake": wake, "answered": answered, "watch": watch, "host": beat, "devices": arms},
+        }
+        self.host = Host(spec, theirs, self.clock)
+        self.watch = RecordWriter(watch, WATCH)
+        self.beat = RecordReader(beat, HOST)
+        self.commands = {name: RecordWriter(fds["command"], COMMAND) for name, fds in arms.items()}
+        self.answers = {name: RecordReader(fds["answer"], ANSWER) for name, fds in arms.items()}
+        self.states = {name: RecordReader(fds["state"], ARM) for name, fds in arms.items()}
+        self.leases: dict[str, int] = {}
+        self.guarding = False
+        self.beating = True
+        self.number = 0
+        for name in arms:
+            for call in ("connect", "configure", "activate"):
+                self.call(call, name)
+            self.leases[name] = self.call("acquire", name, owner="test")["epoch"]
+
+    def block(self, dtype: Any) -> int:
+        self.fds.append(new_block("test", dtype))
+        return self.fds[-1]
+
+    def call(self, call: str, device: str = "", **arguments: Any) -> dict[str, Any]:
+        return self.host._call({"call": call, "device": device, **arguments})
+
+    def arm(self, name: str) -> SimArm:
+        arm = self.host.devices[name]
+        assert isinstance(arm, SimArm)
+        return arm
+
+    def step(self, cycles: int = 1) -> None:
+        for _ in range(cycles):
+            self.clock.advance_s(STEP_NS * 1e-9)
+            if self.beating:
+                self.tell_watch()
+            self.host.cycle()
+
+    def tell_watch(self, cause: Cause | None = None) -> None:
+        value = self.watch.value
+        value["count"] += 1
+        value["t_ns"], value["guarding"] = self.clock.now_ns(), self.guarding
+        if cause is not None:
+            value["stop"] = True
+            put_cause(value, cause)
+        self.watch.publish()
+
+    def send(self, name: str, speed_m_s: float = 0.02, ttl_s: float = 0.06) -> TouchcellError | None:
+        """Write a twist, let the host look, and return what it refused it with."""
+        self.number += 1
+        value = self.commands[name].value
+        value["number"], value["lease"], value["t_ns"] = self.number, self.leases[name], self.clock.now_ns()
+        value["twist"], value["ttl_s"] = [speed_m_s, 0, 0, 0, 0, 0], ttl_s
+        self.commands[name].publish()
+        self.host.cycle()
+        _, answer, note = self.answers[name].read_all()
+        assert answer["number"] == self.number
+        return decode_note(note, name) if answer["refused"] else None
+
+    def move(self, cycles: int = 30) -> None:
+        """Both arms at 20 mm/s, guarded."""
+        self.guarding = True
+        for _ in range(cycles):
+            self.step()
+            assert [self.send(name) for name in self.states] == [None, None]
+        assert all(np.isclose(state.read()["twist"][0], 0.02) for state in self.states.values())
+
+    def close(self) -> None:
+        for block in (self.watch, self.beat, *self.commands.values(), *self.answers.values(), *self.states.values()):
+            block.close()
+        self.ours.close()
+        self.theirs.close()
+        for fd in self.fds:
+            close_fd(fd)
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    bench = Bench()
+    yield bench
+    bench.close()
+
+
+def test_without_a_guard_nothing_moves(bench: Bench) -> None:
+    bench.step()
+    refused = bench.send("left")
+    assert isinstance(refused, CommandRejected)
+    assert refused.reason is Rejection.MODE
+    bench.step(20)
+    assert bench.states["left"].read()["at_rest"]
+    assert bench.states["left"].read()["obeyed"] == 0
+
+
+def test_lease_freshness_and_limits_are_checked_in_the_host(bench: Bench) -> None:
+    bench.guarding = True
+    bench.step()
+    bench.leases["left"] += 1
+    refused = bench.send("left")
+    assert isinstance(refused, CommandRejected)
+    assert refused.reason is Rejection.LEASE
+    bench.leases["left"] -= 1
+    refused = bench.send("left", ttl_s=5.0)
+    assert isinstance(refused, CommandRejected)
+    assert refused.reason is Rejection.LIMIT
+    refused = bench.send("left", speed_m_s=float("nan"))
+    assert isinstance(refused, CommandRejected)
+    assert refused.reason is Rejection.NON_FINITE
+    bench.step()
+    assert bench.send("left", speed_m_s=9.0) is None
+    sent = bench.answers["left"].read()["twist"]
+    assert np.isclose(sent[0], 0.5 * 0.06), "the gate limits acceleration"
+
+
+def test_a_command_expires_in_the_host_when_no_other_comes(bench: Bench) -> None:
+    bench.move()
+    bench.step(60)
+    record = bench.states["left"].read()
+    assert record["at_rest"]
+    assert not bench.beat.read()["latched"]
+
+
+def test_the_stop_word_stops_both_arms_in_that_cycle_and_for_good(bench: Bench) -> None:
+    bench.move()
+    bench.tell_watch(Cause(Reason.TASK_SILENT, bench.clock.now_ns(), 0.06, 0.05))
+    bench.host.cycle()
+    stopped_ns = bench.clock.now_ns()
+    for _ in range(60):
+        refused = bench.send("left")
+        assert isinstance(refused, CommandRejected)
+        assert refused.reason is Rejection.MODE
+        bench.step()
+    assert cause_of(bench.beat.read()).reason is Reason.TASK_SILENT
+    for state in bench.states.values():
+        record = state.read()
+        assert record["at_rest"]
+        assert record["stop_ns"] == stopped_ns
+        assert record["obeyed_ns"] <= stopped_ns
+        assert 0.038 <= (record["rest_ns"] - stopped_ns) * 1e-9 <= 0.046, "20 mm/s at 0.5 m/s2"
+        assert np.isclose(record["stop_speed_m_s"], 0.02)
+        assert np.isclose(record["stop_way_m"], 0.0004, atol=1e-4)
+
+
+@given(silent_after=st.integers(1, 20))
+@settings(max_examples=20)
+def test_a_silent_watchdog_is_found_within_its_time(silent_after: int) -> None:
+    bench = Bench()
+    try:
+        bench.move(20 + silent_after)
+        last_ns = int(bench.watch.value["t_ns"])
+        bench.beating = False
+        refused = None
+        while refused is None:
+            bench.step()
+            refused = bench.send("right")
+        cause = cause_of(bench.beat.read())
+        assert cause.reason is Reason.WATCHDOG_SILENT
+        assert 0.05 < (cause.t_ns - last_ns) * 1e-9 <= 0.05 + STEP_NS * 1e-9
+        # Its beats come back, and nothing changes.
+        bench.beating = True
+        bench.step(60)
+        assert bench.send("right") is not None
+        assert all(state.read()["at_rest"] for state in bench.states.values())
+    finally:
+        bench.close()
+
+
+def test_an_end_of_the_guard_stops_what_still_moves(bench: Bench) -> None:
+    bench.move()
+    bench.guarding = False
+    bench.step(30)
+    assert all(state.read()["at_rest"] for state in bench.states.values())
+    assert not bench.beat.read()["latched"]
+
+
+def test_an_arm_that_runs_on_is_stopped_by_stronger_means(bench: Bench) -> None:
+    bench.move()
+    arm = bench.arm("left")
+    arm.faults = replace(arm.faults, runs_on=True)
+    bench.tell_watch(Cause(Reason.TASK_SILENT, bench.clock.now_ns()))
+    bench.step(400)
+    record = bench.states["left"].read()
+    assert record["escalated"]
+    assert record["at_rest"]
+    assert arm.state is Lifecycle.READY
+    assert not bench.states["right"].read()["escalated"]
+
+
+def test_each_arm_stops_by_its_own_category() -> None:
+    bench = Bench((1, 2))
+    bench.move()
+    bench.tell_watch(Cause(Reason.HOST_SILENT, bench.clock.now_ns(), host=1))
+    bench.step(60)
+    assert bench.arm("left").state is Lifecycle.READY
+    assert bench.arm("right").state is Lifecycle.ACTIVE
+    bench.close()
+
+
+def test_the_latch_is_cleared_at_rest_without_lease_and_stop_word_only(bench: Bench) -> None:
+    bench.move()
+    bench.tell_watch(Cause(Reason.TASK_SILENT, bench.clock.now_ns()))
+    bench.host.cycle()
+    bench.guarding = False
+
+    def refused() -> bool:
+        try:
+            bench.call("clear")
+        except LifecycleError:
+            return True
+        return False
+
+    assert refused(), "still moving"
+    bench.step(60)
+    assert refused(), "the stop word stands"
+    bench.watch.value["stop"] = False
+    bench.step()
+    assert refused(), "somebody holds the lease"
+    for name, epoch in bench.leases.items():
+        bench.call("release", name, epoch=epoch)
+    bench.guarding = True
+    bench.step()
+    assert refused(), "guarded"
+    bench.guarding = False
+    bench.step()
+    assert not refused()
+    bench.step(60)
+    assert not bench.beat.read()["latched"]
+    assert all(state.read()["at_rest"] for state in bench.states.values()), "clearing moves nothing"
+
+
+def test_a_stop_drops_the_twist_that_was_written_before_it(bench: Bench) -> None:
+    bench.move()
+    bench.step()
+    obeyed = int(bench.states["left"].read()["obeyed"])
+    value = bench.commands["left"].value
+    value["number"] += 1
+    value["stop"], value["category"] = value["number"] + 1, 2
+    bench.commands["left"].publish()
+    bench.step(60)
+    record = bench.states["left"].read()
+    assert record["obeyed"] == obeyed
+    assert record["at_rest"]
+
+
+def test_what_a_driver_raises_is_told_with_the_state(bench: Bench) -> None:
+    bench.move()
+    bench.arm("left").disconnect()
+    bench.step()
+    record = bench.states["left"].read()
+    assert record["lifecycle"] == 0
+    assert not bench.states["right"].read()["failed"]

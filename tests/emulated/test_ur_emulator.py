@@ -1,0 +1,220 @@
+"""The inside of the emulated UR controller, stepped by hand: no process, no clock."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from touchcell.drivers.ur.codec import Value
+from touchcell.drivers.ur.emulator import kinematics as ur_model
+from touchcell.drivers.ur.emulator import program as ur_program
+from touchcell.drivers.ur.emulator.controller import Controller
+from touchcell.drivers.ur.emulator.motion import Trapezoid
+from touchcell.drivers.ur.emulator.program import PERIOD_S
+from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyMode
+
+SCRIPT = "def rtde_control():\n rtde_set_watchdog()\nend\n"
+ANGLES = st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6).map(np.array)
+
+
+def run(controller: Controller, seconds: float) -> None:
+    for _ in range(round(seconds / PERIOD_S)):
+        controller.step()
+
+
+def command(controller: Controller, number: int, doubles: list[float] = [], *integers: int) -> None:  # noqa: B006
+    values: dict[str, Value] = {"input_int_register_0": number}
+    values |= {f"input_double_register_{i}": value for i, value in enumerate(doubles)}
+    values |= {f"input_int_register_{i + 1}": value for i, value in enumerate(integers)}
+    controller.write_inputs(values)
+
+
+@pytest.fixture
+def controller() -> Controller:
+    """A controller on which the control program plays."""
+    made = Controller()
+    made.start_program(SCRIPT)
+    run(made, 0.04)
+    assert made.runtime_state is RuntimeState.PLAYING
+    return made
+
+
+def test_flange_of_the_stretched_arm() -> None:
+    # All joints zero: the arm lies along -x, so the sheet's lengths add up.
+    T, _ = ur_model.forward(np.zeros(6), np.eye(4))
+    np.testing.assert_allclose(T[:3, 3], [-0.425 - 0.3922, -0.1333 - 0.0996, 0.1625 - 0.0997], atol=1e-12)
+
+
+@given(ANGLES, st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6).map(np.array))
+def test_jacobian_is_the_derivative_of_the_pose(q: np.ndarray, qd: np.ndarray) -> None:
+    tool = ur_model.from_pose_vector(np.array([0.01, -0.02, 0.1, 0.1, 0.2, -0.3]))
+    h = 1e-6
+    (ahead, _), (behind, _) = ur_model.forward(q + h * qd, tool), ur_model.forward(q - h * qd, tool)
+    twist = ur_model.forward(q, tool)[1] @ qd
+    np.testing.assert_allclose((ahead[:3, 3] - behind[:3, 3]) / (2 * h), twist[:3], atol=1e-7)
+    spin = ur_model.rotation_vector(ahead[:3, :3] @ behind[:3, :3].T) / (2 * h)
+    np.testing.assert_allclose(spin, twist[3:], atol=1e-7)
+
+
+def test_inverse_reaches_the_pose_or_says_no() -> None:
+    controller = Controller()
+    T = controller.arm.T_base_tcp.copy()
+    T[:3, 3] += [0.05, -0.03, 0.04]
+    q = ur_model.inverse(T, controller.arm.q, np.eye(4))
+    assert q is not None
+    np.testing.assert_allclose(ur_model.forward(q, np.eye(4))[0], T, atol=1e-8)
+    T[:3, 3] = [3.0, 0.0, 0.0]
+    assert ur_model.inverse(T, controller.arm.q, np.eye(4)) is None
+
+
+@given(st.floats(1e-6, 10.0), st.floats(1e-3, 3.0), st.floats(1e-2, 40.0))
+def test_trapezoid_arrives_within_its_limits(distance: float, speed: float, accel: float) -> None:
+    profile = Trapezoid(distance, speed, accel)
+    t_s = np.linspace(0.0, profile.duration_s, 400)
+    s = np.array([profile.at(float(t)) for t in t_s])
+    assert s[0] == 0.0
+    assert s[-1] == distance
+    speeds = np.diff(s) / np.diff(t_s)
+    assert speeds.min() >= -1e-9 * speed
+    assert speeds.max() <= speed * (1 + 1e-6)
+
+
+def test_speedl_moves_the_tool_along_base_axes(controller: Controller) -> None:
+    controller.set_tool(ur_model.from_pose_vector(np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0])))
+    start = controller.arm.T_base_tcp.copy()
+    command(controller, ur_program.SPEEDL, [0.05, 0, 0, 0, 0, 0.2, 100.0, PERIOD_S])
+    run(controller, 1.0)
+    moved = controller.arm.T_base_tcp[:3, 3] - start[:3, 3]
+    np.testing.assert_allclose(moved, [0.05, 0.0, 0.0], atol=3e-4)
+    turned = ur_model.rotation_vector(controller.arm.T_base_tcp[:3, :3] @ start[:3, :3].T)
+    np.testing.assert_allclose(turned, [0.0, 0.0, 0.2], atol=1e-3)
+    np.testing.assert_allclose(controller.arm.twist, [0.05, 0, 0, 0, 0, 0.2], atol=5e-5)
+
+
+def test_the_speed_thread_goes_on_for_ever_whatever_time_says(controller: Controller) -> None:
+    command(controller, ur_program.SPEEDL, [0.05, 0, 0, 0, 0, 0, 1.0, 0.1])
+    run(controller, 1.0)
+    command(controller, 0)
+    run(controller, 1.0)
+    assert controller.arm.twist[0] == pytest.approx(0.05, abs=1e-5)
+
+
+def test_time_is_when_a_newer_target_is_taken_up(controller: Controller) -> None:
+    command(controller, ur_program.SPEEDL, [0.05, 0, 0, 0, 0, 0, 10.0, 0.5])
+    run(controller, 0.1)
+    command(controller, ur_program.SPEEDL, [0.0] * 6 + [10.0, PERIOD_S])
+    run(controller, 0.3)
+    assert controller.arm.twist[0] == pytest.approx(0.05, abs=1e-5)
+    run(controller, 0.3)
+    assert not controller.arm.qd.any()
+
+
+def test_without_time_a_newer_target_waits_until_the_old_one_is_reached(controller: Controller) -> None:
+    command(controller, ur_program.SPEEDL, [0.1, 0, 0, 0, 0, 0, 0.1, 0.0])
+    run(controller, 0.1)
+    command(controller, ur_program.SPEEDL, [0.0] * 6 + [10.0, 0.0])
+    run(controller, 0.5)
+    assert controller.arm.twist[0] > 0.05
+    run(controller, 0.6)
+    assert not controller.arm.qd.any()
+
+
+def test_the_watchdog_stops_the_program_and_the_arm(controller: Controller) -> None:
+    command(controller, ur_program.SET_WATCHDOG, [10.0])
+    run(controller, 0.01)
+    command(controller, ur_program.SPEEDL, [0.05, 0, 0, 0, 0, 0, 100.0, PERIOD_S])
+    run(controller, 0.098)
+    assert controller.arm.twist[0] == pytest.approx(0.05, abs=1e-5)
+    start_m = controller.arm.travel_m
+    run(controller, 1.0)
+    assert controller.watchdog_trips == 1
+    assert controller.runtime_state is RuntimeState.STOPPED
+    assert controller.arm.travel_m - start_m < 0.05 * 0.06
+    assert not controller.arm.qd.any()
+
+
+def test_registers_outlive_the_program_so_a_new_one_moves_at_once(controller: Controller) -> None:
+    command(controller, ur_program.SPEEDL, [0.05, 0, 0, 0, 0, 0, 1.0, PERIOD_S])
+    run(controller, 0.2)
+    controller.stop_program()
+    run(controller, 0.5)
+    assert not controller.arm.qd.any()
+    controller.start_program(SCRIPT)
+    run(controller, 0.5)
+    assert controller.arm.twist[0] == pytest.approx(0.05, abs=1e-5)
+
+
+def test_a_protective_stop_pauses_and_play_resumes_the_motion(controller: Controller) -> None:
+    command(controller, ur_program.SPEEDL, [0.05, 0, 0, 0, 0, 0, 1.0, PERIOD_S])
+    run(controller, 0.2)
+    controller.protective_stop()
+    run(controller, 1.0)
+    assert controller.runtime_state is RuntimeState.PAUSED
+    assert not controller.arm.qd.any()
+    assert not controller.unlock_protective_stop()
+    run(controller, 4.5)
+    assert controller.unlock_protective_stop()
+    assert controller.play()
+    run(controller, 0.5)
+    assert controller.arm.twist[0] == pytest.approx(0.05, abs=1e-4)
+
+
+def test_an_emergency_stop_ends_the_program_and_cuts_the_power(controller: Controller) -> None:
+    controller.stop_by_safety(SafetyMode.ROBOT_EMERGENCY_STOP)
+    run(controller, 1.0)
+    assert controller.runtime_state is RuntimeState.STOPPED
+    assert controller.robot_mode is RobotMode.POWER_OFF
+
+
+def test_two_threads_may_not_drive_the_arm(controller: Controller) -> None:
+    command(controller, ur_program.SPEEDL, [0.05, 0, 0, 0, 0, 0, 1.0, PERIOD_S])
+    run(controller, 0.1)
+    command(controller, ur_program.MOVEJ, [*controller.arm.q + 0.1, 1.0, 1.0], 1)
+    run(controller, 0.1)
+    assert controller.runtime_state is RuntimeState.STOPPED
+    assert "another thread" in controller.messages[-1]
+
+
+def test_movej_arrives_and_reports_its_operation(controller: Controller) -> None:
+    goal = controller.arm.q + 0.2
+    command(controller, ur_program.MOVEJ, [*goal, 1.0, 2.0], 1)
+    run(controller, 0.02)
+    assert int(controller.outputs["output_int_register_2"]) & 0x8000  # type: ignore[arg-type]
+    run(controller, 1.5)
+    np.testing.assert_allclose(controller.arm.q, goal, atol=1e-12)
+    assert not int(controller.outputs["output_int_register_2"]) & 0x8000  # type: ignore[arg-type]
+
+
+def test_running_too_fast_is_a_protective_stop(controller: Controller) -> None:
+    command(controller, ur_program.SPEEDJ, [5.0, 0, 0, 0, 0, 0, 40.0, PERIOD_S])
+    run(controller, 0.5)
+    assert controller.safety_mode is SafetyMode.PROTECTIVE_STOP
+
+
+def test_the_slider_slows_the_tool(controller: Controller) -> None:
+    controller.speed_slider = 0.5
+    command(controller, ur_program.SPEEDL, [0.05, 0, 0, 0, 0, 0, 100.0, PERIOD_S])
+    run(controller, 0.5)
+    assert float(np.linalg.norm(controller.arm.twist[:3])) == pytest.approx(0.025, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    "text", ["def other():\nend\n", "def rtde_control():\nend\n", SCRIPT.replace(" rtde", "$5.0 rtde")]
+)
+def test_only_the_scripts_it_knows_are_played(text: str) -> None:
+    controller = Controller()
+    controller.start_program(text)
+    run(controller, 0.1)
+    assert controller.runtime_state is RuntimeState.STOPPED
+    assert controller.energising == 0
+
+
+def test_travel_counts_the_way_of_the_tool(controller: Controller) -> None:
+    command(controller, ur_program.SPEEDL, [0.05, 0, 0, 0, 0, 0, 100.0, PERIOD_S])
+    run(controller, 0.5)
+    assert controller.arm.travel_m == pytest.approx(0.025, abs=2e-4)
+    assert math.isfinite(controller.last_input_age_s)

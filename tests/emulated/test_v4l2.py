@@ -1,0 +1,585 @@
+"""The V4L2 driver on an emulated camera in a process of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from touchcell.drivers.core.camera import SettingRefused
+from touchcell.drivers.core.clock import MonotonicClock, VirtualClock
+from touchcell.drivers.core.device import Lifecycle, OperatorToken
+from touchcell.drivers.core.errors import (
+    ConfigError,
+    ConnectError,
+    CorruptMessage,
+    DeviceGone,
+    LifecycleError,
+    StaleData,
+    TransportTimeout,
+)
+from touchcell.drivers.core.protocols import FrameSource, HealthSource
+from touchcell.drivers.core.samples import Frame, Quality, Stamped
+from touchcell.drivers.core.spec import spec
+from touchcell.drivers.v4l2.codec import Arrival
+from touchcell.drivers.v4l2.driver import SPEC, V4l2Camera, V4l2Config
+from touchcell.drivers.v4l2.emulator import picture
+from touchcell.drivers.v4l2.emulator.shim import ShimCalls
+from touchcell.drivers.v4l2.rig import rig
+from touchcell.testing.emulation.process import EmulatorProcess
+
+TOKEN = OperatorToken("test", 0)
+DEADLINE_S = 5.0
+NODE = "/dev/video7"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("camera")
+
+
+@pytest.fixture(scope="module")
+def process(folder: Path) -> Iterator[EmulatorProcess]:
+    with EmulatorProcess("v4l2", "--folder", str(folder), "--minor", "7") as running:
+        yield running
+
+
+@pytest.fixture
+def emulator(process: EmulatorProcess) -> Iterator[EmulatorProcess]:
+    yield process
+    for fault in ("pause", "delay", "freeze_frame", "exposure_drift", "stuck_controls", "no_monotonic", "unplug"):
+        process.clear(fault)
+
+
+@pytest.fixture
+def make(folder: Path, emulator: EmulatorProcess) -> Iterator[Callable[..., V4l2Camera]]:
+    made: list[V4l2Camera] = []
+
+    def build(**settings: object) -> V4l2Camera:
+        config = V4l2Config.model_validate(
+            {"device": NODE, "rate_hz": 120, "gain": 10, "exposure_us": 15700} | settings
+        )
+        made.append(V4l2Camera("tip", MonotonicClock(), config, ShimCalls(folder)))
+        return made[-1]
+
+    yield build
+    for camera in made:
+        camera.disconnect()
+
+
+@pytest.fixture
+def camera(make: Callable[..., V4l2Camera]) -> V4l2Camera:
+    return ready(make())
+
+
+def ready(camera: V4l2Camera) -> V4l2Camera:
+    camera.connect()
+    camera.configure()
+    return camera
+
+
+def read(camera: V4l2Camera, frames: int) -> list[Stamped[Frame]]:
+    got = [camera.latest()]
+    while len(got) < frames:
+        got.append(camera.next(got[-1].seq, 1.0))
+    return got
+
+
+def read_until(camera: V4l2Camera, reading: str, at_least: float) -> None:
+    deadline = time.monotonic() + DEADLINE_S
+    seq = -1
+    while time.monotonic() < deadline:
+        seq = camera.next(seq, 1.0).seq
+        value = camera.health().get(reading, 0)
+        assert isinstance(value, int | float)
+        if value >= at_least:
+            return
+    pytest.fail(f"{reading} did not reach {at_least}: {camera.health()}")
+
+
+def test_the_driver_is_found_by_name_and_offers_what_it_says(camera: V4l2Camera) -> None:
+    assert spec("v4l2") is SPEC
+    assert SPEC.capabilities.abilities == {"FrameSource", "HealthSource"}
+    assert isinstance(camera, FrameSource)
+    assert isinstance(camera, HealthSource)
+
+
+def test_connecting_changes_nothing_and_configuring_moves_nothing(
+    make: Callable[..., V4l2Camera], emulator: EmulatorProcess
+) -> None:
+    before = emulator.state()
+    camera = make()
+    camera.connect()
+    after = emulator.wait_for(clients=1)
+    assert camera.state is Lifecycle.PASSIVE
+    assert after["settings_changed"] == before["settings_changed"]
+    assert after["streaming"] is False
+    with pytest.raises(LifecycleError):
+        camera.latest()
+    camera.configure()
+    camera.activate()
+    assert emulator.state()["energising"] == 0
+    camera.deactivate()
+    assert camera.state is Lifecycle.READY
+    camera.disconnect()
+    state = emulator.wait_for(clients=0, streaming=False)
+    assert state["buffers"] == 0
+
+
+def test_frames_are_stamped_numbered_and_show_what_the_sensor_saw(
+    make: Callable[..., V4l2Camera], emulator: EmulatorProcess
+) -> None:
+    began_ns = time.monotonic_ns()
+    frames = read(ready(make(pixel_format="GREY")), 20)
+    ended_ns = time.monotonic_ns()
+    for frame in frames:
+        assert_number_is_true(frame)
+        assert frame.quality is Quality.GOOD
+        assert (frame.value.exposure, frame.value.gain) == (0.0157, 10.0)
+    stamps = np.array([began_ns, *(frame.t_ns for frame in frames), ended_ns])
+    assert (np.diff(stamps) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("pixel_format", "color", "shape", "tolerance"),
+    [
+        ("MJPG", "grey", (480, 640), 3.0),
+        ("MJPG", "bgr", (480, 640, 3), 3.0),
+        ("YUYV", "grey", (480, 640), 0.0),
+        ("YUYV", "bgr", (480, 640, 3), 20.0),
+        ("GREY", "bgr", (480, 640, 3), 0.0),
+    ],
+)
+def test_every_format_decodes_to_the_picture(
+    make: Callable[..., V4l2Camera], pixel_format: str, color: str, shape: tuple[int, ...], tolerance: float
+) -> None:
+    frame = ready(make(pixel_format=pixel_format, color=color)).latest()
+    expected = picture.brightened(picture.synthetic(frame.seq % picture.PICTURES, 640, 480), 1.2).astype(float)
+    image = frame.value.image.astype(float)
+    assert image.shape == shape
+    difference = np.abs((image if image.ndim == 2 else image.mean(axis=2)) - expected)
+    # YUYV carries brightness 16..235 where BGR has 0..255; JPEG loses a little.
+    assert difference.mean() <= tolerance
+
+
+def test_settings_read_back_in_health(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
+    health = camera.health()
+    assert (health["exposure_us"], health["gain"]) == (15700, 10)
+    assert health["kernel_stamps"] is True
+    assert health["stamp_marks"] == "start of exposure"
+    controls = emulator.state()["controls"]
+    assert (controls["Auto Exposure"], controls["Exposure Time, Absolute"], controls["Gain"]) == (1, 157, 10)
+
+
+@pytest.mark.parametrize(
+    ("settings", "setting", "given"),
+    [
+        ({"width_px": 700}, "width_px", 640),
+        ({"rate_hz": 47.0}, "rate_hz", 60.0),
+        ({"exposure_us": 1_000_000}, "exposure_us", 500_000),
+        ({"gain": 200}, "gain", 100),
+    ],
+)
+def test_a_setting_that_the_camera_changes_is_refused(
+    make: Callable[..., V4l2Camera], settings: dict[str, object], setting: str, given: float
+) -> None:
+    camera = make(**settings)
+    camera.connect()
+    with pytest.raises(SettingRefused) as caught:
+        camera.configure()
+    assert caught.value.setting == setting
+    assert caught.value.asked == settings[setting]
+    assert caught.value.given == given
+    assert str(given) in str(caught.value)
+    assert camera.state is Lifecycle.PASSIVE
+
+
+def test_a_control_that_only_seems_to_obey_is_refused(
+    make: Callable[..., V4l2Camera], emulator: EmulatorProcess
+) -> None:
+    ready(make(gain=20)).disconnect()
+    emulator.fault("stuck_controls")
+    camera = make(gain=30)
+    camera.connect()
+    with pytest.raises(SettingRefused) as caught:
+        camera.configure()
+    assert (caught.value.setting, caught.value.asked, caught.value.given) == ("gain", 30, 20)
+    emulator.clear("stuck_controls")
+    camera.configure()
+    assert camera.latest().value.gain == 30.0
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"rate_hz": float("nan")}, {"exposure_us": 150}, {"width_px": 0}, {"gane": 3}, {"stall_s": 0.05}],
+)
+def test_nonsense_is_refused_before_any_device_is_touched(settings: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        V4l2Config.model_validate({"device": NODE} | settings)
+
+
+def test_latest_never_returns_the_same_frame_as_new_and_next_waits(camera: V4l2Camera) -> None:
+    first = camera.latest()
+    later = camera.next(first.seq, 1.0)
+    assert later.seq > first.seq
+    assert later.t_ns > first.t_ns
+    with pytest.raises(TransportTimeout):
+        camera.next(later.seq + 1000, 0.02)
+    assert camera.state is Lifecycle.READY
+
+
+def test_after_a_long_pause_the_newest_frame_comes_and_the_gap_is_the_readers(
+    make: Callable[..., V4l2Camera], emulator: EmulatorProcess
+) -> None:
+    camera = ready(make(rate_hz=30))
+    before = camera.latest()
+    buffers = int(camera.health()["buffers"])
+    overruns = emulator.state()["overruns"]
+    deadline = time.monotonic() + DEADLINE_S
+    while emulator.state()["overruns"] < overruns + 5:
+        assert time.monotonic() < deadline
+    filled = time.monotonic_ns()
+    # Only on a machine too busy to make a frame within four periods is there another answer, and an honest one.
+    with contextlib.suppress(StaleData):
+        frame = camera.latest(max_age_s=0.25)
+        assert frame.t_ns > filled
+        assert frame.seq > before.seq + buffers
+    camera.next(before.seq + buffers, DEADLINE_S)
+    health = camera.health()
+    assert int(health["frames_unread"]) >= 5
+    assert health["frames_lost"] == 0
+
+
+def assert_number_is_true(frame: Stamped[Frame]) -> None:
+    # Gain 10 is 1.2 times the light, exposure 15.7 ms is the emulated camera's nominal one.
+    expected = picture.brightened(picture.synthetic(frame.seq % picture.PICTURES, 640, 480), 1.2)
+    np.testing.assert_array_equal(frame.value.image, expected)
+
+
+def test_lost_frames_are_counted_and_leave_a_gap_in_the_numbers(
+    make: Callable[..., V4l2Camera], emulator: EmulatorProcess
+) -> None:
+    camera = ready(make(pixel_format="GREY"))
+    assert_number_is_true(camera.latest())
+    emulator.fault("drop", 3)
+    read_until(camera, "frames_lost", 3)
+    assert_number_is_true(camera.latest())
+    assert camera.health()["frames_lost"] == 3
+    assert camera.health()["frames_unread"] == 0
+
+
+@pytest.mark.parametrize(
+    ("fault", "reading"),
+    [
+        ("corrupt", "frames_bad_damaged"),
+        ("error_flag", "frames_bad_marked_damaged"),
+        ("out_of_order", "frames_bad_out_of_order"),
+    ],
+)
+@pytest.mark.parametrize("pixel_format", ["MJPG", "YUYV"])
+def test_a_few_bad_frames_are_refused_counted_and_survived(
+    make: Callable[..., V4l2Camera], emulator: EmulatorProcess, fault: str, reading: str, pixel_format: str
+) -> None:
+    camera = ready(make(pixel_format=pixel_format))
+    emulator.fault(fault, 3)
+    read_until(camera, reading, 3)
+    frames = read(camera, 5)
+    assert camera.health()[reading] == 3
+    assert camera.health()["frames_bad"] == 3
+    assert (np.diff([frame.seq for frame in frames]) > 0).all()
+    assert (np.diff([frame.t_ns for frame in frames]) > 0).all()
+    assert camera.state is Lifecycle.READY
+
+
+@pytest.mark.parametrize(
+    ("sequence", "stamp_ahead_ns", "reading"),
+    [
+        (1, -900_000, "frames_bad_out_of_order"),
+        (0, -900_000, "frames_bad_out_of_order"),
+        (2, -1_000_000, "frames_bad_out_of_order"),
+        (2, 10_000_000_000, "frames_bad_from_the_future"),
+        (2, -900_000, "frames_good"),
+    ],
+)
+def test_a_number_or_a_stamp_alone_can_make_a_frame_bad(sequence: int, stamp_ahead_ns: int, reading: str) -> None:
+    clock = MonotonicClock()
+    camera = V4l2Camera("tip", clock, V4l2Config(device=NODE, pixel_format="GREY"))
+    now_ns = clock.now_ns()
+    data = bytes(640 * 480)
+    camera._examine(_arrival(1, now_ns - 1_000_000), data)
+    before = camera.health()
+    camera._examine(_arrival(sequence, now_ns + stamp_ahead_ns), data)
+    after = camera.health()
+    changed = {key for key in after if key.startswith("frames_") and after[key] != before.get(key, 0)}
+    assert reading in changed
+    assert ("frames_good" in changed) == (reading == "frames_good")
+
+
+def _arrival(sequence: int, stamp_ns: int) -> Arrival:
+    return Arrival(
+        index=0,
+        bytes_used=640 * 480,
+        sequence=sequence,
+        stamp_ns=stamp_ns,
+        monotonic=True,
+        start_of_exposure=True,
+        damaged=False,
+    )
+
+
+def test_too_many_bad_frames_are_a_fault(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
+    emulator.fault("error_flag", 11)
+    with pytest.raises(CorruptMessage):
+        read(camera, 100)
+    assert camera.state is Lifecycle.FAULTED
+    assert isinstance(camera.fault, CorruptMessage)
+    camera.recover(TOKEN)
+    assert camera.state is Lifecycle.READY
+    assert len(read(camera, 3)) == 3
+
+
+def test_late_frames_are_stale_by_their_true_stamp(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
+    read(camera, 2)
+    emulator.fault("delay", 0.2)
+    deadline = time.monotonic() + DEADLINE_S
+
+    def read_on() -> None:
+        while time.monotonic() < deadline:
+            camera.latest(max_age_s=0.1)
+
+    with pytest.raises(StaleData) as caught:
+        read_on()
+    assert caught.value.age_s > 0.1
+    assert caught.value.limit_s == 0.1
+    late = camera.next(caught.value.seq, 1.0)
+    late = camera.next(late.seq, 1.0)
+    assert late.age_s(time.monotonic_ns()) >= 0.2
+    assert camera.state is Lifecycle.READY
+
+
+def test_a_sensor_that_hangs_is_stale_first_and_then_a_fault(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
+    emulator.fault("pause")
+    seen: list[type[Exception]] = []
+    deadline = time.monotonic() + DEADLINE_S
+    while camera.state is Lifecycle.READY and time.monotonic() < deadline:
+        try:
+            camera.latest(max_age_s=0.1)
+        except (StaleData, TransportTimeout) as error:
+            seen.append(type(error))
+    assert seen[0] is StaleData
+    assert seen[-1] is TransportTimeout
+    assert isinstance(camera.fault, TransportTimeout)
+    with pytest.raises(LifecycleError):
+        camera.latest()
+    emulator.clear("pause")
+    camera.recover(TOKEN)
+    assert camera.latest().seq > 0
+
+
+def test_a_frozen_picture_is_reported(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
+    read(camera, 5)
+    assert camera.health()["frames_frozen"] == 0
+    emulator.fault("freeze_frame")
+    read_until(camera, "frozen_run", 5)
+    emulator.clear("freeze_frame")
+    deadline = time.monotonic() + DEADLINE_S
+    while camera.health()["frozen_run"] != 0:
+        assert time.monotonic() < deadline
+        read(camera, 2)
+
+
+def test_exposure_drift_is_reported(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
+    read(camera, 80)
+    assert abs(float(camera.health()["brightness_drift"])) < 0.02
+    emulator.fault("exposure_drift", 1.0)
+    read_until(camera, "brightness_drift", 0.2)
+
+
+def test_stamps_of_an_unknown_clock_make_frames_suspect(
+    make: Callable[..., V4l2Camera], emulator: EmulatorProcess
+) -> None:
+    emulator.fault("no_monotonic")
+    camera = ready(make())
+    frame = camera.next(camera.latest().seq, 1.0)
+    assert frame.quality is Quality.SUSPECT
+    assert frame.t_device_ns is not None
+    # The emulated camera's foreign clock is 1000 s ahead; the stamp given is never later than the true one.
+    assert frame.t_ns <= frame.t_device_ns - 1_000_000_000_000
+    assert camera.health()["kernel_stamps"] is False
+
+
+def test_an_unplugged_camera_is_a_fault_that_only_a_person_clears(
+    camera: V4l2Camera, emulator: EmulatorProcess
+) -> None:
+    last = read(camera, 3)[-1]
+    emulator.fault("unplug")
+    with pytest.raises(DeviceGone):
+        read(camera, 100)
+    assert camera.state is Lifecycle.FAULTED
+    assert isinstance(camera.fault, DeviceGone)
+    with pytest.raises(ConnectError):
+        camera.recover(TOKEN)
+    assert camera.state is Lifecycle.FAULTED
+    emulator.clear("unplug")
+    camera.recover(TOKEN)
+    assert camera.state is Lifecycle.READY
+    assert camera.fault is None
+    assert camera.latest().seq > last.seq
+
+
+def test_a_camera_that_restarts_by_itself_does_not_come_back_by_itself(
+    camera: V4l2Camera, emulator: EmulatorProcess
+) -> None:
+    emulator.fault("restart", 0.05)
+    with pytest.raises(DeviceGone):
+        read(camera, 100)
+    emulator.wait_for(plugged=True)
+    with pytest.raises(LifecycleError):
+        camera.latest()
+    camera.recover(TOKEN)
+    assert camera.latest().quality is Quality.GOOD
+
+
+def test_health_alone_notices_that_the_camera_has_gone(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
+    emulator.fault("unplug")
+    assert camera.health()["state"] == "faulted"
+    assert isinstance(camera.fault, DeviceGone)
+
+
+def test_a_second_program_is_turned_away_and_disturbs_nobody(
+    make: Callable[..., V4l2Camera], camera: V4l2Camera
+) -> None:
+    second = make()
+    second.connect()
+    with pytest.raises(ConnectError, match="busy"):
+        second.configure()
+    assert second.state is Lifecycle.PASSIVE
+    assert len(read(camera, 5)) == 5
+
+
+def test_a_camera_that_is_not_there_is_named(make: Callable[..., V4l2Camera]) -> None:
+    camera = make(device="/dev/v4l/by-id/usb-Nobody-video-index0")
+    with pytest.raises(ConnectError, match="usb-Nobody"):
+        camera.connect()
+    assert camera.state is Lifecycle.DISCONNECTED
+
+
+def test_a_virtual_clock_is_refused(folder: Path, emulator: EmulatorProcess) -> None:
+    camera = V4l2Camera("tip", VirtualClock(), V4l2Config(device=NODE), ShimCalls(folder))
+    with pytest.raises(ConnectError, match="CLOCK_MONOTONIC"):
+        camera.connect()
+
+
+def test_only_stable_names_go_without_a_warning(make: Callable[..., V4l2Camera]) -> None:
+    bare = ready(make())
+    assert "by-id" in str(bare.health()["warning"])
+    bare.disconnect()
+    stable = ready(make(device="/dev/v4l/by-id/usb-TacTip_0007-video-index0"))
+    assert "warning" not in stable.health()
+
+
+def test_nothing_leaks_over_fifty_sessions(make: Callable[..., V4l2Camera], emulator: EmulatorProcess) -> None:
+    camera = make()
+    ready(camera).disconnect()
+
+    def held() -> tuple[int, int, int]:
+        maps = Path("/proc/self/maps").read_text()
+        return threading.active_count(), len(os.listdir("/proc/self/fd")), maps.count("touchcell-v4l2")
+
+    before = held()
+    for _ in range(50):
+        ready(camera).disconnect()
+    assert held() == before
+    assert before[2] == 0
+    emulator.wait_for(clients=0, streaming=False)
+
+
+def test_reading_starts_no_thread(make: Callable[..., V4l2Camera]) -> None:
+    before = set(threading.enumerate())
+    read(ready(make()), 3)
+    assert set(threading.enumerate()) == before
+
+
+CLIENT = """
+import sys
+from pathlib import Path
+from touchcell.drivers.core.clock import MonotonicClock
+from touchcell.drivers.v4l2.emulator.shim import ShimCalls
+from touchcell.drivers.v4l2.driver import V4l2Camera, V4l2Config
+camera = V4l2Camera("tip", MonotonicClock(), V4l2Config(device=sys.argv[2]), ShimCalls(Path(sys.argv[1])))
+camera.connect()
+camera.configure()
+print(camera.latest().seq, flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_client_killed_while_streaming_leaves_the_camera_free(
+    folder: Path, make: Callable[..., V4l2Camera], emulator: EmulatorProcess
+) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", CLIENT, str(folder), NODE], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as client:
+        assert client.stdout is not None
+        assert int(client.stdout.readline()) >= 0
+        assert emulator.state()["streaming"] is True
+        client.kill()
+    emulator.wait_for(clients=0, streaming=False)
+    assert ready(make()).latest().quality is Quality.GOOD
+
+
+def test_a_frozen_or_killed_device_never_blocks_the_reader(tmp_path: Path) -> None:
+    bench = rig(tmp_path, 3)
+    emulator = bench.start()
+    camera = bench.build(MonotonicClock())
+    assert isinstance(camera, V4l2Camera)
+    try:
+        ready(camera)
+        emulator.freeze()
+        with pytest.raises(TransportTimeout):
+            read(camera, 100)
+        assert camera.state is Lifecycle.FAULTED
+        emulator.thaw()
+        camera.recover(TOKEN)
+        emulator.kill()
+        with pytest.raises(DeviceGone):
+            read(camera, 1000)
+        assert camera.state is Lifecycle.FAULTED
+        camera.disconnect()
+    finally:
+        camera.disconnect()
+        emulator.kill()
+
+
+def test_a_folder_of_images_is_played_in_order(tmp_path: Path) -> None:
+    import cv2
+
+    images = tmp_path / "images"
+    images.mkdir()
+    for number in range(3):
+        cv2.imwrite(str(images / f"{number}.png"), np.full((48, 64), 50 * (number + 1), np.uint8))
+    with EmulatorProcess("v4l2", "--folder", str(tmp_path), "--images", str(images)):
+        config = V4l2Config(device="/dev/video0", pixel_format="GREY", exposure_us=15700, gain=0)
+        camera = V4l2Camera("tip", MonotonicClock(), config, ShimCalls(tmp_path))
+        with camera:
+            camera.configure()
+            for frame in read(camera, 4):
+                assert (frame.value.image == 50 * (frame.seq % 3 + 1)).all()
+
+
+def test_an_unknown_fault_is_a_typed_error(emulator: EmulatorProcess) -> None:
+    with pytest.raises(ConnectError, match="unknown fault 'nan'"):
+        emulator.fault("nan")
+
+
+def test_a_folder_without_images_is_a_typed_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="holds no images"):
+        picture.files(tmp_path)

@@ -1,0 +1,465 @@
+"""One place of the matrix of ``touchcell bench faults``: an emulated device is hurt in one state of a task.
+
+The device is the real driver on its emulator, in real time. Whether an emulated arm stands is asked of the emulator,
+which knows the truth.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+
+from tests.fault_injection.emulated_cells import HURT, arm_cell, camera_cell, sensor_of, sensors_of
+from tests.fault_injection.sent_commands import SentCommands
+from touchcell.cell.config.schema import CellPlan, plan_cell
+from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.loop import Outcome, RunLoop, RunResult, StopRequest
+from touchcell.drivers.core.arm import Arm
+from touchcell.drivers.core.clock import MonotonicClock
+from touchcell.drivers.core.device import Device
+from touchcell.drivers.core.errors import DeviceError
+from touchcell.drivers.core.spec import DriverContext
+from touchcell.geometry.errors import TouchcellError
+from touchcell.geometry.types import Array
+from touchcell.tasks import registry as tasks_registry
+from touchcell.tasks.interface import TaskContext
+from touchcell.tasks.servoing import ServoTask
+from touchcell.tasks.state_machine_task import MachineTask
+from touchcell.testing.emulation.rig import Emulated, Rig, rig_of
+
+ARMS: Final = ("ur", "franka", "damiao_can", "feetech_serial")
+CAMERAS: Final = ("v4l2",)
+VANISH: Final = "kill -9"
+HANG: Final = "SIGSTOP"
+
+MORE_FAULTS: Final[Mapping[str, Mapping[str, tuple[Any, str]]]] = {
+    "ur": {
+        "fault_bits": (5, "fault"),
+        "local_control": (True, "unseen"),
+        "other_program": (True, "unseen"),
+        "registers_in_use": (True, "unseen"),
+        "speed_slider": (0.5, "unseen"),
+        "wrench": ([0.0, 0.0, 5.0, 0.0, 0.0, 0.0], "unseen"),
+    },
+    "franka": {
+        "drop": (25, "fault"),
+        "delay": (0.5, "fault"),
+        "corrupt": (3, "fault"),
+        "locked": (True, "fault"),
+        "external_wrench": ([35.0, 0.0, 0.0, 0.0, 0.0, 0.0], "fault"),
+    },
+    "damiao_can": {
+        "push": ([0, 5.0], "unseen"),
+        "refuse": (1, "unseen"),
+        "nan": (True, "unseen"),
+    },
+    "feetech_serial": {
+        "block": (0, "unseen"),
+        "carry": ([0, 300], "fault"),
+        "registers": ([0, 7, "fa"], "unseen"),
+    },
+    "v4l2": {
+        "delay": (0.4, "stale"),
+        "freeze_frame": (True, "fault"),
+        "exposure_drift": (0.5, "fault"),
+        "stuck_controls": (True, "unseen"),
+        "no_monotonic": (True, "transient"),
+    },
+}
+"""Faults that the conformance suite does not try, or not so, with a value and the lawful answer in a running task."""
+
+UNSEEN: Final[Mapping[tuple[str, str], Mapping[str, str]]] = {
+    ("franka", "drop"): {"prepare": "the controller waits for the first command of a motion"},
+    ("feetech_serial", "carry"): {"retract": "the tool is carried farther than it has to withdraw: the task has ended"},
+}
+"""States in which a fault ends nothing, and why."""
+
+_WATCHED_S: Final = 3.0
+_CALM_S: Final = 0.6
+_SETTLED_CYCLES: Final = 5
+_STILL_M: Final = 2e-4
+_STILL_S: Final = 0.12
+# Whoever does not run for so long has not been let run.
+_STALL_S: Final = 0.15
+_TRIES: Final = 3
+# The last state; asked for the end, a task comes there from the one before, in which it presses.
+_AFTER_STOP: Final = "retract"
+_RATE_HZ: Final = 50.0
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """One place of the matrix.
+
+    Attributes:
+        driver: whose emulator is hurt.
+        fault: how.
+        task: what the cell does.
+        role: of the arm or sensor that is hurt.
+        state: of the task in which it happens.
+    """
+
+    driver: str
+    fault: str
+    task: str
+    role: str
+    state: str
+
+    def __str__(self) -> str:
+        return f"{self.driver}, {self.fault}, {self.task}, {self.role}, {self.state}"
+
+
+@dataclass(frozen=True, slots=True)
+class EmulatedCase:
+    """What was found in one place of the matrix.
+
+    Attributes:
+        place: which.
+        lawful: the driver's lawful answer: "fault" or "stale" ends the run, "transient" and "unseen" need not.
+        ended_by: interlock or error that ended the run; empty if none did.
+        detection_s: from the fault until the run ended; None if it went on.
+        rest_s: from the end of the run until the arm truly stood; None where it cannot be told.
+        distance_m: way of the tool in that time.
+        reached: whether the fault was made to happen.
+        stalled_s: longest time for which this process was not let run from the fault on.
+        problem: what was not as it has to be; empty if all was.
+    """
+
+    place: Place
+    lawful: str
+    ended_by: str = ""
+    detection_s: float | None = None
+    rest_s: float | None = None
+    distance_m: float | None = None
+    reached: bool = True
+    stalled_s: float = 0.0
+    problem: str = ""
+
+
+def states_of(task: str) -> tuple[tuple[str, ...], bool]:
+    """The states of a task by its own table, and whether it is one of those that share ``ServoTask``."""
+    spec = tasks_registry.spec(task)
+    required = {"target_mm": (0.0, 0.0)} if "target_mm" in spec.config.model_fields else {}
+    poses = {sensor: np.eye(4) for sensor in sensors_of(task)}
+    made = spec.build(spec.config.model_validate(required), TaskContext(_RATE_HZ, poses, 0))
+    assert isinstance(made, MachineTask)
+    return made.states, isinstance(made, ServoTask)
+
+
+def faults_of(driver: str, folder: Path) -> dict[str, tuple[Any, str]]:
+    """Every fault of the driver's emulator with its value and the lawful answer, and what befalls its process."""
+    ends = {HANG: (True, "fault"), VANISH: (True, "fault")}
+    return {**rig_of(driver, folder, 0).faults, **MORE_FAULTS[driver], **ends}
+
+
+SERVO: Final = (
+    "prepare, approach, settle and retract are one code, whatever the task that servoes and however many hands it has: "
+    "tried in surface_following"
+)
+REACH: Final = "lift, tilt, press and shear of data_collection are one code, motion to a place: tried in press"
+HIDDEN: Final = "what a driver takes in without a word reaches no task: faults that end nothing are tried in one task"
+RULES: Final = (SERVO, REACH, HIDDEN)
+"""Why a place is the same as another by construction."""
+
+LEFT_OUT: Final = (
+    "data_collection asks an arm to repeat to 20 um, which damiao_can and feetech_serial cannot by their encoders",
+    "what becomes of a camera's fault does not depend on the arm that carries it: v4l2 sits on simulated arms",
+)
+"""What is no part of the matrix."""
+
+_COARSE: Final = ("damiao_can", "feetech_serial")
+
+
+def places(driver: str, folder: Path) -> Iterator[tuple[Place, str]]:
+    """Every place of ``driver``, with which of ``RULES`` makes it the same as another one; empty for none.
+
+    Args:
+        driver: of ``ARMS`` or ``CAMERAS``.
+        folder: for the rig, of which only the faults are looked at.
+    """
+    tasks: list[str] = [*HURT]
+    if driver in CAMERAS:
+        tasks.append("observe")
+    elif driver in _COARSE:
+        tasks.remove("data_collection")
+    faults = faults_of(driver, folder)
+    for task in tasks:
+        states, servoes = states_of(task)
+        for role in HURT.get(task, ("",)):
+            hurt = role if driver in ARMS else sensor_of(role or "arm")
+            for state in states:
+                rule = _rule(task, state, servoes=servoes)
+                for fault, (_, lawful) in faults.items():
+                    hidden = lawful in ("transient", "unseen") and task != "surface_following"
+                    yield Place(driver, fault, task, hurt, state), HIDDEN if hidden else rule
+
+
+def _rule(task: str, state: str, *, servoes: bool) -> str:
+    if servoes and state != "run" and task != "surface_following":
+        return SERVO
+    return REACH if task == "data_collection" and state in ("lift", "tilt", "shear") else ""
+
+
+@dataclass
+class Bench:
+    """Runs places of the matrix, one after another.
+
+    Args:
+        folder: for sockets, cell files and what tasks collect.
+        address: from which on addresses are free.
+    """
+
+    folder: Path
+    address: int
+    _poses: dict[str, Array] = field(default_factory=dict, init=False)
+
+    def run(self, place: Place) -> EmulatedCase:
+        """Let the fault happen and judge what comes of it; tried again where this machine does not let it be."""
+        for _ in range(_TRIES):
+            case = self._run_once(place)
+            if case.reached and case.stalled_s < _STALL_S:
+                break
+        return case
+
+    def _run_once(self, place: Place) -> EmulatedCase:
+        value, lawful = faults_of(place.driver, self.folder)[place.fault]
+        if place.state in UNSEEN.get((place.driver, place.fault), {}):
+            lawful = "unseen"
+        case = EmulatedCase(place, lawful)
+        self.address += 10
+        rig = rig_of(place.driver, self.folder, self.address)
+        with ExitStack() as exits:
+            try:
+                emulator = _started(rig, exits)
+                plan = self._arm_plan(place, rig) if place.driver in ARMS else self._camera_plan(place, rig, exits)
+                return _run(case, rig, emulator, plan, value)
+            except TouchcellError as error:
+                return replace(case, reached=False, problem=f"before the fault: {error}")
+
+    def _arm_plan(self, place: Place, rig: Rig) -> CellPlan:
+        # Every fresh emulator has its tool at the same place.
+        if place.driver not in self._poses:
+            self._poses[place.driver] = _told_pose(rig)
+        collected = self._collected()
+        return self._planned(arm_cell(place.task, place.role, rig, self._poses[place.driver], str(collected)))
+
+    def _camera_plan(self, place: Place, rig: Rig, exits: ExitStack) -> CellPlan:
+        rigs = {}
+        for number, sensor in enumerate(sensors_of(place.task), start=1):
+            rigs[sensor] = rig if sensor == place.role else rig_of(place.driver, self.folder, self.address + number)
+            if rigs[sensor] is not rig:
+                _started(rigs[sensor], exits)
+        plan = self._planned(camera_cell(place.task, rigs, str(self._collected())))
+        # No kernel module is needed: this process asks the emulator in place of the kernel.
+        sensors = {
+            name: replace(device, spec=replace(device.spec, build=_on_shim(rigs[name])))
+            for name, device in plan.sensors.items()
+        }
+        return replace(plan, sensors=sensors)
+
+    def _collected(self) -> Path:
+        folder = self.folder / "collected"
+        shutil.rmtree(folder, ignore_errors=True)
+        return folder
+
+    def _planned(self, data: Mapping[str, Any]) -> CellPlan:
+        path = self.folder / "cell.yaml"
+        path.write_text(yaml.safe_dump(data))
+        return plan_cell(path)
+
+
+def _started(rig: Rig, exits: ExitStack) -> Emulated:
+    assert rig.start is not None
+    emulator = rig.start()
+    exits.callback(emulator.stop)
+    return emulator
+
+
+def _on_shim(rig: Rig) -> Callable[[str, Any, DriverContext], Device]:
+    return lambda name, config, context: rig.build(context.clock)
+
+
+def _run(case: EmulatedCase, rig: Rig, emulator: Emulated, plan: CellPlan, value: Any) -> EmulatedCase:
+    place = case.place
+    cell, stop, sent = compose(plan), StopRequest(), SentCommands()
+    injected_s: float | None = None
+    given_up_ns: int | None = None
+    witness: _Witness | None = None
+    stalls: _Stalls | None = None
+    with ExitStack() as watch, suppress(DeviceError), cell:
+        task = cell.task
+        assert isinstance(task, MachineTask)
+        wait = 1 if place.state == task.states[0] else _SETTLED_CYCLES
+        loop = RunLoop(cell, None, box=sent, stop=stop)
+        loop.begin()
+        going = True
+        while going:
+            if place.state == _AFTER_STOP and task.state == task.states[-2] and not stop.count:
+                stop.ask()
+            if injected_s is None and task.state == place.state:
+                wait -= 1
+                if wait <= 0:
+                    stalls = watch.enter_context(closing(_Stalls()))
+                    injected_s = time.monotonic()
+                    asked = _inject(emulator, place.fault, value)
+                    if asked and rig.pose is not None and not rig.spec.capabilities.falls_on_power_loss:
+                        witness = watch.enter_context(closing(_Witness(rig, emulator)))
+            if injected_s is not None and given_up_ns is None:
+                for_s = _CALM_S if case.lawful in ("transient", "unseen") else _WATCHED_S
+                if time.monotonic() > injected_s + for_s:
+                    given_up_ns = cell.clock.now_ns()
+                    stop.ask_at_once()
+            going = loop.step()
+        ended_s = time.monotonic()
+        result = loop.end()
+        if injected_s is None or stalls is None:
+            case = replace(case, reached=False, problem=f"the state was not reached: {result.reason}")
+        else:
+            # What the stop at the end brings about is no answer to the fault.
+            causes = [cause for cause in result.causes if given_up_ns is None or cause.t_ns < given_up_ns]
+            case = _judged(case, cell, replace(result, causes=tuple(causes)), sent, ended_s - injected_s)
+            case = replace(case, stalled_s=stalls.longest_s)
+        if witness is not None:
+            time.sleep(_STILL_S)
+            witness.close()
+            case = _with_rest(case, witness, ended_s)
+        _mend(emulator, place.fault)
+    return case
+
+
+def _inject(emulator: Emulated, fault: str, value: Any) -> bool:
+    """Make it happen; whether the emulator can still be asked."""
+    if fault == VANISH:
+        emulator.kill()
+    elif fault == HANG:
+        emulator.freeze()
+    else:
+        emulator.fault(fault, value)
+    return fault not in (VANISH, HANG)
+
+
+def _mend(emulator: Emulated, fault: str) -> None:
+    """All has been seen: a device that answers again is left sooner."""
+    if fault == HANG:
+        emulator.thaw()
+    elif fault != VANISH:
+        with suppress(DeviceError, OSError):
+            emulator.clear(fault)
+
+
+def _judged(case: EmulatedCase, cell: Cell, result: RunResult, sent: SentCommands, took_s: float) -> EmulatedCase:
+    problems = []
+    first = result.causes[0] if result.causes else None
+    by = "" if result.error is None else type(result.error).__name__
+    by = by if first is None else first.interlock
+    by = by or ("retreat" if result.outcome is Outcome.FAILED else "")
+    if case.lawful in ("fault", "stale") and not by:
+        problems.append(f"nothing ended the run, which went on for {_WATCHED_S:g} s ({result.outcome.value})")
+    if first is not None and sent.since(first.t_ns):
+        problems.append("a command was sent after the trip")
+    simulated = {role: stop for role, stop in result.stops.items() if cell.arms[role].name != _emulated_arm(case)}
+    problems += [f"{role}: {stop.problem}" for role, stop in simulated.items() if stop.problem]
+    if by and case.place.driver in CAMERAS:
+        times = [stop.time_s for stop in simulated.values() if stop.time_s is not None]
+        ways = [stop.distance_m for stop in simulated.values() if stop.distance_m is not None]
+        case = replace(case, rest_s=max(times, default=None), distance_m=max(ways, default=None))
+    return replace(case, ended_by=by, detection_s=took_s if by else None, problem="; ".join(problems))
+
+
+def _emulated_arm(case: EmulatedCase) -> str:
+    return case.place.role if case.place.driver in ARMS else ""
+
+
+def _with_rest(case: EmulatedCase, witness: _Witness, ended_s: float) -> EmulatedCase:
+    if not witness.seen:
+        return case
+    moved_s, way_m = witness.last_moved(ended_s)
+    case = replace(case, rest_s=max(0.0, moved_s - ended_s), distance_m=way_m)
+    if witness.seen[-1][0] - moved_s < _STILL_S / 2:
+        return replace(case, problem=f"{case.problem}; the tool still moves".strip("; "))
+    return case
+
+
+class _Stalls:
+    """How long a thread of this process that only wants to sleep was kept from running, until it is closed."""
+
+    def __init__(self) -> None:
+        self.longest_s = 0.0
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._tick, name="stalls")
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._done.set()
+        self._thread.join()
+
+    def _tick(self) -> None:
+        step_s = 0.02
+        before_s = time.monotonic()
+        while not self._done.wait(step_s):
+            now_s = time.monotonic()
+            self.longest_s = max(self.longest_s, now_s - before_s - step_s)
+            before_s = now_s
+
+
+class _Witness:
+    """Asks the emulator where the tool truly is, again and again, in a thread of its own until it is closed.
+
+    Nobody else may talk to the emulator in that time.
+    """
+
+    def __init__(self, rig: Rig, emulator: Emulated) -> None:
+        self._rig = rig
+        self._emulator = emulator
+        self._done = threading.Event()
+        self.seen: list[tuple[float, Array]] = []
+        self._thread = threading.Thread(target=self._look, name="witness")
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._done.set()
+        self._thread.join()
+
+    def _look(self) -> None:
+        # An emulator that a fault has ended is asked no more.
+        with suppress(DeviceError, OSError):
+            self._look_on()
+
+    def _look_on(self) -> None:
+        while not self._done.wait(0.005):
+            self.seen.append((time.monotonic(), _true_pose(self._rig, self._emulator)[:3, 3]))
+
+    def last_moved(self, since_s: float) -> tuple[float, float]:
+        """When the tool was last seen in another place than at last, and how far it went after ``since_s``."""
+        last = self.seen[-1][1]
+        moved_s = max((t for t, p in self.seen if np.linalg.norm(p - last) > _STILL_M), default=since_s)
+        start = next((p for t, p in self.seen if t >= since_s), last)
+        way_m = max(float(np.linalg.norm(p - start)) for t, p in self.seen if t >= since_s or p is last)
+        return moved_s, way_m
+
+
+def _true_pose(rig: Rig, emulator: Emulated) -> Array:
+    assert rig.pose is not None
+    return np.array(emulator.state()[rig.pose], dtype=np.float64).reshape(4, 4)
+
+
+def _told_pose(rig: Rig) -> Array:
+    device = rig.build(MonotonicClock())
+    assert isinstance(device, Arm)
+    with device:
+        device.configure()
+        # Some tell their tool only then; others would fall when they are let go.
+        if not rig.spec.capabilities.falls_on_power_loss:
+            device.activate()
+        return device.tcp().value.T_base_tcp

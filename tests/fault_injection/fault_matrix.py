@@ -1,0 +1,298 @@
+"""Every fault of the simulated devices in every state of every task: what trips, and how the arm comes to rest.
+
+The matrix is generated: faults are listed once, states come from the tasks' own tables.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import yaml
+
+from tests.fault_injection.sent_commands import SentCommands
+from touchcell.cell.cli.main import find_cell
+from touchcell.cell.config.schema import CellPlan, plan_cell
+from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.loop import RunLoop, RunResult, StopRequest
+from touchcell.simulation.devices.arm import SimArm
+from touchcell.simulation.devices.tactip import SimTactip
+from touchcell.tasks.state_machine_task import MachineTask
+
+_WATCHED_S = 3.0
+_SETTLED_CYCLES = 3
+# By then the camera has shown enough for its brightness to be known.
+_NOT_BEFORE_S = 0.4
+# Some tasks withdraw only when they are asked to end.
+_AFTER_STOP = "retract"
+_ASKED_AFTER_S = 0.8
+
+Inject = Callable[[Cell, StopRequest, str], None]
+"""Hurts the device with that name (a camera) or in that role (an arm)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Something that goes wrong, and what has to come of it.
+
+    Attributes:
+        name: in tables.
+        device: what it belongs to; a task without an arm has no faults of one.
+        inject: makes it happen.
+        expected: kinds of interlock, or of error, of which one has to end the run; empty: it ends without.
+        unseen: states in which it has no effect that could be seen, and why.
+        obeys: whether the arm still does what its stop category asks for; if not, it takes twice as long ...
+        extra_m_s: ... and moves at this speed besides.
+    """
+
+    name: str
+    device: Literal["arm", "camera"]
+    inject: Inject
+    expected: frozenset[str]
+    unseen: Mapping[str, str]
+    obeys: bool = True
+    extra_m_s: float = 0.0
+
+
+def _arm(**changes: Any) -> Inject:
+    def inject(cell: Cell, stop: StopRequest, device: str) -> None:
+        arm = cell.arms[device]
+        assert isinstance(arm, SimArm)
+        arm.faults = replace(arm.faults, **changes)
+
+    return inject
+
+
+def _camera(**changes: Any) -> Inject:
+    def inject(cell: Cell, stop: StopRequest, device: str) -> None:
+        camera = cell.cameras[device]
+        assert isinstance(camera, SimTactip)
+        if "last_seq" in changes:
+            camera.faults = replace(camera.faults, last_seq=camera.latest().seq)
+        else:
+            camera.faults = replace(camera.faults, **changes)
+
+    return inject
+
+
+def _and_stop(inject: Inject) -> Inject:
+    """The fault, and a stop by the operator at the same time, without which it would not show."""
+
+    def both(cell: Cell, stop: StopRequest, device: str) -> None:
+        inject(cell, stop, device)
+        stop.ask_at_once()
+
+    return both
+
+
+_STANDS = {"prepare": "nothing moves yet", "grab": "it stands while a frame is taken"}
+_NO_BASELINE = {"prepare": "the first frames are the measure", "wait": "the first frames are the measure"}
+
+FAULTS: Final = (
+    Fault("operator's stop", "arm", _and_stop(lambda cell, stop, device: None), frozenset(), {}),
+    Fault("arm: nan_state", "arm", _arm(nan_state=True), frozenset({"finite"}), {}),
+    Fault("arm: stale", "arm", _arm(stale=True), frozenset({"arm_state_age"}), {}),
+    Fault(
+        "arm: drift_m_s",
+        "arm",
+        _arm(drift_m_s=0.03),
+        frozenset({"tracking", "standstill", "depth", "workspace"}),
+        {},
+        obeys=False,
+        extra_m_s=0.03,
+    ),
+    Fault("arm: deaf", "arm", _and_stop(_arm(deaf=True)), frozenset(), {}),
+    Fault(
+        "arm: runs_on", "arm", _and_stop(_arm(runs_on=True)), frozenset({"stop"}), _STANDS, obeys=False, extra_m_s=0.02
+    ),
+    Fault("camera: frozen", "camera", _camera(frozen=True), frozenset({"frame_frozen"}), {}),
+    Fault("camera: last_seq", "camera", _camera(last_seq=0), frozenset({"frame_age"}), {}),
+    # Where the loop waits for the first frame, the arm's state is too old when it comes; a task without an arm sees the
+    # same picture for too long.
+    Fault(
+        "camera: extra_latency_s",
+        "camera",
+        _camera(extra_latency_s=0.3),
+        frozenset({"frame_age", "arm_state_age", "frame_frozen"}),
+        {},
+    ),
+    Fault("camera: gain", "camera", _camera(gain=0.6), frozenset({"exposure"}), _NO_BASELINE),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One place in the matrix and what was found there.
+
+    Attributes:
+        task, device, fault, state: which place.
+        ended_by: kind of the interlock that came first, "stop" for an arm that had to be stopped by stronger means, the
+            kind of the error that was raised, or empty if none.
+        detection_s: from the fault to the trip.
+        stop_s, distance_m: until the arm stood, of two the later; None where there is no arm, or nothing to be read.
+        declared_s, declared_m: what that may take.
+        problem: what was not as it has to be; empty if all was.
+    """
+
+    task: str
+    device: str
+    fault: str
+    state: str
+    ended_by: str = ""
+    detection_s: float | None = None
+    stop_s: float | None = None
+    distance_m: float | None = None
+    declared_s: float | None = None
+    declared_m: float | None = None
+    problem: str = ""
+
+
+def cells() -> dict[str, dict[str, Any]]:
+    """A short cell file for every task, by the task's name."""
+    following, tracking = _shipped("surface_follow_sim.yaml"), _shipped("object_track_sim.yaml")
+    following["task"] |= {"distance_mm": 10, "retract_mm": 10}
+    tracking["task"] |= {"duration_s": 0.6, "retract_mm": 12}
+    observing = _shipped("surface_follow_sim.yaml")
+    observing["task"] = {"name": "observe"}
+    of_sensors = ("frame_age", "frame_frozen", "exposure")
+    observing["interlocks"] = {n: e for n, e in observing["interlocks"].items() if e["kind"] in of_sensors}
+    single, dual = _shipped("single_push_sim.yaml"), _shipped("dual_push_sim.yaml")
+    for pushing in (single, dual):
+        pushing["task"] |= {"target_mm": [70, 0], "retract_mm": 10}
+    collecting = _shipped("collect_sim.yaml")
+    collecting["task"]["samples"] = 2
+    # Thresholded images are the same while nothing moves, which would seem frozen.
+    collecting["sensors"]["sensor"] |= {"output": "raw", "rate_hz": 30}
+    collecting["interlocks"]["stale_frame"]["limit_ms"] = 150
+    watching = ("frame_frozen", "exposure", "standstill")
+    collecting["interlocks"] |= {n: e for n, e in following["interlocks"].items() if e["kind"] in watching}
+    tasks = (following, tracking, observing, single, dual, collecting)
+    return {data["task"]["name"]: data for data in tasks}
+
+
+def matrix(
+    folder: Path, devices: Sequence[str] = ("arm", "camera"), tasks: Sequence[str] | None = None
+) -> Iterator[Case]:
+    """Run every place of the matrix and yield what was found.
+
+    Args:
+        folder: for cell files, and for what tasks collect.
+        devices: whose faults; those of cameras need a model, those of arms run on the true contact.
+        tasks: of which; None for all.
+    """
+    for task, data in cells().items():
+        if tasks is not None and task not in tasks:
+            continue
+        for kind in devices:
+            path = folder / f"{task}_{kind}.yaml"
+            path.write_text(yaml.safe_dump(on_true_contact(data) if kind == "arm" else data))
+            probe = compose(plan_anew(path))
+            assert isinstance(probe.task, MachineTask)
+            hurt = probe.plan.arm_roles if kind == "arm" else probe.cameras
+            for fault in (fault for fault in FAULTS if fault.device == kind):
+                for device in hurt:
+                    for state in probe.task.states:
+                        yield run_case(path, fault, device, state)
+
+
+def on_true_contact(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The cell file ``data`` with the scene's own contact in place of a network's estimate."""
+    sensors = {name: dict(sensor) for name, sensor in data["sensors"].items()}
+    for sensor in sensors.values():
+        if sensor["estimator"]["kind"] == "network":
+            sensor["estimator"] = {"kind": "true_contact"}
+    return {**data, "sensors": sensors}
+
+
+def plan_anew(path: Path) -> CellPlan:
+    """Its plan; a task that collects begins anew, in a folder beside the file."""
+    collected = path.with_suffix(".collected")
+    shutil.rmtree(collected, ignore_errors=True)
+    # Only a cell that collects has something to be overridden.
+    return plan_cell(path, {"data": collected})
+
+
+def run_case(path: Path, fault: Fault, device: str, state: str) -> Case:
+    """Run the cell, let the fault happen to ``device`` in ``state``, and judge what comes of it."""
+    cell, stop, sent = compose(plan_anew(path)), StopRequest(), SentCommands()
+    case = Case(cell.plan.task.name, device, fault.name, state)
+    injected_ns: int | None = None
+    with cell:
+        assert isinstance(cell.task, MachineTask)
+        initial = state == cell.task.states[0]
+        wait = 1 if initial else _SETTLED_CYCLES
+        loop = RunLoop(cell, None, box=sent, stop=stop)
+        loop.begin()
+        going = True
+        while going:
+            if injected_ns is None and cell.task.state == state:
+                wait -= 1
+                now_ns = cell.clock.now_ns()
+                if wait <= 0 and (initial or now_ns >= cell.start_ns + _NOT_BEFORE_S * 1e9):
+                    injected_ns = now_ns
+                    fault.inject(cell, stop, device)
+            if injected_ns is not None and cell.clock.now_ns() > injected_ns + _WATCHED_S * 1e9:
+                break
+            if state == _AFTER_STOP and cell.clock.now_ns() > cell.start_ns + _ASKED_AFTER_S * 1e9 and not stop.count:
+                stop.ask()
+            going = loop.step()
+        result = loop.end()
+        at_rest = all(arm.at_rest() for arm in cell.arms.values())
+    if injected_ns is None:
+        return replace(case, problem="the state was not reached")
+    return _judged(case, fault, cell, result, sent, injected_ns, at_rest=at_rest)
+
+
+def _judged(
+    case: Case, fault: Fault, cell: Cell, result: RunResult, sent: SentCommands, injected_ns: int, *, at_rest: bool
+) -> Case:
+    problems = []
+    first = result.causes[0] if result.causes else None
+    kinds = {name: entry.kind for name, entry in cell.plan.cell.interlocks.items()}
+    by = "" if result.error is None else type(result.error).__name__
+    if first is not None:
+        by = kinds.get(first.interlock, first.interlock)
+    expected: frozenset[str] = frozenset() if case.state in fault.unseen else fault.expected
+    if by not in (expected or {""}):
+        problems.append(f"ended by {by or 'nothing'}, expected {' or '.join(sorted(expected)) or 'nothing'}")
+    if first is not None and sent.since(first.t_ns):
+        problems.append("a command was sent after the trip")
+    if not at_rest:
+        problems.append("the arm does not stand")
+    case = replace(case, ended_by=by, detection_s=None if first is None else (first.t_ns - injected_ns) * 1e-9)
+    for role, report in result.stops.items():
+        hurt = role == case.device
+        times = 2 if hurt and not fault.obeys else 1
+        longest_s = times * report.declared_s + 1.0 / cell.rate_hz
+        farthest_m = times * report.declared_m + (fault.extra_m_s * longest_s if hurt else 0.0)
+        if report.time_s is None or report.time_s > longest_s:
+            problems.append(f"{role} at rest after {report.time_s} s, declared {report.declared_s:.3f} s")
+        if report.distance_m is not None and report.distance_m > farthest_m:
+            problems.append(
+                f"{role} stood after {1e3 * report.distance_m:.2f} mm, declared {1e3 * report.declared_m:.2f} mm"
+            )
+        if case.stop_s is None or (report.time_s or 0.0) > case.stop_s:
+            case = replace(
+                case,
+                stop_s=report.time_s,
+                distance_m=report.distance_m,
+                declared_s=report.declared_s,
+                declared_m=report.declared_m,
+            )
+    return replace(case, problem="; ".join(problems))
+
+
+def _shipped(name: str) -> dict[str, Any]:
+    data: dict[str, Any] = yaml.safe_load(find_cell(Path("configs") / name).read_text())
+    return data
+
+
+def median_and_worst(values: Sequence[float], first: int, second: int, digits: int) -> str:
+    """Two columns of the given widths; dashes where there is nothing."""
+    if not values:
+        return f"{'-':>{first}}{'-':>{second}}"
+    return f"{np.median(values):{first}.{digits}f}{max(values):{second}.{digits}f}"

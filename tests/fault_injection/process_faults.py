@@ -1,0 +1,292 @@
+"""Faults of whole processes, each while two arms move, and what the hosts' own records say became of the arms.
+
+The cells are those of ``tests.fault_injection.two_arms``, in a process tree of their own. Nothing that the tree says of
+itself is believed but the records of the hosts, which are read from their memory, also when the processes have gone.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from tests.fault_injection.two_arms import PERIOD_S, pushing_emulators
+from touchcell.cell.runtime.watchdog import NOTES
+from touchcell.drivers.core.arm import LimitsConfig
+from touchcell.drivers.hosting.layouts import ARM, RecordReader
+from touchcell.drivers.hosting.watchdog import silence_s
+
+_READY_S: Final = 60.0
+_MOVING_S: Final = 30.0
+_MOVING_M_S: Final = 0.005
+_WATCHED_S: Final = 8.0
+_AFTERWARDS_S: Final = 0.3
+_END_S: Final = 30.0
+_STEADY_S: Final = 0.1
+MARGIN_S: Final = {"sway": 0.1, "push": 0.2}
+"""What a stop may take besides: an emulated arm rounds its corners, and takes its time to say that it stands."""
+
+_numbers = itertools.count(os.getpid())
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessFault:
+    """What goes wrong.
+
+    Attributes:
+        name: in words.
+        who: "task", "watchdog", or "host" for the first of these.
+        signal: what it is sent.
+        inner: word for ``process_victim``, for faults within the task's process.
+        at_once: whether it takes effect when it is injected; a full disk is only met by the next write.
+    """
+
+    name: str
+    who: str
+    signal: signal.Signals
+    inner: str = ""
+    at_once: bool = True
+
+
+FAULTS: Final = (
+    ProcessFault("task killed", "task", signal.SIGKILL),
+    ProcessFault("task stopped", "task", signal.SIGSTOP),
+    ProcessFault("watchdog killed", "watchdog", signal.SIGKILL),
+    ProcessFault("watchdog stopped", "watchdog", signal.SIGSTOP),
+    ProcessFault("host killed", "host", signal.SIGKILL),
+    ProcessFault("host stopped", "host", signal.SIGSTOP),
+    ProcessFault("task holds the GIL", "task", signal.SIGUSR1, "gil"),
+    ProcessFault("task out of memory", "task", signal.SIGUSR1, "memory"),
+    ProcessFault("disk full", "task", signal.SIGUSR1, "disk", at_once=False),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ArmCase:
+    """What became of one arm.
+
+    Attributes:
+        arm: its name.
+        detected_s: from the fault until it was told to stop; None if nobody had to tell it.
+        stop_s: from then until it stood; None if it never did.
+        rest_s: from the fault until it stood.
+        way_m: how far it went from where it was at the fault.
+    """
+
+    arm: str
+    detected_s: float | None
+    stop_s: float | None
+    rest_s: float | None
+    way_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessCase:
+    """One fault, once.
+
+    Attributes:
+        fault: which.
+        arms: those whose host was not the one hurt.
+        declared_s: from the fault to rest, at most.
+        outcome: last line of the task's process, empty if it had none.
+        notes: what the watchdog left, empty if nothing.
+        problems: what was not as it has to be.
+    """
+
+    fault: ProcessFault
+    arms: Sequence[ArmCase]
+    declared_s: float
+    outcome: Mapping[str, Any] = field(default_factory=dict)
+    notes: Mapping[str, Any] = field(default_factory=dict)
+    problems: Sequence[str] = ()
+
+
+class TooBusy(RuntimeError):
+    """The cell stopped before anything was done to it: this machine does not let it run."""
+
+
+def declared_s(rate_hz: float, fastest_m_s: float, what: str = "sway") -> float:
+    """Longest time (s) from a fault until both arms stand: two missed beats, a cycle of everybody, braking, margin."""
+    limits = LimitsConfig().build()
+    return silence_s(1.0 / rate_hz) + 1.0 / rate_hz + fastest_m_s / limits.accel_m_s2 + MARGIN_S[what]
+
+
+def run_fault(folder: Path, fault: ProcessFault, rate_hz: float, what: str = "sway") -> ProcessCase:
+    """Let two arms ``sway`` or ``push``, let ``fault`` happen, and judge what the hosts' records say.
+
+    Raises:
+        TooBusy: the cell did not run long enough to be hurt.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "fault").write_text(fault.inner)
+    with running_cell(folder, rate_hz, what) as (process, who, states):
+        await_motion(process, states)
+        host = next(iter(who["hosts"]))
+        victim = {"task": who["task"], "watchdog": who["watchdog"], "host": who["hosts"][host]}[fault.who]
+        hurt_arms = set(who["arms"][host]) if fault.who == "host" else set()
+        before = {name: state.read() for name, state in states.items()}
+        hurt_ns = time.monotonic_ns()
+        os.kill(victim, fault.signal)
+        survivors = {name: state for name, state in states.items() if name not in hurt_arms}
+        _await_rest(survivors)
+        at_rest = {name: state.read() for name, state in survivors.items()}
+        if fault.signal is signal.SIGSTOP:
+            # The cell may have ended it meanwhile.
+            with suppress(ProcessLookupError):
+                os.kill(victim, signal.SIGCONT)
+            _await_rest(states)
+        time.sleep(_AFTERWARDS_S)
+        afterwards = {name: state.read() for name, state in states.items()}
+        process.send_signal(signal.SIGTERM)
+        outcome = last_line(process)
+        problems = left_over([who["task"], who["watchdog"], *who["hosts"].values()])
+        arms = [_arm_case(name, before[name], record, hurt_ns) for name, record in at_rest.items()]
+        longest_s = declared_s(rate_hz, max(speed_m_s(record) for record in before.values()), what)
+        for case in arms:
+            problems += _judged(case, fault, longest_s)
+        for name, record in afterwards.items():
+            # A killed host obeys nothing any more, and its record ends where it was killed.
+            if fault.signal is signal.SIGKILL and name in hurt_arms:
+                continue
+            if not record["at_rest"]:
+                problems.append(f"{name} moved afterwards")
+            if record["obeyed_ns"] > record["stop_ns"] > hurt_ns or (
+                name in at_rest and record["obeyed"] != at_rest[name]["obeyed"]
+            ):
+                problems.append(f"{name} obeyed a command after the stop")
+        notes = json.loads((folder / NOTES).read_text()) if (folder / NOTES).exists() else {}
+    return ProcessCase(fault, arms, longest_s, outcome, notes, problems)
+
+
+def _judged(case: ArmCase, fault: ProcessFault, longest_s: float) -> list[str]:
+    if case.rest_s is None or case.stop_s is None:
+        return [f"{case.arm} did not come to rest"]
+    # From its detection on, where that does not follow the fault at once.
+    took_s = case.rest_s if fault.at_once else case.stop_s
+    return [f"{case.arm} stood after {took_s:.3f} s, declared {longest_s:.3f} s"] if took_s > longest_s else []
+
+
+def _arm_case(name: str, before: Any, record: Any, hurt_ns: int) -> ArmCase:
+    told = [int(record[key]) for key in ("asked_ns", "stop_ns") if record[key] > hurt_ns]
+    rested_ns = int(record["moved_ns"]) if record["at_rest"] else None
+    detected_ns = min(told, default=None)
+    return ArmCase(
+        name,
+        None if detected_ns is None else (detected_ns - hurt_ns) * 1e-9,
+        None if rested_ns is None else max(0, rested_ns - (detected_ns or hurt_ns)) * 1e-9,
+        None if rested_ns is None else max(0, rested_ns - hurt_ns) * 1e-9,
+        math.dist(record["T_base_tcp"][:3, 3], before["T_base_tcp"][:3, 3]),
+    )
+
+
+@contextmanager
+def running_cell(
+    folder: Path, rate_hz: float, what: str, environment: Mapping[str, str] | None = None
+) -> Iterator[tuple[subprocess.Popen[bytes], dict[str, Any], dict[str, RecordReader]]]:
+    """The running cell, who takes part in it, and the records of its arms."""
+    command = [sys.executable, "-m", "tests.fault_injection.process_victim", str(folder), f"{rate_hz:g}", what]
+    with ExitStack() as exits, (folder / "stderr").open("wb") as stderr:
+        if what == "push":
+            exits.enter_context(pushing_emulators(folder, next(_numbers)))
+        process = subprocess.Popen(
+            command,
+            bufsize=0,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            env=os.environ | {"OMP_NUM_THREADS": "1", **(environment or {})},
+        )
+        exits.enter_context(process)
+        exits.callback(process.kill)
+        assert process.stdout is not None
+        if not select.select([process.stdout], [], [], _READY_S)[0]:
+            raise TooBusy(f"not ready within {_READY_S:g} s")
+        line = process.stdout.readline()
+        if not line:
+            raise TooBusy((folder / "stderr").read_text()[-400:])
+        who = json.loads(line)
+        states = {}
+        for name, number in who["states"].items():
+            fd = os.open(f"/proc/{who['task']}/fd/{number}", os.O_RDONLY)
+            states[name] = exits.enter_context(RecordReader(fd, ARM))
+            os.close(fd)
+        yield process, who, states
+
+
+def await_motion(process: subprocess.Popen[bytes], states: Mapping[str, RecordReader]) -> None:
+    """Return when both arms are at work, and going as fast as they do."""
+    assert process.stdout is not None
+    if not select.select([process.stdout], [], [], _MOVING_S)[0]:
+        raise TooBusy(f"not at work within {_MOVING_S:g} s")
+    if b"moving" not in (line := process.stdout.readline()):
+        raise TooBusy(f"it stopped by itself: {line.decode()}")
+    deadline_s, since_s = time.monotonic() + _MOVING_S, None
+    while since_s is None or time.monotonic() < since_s + _STEADY_S:
+        if process.poll() is not None or time.monotonic() > deadline_s:
+            raise TooBusy("it stopped by itself")
+        turning = (time.monotonic() * 2.0 / PERIOD_S) % 1.0 > 0.5
+        if turning or min(speed_m_s(state.read()) for state in states.values()) < _MOVING_M_S:
+            since_s = None
+        elif since_s is None:
+            since_s = time.monotonic()
+        time.sleep(0.005)
+
+
+def speed_m_s(record: Any) -> float:
+    """Speed of the tool that a host's record tells."""
+    return float(np.linalg.norm(record["twist"][:3]))
+
+
+def _await_rest(states: Mapping[str, RecordReader]) -> None:
+    """Return when all arms have stood for a while, or have had their time; a person would wait no longer either."""
+    deadline_s = time.monotonic() + _WATCHED_S
+    standing_s = None
+    while time.monotonic() < deadline_s and (standing_s is None or time.monotonic() < standing_s + _AFTERWARDS_S):
+        if not all(state.read()["at_rest"] for state in states.values()):
+            standing_s = None
+        elif standing_s is None:
+            standing_s = time.monotonic()
+        time.sleep(0.005)
+
+
+def last_line(process: subprocess.Popen[bytes]) -> dict[str, Any]:
+    """What the cell says at its end; empty if it says nothing."""
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(_END_S)
+    process.kill()
+    assert process.stdout is not None
+    lines = process.stdout.read().splitlines()
+    return dict(json.loads(lines[-1])) if lines else {}
+
+
+def left_over(pids: Sequence[int]) -> list[str]:
+    """Processes of the cell that are still there when it has ended; they are ended then."""
+    deadline_s = time.monotonic() + _END_S
+    left = [pid for pid in pids if _alive(pid)]
+    while left and time.monotonic() < deadline_s:
+        time.sleep(0.02)
+        left = [pid for pid in left if _alive(pid)]
+    for pid in left:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    return [f"process {pid} was left over" for pid in left]
+
+
+def _alive(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state not in "ZX"

@@ -1,0 +1,31 @@
+"""When the last command was sent, as a run loop tells it to its black box."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from touchcell.cell.runtime.loop import Box
+
+
+class SentCommands:
+    """A black box that remembers when the last command was sent.
+
+    Args:
+        box: gets everything too.
+    """
+
+    def __init__(self, box: Box | None = None) -> None:
+        self._box = box
+        self._last_ns: int | None = None
+
+    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
+        """Take in one message."""
+        if topic.endswith("/command"):
+            self._last_ns = t_ns
+        if self._box is not None:
+            self._box.add(topic, t_ns, data)
+
+    def since(self, t_ns: int) -> bool:
+        """Whether a command was sent at ``t_ns`` or later."""
+        return self._last_ns is not None and self._last_ns >= t_ns

@@ -1,0 +1,65 @@
+"""Every fault of the simulated devices in every state of every task ends as it has to."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import fields
+from pathlib import Path
+from typing import Literal
+
+import pytest
+import yaml
+
+from tests.fault_injection.fault_matrix import FAULTS, Case, cells, matrix, run_case
+from touchcell.paths import MODELS
+from touchcell.simulation.faults import ArmFaults, FrameFaults
+from touchcell.tasks import registry
+
+
+def test_every_fault_and_every_task_is_in_the_matrix() -> None:
+    names = {fault.name for fault in FAULTS}
+    assert {f"arm: {field.name}" for field in fields(ArmFaults)} <= names
+    assert {f"camera: {field.name}" for field in fields(FrameFaults)} <= names
+    assert set(cells()) == set(registry.installed())
+
+
+MOVING = ("surface_following", "object_tracking", "single_arm_pushing", "dual_arm_pushing", "data_collection")
+
+
+def run_all(folder: Path, kind: Literal["arm", "camera"], task: str) -> list[Case]:
+    """All places of one task, none of them with a problem, and none left out."""
+    cases = list(matrix(folder, [kind], [task]))
+    assert [f"{c.state}, {c.device}, {c.fault}: {c.problem}" for c in cases if c.problem] == []
+    faults = {fault.name for fault in FAULTS if fault.device == kind}
+    places = {(case.fault, case.device, case.state) for case in cases}
+    states, devices = {case.state for case in cases}, {case.device for case in cases}
+    assert places == set(itertools.product(faults, devices, states))
+    assert len(devices) == (2 if task == "dual_arm_pushing" else 1)
+    assert states >= ({"prepare", "approach", "run", "retract"} if task in MOVING[:4] else {"prepare"} & states)
+    return cases
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", MOVING)
+def test_faults_of_arms_in_every_state(task: str, tmp_path: Path) -> None:
+    run_all(tmp_path, "arm", task)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (MODELS / "sim_gdn.safetensors").exists(), reason="needs the model that ships")
+@pytest.mark.parametrize("task", ["surface_following", "object_tracking", "observe", "data_collection"])
+def test_faults_of_cameras_in_every_state(task: str, tmp_path: Path) -> None:
+    """Those of the pushing tasks take minutes; ``touchcell bench safety`` has them."""
+    run_all(tmp_path, "camera", task)
+
+
+def test_the_matrix_would_notice_a_missing_interlock(tmp_path: Path) -> None:
+    data = cells()["surface_following"]
+    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    for name, entry in list(data["interlocks"].items()):
+        if entry["kind"] == "arm_state_age":
+            data["interlocks"][name] = {**entry, "limit_ms": 10_000}
+    path = tmp_path / "cell.yaml"
+    path.write_text(yaml.safe_dump(data))
+    stale = next(fault for fault in FAULTS if fault.name == "arm: stale")
+    assert "expected arm_state_age" in run_case(path, stale, "arm", "run").problem

@@ -1,0 +1,108 @@
+"""The least plant that closes the loop: a tool that moves exactly as told, and exact estimates of a flat surface."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from touchcell.drivers.core.samples import Stamped, TcpState
+from touchcell.geometry import se3
+from touchcell.geometry.gaussian import PoseGaussian
+from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.tasks.interface import Action, Observation, Task, TaskContext
+
+RATE_HZ = 100.0
+DT = 1.0 / RATE_HZ
+T_TCP_SENSOR = se3.from_euler_mm_deg(np.array([10.0, -5.0, 60.0, 20.0, -10.0, 30.0]))
+CONTEXT = TaskContext(RATE_HZ, {"sensor": T_TCP_SENSOR})
+COVARIANCE = np.diag([1e-8] * 3 + [1e-6] * 3)
+UPSIDE_DOWN = se3.from_euler_mm_deg(np.array([0, 0, 0, 180.0, 0, 0]))
+
+
+class KinematicPlant:
+    """A sensor above a plane. The skin sticks where it touches first and never slips.
+
+    Args:
+        gap_mm: distance from the tip to the surface at the start.
+        tilt_deg: (alpha, beta) of the sensor at the start.
+
+    Attributes:
+        velocity: (6,) twist of the surface, along its own axes.
+        frozen: the arm does not move, whatever it is told.
+        frames, states: whether new ones arrive; old ones stay.
+        touching: False hides the contact, True leaves it to geometry.
+        in_range: what estimates say of themselves.
+        broken: the arm reports a pose that is none.
+        seen: ``T_f_s`` (4, 4) as the latest cycle found it.
+        operator_stop: whether the person asks for the end.
+    """
+
+    def __init__(self, gap_mm: float = 5.0, tilt_deg: tuple[float, float] = (4.0, -3.0)) -> None:
+        self.T_w_f = UPSIDE_DOWN
+        T_f_s = se3.from_euler_mm_deg(np.array([0, 0, -gap_mm, *tilt_deg, 0]))
+        self.T_w_s = se3.compose(self.T_w_f, T_f_s)
+        self.now_ns = 0
+        self.velocity = np.zeros(6)
+        self.frozen = False
+        self.frames = True
+        self.states = True
+        self.touching = True
+        self.in_range = True
+        self.broken = False
+        self.operator_stop = False
+        self.twist = np.zeros(6)
+        self.seen = T_f_s
+        self._anchored = False
+        self._seq = 0
+        self._contact: ContactEstimate | None = None
+        self._state: Stamped[TcpState] | None = None
+
+    def sensor_in_surface(self) -> np.ndarray:
+        """True ``T_f_s`` (4, 4)."""
+        return se3.compose(se3.inverse(self.T_w_f), self.T_w_s)
+
+    def cycle(self, task: Task) -> Action:
+        """One control cycle: observe, ask the task, move."""
+        self.now_ns += round(DT * 1e9)
+        self.seen = self.sensor_in_surface()
+        action = task.tick(self._observe())
+        command = action.twists.get("arm")
+        self.twist = np.zeros(6) if command is None or self.frozen else command.twist
+        T_w_tcp = se3.compose(self.T_w_s, se3.inverse(T_TCP_SENSOR))
+        self.T_w_s = se3.compose(se3.compose(T_w_tcp, se3.exp(self.twist * DT)), T_TCP_SENSOR)
+        self.T_w_f = se3.compose(self.T_w_f, se3.exp(self.velocity * DT))
+        return action
+
+    def run(self, task: Task, until: str | None = None, limit_s: float = 60.0) -> list[Action]:
+        """Cycles until the task is in state ``until``, or has finished."""
+        actions: list[Action] = []
+        for _ in range(round(limit_s * RATE_HZ)):
+            if task.finished or task.state == until:
+                return actions
+            actions.append(self.cycle(task))
+        raise AssertionError(f"still in {task.state} after {limit_s} s")
+
+    def _observe(self) -> Observation:
+        if self.states or self._state is None:
+            T = se3.compose(self.T_w_s, se3.inverse(T_TCP_SENSOR))
+            self._state = Stamped(TcpState(2.0 * T if self.broken else T, self.twist), self.now_ns, self._seq)
+        if self.frames:
+            self._seq += 1
+            self._contact = self._estimate()
+        contacts = {} if self._contact is None else {"sensor": self._contact}
+        return Observation(self.now_ns, {"arm": self._state}, contacts, self.operator_stop)
+
+    def _estimate(self) -> ContactEstimate:
+        nothing = ContactEstimate(False, None, self.now_ns, self._seq, self.now_ns)
+        if not self.touching or self.seen[2, 3] <= 0.0:
+            self._anchored = False
+            return nothing
+        if not self._anchored:
+            # Here the skin takes hold: the surface frame moves to where there is no shear.
+            labels = se3.to_euler_mm_deg(self.seen)
+            shear = np.array([labels[0], labels[1], 0.0, 0.0, 0.0, labels[5]])
+            self.T_w_f = se3.compose(self.T_w_f, se3.from_euler_mm_deg(shear))
+            self._anchored = True
+        belief = PoseGaussian(se3.inverse(self.sensor_in_surface()), COVARIANCE)
+        return replace(nothing, in_contact=True, belief=belief, in_range=self.in_range)

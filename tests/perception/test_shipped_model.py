@@ -1,0 +1,68 @@
+"""The model that ships is the one that the documented command makes, and it is good enough to be servoed on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from touchcell.cell.cli.main import main
+from touchcell.cell.runtime.compose import MODELS
+from touchcell.geometry import se3
+from touchcell.perception.runtime.contact_gate import ContactGate
+from touchcell.perception.runtime.inference import ContactModel
+from touchcell.simulation.render import FrameRenderer
+from touchcell.simulation.samples import Variation, contacts
+from touchcell.simulation.tip import Tip
+
+MODEL = MODELS / "sim_gdn.safetensors"
+
+
+@pytest.fixture(scope="module")
+def model() -> ContactModel:
+    return ContactModel.load(MODEL)
+
+
+def test_it_is_small_and_made_by_the_command(model: ContactModel) -> None:
+    training = pytest.importorskip("touchcell.cell.cli.train_sim", exc_type=ImportError)
+    assert MODEL.stat().st_size < 3_000_000
+    assert model.header.preprocessing == training.PREPROCESSING
+    assert model.header.architecture == training.ARCHITECTURE
+
+
+def test_it_reads_the_simulated_sensor(model: ContactModel) -> None:
+    still = Variation(0, 0, 0, 0, 0, 0)
+    renderer = FrameRenderer(seed=99)
+    errors = []
+    for i, contact in enumerate(contacts(60, 12345, depth_mm=(1.0, 6.0), variation=still)):
+        prediction = model.predict(renderer.raw(contact.pixels, i))
+        predicted = se3.to_euler_mm_deg(se3.inverse(se3.exp(prediction.xi)))
+        errors.append(np.abs(predicted - se3.to_euler_mm_deg(contact.T_f_s)))
+    mae = np.mean(errors, axis=0)
+    assert (mae < [0.15, 0.15, 0.15, 1.2, 1.2, 0.6]).all(), mae
+
+
+def test_its_gate_knows_rest_from_touch(model: ContactModel) -> None:
+    assert model.reference is not None
+    gate = ContactGate(model.reference)
+    renderer = FrameRenderer(seed=7)
+    scores = {}
+    for depth_mm in (-1.0, 0.5, 1.0):
+        pixels = Tip().pixels(se3.from_euler_mm_deg([0, 0, depth_mm, 0, 0, 0]))
+        gate.update(model.reduce(renderer.raw(pixels, 3)))
+        scores[depth_mm] = gate.score
+    assert scores[-1.0] < 0.02
+    assert scores[0.5] > 0.04
+    assert scores[1.0] > scores[0.5]
+
+
+def test_the_demo_follows_the_ramp(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "configs/surface_follow_sim.yaml", "--out", str(tmp_path), "--quiet"]) == 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    rms = summary["errors"]["sensor"]["control"]["rms"]
+    assert summary["outcome"] == "done"
+    assert rms["z_mm"] < 0.2
+    assert rms["alpha_deg"] < 1.0
+    assert rms["beta_deg"] < 1.2

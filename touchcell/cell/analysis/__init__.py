@@ -1,0 +1,1 @@
+"""What is made from a recording after a run."""

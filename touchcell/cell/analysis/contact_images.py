@@ -1,0 +1,126 @@
+"""What a sensor felt, as pictures of its markers, from the images of a recording alone."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from pydantic import ValidationError
+
+from touchcell.cell.recording.mcap import Message, read
+from touchcell.geometry.types import ImageArray
+from touchcell.perception.errors import ImageError
+from touchcell.perception.markers.figures import draw_contact, write_markers
+from touchcell.perception.markers.tracking import MarkerTracker, TrackedMarkers
+from touchcell.perception.runtime.preprocessing import Preprocessing
+
+if TYPE_CHECKING:
+    from touchcell.cell.analysis.report import Run
+
+_PICTURES = 5
+
+
+@dataclass(frozen=True, slots=True)
+class ContactPicture:
+    """One recorded image.
+
+    Attributes:
+        role: of the sensor.
+        t_ns: when it was exposed.
+        image: uint8 (height, width), black and white, as markers are looked for in it.
+        markers: of it, followed since the recording's first image.
+        spacing_px: of neighbouring markers in the first image.
+    """
+
+    role: str
+    t_ns: int
+    image: ImageArray
+    markers: TrackedMarkers
+    spacing_px: float
+
+    def drawn(self) -> ImageArray:
+        """uint8 (height, 2 width, 3) BGR: displacement arrows and change of density."""
+        markers = self.markers
+        return draw_contact(self.image, markers.reference, markers.positions, self.spacing_px, arrows=markers.followed)
+
+
+def contact_pictures(messages: Iterable[Message]) -> Iterator[ContactPicture]:
+    """Each recorded image with its markers; images in which none can be found are passed over.
+
+    The first image of a sensor counts as undeformed, as a run begins out of contact.
+    """
+    chains: dict[str, Preprocessing] = {}
+    trackers: dict[str, MarkerTracker] = {}
+    for message in messages:
+        parts = message.topic.split("/")
+        if len(parts) != 4 or parts[1] != "sensors":
+            continue
+        role, leaf = parts[2:]
+        if leaf == "preprocessing":
+            try:
+                chains[role] = Preprocessing.model_validate(message.data).in_full_resolution()
+            except ValidationError:
+                continue
+        if leaf != "image" or role not in chains:
+            continue
+        try:
+            image = chains[role].reduce(_decoded(message.data))
+            if role not in trackers:
+                trackers[role] = MarkerTracker(image)
+            markers = trackers[role].update(image)
+        except ImageError:
+            continue
+        yield ContactPicture(role, message.t_ns, image, markers, trackers[role].spacing_px)
+
+
+def write_strip(recording: Path, run: Run, role: str, path: Path) -> Path | None:
+    """A few contacts of a run side by side, arrows above and density below; None where there is nothing to show.
+
+    Args:
+        recording: of the run.
+        run: its series.
+        role: of the sensor.
+        path: PNG to write.
+
+    Raises:
+        RecordingError: the recording is gone.
+    """
+    contact = run.series(f"/sensors/{role}/contact")
+    if contact is None:
+        return None
+    touching_s = contact.t_s[np.array([bool(row.get("in_contact")) for row in contact.rows], dtype=bool)]
+    if not len(touching_s):
+        return None
+    wanted_s = np.linspace(touching_s[0], touching_s[-1], _PICTURES + 2)[1:-1].tolist()
+    shown: list[tuple[float, ContactPicture]] = []
+    for picture in contact_pictures(read(recording)):
+        t_s = (picture.t_ns - run.start_ns) * 1e-9
+        if picture.role == role and wanted_s and t_s >= wanted_s[0]:
+            del wanted_s[0]
+            if picture.markers.followed:
+                shown.append((t_s, picture))
+    if not shown:
+        return None
+    first = shown[0][1]
+    write_markers(
+        path,
+        first.markers.reference,
+        [picture.markers.positions for _, picture in shown],
+        [f"t = {t_s:.2f} s" for t_s, _ in shown],
+        (first.image.shape[0], first.image.shape[1]),
+        first.spacing_px,
+    )
+    return path
+
+
+def _decoded(data: dict[str, Any]) -> ImageArray:
+    encoded = np.frombuffer(base64.b64decode(data["data"]), np.uint8)
+    image = cv2.imdecode(encoded, cv2.IMREAD_ANYCOLOR)
+    if image is None:
+        raise ImageError("content", data["format"], "no image")
+    return np.asarray(image, dtype=np.uint8)

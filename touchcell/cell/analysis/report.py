@@ -1,0 +1,270 @@
+"""A run's summary and plots, made from its recording alone, so that they can be made again at any time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from touchcell.cell.recording.mcap import RECORDING, Message, read
+from touchcell.cell.recording.messages import COMPONENTS
+from touchcell.drivers.core.errors import ConfigError
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+
+Times = NDArray[np.int64]
+STAGES = (
+    "read_arms",
+    "read_frame",
+    "preprocess",
+    "infer",
+    "filter",
+    "task_and_control",
+    "supervisor",
+    "gate_and_send",
+    "cycle",
+)
+"""Stages of a control cycle as recorded under /timing, in the order in which they run, and the whole."""
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One topic over time: ``t_s`` (n,) and columns of the same length; what was not recorded is NaN."""
+
+    t_s: Array
+    rows: tuple[dict[str, Any], ...]
+
+    def column(self, name: str) -> Array:
+        """(n,) values of one key."""
+        return np.array([_number(row.get(name)) for row in self.rows])
+
+    def poses(self) -> Array:
+        """(n, 6) Euler components in mm and degrees."""
+        return np.stack([self.column(name) for name in COMPONENTS], axis=1)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A recording, by topic, with the task's states."""
+
+    topics: dict[str, Series]
+    events: tuple[Message, ...]
+    start_ns: int
+
+    def series(self, topic: str) -> Series | None:
+        """The topic's series, or None where nothing was recorded."""
+        return self.topics.get(topic)
+
+    def roles(self, kind: str, leaf: str) -> list[str]:
+        """Roles with a topic ``/kind/ROLE/leaf``."""
+        parts = [topic.split("/") for topic in self.topics]
+        return sorted(p[2] for p in parts if len(p) == 4 and p[1] == kind and p[3] == leaf)
+
+    def during(self, t_s: Array, state: str) -> NDArray[np.bool_]:
+        """Which of ``t_s`` lie in cycles in which the task was in ``state``."""
+        task = self.topics.get("/task")
+        if task is None or not len(task.t_s):
+            return np.zeros(len(t_s), dtype=bool)
+        inside = np.array([row.get("state") == state for row in task.rows])
+        index = np.clip(np.searchsorted(task.t_s, t_s, side="right") - 1, 0, len(inside) - 1)
+        found: NDArray[np.bool_] = inside[index]
+        return found
+
+
+def load_run(path: Path) -> Run:
+    """Read a recording; images are left out. Raises RecordingError."""
+    grouped: dict[str, list[Message]] = {}
+    for message in read(path):
+        if not message.topic.endswith("/image"):
+            grouped.setdefault(message.topic, []).append(message)
+    events = tuple(grouped.pop("/events", []))
+    start_ns = min((messages[0].t_ns for messages in grouped.values()), default=0)
+    topics = {
+        topic: Series(
+            np.array([(message.t_ns - start_ns) * 1e-9 for message in messages]),
+            tuple(message.data for message in messages),
+        )
+        for topic, messages in grouped.items()
+    }
+    return Run(topics, events, start_ns)
+
+
+def write_report(folder: Path) -> str:
+    """Write ``summary.json``, ``summary.txt`` and the plots into a run folder; returns the text.
+
+    Raises:
+        RecordingError: the folder holds no recording.
+    """
+    run = load_run(folder / RECORDING)
+    result_file = folder / "result.json"
+    result = json.loads(result_file.read_text()) if result_file.exists() else {}
+    summary = summarise(run)
+    (folder / "summary.json").write_text(json.dumps({**result, **summary}, indent=1) + "\n")
+    text = _text(folder, result, summary, _pictures(run, folder), run)
+    (folder / "summary.txt").write_text(text + "\n")
+    return text
+
+
+def _pictures(run: Run, folder: Path) -> list[Path]:
+    from touchcell.cell.analysis.contact_images import write_strip
+    from touchcell.cell.analysis.plots import plot_agreement, plot_budget, plot_contact, plot_trajectory
+
+    moved = bool(run.roles("arms", "command"))
+    pictures = []
+    for sensor in run.roles("sensors", "contact"):
+        pictures.append(plot_contact(run, sensor, folder / f"contact_{sensor}.png", last_s=None if moved else 2.0))
+        if not moved and run.series(f"/sensors/{sensor}/truth") is not None:
+            pictures.append(plot_agreement(run, sensor, folder / f"agreement_{sensor}.png"))
+    if moved:
+        pictures.append(plot_trajectory(run, folder / "trajectory.png", _mounts(folder)))
+    for sensor in run.roles("sensors", "preprocessing"):
+        strip = write_strip(folder / RECORDING, run, sensor, folder / f"markers_{sensor}.png")
+        pictures += [strip] if strip is not None else []
+    if stages_ms := _stages_ms(run):
+        title = "time that each stage of a control cycle took, in the cycles in which it ran"
+        pictures.append(plot_budget(stages_ms, folder / "budget.png", title))
+    return pictures
+
+
+def _mounts(folder: Path) -> dict[str, tuple[Array, Array]]:
+    """Where each arm stands in the world, and where its sensor sits on its tool, as far as the cell file is there."""
+    from touchcell.cell.analysis.run_folder import RunFolder
+
+    try:
+        plan = RunFolder(folder).plan
+    except (ConfigError, OSError):
+        return {}
+    sits = {section.mounted_on: section.T_tcp_sensor for section in plan.cell.sensors.values()}
+    return {
+        role: (plan.cell.arms[name].T_world_base, sits.get(name, np.eye(4))) for role, name in plan.arm_roles.items()
+    }
+
+
+def _stages_ms(run: Run) -> dict[str, Array]:
+    """Durations of each stage in the cycles in which it ran, in the order in which they run."""
+    timing = run.series("/timing")
+    if timing is None:
+        return {}
+    columns = {stage: timing.column(f"{stage}_us") for stage in STAGES}
+    ran = {stage: us[np.isfinite(us)] for stage, us in columns.items()}
+    return {stage.replace("_", " "): 1e-3 * us for stage, us in ran.items() if len(us)}
+
+
+def summarise(run: Run) -> dict[str, Any]:
+    """Errors of a run in millimetres and degrees.
+
+    ``control`` is the true contact against the reference (what the arm achieved), ``estimation`` the estimate against
+    the truth, ``single_frame`` each frame's own measurement against the truth; all during the task's ``run`` state, or
+    the whole recording where the task has none.
+    """
+    return {
+        "errors": {
+            sensor: errors for sensor in run.roles("sensors", "contact") if (errors := _sensor_errors(run, sensor))
+        }
+    }
+
+
+def _sensor_errors(run: Run, sensor: str) -> dict[str, dict[str, dict[str, float]]]:
+    contact = run.series(f"/sensors/{sensor}/contact")
+    truth = run.series(f"/sensors/{sensor}/truth")
+    measured = run.series(f"/sensors/{sensor}/measurement")
+    assert contact is not None
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    running = run.during(contact.t_s, "run")
+    inside = running if running.any() else np.ones(len(contact.t_s), dtype=bool)
+    if truth is not None:
+        if (error := _difference(contact, inside, truth)) is not None:
+            found["estimation"] = error
+        if measured is not None:
+            selected = run.during(measured.t_s, "run") if running.any() else np.ones(len(measured.t_s), dtype=bool)
+            if (error := _difference(measured, selected, truth)) is not None:
+                found["single_frame"] = error
+    achieved = truth if truth is not None else contact
+    if (error := _reference_error(run, sensor, achieved)) is not None:
+        found["control"] = error
+    return found
+
+
+def _difference(series: Series, selected: NDArray[np.bool_], truth: Series) -> dict[str, dict[str, float]] | None:
+    """Error of ``series`` against the truth of its time, RMS and mean absolute, per component."""
+    poses, true = series.poses(), truth.poses()
+    index = np.clip(np.searchsorted(truth.t_s, series.t_s + 1e-6, side="right") - 1, 0, len(truth.t_s) - 1)
+    error = (poses - true[index])[selected]
+    error = error[np.isfinite(error).all(axis=1)]
+    return _statistics(error) if len(error) else None
+
+
+def _reference_error(run: Run, sensor: str, achieved: Series) -> dict[str, dict[str, float]] | None:
+    """Achieved contact against the reference that the task recorded, for the components that it controls."""
+    task = run.series("/task")
+    if task is None:
+        return None
+    index = np.clip(np.searchsorted(task.t_s, achieved.t_s, side="right") - 1, 0, len(task.t_s) - 1)
+    running = run.during(achieved.t_s, "run")
+    poses = achieved.poses()
+    errors = {}
+    for i, name in enumerate(COMPONENTS):
+        # A task with several sensors says whose reference it is.
+        told = task.column(f"{sensor}_reference_{name}")
+        reference = (told if np.isfinite(told).any() else task.column(f"reference_{name}"))[index]
+        error = (poses[:, i] - reference)[running]
+        error = error[np.isfinite(error)]
+        if len(error):
+            errors[name] = error
+    if not errors:
+        return None
+    return {
+        "rms": {name: float(np.sqrt(np.mean(error**2))) for name, error in errors.items()},
+        "mae": {name: float(np.mean(np.abs(error))) for name, error in errors.items()},
+    }
+
+
+def _statistics(error: Array) -> dict[str, dict[str, float]]:
+    return {
+        "rms": dict(zip(COMPONENTS, np.sqrt(np.mean(error**2, axis=0)).tolist(), strict=True)),
+        "mae": dict(zip(COMPONENTS, np.mean(np.abs(error), axis=0).tolist(), strict=True)),
+    }
+
+
+def _text(folder: Path, result: dict[str, Any], summary: dict[str, Any], pictures: Sequence[Path], run: Run) -> str:
+    lines = []
+    if result:
+        lines.append(f"{result['cell']}: {result['task']} {result['outcome']} after {result['duration_s']:.2f} s")
+        if result["reason"]:
+            lines.append(f"  {result['reason']}")
+    for sensor, kinds in summary["errors"].items():
+        lines.append(f"{sensor}, error RMS    " + "".join(f"{name:>11}" for name in COMPONENTS))
+        for kind, statistics in kinds.items():
+            cells = "".join(
+                f"{statistics['rms'][name]:11.3f}" if name in statistics["rms"] else f"{'-':>11}" for name in COMPONENTS
+            )
+            lines.append(f"  {_KINDS[kind]:<19}{cells}")
+    if stages := result.get("stages_us"):
+        lines.append("time per cycle      " + f"{'median us':>11}{'p99 us':>11}{'times':>9}")
+        lines += [
+            f"  {stage:<18}{row['median']:11.1f}{row['p99']:11.1f}{row['count']:9d}" for stage, row in stages.items()
+        ]
+    lines.append(f"run folder: {folder}")
+    lines += [f"  {picture.name}" for picture in pictures]
+    return "\n".join(lines)
+
+
+_KINDS = {
+    "control": "true - reference",
+    "estimation": "estimate - true",
+    "single_frame": "one frame - true",
+}
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else float("nan")
+
+
+def tip_points(series: Series) -> Array:
+    """(n, 4, 4) poses of a pose series."""
+    return se3.from_euler_mm_deg(series.poses())

@@ -1,0 +1,110 @@
+"""What a run has left behind, and what was true in it: where sensors and surfaces were, what was touched."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from touchcell.cell.analysis.report import Run, Series, load_run, tip_points
+from touchcell.cell.config.schema import CellPlan, plan_cell
+from touchcell.geometry.types import Array
+from touchcell.simulation.scene import SceneConfig
+from touchcell.simulation.surfaces import Surface
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run's folder: ``cell.yaml`` and ``run.mcap``, read when they are asked for."""
+
+    path: Path
+
+    @cached_property
+    def plan(self) -> CellPlan:
+        """Its cell. Raises ConfigError."""
+        return plan_cell(self.path / "cell.yaml")
+
+    @cached_property
+    def recording(self) -> Run:
+        """What was recorded, without images. Raises RecordingError."""
+        return load_run(self.path / "run.mcap")
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """Poses over time: ``t_s`` (n,) since the start of the scene, ``T_world`` (n, 4, 4)."""
+
+    t_s: Array
+    T_world: Array
+
+    def at(self, t_s: Array) -> Array:
+        """(m, 4, 4) the newest pose at each of ``t_s``, or the first."""
+        index = np.searchsorted(self.t_s, t_s + 1e-6, side="right") - 1
+        poses: Array = self.T_world[np.clip(index, 0, len(self.t_s) - 1)]
+        return poses
+
+
+def scene_time(run: RunFolder, series: Series) -> Array:
+    """(n,) times of a series since the start of the scene, which is when simulated time was zero."""
+    return series.t_s + 1e-9 * run.recording.start_ns
+
+
+def sensor_poses(run: RunFolder, role: str) -> Poses:
+    """Where the sensor of a role was."""
+    plan = run.plan
+    section = plan.cell.sensors[plan.sensor_roles[role]]
+    assert section.mounted_on is not None
+    arm = section.mounted_on
+    arm_role = next((each for each, name in plan.arm_roles.items() if name == arm), arm)
+    series = run.recording.series(f"/arms/{arm_role}/tcp")
+    assert series is not None
+    T_world_base = plan.cell.arms[arm].T_world_base
+    return Poses(scene_time(run, series), T_world_base @ tip_points(series) @ section.T_tcp_sensor)
+
+
+def during(run: RunFolder, series: Series, state: str = "run") -> NDArray[np.bool_]:
+    """(n,) which samples lie in cycles in which the task was in ``state``."""
+    return run.recording.during(series.t_s, state)
+
+
+def true_contacts(run: RunFolder, role: str) -> tuple[Series, Array]:
+    """The series of true contacts of a sensor, and them as (n, 6) in mm and degrees; NaN out of contact."""
+    series = run.recording.series(f"/sensors/{role}/truth")
+    assert series is not None
+    return series, series.poses()
+
+
+def tilt_deg(contacts_mm_deg: Array) -> Array:
+    """(n,) angle between the sensor's axis and the surface's normal, of contacts (n, 6)."""
+    alpha, beta = np.radians(contacts_mm_deg[:, 3]), np.radians(contacts_mm_deg[:, 4])
+    angle: Array = np.degrees(np.arccos(np.clip(np.cos(alpha) * np.cos(beta), -1.0, 1.0)))
+    return angle
+
+
+def rms(values: Array) -> float:
+    """Root mean square of what is finite; NaN of nothing."""
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite**2))) if len(finite) else float("nan")
+
+
+def surface(run: RunFolder) -> Surface:
+    """The first surface of the run's scene, with its motion."""
+    return next(iter(scene(run).surfaces.values())).build()
+
+
+def object_poses(run: RunFolder) -> Mapping[str, Poses]:
+    """Where every free object was, by its name."""
+    return {
+        topic.rpartition("/")[2]: Poses(scene_time(run, series), tip_points(series))
+        for topic, series in run.recording.topics.items()
+        if topic.startswith("/objects/")
+    }
+
+
+def scene(run: RunFolder) -> SceneConfig:
+    """The scene of a simulated run."""
+    return SceneConfig.model_validate(run.plan.cell.scene)

@@ -1,0 +1,58 @@
+"""The plot around a trip. Imported only then, because matplotlib is heavy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+from touchcell.cell.analysis.report import Run
+
+_BEFORE_S, _AFTER_S = 1.0, 0.5
+
+
+def plot_trip(run: Run, trip_s: float, cause: dict[str, Any] | None, path: Path) -> Path:
+    """Speed sent and measured, depth, and the age of the frames, from a second before the trip until after the stop."""
+    figure, axes = plt.subplots(3, 1, figsize=(11, 8), sharex=True, layout="constrained")
+    speed, depth, age = axes
+    axes[-1].set_xlim(-_BEFORE_S, _AFTER_S)
+    for role in run.roles("arms", "tcp"):
+        tcp, sent = run.series(f"/arms/{role}/tcp"), run.series(f"/arms/{role}/command")
+        assert tcp is not None
+        (line,) = speed.plot(tcp.t_s - trip_s, tcp.column("speed_mm_s"), lw=1.4, label=f"{role}, measured")
+        if sent is not None:
+            speed.plot(
+                sent.t_s - trip_s,
+                sent.column("speed_mm_s"),
+                ls="none",
+                marker=".",
+                ms=4,
+                color=line.get_color(),
+                label=f"{role}, sent",
+            )
+    for role in run.roles("sensors", "contact"):
+        contact = run.series(f"/sensors/{role}/contact")
+        assert contact is not None
+        t_s = contact.t_s - trip_s
+        depth.plot(t_s, contact.column("z_mm"), lw=1.4, label=f"{role}, estimate")
+        frame_s = (contact.column("t_frame_ns") - run.start_ns) * 1e-9 - trip_s
+        age.plot(t_s, 1e3 * (t_s - frame_s), lw=1.2, label=role)
+        truth = run.series(f"/sensors/{role}/truth")
+        if truth is not None:
+            depth.plot(truth.t_s - trip_s, truth.column("z_mm"), lw=1.0, ls="--", label=f"{role}, true")
+    for axis, title in zip(axes, ("tool speed (mm/s)", "depth (mm)", "age of the frame (ms)"), strict=True):
+        axis.axvline(0.0, color="#c44e52", lw=1.2)
+        axis.set_ylabel(title)
+        axis.grid(alpha=0.3)
+        if axis.get_legend_handles_labels()[0]:
+            axis.legend(fontsize=9, loc="upper left")
+    axes[-1].set_xlabel("time from the trip (s)")
+    if cause is not None:
+        figure.suptitle(f"{cause['interlock']}: {cause['subject']}: {cause['reason']}")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return path

@@ -1,0 +1,208 @@
+"""``touchcell bench devices``: every driver on its emulator, and the vendor's client beside it.
+
+All figures are of this machine and of emulators, never of metal. It works with the conformance suite's bench, so it
+needs pytest (extra ``dev``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from touchcell.cell.bench.provenance import provenance
+from touchcell.drivers.core.errors import DeviceError
+from touchcell.testing.conformance.client import MovingClient
+from touchcell.testing.conformance.context import Bench, Seat
+from touchcell.testing.emulation.rig import rig_of
+
+_RIGS = ("ur", "franka", "damiao_can", "feetech_serial", "v4l2")
+_TRIALS = 20
+_CALM_S = 0.12
+_TTL_S = 0.2
+_CLIENT_TIMEOUT_S = 30.0
+_COLUMNS = (
+    ("connect_s", "connect s", ".3f"),
+    ("active_s", "active s", ".3f"),
+    ("rate_hz", "state Hz", ".0f"),
+    ("age_ms", "age ms", ".1f"),
+    ("wire_ms", "wire ms", ".2f"),
+    ("wire_p99_ms", "p99 ms", ".2f"),
+    ("cycle_cpu_us", "cycle us", ".0f"),
+    ("stop_ttl_ms", "ttl ms", ".0f"),
+    ("stop_kill_ms", "kill ms", ".0f"),
+    ("stop_kill_mm", "kill mm", ".1f"),
+    ("frozen_ms", "frozen ms", ".0f"),
+    ("memory_mb", "MB", ".0f"),
+)
+
+
+def run(arguments: Sequence[str], out: Path) -> None:
+    """Print the table; writes ``devices.json`` into ``out``."""
+    parser = argparse.ArgumentParser(prog="touchcell bench devices", description=__doc__.partition("\n")[0])
+    parser.add_argument("names", nargs="*", default=_RIGS, metavar="driver", help=f"of {', '.join(_RIGS)}")
+    names = parser.parse_args(arguments).names
+    rows: dict[str, dict[str, Any]] = {}
+    for number, name in enumerate(names):
+        print(f"{name} ...", flush=True)
+        with tempfile.TemporaryDirectory(prefix="touchcell-bench-") as folder:
+            address = 1000 + (os.getpid() % 30_000) * 16 + number
+            seat = Seat(partial(rig_of, name), Path(folder), address)
+            try:
+                rows[name] = _measure(seat)
+                rows[f"{name}, vendor"] = _vendor(seat)
+            finally:
+                seat.clear()
+    print(f"\n{'':<24}" + "".join(f"{title:>11}" for _, title, _ in _COLUMNS))
+    for name, row in rows.items():
+        cells = (f"{format(row[key], form) if row.get(key) is not None else '-':>11}" for key, _, form in _COLUMNS)
+        print(f"{name:<24}" + "".join(cells) + (f"  {row['error']}" if "error" in row else ""))
+    print(
+        "\nwire: from send_twist to the emulator's receive stamp, always from rest. ttl, kill: from expiry or kill -9"
+        "\nuntil the tool rests, or the motors of an arm without brakes let go. frozen: until the driver is FAULTED."
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "devices.json").write_text(json.dumps({"provenance": provenance(), "rows": rows}, indent=1) + "\n")
+
+
+def _measure(seat: Seat) -> dict[str, Any]:
+    name = seat.function.__module__.rpartition(".")[2]
+    seat.emulator()
+    row = _client("ours", seat, name)
+    for part in (_wire, _ttl, _kill, _frozen):
+        seat.clear()
+        if "TwistSink" in seat.rig.spec.capabilities.abilities or part is _frozen:
+            try:
+                row |= part(seat)
+            except BaseException as error:
+                if isinstance(error, KeyboardInterrupt):
+                    raise
+                row["error"] = f"{part.__name__.strip('_')}: {error}"
+    seat.clear()
+    return row
+
+
+def _vendor(seat: Seat) -> dict[str, Any]:
+    name = seat.function.__module__.rpartition(".")[2]
+    seat.emulator()
+    return _client("vendor", seat, name)
+
+
+def _client(who: str, seat: Seat, name: str) -> dict[str, Any]:
+    environment = dict(os.environ)
+    if name == "v4l2":
+        from touchcell.drivers.v4l2.emulator.shim import environment as shim
+
+        environment |= shim(seat.folder)
+    try:
+        result = subprocess.run(
+            [
+                sys.executable,
+                "-W",
+                "ignore",
+                "-m",
+                "touchcell.cell.bench.device_client",
+                who,
+                name,
+                seat.folder,
+                str(seat.address),
+            ],
+            capture_output=True,
+            text=True,
+            timeout=_CLIENT_TIMEOUT_S,
+            env=environment,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return {"error": f"no figures within {_CLIENT_TIMEOUT_S:g} s"}
+    if result.returncode:
+        return {"error": result.stderr.strip().splitlines()[-1]}
+    row: dict[str, Any] = json.loads(result.stdout.splitlines()[-1])
+    return row
+
+
+def _wire(seat: Seat) -> dict[str, Any]:
+    """From the call of ``send_twist`` to the emulator's own receive stamp, each time from rest."""
+    bench = Bench(seat)
+    try:
+        lease = bench.leased()
+        bench.settle()
+        latencies_ms = []
+        for trial in range(_TRIALS):
+            bench.sleep(_CALM_S)
+            sign = 1.0 if trial % 2 else -1.0
+            command = bench.command(sign * bench.twist(bench.axis()), ttl_s=0.04)
+            before_ns = time.monotonic_ns()
+            bench.arm.send_twist(command, lease)
+            bench.sleep(0.035)
+            onset_ns = bench.truth()["command_onset_ns"]
+            if onset_ns > before_ns:
+                latencies_ms.append((onset_ns - before_ns) * 1e-6)
+            bench.arm.stop()
+            bench.settle()
+        return {
+            "wire_ms": statistics.median(latencies_ms),
+            "wire_p99_ms": float(np.percentile(latencies_ms, 99)),
+            "wire_trials": len(latencies_ms),
+        }
+    finally:
+        bench.close()
+
+
+def _ttl(seat: Seat) -> dict[str, Any]:
+    """From the expiry of the last command until the tool truly rests."""
+    bench = Bench(seat)
+    try:
+        lease = bench.leased()
+        bench.settle()
+        track, _ = bench.stream(lease, bench.twist(bench.axis()), 0.6, ttl_s=_TTL_S)
+        expiry_ns = track.t_ns[-1] + _TTL_S * 1e9
+        rest = bench.track_to_rest(3.0)
+        return {"stop_ttl_ms": (rest.t_ns[-1] - expiry_ns) * 1e-6}
+    finally:
+        bench.close()
+
+
+def _kill(seat: Seat) -> dict[str, Any]:
+    """From kill -9 of the client until the tool rests, or motors that carry an arm without brakes let go."""
+    bench = Bench(seat)
+    falls = seat.rig.spec.capabilities.falls_on_power_loss
+    try:
+        with MovingClient(seat.function, seat.folder, seat.address, bench.speed()) as client:
+            bench.sleep(0.3)
+            client.kill()
+            start_ns, start = bench.clock.now_ns(), bench.position()
+            ended = (lambda truth: not truth["energised"]) if falls else None
+            rest = bench.track_to_rest(client.silence_s + 3.0, ended)
+        travel_mm = 1e3 * float(np.linalg.norm(rest.poses[-1][:3, 3] - start))
+        return {"stop_kill_ms": (rest.t_ns[-1] - start_ns) * 1e-6, "stop_kill_mm": travel_mm}
+    finally:
+        bench.close()
+
+
+def _frozen(seat: Seat) -> dict[str, Any]:
+    """From SIGSTOP of the device until the driver is FAULTED."""
+    bench = Bench(seat)
+    bench.spoiled = True
+    try:
+        bench.active()
+        lease = bench.arm.acquire("bench") if "TwistSink" in seat.rig.spec.capabilities.abilities else None
+        with suppress(DeviceError):
+            bench.read()
+        bench.sleep(0.2)
+        bench.emulator.freeze()
+        return {"frozen_ms": 1e3 * bench.reach_faulted(5.0, lease)}
+    finally:
+        bench.close()

@@ -1,0 +1,1 @@
+"""The ``touchcell`` command line."""

@@ -1,0 +1,224 @@
+"""``touchcell emulate cell FILE``: every device of a cell file as an emulator, around one simulated scene.
+
+    touchcell emulate cell configs/dual_push_emulated.yaml
+
+prints the command that runs the cell on them. Arms are processes of their own, as they keep time to a millisecond; the
+scene and the cameras are in this one. Where an emulated arm is, there its tip touches the scene of the file's
+``emulated_scene:``, and the camera that it carries shows that tip. The cell sees none of this but frames and poses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shlex
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from touchcell.cell.cli.main import find_cell
+from touchcell.cell.config.schema import CellPlan, plan_cell
+from touchcell.drivers.core.clock import MonotonicClock
+from touchcell.drivers.core.errors import ConfigError, DeviceError
+from touchcell.drivers.franka.emulator import arm as franka_arm
+from touchcell.drivers.ur.emulator import kinematics as ur_model
+from touchcell.drivers.v4l2.emulator.server import V4l2Emulator
+from touchcell.drivers.v4l2.emulator.shim import environment
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array, ImageArray
+from touchcell.simulation.render import FrameRenderer
+from touchcell.simulation.scene import Scene, SceneConfig
+from touchcell.simulation.tip import Tip
+from touchcell.testing.emulation.base import Emulator
+from touchcell.testing.emulation.process import EmulatorProcess
+from touchcell.testing.emulation.ticker import Ticker
+
+_FLANGES: Mapping[str, Callable[[Array], Array]] = {
+    "franka": lambda q: franka_arm.flange_pose(q)[0],
+    "ur": lambda q: ur_model.forward(q, np.eye(4))[0],
+}
+"""T_base_flange (4, 4) of an emulated arm from its joint angles, by driver, which is also the emulator's name."""
+
+_CAMERA = re.compile(r"/dev/(?:video|v4l/by-id/usb-TacTip_)(\d+)(?:-video-index0)?")
+# What an arm was asked less long ago than this is not asked again: scenes take their steps in bursts.
+_FRESH_NS = 2_000_000
+
+
+class EmulatedArm:
+    """An emulated arm as what carries a sensor through a scene; once it is gone, it is where it was last.
+
+    Args:
+        process: its emulator, running.
+        flange: T_base_flange (4, 4) from joint angles.
+        T_flange_tcp: (4, 4) its tool, None for the one that the emulator has.
+        T_world_base: (4, 4) where its base stands.
+    """
+
+    def __init__(
+        self,
+        process: EmulatorProcess,
+        flange: Callable[[Array], Array],
+        T_flange_tcp: Array | None,
+        T_world_base: Array,
+    ) -> None:
+        self._process = process
+        self._flange = flange
+        self._T_flange_tcp = T_flange_tcp
+        self._T_world_base = T_world_base
+        self._T_world_tcp = self._ask()
+        self._asked_ns = time.monotonic_ns()
+
+    def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
+        """(4, 4) where its tool truly is."""
+        now_ns = time.monotonic_ns()
+        if now_ns - self._asked_ns > _FRESH_NS:
+            self._asked_ns = now_ns
+            with suppress(DeviceError, OSError):
+                self._T_world_tcp = self._ask()
+        return self._T_world_tcp
+
+    def _ask(self) -> Array:
+        state = self._process.state()
+        if self._T_flange_tcp is None:
+            T_base_tcp = np.array(state["T_base_ee"], dtype=np.float64)
+        else:
+            T_base_tcp = self._flange(np.array(state["q"], dtype=np.float64)) @ self._T_flange_tcp
+        return self._T_world_base @ T_base_tcp
+
+
+class CellEmulator(Emulator):
+    """All devices that the task of a cell needs, and what they touch.
+
+    Args:
+        plan: the cell.
+        folder: where the cameras' sockets live.
+
+    Raises:
+        ConfigError: the cell has no ``emulated_scene:``, or a device that this cannot emulate.
+    """
+
+    def __init__(self, plan: CellPlan, folder: Path) -> None:
+        super().__init__()
+        if plan.cell.emulated_scene is None:
+            raise ConfigError("there is nothing to touch", key="emulated_scene", hint="describe it as a `scene:`")
+        self._scene_config = SceneConfig.model_validate(plan.cell.emulated_scene)
+        self._plan = plan
+        for name, device in plan.arms.items():
+            if device.spec.name not in _FLANGES:
+                raise _not_emulated("arms", name, device.spec.name, "franka, ur")
+        self._arm_processes = {
+            name: EmulatorProcess(device.spec.name, "--host", str(getattr(device.config, "host", "")))
+            for name, device in plan.arms.items()
+        }
+        self._arms: dict[str, EmulatedArm] = {}
+        self._cameras = {name: self._camera(name, folder) for name in plan.sensors}
+        self._scene: Scene | None = None
+        self._ticker: Ticker | None = None
+        self._tip = Tip()
+        self._renderers = {
+            name: FrameRenderer(self._tip.parameters.disc_radius_px, seed=(plan.cell.seed, number))
+            for number, name in enumerate(plan.sensors)
+        }
+
+    async def start(self) -> None:
+        for process in self._arm_processes.values():
+            process.start()
+        self._arms = {name: self._arm(name) for name in self._arm_processes}
+        scene = self._scene = self._scene_config.build(MonotonicClock())
+        for name in self._cameras:
+            scene.mount(name, self._sensor_pose(name))
+        self._ticker = Ticker(scene.timeline.step_ns, lambda late: _advance(scene))
+        for camera in self._cameras.values():
+            await camera.start()
+
+    async def stop(self) -> None:
+        for camera in self._cameras.values():
+            await camera.stop()
+        if self._ticker is not None:
+            self._ticker.close()
+        for process in self._arm_processes.values():
+            process.stop()
+
+    def state(self) -> dict[str, Any]:
+        """What is true: where objects and sensors are, and what these touch; cameras as their own emulators tell."""
+        scene = self._scene
+        if scene is None:
+            return {}
+        objects = scene.objects()
+        felt = {name: scene.contact(name).value for name in self._cameras}
+        return {
+            "t_ns": objects.t_ns,
+            "objects": {name: T.tolist() for name, T in objects.value.items()},
+            "sensors": {name: self._sensor_pose(name)().tolist() for name in self._cameras},
+            "contacts": {name: state.T_f_s.tolist() if state.in_contact else None for name, state in felt.items()},
+            "cameras": {name: camera.state() for name, camera in self._cameras.items()},
+        }
+
+    def _arm(self, name: str) -> EmulatedArm:
+        device, section = self._plan.arms[name], self._plan.cell.arms[name]
+        tool = getattr(device.config, "flange_to_tcp_mm_deg", None)
+        return EmulatedArm(
+            self._arm_processes[name],
+            _FLANGES[device.spec.name],
+            None if tool is None else se3.from_euler_mm_deg(tool),
+            section.T_world_base,
+        )
+
+    def _camera(self, name: str, folder: Path) -> V4l2Emulator:
+        device = self._plan.sensors[name]
+        if device.spec.name != "v4l2":
+            raise _not_emulated("sensors", name, device.spec.name, "v4l2")
+        if self._plan.cell.sensors[name].mounted_on is None:
+            raise ConfigError("nothing carries it", key=f"sensors.{name}.mounted_on", hint="name one of the arms")
+        node = str(getattr(device.config, "device", ""))
+        found = _CAMERA.fullmatch(node)
+        if found is None:
+            raise ConfigError(
+                "no emulated camera is called so",
+                key=f"sensors.{name}.device",
+                value=node,
+                hint="/dev/v4l/by-id/usb-TacTip_0000-video-index0, or another number",
+            )
+        return V4l2Emulator(folder, int(found[1]), show=lambda number: self._picture(name, number))
+
+    def _sensor_pose(self, name: str) -> Callable[[], Array]:
+        section = self._plan.cell.sensors[name]
+        arm, T_tcp_s = self._arms[section.mounted_on or ""], section.T_tcp_sensor
+        return lambda: arm.T_world_tcp() @ T_tcp_s
+
+    def _picture(self, name: str, number: int) -> ImageArray:
+        assert self._scene is not None
+        pixels = self._tip.pixels(self._scene.contact(name).value.T_f_s)
+        return self._renderers[name].raw(pixels, number)
+
+
+def _advance(scene: Scene) -> None:
+    scene.timeline.advance()
+
+
+def _not_emulated(kind: str, name: str, driver: str, known: str) -> ConfigError:
+    return ConfigError(
+        "there is no emulator for it here", key=f"{kind}.{name}.driver", value=driver, hint=f"known: {known}"
+    )
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare its command line."""
+    parser.add_argument("cell", type=Path, help="cell file with an `emulated_scene:`")
+    folder = Path(tempfile.gettempdir()) / "touchcell-cameras"
+    parser.add_argument("--folder", type=Path, default=folder, help="folder for the cameras' sockets")
+
+
+def build(arguments: argparse.Namespace) -> CellEmulator:
+    """Make the emulator, not yet started, and tell how to run the cell on it."""
+    file = find_cell(arguments.cell)
+    emulator = CellEmulator(plan_cell(file), arguments.folder)
+    variables = [f"{key}={value}" for key, value in environment(arguments.folder).items()]
+    print(shlex.join(["env", *variables, "touchcell", "run", str(arguments.cell)]), file=sys.stderr)
+    return emulator

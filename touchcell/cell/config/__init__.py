@@ -1,0 +1,1 @@
+"""Cell files: schema, validation and the plan that follows from them."""

@@ -1,0 +1,611 @@
+"""The cell file: what it may say, and the plan that comes of it. Nothing is connected here, and no SDK is imported.
+
+A plan holds every device, interlock and task of the file with its own validated configuration, proves that devices and
+task fit, and says which devices the task does not need, so that they are not even built.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag, model_validator
+
+from touchcell.cell.config.stopping_distance import Overshoot, overshoot, together
+from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile, load
+from touchcell.control.interlocks.clearance import ClearanceConfig
+from touchcell.control.interlocks.config import (
+    INTERLOCKS,
+    REQUIRED_TO_MOVE,
+    REQUIRED_TO_TOUCH,
+    InterlocksConfig,
+    WorkspaceConfig,
+)
+from touchcell.drivers.core import spec as driver_registry
+from touchcell.drivers.core.arm import LimitsConfig
+from touchcell.drivers.core.device import DeactivatePolicy
+from touchcell.drivers.core.errors import ConfigError, suggest
+from touchcell.drivers.core.spec import DriverConfig, DriverSpec
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+from touchcell.tasks import registry as task_registry
+from touchcell.tasks.interface import TaskConfig, TaskSpec
+
+M = TypeVar("M", bound=BaseModel)
+Three = tuple[float, float, float]
+Six = tuple[float, float, float, float, float, float]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class _OpenSection(BaseModel):
+    """A section whose other keys belong to the driver or task that it names."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
+
+
+class StillSurfaceSection(_Section):
+    """The SE(3) Bayesian filter: how fast certainty is lost when no frame comes (slip, curvature)."""
+
+    model: Literal["still_surface"] = "still_surface"
+    drift_mm_per_sqrt_s: PositiveFloat
+    drift_deg_per_sqrt_s: PositiveFloat
+
+
+class MovingSurfaceSection(_Section):
+    """The filter that also estimates the surface's velocity, for surfaces that move steadily.
+
+    ``speed_*`` is how fast a surface may be when it is first touched (one standard deviation), ``accel_*`` how fast its
+    velocity stops being known.
+    """
+
+    model: Literal["moving_surface"]
+    drift_mm_per_sqrt_s: PositiveFloat
+    drift_deg_per_sqrt_s: PositiveFloat
+    speed_mm_s: PositiveFloat
+    speed_deg_s: PositiveFloat
+    accel_mm_s_per_sqrt_s: PositiveFloat
+    accel_deg_s_per_sqrt_s: PositiveFloat
+
+
+def _filter_model(value: Any) -> str | None:
+    """Which model a filter section means: a file that names none means a still surface."""
+    if isinstance(value, Mapping):
+        return str(value.get("model", "still_surface"))
+    return getattr(value, "model", None)
+
+
+FilterSection = Annotated[
+    Annotated[StillSurfaceSection, Tag("still_surface")] | Annotated[MovingSurfaceSection, Tag("moving_surface")],
+    Discriminator(
+        _filter_model,
+        custom_error_type="filter_model",
+        custom_error_message="must say `model: still_surface` or `model: moving_surface`",
+    ),
+]
+
+
+class GateSection(_Section):
+    """The contact gate: mean marker-image change, in per cent, that begins and ends a contact."""
+
+    touch_percent: PositiveFloat
+    release_percent: PositiveFloat
+
+
+class NetworkEstimator(_Section):
+    """Image -> network -> filter. ``calibration`` is a file of ``touchcell calibrate``."""
+
+    kind: Literal["network"]
+    model: str
+    calibration: str | None = None
+    gate: GateSection | None = None
+    filter: FilterSection | None = None
+
+
+class TrueContact(_Section):
+    """The simulator's own contact state, to see control error apart from estimation error."""
+
+    kind: Literal["true_contact"]
+
+
+class KnownSurface(_Section):
+    """The contact from the arm's pose over a surface that stands where the file says, for collecting labels.
+
+    ``surface_mm_deg`` is where the sensor frame is, in the arm's base, when it just touches the surface, upright.
+    """
+
+    kind: Literal["known_surface"]
+    surface_mm_deg: Six
+
+
+EstimatorSection = Annotated[NetworkEstimator | TrueContact | KnownSurface, Field(discriminator="kind")]
+
+
+class CapsuleSection(_Section):
+    """A part of an arm: all within ``radius_mm`` of a segment from ``from_mm`` to ``to_mm`` in the tool's frame.
+
+    ``from_base_mm`` in place of ``from_mm`` is a place in the base's frame: for the forearm of an arm that tells only
+    where its tool is.
+    """
+
+    from_mm: Three | None = None
+    from_base_mm: Three | None = None
+    to_mm: Three
+    radius_mm: PositiveFloat
+
+    @model_validator(mode="after")
+    def _one_start(self) -> Self:
+        if (self.from_mm is None) == (self.from_base_mm is None):
+            raise ValueError("say either from_mm or from_base_mm")
+        return self
+
+
+class BoxSection(_Section):
+    """Something that stands still: the pose of its centre in the world, and the lengths of its sides."""
+
+    pose_mm_deg: Six
+    size_mm: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+
+
+class ArmSection(_OpenSection):
+    """An arm: its driver, where it stands, what it looks like, what happens when it is deactivated or has to stop, and
+    the driver's own keys.
+
+    ``stop_category`` is by IEC 60204-1: 2 stops and holds with power, 1 stops and then removes it. ``base_pose_mm_deg``
+    is in the world; ``body`` adds capsules to those of the arm's chain, for ``clearance``.
+    """
+
+    driver: str
+    deactivate: DeactivatePolicy
+    stop_category: Literal[1, 2] = 2
+    base_pose_mm_deg: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    body: tuple[CapsuleSection, ...] = ()
+
+    @property
+    def T_world_base(self) -> Array:  # noqa: N802  the field's own name
+        """(4, 4) where it stands."""
+        return se3.from_euler_mm_deg(self.base_pose_mm_deg)
+
+
+class SensorSection(_OpenSection):
+    """A tactile sensor: its camera's driver, where it sits, and how frames become contacts."""
+
+    driver: str
+    mounted_on: str | None = None
+    tcp_to_sensor_mm_deg: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    estimator: EstimatorSection
+
+    @property
+    def T_tcp_sensor(self) -> Array:  # noqa: N802  the field's own name
+        """(4, 4) where it sits on the tool."""
+        return se3.from_euler_mm_deg(self.tcp_to_sensor_mm_deg)
+
+
+class TaskSection(_OpenSection):
+    """The task, which arms and sensors play its roles, and the task's own keys."""
+
+    name: str
+    arms: dict[str, str] = {}
+    sensors: dict[str, str] = {}
+
+
+class RecordingSection(_Section):
+    """What is kept of a run besides numbers."""
+
+    frames: Literal["none", "jpeg", "png"] = "none"
+
+
+class PairSection(_Section):
+    """Two arms with something between them.
+
+    All arms of a cell stop together. With ``on_stop: hold`` the follower then keeps its power, and so what it holds,
+    whatever its ``stop_category`` says, unless it is itself what is wrong; with ``same`` it stops as that says.
+    """
+
+    leader: str
+    follower: str
+    on_stop: Literal["hold", "same"] = "hold"
+
+
+class CollectSection(_Section):
+    """Where labelled frames go, and in which proportion to which split."""
+
+    data: Path
+    shares: dict[Literal["train", "val", "test"], Annotated[int, Field(ge=1)]] = Field(
+        default={"train": 3, "val": 1}, min_length=1
+    )
+
+
+class CellFile(_Section):
+    """A whole cell file.
+
+    ``on_trip: end`` ends a run that has tripped; ``wait_for_reset`` keeps it up, with the arms stopped and watched,
+    until a person has reset it and lets the task start again. ``emulated_scene`` is what `touchcell emulate cell` puts
+    around the cell's arms and cameras; nothing else looks at it.
+    """
+
+    schema_: Literal[1] = Field(alias="schema")
+    name: str
+    time: Literal["simulated", "real"]
+    rate_hz: Annotated[float, Field(gt=0, le=1000)]
+    processes: Literal["one", "separate"] = "one"
+    seed: int = 0
+    max_duration_s: PositiveFloat = 3600.0
+    scene: dict[str, Any] | None = None
+    emulated_scene: dict[str, Any] | None = None
+    obstacles: dict[str, BoxSection] = {}
+    arms: dict[str, ArmSection] = {}
+    sensors: dict[str, SensorSection] = {}
+    pairs: tuple[PairSection, ...] = ()
+    interlocks: InterlocksConfig = {}
+    on_trip: Literal["end", "wait_for_reset"] = "end"
+    task: TaskSection
+    recording: RecordingSection = RecordingSection()
+    collect: CollectSection | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DevicePlan:
+    """A device that will be built: its section, spec and validated configuration."""
+
+    name: str
+    spec: DriverSpec
+    config: DriverConfig
+
+
+@dataclass(frozen=True)
+class CellPlan:
+    """A cell file that makes sense.
+
+    Attributes:
+        file: where it came from.
+        cell: the file's own sections.
+        arms, sensors: devices that the task needs, by name in the cell.
+        arm_roles, sensor_roles: role in the task -> name in the cell.
+        task: the task's spec.
+        task_config: its validated parameters.
+        skipped: devices of the file that this task does not need and that are not built.
+        devices: every device of the file, whether the task needs it or not.
+        overshoots: by the name of a workspace or clearance, how far its arm gets beyond it, or the two fastest arms
+            towards each other, before they stand.
+    """
+
+    file: Path
+    cell: CellFile
+    arms: Mapping[str, DevicePlan]
+    sensors: Mapping[str, DevicePlan]
+    arm_roles: Mapping[str, str]
+    sensor_roles: Mapping[str, str]
+    task: TaskSpec
+    task_config: TaskConfig
+    skipped: tuple[str, ...]
+    devices: Mapping[str, DevicePlan]
+    overshoots: Mapping[str, Overshoot] = field(default_factory=dict)
+
+
+def plan_cell(path: Path, overrides: Mapping[str, Any] | None = None, *, model: str | None = None) -> CellPlan:
+    """Read and check a cell file without connecting anything.
+
+    Args:
+        path: the YAML file.
+        overrides: driver keys set from the command line (``--data``), for every device whose driver has such a key.
+        model: network model in place of the one that the file names.
+
+    Raises:
+        ConfigError: with file, line, key, value and remedy; InvalidCell for several at once.
+    """
+    file = load(path)
+    if model is not None:
+        for sensor in file.data.get("sensors", {}).values():
+            if sensor.get("estimator", {}).get("kind") == "network":
+                sensor["estimator"]["model"] = model
+    return _Planner(file, overrides or {}).plan()
+
+
+class _Planner:
+    def __init__(self, file: YamlFile, overrides: Mapping[str, Any]) -> None:
+        self._file = file
+        self._overrides = overrides
+        self._problems: list[ConfigError] = []
+
+    def plan(self) -> CellPlan:
+        file = self._file
+        if "data" in self._overrides and isinstance(collect := file.data.get("collect"), dict):
+            collect["data"] = self._overrides["data"]
+        cell = file.validate(CellFile, file.data)
+        self._require_scene_fits(cell)
+        task, task_config = self._task(cell)
+        arm_roles = self._roles(cell, "arms", task.arms, cell.arms) if task else {}
+        sensor_roles = self._roles(cell, "sensors", task.sensors, cell.sensors) if task else {}
+        needed_sensors = set(sensor_roles.values())
+        mounts = {cell.sensors[name].mounted_on for name in needed_sensors} - {None}
+        needed_arms = set(arm_roles.values()) | mounts
+        devices = {name: plan for name in cell.arms if (plan := self._arm(cell, name))}
+        devices |= {name: plan for name in cell.sensors if (plan := self._sensor(cell, name))}
+        arms = {name: plan for name, plan in devices.items() if name in needed_arms}
+        sensors = {name: plan for name, plan in devices.items() if name in needed_sensors}
+        if task:
+            self._require_collection(cell, task)
+            self._require_abilities(task, arm_roles, arms)
+            self._require_interlocks(cell, task)
+            self._require_processes(cell, task, arm_roles)
+        self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
+        self._require_pairs(cell)
+        overshoots = self._require_margins(cell, arm_roles, sensor_roles, arms)
+        if self._problems:
+            raise InvalidCell(self._problems)
+        assert task is not None
+        assert task_config is not None
+        skipped = sorted((set(cell.arms) - set(arms)) | (set(cell.sensors) - set(sensors)))
+        return CellPlan(
+            file.path,
+            cell,
+            arms,
+            sensors,
+            arm_roles,
+            sensor_roles,
+            task,
+            task_config,
+            tuple(skipped),
+            devices,
+            overshoots,
+        )
+
+    @cached_property
+    def _scene_model(self) -> type[BaseModel]:
+        from touchcell.simulation.scene import SceneConfig
+
+        return SceneConfig
+
+    def _require_scene_fits(self, cell: CellFile) -> None:
+        if cell.scene is not None:
+            self._validated(self._scene_model, cell.scene, ("scene",))
+        if cell.emulated_scene is not None:
+            self._validated(self._scene_model, cell.emulated_scene, ("emulated_scene",))
+
+    def _task(self, cell: CellFile) -> tuple[TaskSpec | None, TaskConfig | None]:
+        try:
+            spec = task_registry.spec(cell.task.name)
+        except ConfigError as error:
+            self._add(("task", "name"), error.reason, value=cell.task.name, hint=error.hint)
+            return None, None
+        return spec, self._validated(spec.config, cell.task.model_extra or {}, ("task",))
+
+    def _roles(
+        self, cell: CellFile, kind: str, roles: Any, devices: Mapping[str, ArmSection] | Mapping[str, SensorSection]
+    ) -> dict[str, str]:
+        """Role -> device name. A role that the file does not assign goes to the device of the same name."""
+        assigned: dict[str, str] = getattr(cell.task, kind)
+        for role in assigned.keys() - set(roles):
+            self._add(("task", kind, role), f"{cell.task.name} has no such role", hint=suggest(role, sorted(roles)))
+        found = {}
+        # In one order in every process: a set of names has another in each.
+        for role in sorted(roles):
+            name = assigned.get(role, role)
+            if name in devices:
+                found[role] = name
+            else:
+                self._add(
+                    ("task", kind, role),
+                    f"the role {role!r} needs one of `{kind}:`, and {name!r} is not there",
+                    value=name,
+                    hint=suggest(name, sorted(devices)) if devices else f"add `{kind}:`",
+                )
+        return found
+
+    def _arm(self, cell: CellFile, name: str) -> DevicePlan | None:
+        section = cell.arms[name]
+        shared = {"deactivate": section.deactivate, "base_pose_mm_deg": section.base_pose_mm_deg}
+        plan = self._device(cell, ("arms", name), section, shared, "arm")
+        offered = plan.spec.capabilities.stop_categories if plan else ()
+        if plan and offered and section.stop_category not in offered:
+            self._add(
+                ("arms", name, "stop_category"),
+                f"{plan.spec.name} does not offer stop category {section.stop_category}",
+                value=section.stop_category,
+                hint=f"it offers {', '.join(str(int(category)) for category in sorted(offered))}",
+            )
+        return plan
+
+    def _sensor(self, cell: CellFile, name: str) -> DevicePlan | None:
+        section = cell.sensors[name]
+        if section.mounted_on is not None and section.mounted_on not in cell.arms:
+            self._add(
+                ("sensors", name, "mounted_on"),
+                f"there is no arm {section.mounted_on!r}",
+                value=section.mounted_on,
+                hint=suggest(section.mounted_on, sorted(cell.arms)),
+            )
+        if section.estimator.kind == "true_contact" and cell.scene is None:
+            self._add(("sensors", name, "estimator"), "true_contact needs a `scene:`", hint="use kind: network")
+        shared = {"mounted_on": section.mounted_on, "tcp_to_sensor_mm_deg": section.tcp_to_sensor_mm_deg}
+        return self._device(cell, ("sensors", name), section, shared, "camera")
+
+    def _device(
+        self,
+        cell: CellFile,
+        at: tuple[str, str],
+        section: ArmSection | SensorSection,
+        shared: Mapping[str, Any],
+        kind: str,
+    ) -> DevicePlan | None:
+        try:
+            spec = driver_registry.spec(section.driver)
+        except ConfigError as error:
+            self._add((*at, "driver"), error.reason, value=section.driver, hint=error.hint)
+            return None
+        if spec.capabilities.kind != kind:
+            self._add(
+                (*at, "driver"),
+                f"{spec.name} drives a {spec.capabilities.kind}, not a {kind}",
+                value=section.driver,
+                hint="`touchcell list` tells which drivers there are",
+            )
+        if cell.time == "simulated" and not spec.capabilities.virtual_time:
+            self._add(
+                (*at, "driver"), f"{spec.name} cannot run in simulated time", value=spec.name, hint="set `time: real`"
+            )
+        fields = spec.config.model_fields
+        settings = {key: value for key, value in {**shared, **self._overrides}.items() if key in fields}
+        config = self._validated(spec.config, {**(section.model_extra or {}), **settings}, at)
+        return DevicePlan(at[1], spec, config) if config is not None else None
+
+    def _require_interlocks(self, cell: CellFile, task: TaskSpec) -> None:
+        """What moves must be bounded; limits have no defaults, so the file has to name them."""
+        moves = any("TwistSink" in abilities for abilities in task.arms.values())
+        required = REQUIRED_TO_MOVE if moves else frozenset()
+        if moves and task.sensors:
+            required |= REQUIRED_TO_TOUCH
+        stopping = {entry.kind for entry in cell.interlocks.values() if entry.severity != "limit"}
+        for kind in sorted(required - stopping):
+            self._add(
+                ("interlocks",),
+                f"no interlock of kind {kind!r} that stops, which a task that moves an arm must have",
+                hint=f"add one: {INTERLOCKS[kind].summary}",
+            )
+
+    def _require_processes(self, cell: CellFile, task: TaskSpec, arm_roles: Mapping[str, str]) -> None:
+        """What devices in other processes cannot do is not asked of them."""
+        if cell.processes == "one":
+            return
+        from touchcell.drivers.hosting.groups import REMOTE_ABILITIES
+
+        if cell.time == "simulated":
+            self._add(
+                ("processes",), "several processes share real time only", value=cell.processes, hint="`time: real`"
+            )
+        for role, abilities in task.arms.items():
+            if missing := abilities - REMOTE_ABILITIES:
+                self._add(
+                    ("processes",),
+                    f"{task.name} needs {', '.join(sorted(missing))} of {role!r}, which no other process passes on",
+                    hint="leave out `processes:`",
+                )
+
+    def _require_guarded_arms(self, cell: CellFile, roles: set[str]) -> None:
+        for name, entry in cell.interlocks.items():
+            role = getattr(entry, "arm", None)
+            if role is not None and roles and role not in roles:
+                self._add(
+                    ("interlocks", name, "arm"),
+                    f"the task has no arm {role!r}",
+                    value=role,
+                    hint=suggest(role, sorted(roles)),
+                )
+
+    def _require_pairs(self, cell: CellFile) -> None:
+        for k, pair in enumerate(cell.pairs):
+            for key, name in (("leader", pair.leader), ("follower", pair.follower)):
+                if name not in cell.arms:
+                    self._add(
+                        ("pairs", str(k), key),
+                        f"there is no arm {name!r}",
+                        value=name,
+                        hint=suggest(name, sorted(cell.arms)),
+                    )
+            if pair.leader == pair.follower:
+                self._add(("pairs", str(k)), "one arm is no pair", value=pair.leader, hint="name two")
+
+    def _require_margins(
+        self,
+        cell: CellFile,
+        arm_roles: Mapping[str, str],
+        sensor_roles: Mapping[str, str],
+        arms: Mapping[str, DevicePlan],
+    ) -> dict[str, Overshoot]:
+        """What an arm may get beyond its workspace before it stands has to fit the margin that there is."""
+        found = {}
+        for name, entry in cell.interlocks.items():
+            if isinstance(entry, ClearanceConfig):
+                found[name] = self._require_clearance(cell, name, entry, arms)
+            if not isinstance(entry, WorkspaceConfig):
+                continue
+            arm = arms.get(arm_roles.get(entry.arm, entry.arm))
+            section = cell.sensors.get(sensor_roles.get(entry.sensor or "", ""))
+            lever_m = 0.0 if section is None else 1e-3 * float(np.linalg.norm(section.tcp_to_sensor_mm_deg[:3]))
+            way = None if arm is None else _overshoot(arm, lever_m, cell.rate_hz)
+            if arm is None or way is None:
+                continue
+            found[name] = way
+            if entry.margin_mm is not None and found[name].total_m > 1e-3 * entry.margin_mm:
+                self._add(
+                    ("interlocks", name, "margin_mm"),
+                    f"the arm may get further out than the margin of {entry.margin_mm:g} mm: {found[name]}",
+                    value=entry.margin_mm,
+                    hint=f"lower arms.{arm.name}.limits.tcp_speed_m_s, or make the box smaller and the margin larger",
+                )
+        return found
+
+    def _require_collection(self, cell: CellFile, task: TaskSpec) -> None:
+        if task.labels_frames and cell.collect is None:
+            self._add(("collect",), f"{task.name} labels frames, and nothing says where they go", hint="add `collect:`")
+        if cell.collect is not None and not task.labels_frames:
+            self._add(("collect",), f"{task.name} labels no frames", hint="leave out `collect:`")
+
+    def _require_clearance(
+        self, cell: CellFile, name: str, entry: ClearanceConfig, arms: Mapping[str, DevicePlan]
+    ) -> Overshoot:
+        """Two arms that come near each other must stand before they touch, whatever way they go meanwhile."""
+        ways = []
+        for arm in arms.values():
+            body = cell.arms[arm.name].body
+            if not body and "JointSource" not in arm.spec.capabilities.abilities:
+                self._add(
+                    ("arms", arm.name, "body"),
+                    f"{arm.spec.name} tells only where its tool is; interlocks.{name} has to know its shape",
+                    hint="name capsules: body: [{from_mm: [0, 0, 0], to_mm: [0, 0, -100], radius_mm: 40}]",
+                )
+            ends = [end for part in body for end in (part.from_mm, part.to_mm) if end is not None]
+            lever_m = 1e-3 * max((float(np.linalg.norm(end)) for end in ends), default=0.0)
+            if (way := _overshoot(arm, lever_m, cell.rate_hz)) is not None:
+                ways.append(way)
+        both = together(sorted(ways, key=lambda way: way.total_m)[-2:])
+        if both.total_m > 1e-3 * entry.limit_mm:
+            self._add(
+                ("interlocks", name, "limit_mm"),
+                f"the arms may touch before they stand: {both}, more than the limit of {entry.limit_mm:g} mm",
+                value=entry.limit_mm,
+                hint=f"raise it above {1e3 * both.total_m:.0f}, or lower limits.tcp_speed_m_s of "
+                f"{', '.join(sorted(arms))}",
+            )
+        return both
+
+    def _require_abilities(self, task: TaskSpec, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]) -> None:
+        for role, abilities in task.arms.items():
+            name = arm_roles.get(role)
+            if name is None or name not in arms:
+                continue
+            missing = abilities - arms[name].spec.capabilities.abilities
+            if missing:
+                self._add(
+                    ("arms", name, "driver"),
+                    f"{arms[name].spec.name} lacks {', '.join(sorted(missing))}, which {task.name} needs",
+                    value=arms[name].spec.name,
+                    hint="choose another driver; `touchcell list` shows abilities",
+                )
+
+    def _validated(self, model: type[M], data: Any, at: KeyPath) -> M | None:
+        try:
+            return self._file.validate(model, data, at)
+        except InvalidCell as error:
+            self._problems.extend(error.problems)
+            return None
+
+    def _add(self, path: tuple[str, ...], reason: str, *, value: Any = None, hint: str = "") -> None:
+        self._problems.append(self._file.problem(path, reason, value=value, hint=hint))
+
+
+def _overshoot(arm: DevicePlan, lever_m: float, rate_hz: float) -> Overshoot | None:
+    """Of a point ``lever_m`` from the tool centre point; None for what has no limits, as a replay."""
+    limits = getattr(arm.config, "limits", None)
+    if not isinstance(limits, LimitsConfig):
+        return None
+    able = arm.spec.capabilities
+    latency_s = able.command_latency_s + (1.0 / able.state_rate_hz if able.state_rate_hz else 0.0)
+    return overshoot(limits.build(), lever_m, rate_hz, latency_s)

@@ -1,0 +1,1 @@
+"""The paper's experiments (section 5), one module each; ``touchcell.cell.experiments.runner`` runs them."""

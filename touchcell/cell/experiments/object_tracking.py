@@ -1,0 +1,131 @@
+"""Object tracking (paper 5.4): a plate moves one component at a time, then all six at once; the sensor keeps 6 mm.
+
+Errors are geometric, of the sensor against where it would be had it stuck to the plate where it first touched it, so
+what slips away unfelt counts as well. The motion in all six components also runs at other frame rates and latencies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from touchcell.cell.analysis.run_folder import Poses, RunFolder, rms, scene_time, sensor_poses, surface, true_contacts
+from touchcell.cell.experiments.runner import ExperimentSpec, Scale
+from touchcell.cell.experiments.table import Column
+from touchcell.cell.experiments.trials import Finished, Trial
+from touchcell.cell.recording.messages import COMPONENTS
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+
+SENSOR = "sensor"
+CELL = "object_track_sim.yaml"
+ALL_SIX = "all six"
+RATES_HZ = (15, 30, 60)
+LATENCIES_MS = (0, 10, 30)
+_START_S, _MOVE_S = 4.0, 10.0
+# The way of each component alone, and where the plate begins so that the way lies in the arm's box.
+_MOVES: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    "x, 200 mm": ((200, 0, 0, 0, 0, 0), (-100, 0, 0)),
+    "y, 200 mm": ((0, 200, 0, 0, 0, 0), (0, -100, 0)),
+    "z, 200 mm": ((0, 0, 200, 0, 0, 0), (0, 0, -100)),
+    "alpha, 30 deg": ((0, 0, 0, 30, 0, 0), (0, 0, 0)),
+    "beta, 30 deg": ((0, 0, 0, 0, 30, 0), (0, 0, 0)),
+    "gamma, 45 deg": ((0, 0, 0, 0, 0, 45), (0, 0, 0)),
+}
+
+
+def trials(scale: Scale) -> list[Trial]:
+    """Each component alone and all six at the cell's own camera; all six again over frame rates and latencies."""
+    found = []
+    for row, (way, start) in _MOVES.items():
+        x, y, z = start
+        changes: dict[str, Any] = {
+            "scene.surfaces.plate.pose_mm_deg": [x, y, z, 0, 0, 0],
+            "scene.surfaces.plate.motion": {
+                "kind": "glide",
+                "displacement_mm_deg": list(way),
+                "start_s": _START_S,
+                "duration_s": _MOVE_S,
+            },
+            "arms.arm.start_pose_mm_deg": [x, y, z + 25, 180, 0, 0],
+            "task.duration_s": _MOVE_S + 3.0,
+            "interlocks.workspace.min_mm": [-150, -150, -150],
+            "interlocks.workspace.max_mm": [150, 150, 160],
+            "interlocks.tilt.limit_deg": 45,
+        }
+        found += _repeated(row, row.partition(",")[0], changes, scale)
+    combinations = [(rate, latency) for rate in RATES_HZ for latency in LATENCIES_MS]
+    if scale.quick:
+        combinations = [(30, 10), (15, 30)]
+    for rate_hz, latency_ms in combinations:
+        changes = {f"sensors.{SENSOR}.rate_hz": rate_hz, f"sensors.{SENSOR}.latency_ms": latency_ms}
+        if scale.quick:
+            changes["task.duration_s"] = 20
+        row = f"{ALL_SIX}, {rate_hz} Hz, {latency_ms} ms"
+        found += _repeated(row, f"all_{rate_hz}hz_{latency_ms}ms", changes, scale)
+    return found
+
+
+def _repeated(row: str, name: str, changes: Mapping[str, Any], scale: Scale) -> list[Trial]:
+    seeds = range(1, scale.repetitions(1) + 1)
+    return [Trial(f"{name}_{seed}", row, CELL, {**changes, "seed": seed}) for seed in seeds]
+
+
+def measure(trial: RunFolder) -> Mapping[str, float]:
+    """RMS of each component of the sensor's pose against a sensor that sticks where it first touched."""
+    _, _, error = tracking(trial)
+    return {f"{name}_rms": rms(error[:, i]) for i, name in enumerate(COMPONENTS)}
+
+
+def tracking(trial: RunFolder) -> tuple[Poses, Array, Array]:
+    """The sensor's poses, the plate's at the same times, and the errors (n, 6) in mm and degrees.
+
+    The surface frame is that of the first touch, carried along by the plate; the error is the sensor's pose in it
+    against the reference. NaN while the task does not track.
+    """
+    plate = surface(trial)
+    poses = sensor_poses(trial, SENSOR)
+    T_world_plate = np.stack([plate.motion.pose(float(t)) for t in poses.t_s])
+    T_plate_s = se3.inverse(T_world_plate) @ poses.T_world
+    series, contacts = true_contacts(trial, SENSOR)
+    touched = np.flatnonzero([bool(row.get("in_contact")) for row in series.rows])
+    error = np.full((len(poses.t_s), 6), np.nan)
+    task = trial.recording.series("/task")
+    if len(touched) and task is not None:
+        t_touch = scene_time(trial, series)[touched[0]]
+        at_touch = Poses(poses.t_s, T_plate_s).at(np.array([t_touch]))[0]
+        T_f_plate = se3.from_euler_mm_deg(contacts[touched[0]]) @ se3.inverse(at_touch)
+        error = np.asarray(se3.to_euler_mm_deg(T_f_plate @ T_plate_s))
+        error[:, 2] -= np.nanmedian(task.column("reference_z_mm"))
+        error[~trial.recording.during(poses.t_s - 1e-9 * trial.recording.start_ns, "run")] = np.nan
+    return poses, T_world_plate, error
+
+
+def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
+    """The paper's figures 14 and 15, and error against frame rate and latency."""
+    from touchcell.cell.experiments.tracking_plots import plot_all_six, plot_components, plot_sweep
+
+    first = {each.trial.row: each for each in finished if each.trial.name.endswith("_1")}
+    return [
+        plot_components({row: first[row].folder for row in _MOVES}, folder / "components.png"),
+        plot_all_six(first[f"{ALL_SIX}, 30 Hz, 10 ms"].folder, folder / "all_six.png"),
+        plot_sweep([each for each in finished if each.trial.row.startswith(ALL_SIX)], folder / "sweep.png"),
+    ]
+
+
+SPEC = ExperimentSpec(
+    name="object_tracking",
+    summary="a plate moves one component at a time and all six at once; the sensor keeps 6 mm of contact",
+    trials=trials,
+    measure=measure,
+    columns=tuple(
+        Column(f"{name}_rms", title)
+        for name, title in zip(COMPONENTS, ("x mm", "y mm", "z mm", "alpha deg", "beta deg", "gamma deg"), strict=True)
+    ),
+    draw=draw,
+    paper=dict.fromkeys(_MOVES, "tracks (no figure)") | {f"{ALL_SIX}, 30 Hz, 10 ms": "tracks (no figure)"},
+    notes=("errors RMS, of the sensor against one that sticks where it first touched the plate",),
+)

@@ -1,0 +1,251 @@
+"""What the pushing experiments share: the paper's objects, how a trial starts, and what is measured at its end.
+
+The paper tells masses and not sizes, and that the sensor is 45 mm above the table. Sizes here follow from its masses at
+one density: squares of 80 and 60 mm, a circle of 80 mm and a hexagon of 70 mm across flats, all 80 mm high.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from touchcell.cell.analysis.run_folder import Poses, RunFolder, object_poses, scene_time, sensor_poses, true_contacts
+from touchcell.cell.experiments.runner import ExperimentSpec, Scale
+from touchcell.cell.experiments.table import Column
+from touchcell.cell.experiments.trials import Finished, Trial
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+
+OBJECT = "prism"
+SURFACES = ("mdf", "foam")
+PUSH_HEIGHT_MM = 45.0
+_HEIGHT_MM = 80.0
+_GAP_MM = 5.0
+_TIP_MM = 20.0
+# How far an object stands from where it should: a person puts it there.
+_OFFSET_MM, _TURN_DEG = 3.0, 2.0
+
+ESTIMATORS: Mapping[str, Mapping[str, Any] | None] = {"learned": None, "true contact": {"kind": "true_contact"}}
+"""Estimator sections by what rows call them; None for the cell file's own."""
+
+
+COLUMNS = (
+    Column("error_mm", "error mm", below=2.0),
+    Column("error_mm", "worst", "worst"),
+    Column("middle_mm", "middle to target mm"),
+    Column("lean_max_deg", "lean deg", "worst"),
+)
+ERROR_NOTE = "error: from the target to the true contact normal when the push ends, from above"
+
+
+@dataclass(frozen=True, slots=True)
+class Pushed:
+    """An object that is pushed.
+
+    Attributes:
+        name: as the paper calls it.
+        shape: of the cell file's ``scene.objects``.
+        mass_g: its mass.
+        reach_mm: from its middle to where it is pushed.
+    """
+
+    name: str
+    shape: Mapping[str, Any]
+    mass_g: float
+    reach_mm: float
+
+    def taller(self, height_mm: float, mass_g: float) -> Pushed:
+        """One of the same outline, that high."""
+        tall = dict(self.shape)
+        if "size_mm" in tall:
+            tall["size_mm"] = [*tall["size_mm"][:2], height_mm]
+        else:
+            tall["height_mm"] = height_mm
+        return Pushed(f"tall {self.name}", tall, mass_g, self.reach_mm)
+
+
+PRISMS = (
+    Pushed("large square", {"kind": "box", "size_mm": [80, 80, _HEIGHT_MM]}, 479, 40),
+    Pushed("circular", {"kind": "cylinder", "diameter_mm": 80, "height_mm": _HEIGHT_MM}, 363, 40),
+    Pushed("small square", {"kind": "box", "size_mm": [60, 60, _HEIGHT_MM]}, 264, 30),
+    Pushed("hexagonal", {"kind": "hexagon", "width_mm": 70, "height_mm": _HEIGHT_MM}, 310, 35),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Arms:
+    """Who pushes.
+
+    Attributes:
+        name: in a row of a table.
+        cell: the cell file.
+        leader: the arm that pushes.
+        sensors: all of them, the leader's first.
+    """
+
+    name: str
+    cell: str
+    leader: str
+    sensors: tuple[str, ...]
+
+    def around(self, pushed: Pushed, surface: str, height_mm: float) -> dict[str, Any]:
+        """Keys of the cell in which they stand about an object, at that height, 5 mm from touching it."""
+        x_mm = -(pushed.reach_mm + _TIP_MM + _GAP_MM)
+        changes: dict[str, Any] = {
+            "scene.physics": "dynamic",
+            "scene.table": {"friction": surface},
+            f"arms.{self.leader}.start_pose_mm_deg": [x_mm, 0, height_mm, 180, 0, 0],
+            "task.middle_mm": pushed.reach_mm + _TIP_MM,
+        }
+        if len(self.sensors) > 1:
+            # The follower's base is a metre away and turned round.
+            changes["arms.follower.start_pose_mm_deg"] = [1000 + x_mm, 0, height_mm, 180, 0, 0]
+        return changes
+
+    def estimating(self, estimator: str) -> dict[str, Any]:
+        """Keys that give every sensor one of ``ESTIMATORS``."""
+        section = ESTIMATORS[estimator]
+        return {} if section is None else {f"sensors.{sensor}.estimator": dict(section) for sensor in self.sensors}
+
+
+ONE_ARM = Arms("one arm", "single_push_sim.yaml", "arm", ("sensor",))
+TWO_ARMS = Arms("two arms", "dual_push_sim.yaml", "leader", ("leader_sensor", "follower_sensor"))
+
+
+def row_trials(row: str, cell: str, pushed: Pushed, changes: Mapping[str, Any], count: int) -> list[Trial]:
+    """``count`` trials of a row, each from another start near the origin, a little aside and turned.
+
+    Args:
+        row: its name.
+        cell: the cell file.
+        pushed: the object.
+        changes: keys of the cell, the same for all; they may change the object's as well.
+        count: how many.
+    """
+    return [
+        Trial(f"{_slug(row)}_{seed}", row, cell, {"scene.objects": {OBJECT: section}} | dict(changes) | {"seed": seed})
+        for seed, section in _placed(pushed, count)
+    ]
+
+
+def _placed(pushed: Pushed, count: int) -> Iterator[tuple[int, dict[str, Any]]]:
+    for seed in range(1, count + 1):
+        rng = np.random.default_rng((20241, seed))
+        y_mm, gamma_deg = rng.uniform(-_OFFSET_MM, _OFFSET_MM), rng.uniform(-_TURN_DEG, _TURN_DEG)
+        pose_mm_deg = [0.0, round(float(y_mm), 3), 0.0, 0.0, 0.0, round(float(gamma_deg), 3)]
+        yield seed, {"shape": dict(pushed.shape), "mass_g": pushed.mass_g, "pose_mm_deg": pose_mm_deg}
+
+
+def _slug(row: str) -> str:
+    words = row.translate({ord("+"): "more", ord("-"): "less", ord("/"): "by", ord("%"): "", ord(","): ""}).split()
+    return "_".join(words)
+
+
+def prism_experiment(name: str, summary: str, arms: Arms, paper: Mapping[str, str]) -> ExperimentSpec:
+    """The paper's four prisms over two surfaces, five trials each.
+
+    Args:
+        name: of the experiment.
+        summary: one line.
+        arms: who pushes.
+        paper: its figure, by prism.
+    """
+
+    def trials(scale: Scale) -> list[Trial]:
+        """Every prism on every surface with both estimators."""
+        return [
+            trial
+            for estimator in ESTIMATORS
+            for surface in SURFACES
+            for pushed in (PRISMS[:1] if scale.quick and estimator != "learned" else PRISMS)
+            for trial in row_trials(
+                f"{pushed.name}, {surface}, {estimator}",
+                arms.cell,
+                pushed,
+                arms.around(pushed, surface, PUSH_HEIGHT_MM) | arms.estimating(estimator),
+                scale.repetitions(5),
+            )
+        ]
+
+    return ExperimentSpec(
+        name=name,
+        summary=summary,
+        trials=trials,
+        measure=push_measures,
+        columns=COLUMNS,
+        draw=_draw,
+        paper={f"{p.name}, {surface}, {e}": paper[p.name] for p in PRISMS for surface in SURFACES for e in ESTIMATORS},
+        notes=(ERROR_NOTE,),
+    )
+
+
+def _draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
+    """The paper's figures 18 and 19, and every trial's error."""
+    from touchcell.cell.experiments.pushing_plots import plot_errors, plot_pushes
+
+    return [
+        plot_pushes([each for each in finished if "learned_1" in each.trial.name], folder / "pushes.png"),
+        plot_errors(finished, folder / "errors.png", aim_mm=2.0),
+    ]
+
+
+def push_measures(run: RunFolder) -> dict[str, float]:
+    """Where the object and the contact normal were to the target when the push ended, and how far the object leant.
+
+    The sensor is the one that pushes: with two arms the leader's. ``error_mm`` is the paper's: the distance from the
+    target to the true line of the contact normal, from above. A push that never arrived has none.
+    """
+    found = {"lean_max_deg": float(np.max(lean_deg(run)))}
+    found["toppled"] = float(found["lean_max_deg"] > 45.0)
+    end_s = pushed_until_s(run)
+    if end_s is None or not any(event.data.get("event") == "finished" for event in run.recording.events):
+        return found
+    sensors = run.plan.sensor_roles
+    pushing = TWO_ARMS.sensors[0] if TWO_ARMS.sensors[0] in sensors else next(iter(sensors))
+    target = target_mm(run)
+    middle = 1e3 * object_poses(run)[OBJECT].at(np.array([end_s]))[0, :2, 3]
+    return found | {
+        "error_mm": off_normal_mm(_surface_pose(run, pushing, end_s), target),
+        "middle_mm": float(np.linalg.norm(target - middle)),
+    }
+
+
+def target_mm(run: RunFolder) -> Array:
+    """(2,) the target, from above."""
+    return np.array(run.plan.task_config.model_dump()["target_mm"], dtype=np.float64)
+
+
+def pushed_until_s(run: RunFolder) -> float | None:
+    """When the task stopped pushing, in time of the scene; None if it never pushed."""
+    task = run.recording.series("/task")
+    if task is None:
+        return None
+    running = np.flatnonzero([row.get("state") == "run" for row in task.rows])
+    return float(scene_time(run, task)[running[-1]]) if len(running) else None
+
+
+def off_normal_mm(T_world_f: Array, target_mm: Array) -> float:
+    """Distance, from above, of a target (2,) from the line of the contact normal of a surface frame (4, 4)."""
+    x, y = target_mm - 1e3 * T_world_f[:2, 3]
+    along_x, along_y = T_world_f[:2, 2] / math.hypot(*T_world_f[:2, 2])
+    return float(abs(along_x * y - along_y * x))
+
+
+def _surface_pose(run: RunFolder, sensor: str, t_s: float) -> Array:
+    """T_world_f (4, 4) of the true contact."""
+    T_world_s = sensor_poses(run, sensor).at(np.array([t_s]))[0]
+    series, contacts = true_contacts(run, sensor)
+    felt = Poses(scene_time(run, series), np.asarray(se3.from_euler_mm_deg(np.nan_to_num(contacts))))
+    return se3.compose(T_world_s, se3.inverse(felt.at(np.array([t_s]))[0]))
+
+
+def lean_deg(run: RunFolder) -> Array:
+    """(n,) angle of the object's axis from upright over time."""
+    upright = object_poses(run)[OBJECT].T_world[:, 2, 2]
+    angle: Array = np.degrees(np.arccos(np.clip(upright, -1.0, 1.0)))
+    return angle

@@ -1,0 +1,92 @@
+"""The paper's figures 18 to 20: pushes from above with sensor frames and outlines, and the errors of all trials."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from touchcell.cell.analysis.outlines import ABOVE, SIDE, View, solid_outlines_mm
+from touchcell.cell.analysis.run_folder import Poses, RunFolder, object_poses, scene, sensor_poses
+from touchcell.cell.experiments.frames import BLUE, ORANGE, frames_2d, label_2d, path_2d, save
+from touchcell.cell.experiments.pushing import OBJECT, lean_deg, pushed_until_s, target_mm
+from touchcell.cell.experiments.trials import Finished
+
+_RED = "#d62728"
+
+
+def plot_pushes(finished: Sequence[Finished], path: Path, *, view: View = ABOVE) -> Path:
+    """Each trial in its panel: ways and frames of the sensors, the object at start and end, the target."""
+    columns = min(4, len(finished))
+    rows = -(-len(finished) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(4.6 * columns, 2.9 * rows), layout="constrained", squeeze=False)
+    for axis in axes.flat[len(finished) :]:
+        axis.set_axis_off()
+    for axis, each in zip(axes.flat, finished, strict=False):
+        error = each.measures.get("error_mm")
+        title = each.trial.row + ("" if error is None else f": {error:.2f} mm")
+        _draw_push(axis, each.folder, view)
+        label_2d(axis, view, title if each.done else f"{title} ({each.outcome})")
+    return save(figure, path, dpi=80)
+
+
+def plot_errors(finished: Sequence[Finished], path: Path, *, aim_mm: float) -> Path:
+    """Every trial's error, by row, with the aim."""
+    rows = list(dict.fromkeys(each.trial.row for each in finished))
+    figure, axis = plt.subplots(figsize=(0.55 * len(rows) + 3.0, 4.6), layout="constrained")
+    for i, row in enumerate(rows):
+        errors = [
+            each.measures["error_mm"] for each in finished if each.trial.row == row and "error_mm" in each.measures
+        ]
+        colour = BLUE if "learned" in row else ORANGE
+        axis.plot(np.full(len(errors), i), errors, "o", ms=5, color=colour, alpha=0.75)
+        if errors:
+            axis.plot([i - 0.25, i + 0.25], [np.mean(errors)] * 2, color="black", lw=1.4)
+    axis.axhline(aim_mm, color=_RED, ls="--", lw=1.0, label=f"aim: {aim_mm:g} mm")
+    axis.set_xticks(range(len(rows)), rows, rotation=40, ha="right", fontsize=8)
+    axis.set_ylabel("target to contact normal (mm)")
+    axis.set_ylim(bottom=0.0)
+    axis.grid(axis="y", alpha=0.3)
+    axis.legend()
+    return save(figure, path, dpi=80)
+
+
+def _draw_push(axis: plt.Axes, run: RunFolder, view: View) -> None:
+    end_s = pushed_until_s(run)
+    poses = object_poses(run)[OBJECT]
+    solid = scene(run).objects[OBJECT].shape.build()
+    last = poses.T_world[-1] if end_s is None else poses.at(np.array([end_s]))[0]
+    for T_world_object, style in ((poses.T_world[0], ":"), (last, "-")):
+        for outline in solid_outlines_mm(solid, T_world_object, view):
+            axis.plot(*outline.T, color="#8c6d3f", lw=1.1, ls=style)
+    for role in run.plan.sensor_roles:
+        sensor = sensor_poses(run, role)
+        if end_s is not None:
+            before = sensor.t_s <= end_s
+            sensor = Poses(sensor.t_s[before], sensor.T_world[before])
+        path_2d(axis, sensor, view, color="black", lw=0.9)
+        frames_2d(axis, sensor, view, length_mm=11.0)
+    if view == SIDE:
+        axis.axhline(scene(run).table.height_mm, color="#8c8c8c", lw=1.0)
+    else:
+        x, y = target_mm(run)
+        axis.plot(x, y, "o", ms=9, mfc="none", mec=_RED, mew=1.2)
+        axis.plot(x, y, ".", ms=4, color=_RED)
+
+
+def plot_leans(finished: Mapping[str, Sequence[Finished]], path: Path) -> Path:
+    """How far each object leant over time, one panel for each of ``finished``."""
+    figure, axes = plt.subplots(1, len(finished), figsize=(6 * len(finished), 4.4), sharey=True, layout="constrained")
+    for axis, (title, trials) in zip(axes, finished.items(), strict=True):
+        for each in trials:
+            name = each.trial.row.partition(",")[0]
+            axis.plot(object_poses(each.folder)[OBJECT].t_s, lean_deg(each.folder), lw=1.1, label=name)
+        axis.set_title(title)
+        axis.set_xlabel("time (s)")
+        axis.set_yscale("symlog", linthresh=1.0)
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("lean from upright (deg)")
+    axes[-1].legend(fontsize=8, ncols=2)
+    return save(figure, path, dpi=80)

@@ -1,0 +1,217 @@
+"""Trials: cell files with some keys changed, run beside each other in processes, kept once they have finished."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import math
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from touchcell.cell.analysis.run_folder import RunFolder
+from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.errors import RecordingError
+from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.runtime.compose import compose
+from touchcell.cell.runtime.loop import Outcome, RunLoop
+from touchcell.drivers.core.errors import ConfigError, suggest
+from touchcell.paths import CONFIGS
+
+COLLECTED = "data"
+"""Folder, in a trial's own, of the frames that a trial collects."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One run that an experiment asks for.
+
+    Attributes:
+        name: its folder; no two trials of an experiment share one.
+        row: the row of the table that it belongs to.
+        cell: a cell file, among those that ship unless it is a path.
+        changes: values in place of the file's own, by dotted key ("task.depth_mm").
+    """
+
+    name: str
+    row: str
+    cell: str
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+    def cell_data(self) -> dict[str, Any]:
+        """The whole cell file with the changes. Raises ConfigError for a key that leads nowhere."""
+        path = Path(self.cell)
+        data: dict[str, Any] = yaml.safe_load((path if path.is_absolute() else CONFIGS / path).read_text())
+        data = copy.deepcopy(data)
+        for key, value in self.changes.items():
+            *way, leaf = key.split(".")
+            section = data
+            for word in way:
+                if not isinstance(section.get(word), dict):
+                    raise ConfigError("no such section", file=self.cell, key=key, hint=suggest(word, list(section)))
+                section = section[word]
+            section[leaf] = copy.deepcopy(value)
+        return data
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """A trial that has run.
+
+    Attributes:
+        trial: which.
+        folder: what it left.
+        outcome: a word of ``touchcell.cell.runtime.loop.Outcome``.
+        reason: why it ended so.
+        measures: named numbers.
+    """
+
+    trial: Trial
+    folder: RunFolder
+    outcome: str
+    reason: str
+    measures: Mapping[str, float]
+
+    @property
+    def done(self) -> bool:
+        """Whether the task came to its end."""
+        return self.outcome == Outcome.DONE.value
+
+
+@dataclass(frozen=True, slots=True)
+class Perform:
+    """Runs trials into ``root``; as a whole it is handed to other processes.
+
+    Attributes:
+        measure: named numbers of a trial that has run.
+        root: holds one folder for each trial.
+    """
+
+    measure: Callable[[RunFolder], Mapping[str, float]]
+    root: Path
+
+    def __call__(self, trial: Trial) -> Finished:
+        """Run a trial, measure it, and only then say that it has finished."""
+        started = time.perf_counter()
+        folder = self.root / trial.name
+        folder.mkdir(parents=True, exist_ok=True)
+        marker = folder / "trial.json"
+        marker.unlink(missing_ok=True)
+        data = trial.cell_data()
+        settings = _digest(data)
+        if "collect" in data:
+            data["collect"]["data"] = str(folder / COLLECTED)
+        (folder / "cell.yaml").write_text(yaml.safe_dump(data, sort_keys=False))
+        cell = compose(plan_cell(folder / "cell.yaml"))
+        with Recorder(folder / "run.mcap") as recorder, cell:
+            result = RunLoop(cell, recorder).run()
+        measures = self.measure(RunFolder(folder)) if result.cycles else {}
+        record = {
+            "settings": settings,
+            "outcome": result.outcome.value,
+            "reason": result.reason,
+            "duration_s": result.duration_s,
+            "wall_s": round(time.perf_counter() - started, 3),
+            # What could not be measured is left out, as JSON knows no number for it.
+            "measures": {name: float(value) for name, value in measures.items() if math.isfinite(value)},
+        }
+        _write_whole(marker, json.dumps(record, indent=1))
+        # A folder of its own: the one that was measured holds its whole recording in memory.
+        return _finished(trial, RunFolder(folder), record)
+
+    def kept(self, trial: Trial) -> Finished | None:
+        """The trial as an earlier run of the experiment left it, if it had the same settings."""
+        folder = self.root / trial.name
+        try:
+            record = json.loads((folder / "trial.json").read_text())
+        except (OSError, ValueError):
+            return None
+        return _finished(trial, RunFolder(folder), record) if record["settings"] == _digest(trial.cell_data()) else None
+
+
+def perform_all(
+    perform: Perform, trials: Sequence[Trial], *, jobs: int = 1, live: bool = False, title: str = ""
+) -> list[Finished]:
+    """Run what is missing of ``trials``; returns all of them in order.
+
+    Args:
+        perform: how to run one.
+        trials: which.
+        jobs: how many at a time; 1 runs them in this process.
+        live: show a progress bar.
+        title: on it.
+
+    Raises:
+        KeyboardInterrupt: what runs is ended; what has finished is kept.
+    """
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    found = {trial.name: kept for trial in trials if (kept := perform.kept(trial)) is not None}
+    missing = [trial for trial in trials if trial.name not in found]
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, transient=True, disable=not live) as progress:
+        bar = progress.add_task(title, total=len(trials), completed=len(found))
+        for finished in _each(perform, missing, jobs):
+            found[finished.trial.name] = finished
+            progress.update(bar, advance=1, description=f"{title}: {finished.trial.name} {finished.outcome}")
+    return [found[trial.name] for trial in trials]
+
+
+def _each(perform: Perform, trials: Sequence[Trial], jobs: int) -> Iterator[Finished]:
+    if jobs == 1 or len(trials) < 2:
+        for trial in trials:
+            yield perform(trial)
+        return
+    # Fresh processes: a fork would inherit the threads of libraries that do not outlive it.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(jobs, len(trials)), context, initializer=_belong_to_parent) as executor:
+        running = [executor.submit(perform, trial) for trial in trials]
+        try:
+            for future in as_completed(running):
+                yield future.result()
+        except BaseException:
+            executor.shutdown(wait=False, cancel_futures=True)
+            for child in multiprocessing.active_children():
+                child.terminate()
+            raise
+
+
+def _belong_to_parent() -> None:
+    # A terminal's Ctrl-C reaches every process of the group.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # A worker whose parent was killed would wait for work forever.
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _finished(trial: Trial, folder: RunFolder, record: Mapping[str, Any]) -> Finished:
+    return Finished(trial, folder, record["outcome"], record["reason"], record["measures"])
+
+
+def _digest(data: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _write_whole(path: Path, text: str) -> None:
+    unfinished = path.with_suffix(".unfinished")
+    try:
+        unfinished.write_text(text + "\n")
+        os.replace(unfinished, path)
+    except OSError as error:
+        raise RecordingError(path, f"cannot be written: {error.strerror}") from None

@@ -1,0 +1,85 @@
+"""What a recording says, in the units that people think in: millimetres and degrees, with the unit in every key."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from touchcell.control.supervisor import Verdict
+from touchcell.drivers.core.commands import Sent, TwistCommand
+from touchcell.drivers.core.samples import Stamped, TcpState
+from touchcell.geometry import se3
+from touchcell.geometry.gaussian import PoseGaussian
+from touchcell.geometry.types import Array
+from touchcell.perception.runtime.estimate import ContactEstimate
+
+COMPONENTS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
+
+
+def pose_message(T: Array) -> dict[str, float]:
+    """A pose (4, 4) as extrinsic-xyz Euler components (SPEC part 1); NaN for what is not finite, to be on file too."""
+    if not np.isfinite(T).all():
+        return dict.fromkeys(COMPONENTS, float("nan"))
+    return dict(zip(COMPONENTS, se3.to_euler_mm_deg(T).tolist(), strict=True))
+
+
+def tcp_message(state: Stamped[TcpState]) -> dict[str, Any]:
+    """Pose and speed of a tool centre point."""
+    return {
+        "seq": state.seq,
+        **pose_message(state.value.T_base_tcp),
+        "speed_mm_s": 1e3 * float(np.linalg.norm(state.value.twist[:3])),
+    }
+
+
+def command_message(sent: Sent[TwistCommand]) -> dict[str, Any]:
+    """What was really sent, and which limits changed it."""
+    command = sent.command
+    message: dict[str, Any] = {
+        "twist": command.twist,
+        "frame": command.frame.value,
+        "ttl_s": command.ttl_s,
+        "limited_by": [adjustment.limit for adjustment in sent.adjustments],
+        "asked": [adjustment.asked for adjustment in sent.adjustments],
+        "allowed": [adjustment.allowed for adjustment in sent.adjustments],
+        "speed_mm_s": 1e3 * float(np.linalg.norm(command.twist[:3])),
+    }
+    if command.t_cause_ns is not None:
+        message["sensor_to_command_ms"] = (sent.t_ns - command.t_cause_ns) * 1e-6
+    return message
+
+
+def verdict_message(verdict: Verdict) -> dict[str, Any]:
+    """What the supervisor found wrong in one cycle, and whether motion may go on."""
+    return {
+        "allow": verdict.allow,
+        "speed": verdict.speed,
+        "violations": [f"{v.severity.name.lower()} {v.interlock}: {v.subject}: {v.reason}" for v in verdict.violations],
+    }
+
+
+def contact_message(estimate: ContactEstimate) -> dict[str, Any]:
+    """A contact estimate: pose of the sensor in the surface frame, standard deviations of the belief."""
+    message: dict[str, Any] = {
+        "seq": estimate.seq,
+        "t_frame_ns": estimate.t_frame_ns,
+        "in_contact": estimate.in_contact,
+        "in_range": estimate.in_range,
+        "nis": estimate.nis,
+    }
+    if estimate.belief is not None:
+        message |= belief_message(estimate.belief)
+    return message
+
+
+def belief_message(belief: PoseGaussian) -> dict[str, Any]:
+    """A Gaussian over ``T_s_f`` as the pose ``T_f_s`` that people read, and its standard deviations.
+
+    The deviations are those of right perturbations of ``T_f_s``, which are the belief's own up to sign: along and about
+    the sensor's axes.
+    """
+    sigma = np.sqrt(np.diag(belief.covariance)) * np.array([1e3] * 3 + [180 / np.pi] * 3)
+    return pose_message(se3.inverse(belief.mean)) | {
+        f"sigma_{name}": float(value) for name, value in zip(COMPONENTS, sigma, strict=True)
+    }

@@ -1,0 +1,1 @@
+"""Composing devices and running the control loop."""

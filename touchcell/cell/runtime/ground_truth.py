@@ -1,0 +1,57 @@
+"""What is known to be true: the simulator's own contact, or the label of a replayed image.
+
+In place of an estimate it shows control error apart from estimation error; beside one it tells the estimate's error.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from touchcell.drivers.replay.arm import ReplayArm
+from touchcell.geometry import se3
+from touchcell.geometry.gaussian import PoseGaussian
+from touchcell.geometry.types import Array
+from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.simulation.scene import SceneTruth
+
+# As good as exact, yet a proper covariance: a micrometre and a microradian.
+_COVARIANCE = np.eye(6) * 1e-12
+
+
+class TrueContactSource:
+    """A ``ContactSource`` that asks the scene."""
+
+    ended = False
+
+    def __init__(self, scene: SceneTruth, sensor: str) -> None:
+        self._scene = scene
+        self._sensor = sensor
+
+    def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
+        """The scene knows already."""
+
+    def update(self, now_ns: int) -> ContactEstimate | None:
+        """The contact as it was at ``now_ns``, after slip."""
+        # In real time the scene is ahead of a cycle that began a moment ago.
+        contact = self._scene.contact(self._sensor, now_ns)
+        belief = PoseGaussian(contact.value.T_s_f, _COVARIANCE) if contact.value.in_contact else None
+        return ContactEstimate(contact.value.in_contact, belief, contact.t_ns, contact.seq, contact.t_ns)
+
+
+class LabelledContactSource:
+    """A ``ContactSource`` that asks the arm which remembers where the images were taken."""
+
+    ended = False
+
+    def __init__(self, arm: ReplayArm, T_tcp_sensor: Array) -> None:
+        self._arm = arm
+        self._T_tcp_sensor = T_tcp_sensor
+
+    def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
+        """The arm knows already."""
+
+    def update(self, now_ns: int) -> ContactEstimate | None:
+        """The contact that the newest image is labelled with."""
+        pose = self._arm.tcp()
+        T_s_f = se3.inverse(se3.compose(pose.value.T_base_tcp, self._T_tcp_sensor))
+        return ContactEstimate(True, PoseGaussian(T_s_f, _COVARIANCE), pose.t_ns, pose.seq, pose.t_ns)

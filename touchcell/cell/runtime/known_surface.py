@@ -1,0 +1,53 @@
+"""The contact as arm and surface tell it: for collecting labels, when there is no model yet that could look."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from touchcell.drivers.core.protocols import FrameSource
+from touchcell.drivers.core.samples import Frame, Stamped
+from touchcell.geometry import se3
+from touchcell.geometry.gaussian import PoseGaussian
+from touchcell.geometry.types import Array
+from touchcell.perception.runtime.estimate import ContactEstimate
+
+# An arm repeats to about a tenth of a millimetre and of a degree.
+_COVARIANCE = np.diag([1e-8] * 3 + [3e-6] * 3)
+
+
+class KnownSurfaceSource:
+    """A ``ContactSource`` that reads the camera, but takes the contact from the arm's pose.
+
+    What slips on the surface is not seen: the contact is the one that was asked for, as in the public data.
+
+    Args:
+        camera: an opened frame source.
+        T_base_f: (4, 4) surface frame in the arm's base: where the sensor frame is when it just touches, upright.
+    """
+
+    ended = False
+
+    def __init__(self, camera: FrameSource, T_base_f: Array) -> None:
+        self._camera = camera
+        self._T_base_f = T_base_f
+        self._T_base_s: Array | None = None
+        self.frame: Stamped[Frame] | None = None
+
+    def await_frame(self) -> None:
+        """Wait for the camera's first frame. Raises DeviceError."""
+        self._camera.latest()
+
+    def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
+        """Tell where the sensor is."""
+        self._T_base_s = T_base_sensor
+
+    def update(self, now_ns: int) -> ContactEstimate | None:
+        """The contact now, in contact or not, stamped with the newest frame. Raises DeviceError from the camera."""
+        frame = self._camera.latest()
+        if self.frame is None or frame.seq != self.frame.seq:
+            self.frame = frame
+        if self._T_base_s is None:
+            return None
+        T_s_f = se3.compose(se3.inverse(self._T_base_s), self._T_base_f)
+        touches = bool(se3.inverse(T_s_f)[2, 3] > 0.0)
+        return ContactEstimate(touches, PoseGaussian(T_s_f, _COVARIANCE), self.frame.t_ns, self.frame.seq, now_ns)

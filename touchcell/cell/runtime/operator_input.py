@@ -1,0 +1,183 @@
+"""How a person stops a running cell, and lets one that has tripped go on: keys, signals, a lost terminal, other shells.
+
+All of them only ask; the loop looks once a cycle. This is no emergency stop: that one is wired.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import getpass
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Final
+
+from touchcell.cell.runtime.loop import StopRequest
+from touchcell.cell.runtime.operator_channel import Ask, OperatorDesk
+from touchcell.geometry.errors import TouchcellError
+
+PID_FILE: Final = "pid"
+AT_ONCE_KEYS: Final = b" \x1b"
+"""Space and Esc; so does every arrow or function key, which begins with Esc."""
+ORDERLY_KEYS: Final = b"sSqQ"
+ASK_KEYS: Final = {ord("r"): Ask.RESET, ord("g"): Ask.RESUME}
+_WAIT_S = 20.0
+_POLL_S = 0.05
+
+
+class NoSuchRun(TouchcellError):
+    """There is no run to ask.
+
+    Attributes:
+        folder: where it was looked for.
+    """
+
+    def __init__(self, folder: Path, reason: str) -> None:
+        super().__init__(f"{folder}: {reason}", hint="name the folder of a run that goes on")
+        self.folder = folder
+
+
+class FolderInUse(TouchcellError):
+    """Another run goes on in the run folder.
+
+    Attributes:
+        folder: the run folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(f"{folder}: another run goes on here", hint="choose another folder with --out")
+        self.folder = folder
+
+
+@contextlib.contextmanager
+def stop_on_signals(stop: StopRequest) -> Iterator[None]:
+    """The first Ctrl-C, SIGTERM or lost terminal ends the task in an orderly way, the second stops at once."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, lambda *_: stop.ask()) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def stop_on_keys(
+    stop: StopRequest, stream: IO[str] | None = None, desk: OperatorDesk | None = None
+) -> Iterator[Callable[[], None]]:
+    """Yields what the loop calls once a cycle: space or Esc stop at once, s or q end in an orderly way; r asks ``desk``
+    for a reset, and g to go on.
+
+    A terminal that is gone stops at once too. Where ``stream`` (standard input) is no terminal, or belongs to another
+    job of the shell, it does nothing. The terminal is left as it was found.
+    """
+    fd = _terminal(sys.stdin if stream is None else stream)
+    if fd is None:
+        yield lambda: None
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(fd)
+    tty.setcbreak(fd)
+    try:
+        yield lambda: _look(fd, stop, desk)
+    finally:
+        # A terminal that is gone needs no repair.
+        with contextlib.suppress(termios.error):
+            termios.tcsetattr(fd, termios.TCSADRAIN, before)
+
+
+def _terminal(stream: IO[str]) -> int | None:
+    try:
+        fd = stream.fileno()
+        return fd if os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp() else None
+    except (OSError, ValueError):
+        return None
+
+
+def _look(fd: int, stop: StopRequest, desk: OperatorDesk | None) -> None:
+    if not select.select([fd], [], [], 0.0)[0]:
+        return
+    try:
+        keys = os.read(fd, 64)
+    except OSError:
+        keys = b""
+    if not keys or any(key in AT_ONCE_KEYS for key in keys):
+        stop.ask_at_once()
+    elif any(key in ORDERLY_KEYS for key in keys):
+        stop.ask()
+    elif desk is not None:
+        for key in dict.fromkeys(keys.lower()):
+            if key in ASK_KEYS:
+                desk.ask(ASK_KEYS[key], getpass.getuser())
+
+
+@contextlib.contextmanager
+def reachable(folder: Path) -> Iterator[None]:
+    """While inside, ``touchcell stop FOLDER`` finds this process: by a file with its number, locked while it lives.
+
+    Raises:
+        FolderInUse: another run goes on there.
+    """
+    with (folder / PID_FILE).open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise FolderInUse(folder) from None
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        try:
+            yield
+        finally:
+            (folder / PID_FILE).unlink(missing_ok=True)
+
+
+def running(runs: Path) -> list[Path]:
+    """Folders below ``runs`` whose run goes on."""
+    return sorted(file.parent for file in runs.glob(f"*/{PID_FILE}") if _owner(file) is not None)
+
+
+def ask_to_stop(folder: Path, *, at_once: bool) -> None:
+    """Ask the run in ``folder`` to stop.
+
+    Raises:
+        NoSuchRun: nothing runs there.
+    """
+    pid = _owner(folder / PID_FILE)
+    if pid is None:
+        raise NoSuchRun(folder, "no run goes on here")
+    # Two different signals: two of the same kind may arrive as one. A run that ends meanwhile has stopped.
+    with contextlib.suppress(ProcessLookupError):
+        for number in (signal.SIGTERM, signal.SIGINT) if at_once else (signal.SIGTERM,):
+            os.kill(pid, number)
+
+
+def await_end(folder: Path, wait_s: float = _WAIT_S) -> bool:
+    """Whether the run in ``folder`` has ended, ``wait_s`` from now at the latest."""
+    deadline_s = time.monotonic() + wait_s
+    while _owner(folder / PID_FILE) is not None:
+        if time.monotonic() > deadline_s:
+            return False
+        time.sleep(_POLL_S)
+    return True
+
+
+def _owner(file: Path) -> int | None:
+    """Process that holds the file; None where nobody does, so that a number left by a crash reaches no stranger."""
+    try:
+        with file.open() as stream:
+            try:
+                fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                text = stream.read()
+                return int(text) if text.isdigit() else None
+    except OSError:
+        pass
+    return None

@@ -1,0 +1,1 @@
+"""Safety rules over a snapshot of the cell."""

@@ -1,0 +1,99 @@
+"""The interlock that keeps arms apart from each other, from what stands around, and from themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, Self
+
+import numpy as np
+from pydantic import PositiveFloat, model_validator
+
+from touchcell.control.interlocks.collision import Clearances, Pair
+from touchcell.control.interlocks.planning_scene import Body, PlacedSettings, Surroundings
+from touchcell.control.interlocks.snapshot import CellView
+from touchcell.control.interlocks.violation import Severity, Violation
+from touchcell.drivers.core.errors import ConfigError
+from touchcell.geometry.types import Array
+
+_AHEAD_S = 0.01
+_NEGLIGIBLE_M = 1e-7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clearance:
+    """Nothing comes nearer to an arm than ``limit_m``, and towards what is nearer than ``slow_m`` it goes slowly.
+
+    Motion that takes the two apart is allowed. What counts is where a command would lead within 10 ms.
+    """
+
+    name: str
+    severity: Severity
+    bodies: Mapping[str, Body]
+    clearances: Clearances
+    limit_m: float
+    slow_m: float
+
+    def check(self, view: CellView) -> Violation | None:
+        """The nearest two of those that are too near and do not go apart."""
+        apart = self.clearances.distances(self._frames(view, 0.0))
+        if not np.min(apart, initial=np.inf) < self.slow_m:
+            return None
+        commanded = any(view.arms[role].command is not None for role in self.bodies)
+        change = self.clearances.distances(self._frames(view, _AHEAD_S)) - apart if commanded else np.zeros_like(apart)
+        wrong = (apart < self.limit_m) & (change <= _NEGLIGIBLE_M)
+        wrong |= (apart < self.slow_m) & (change < -_NEGLIGIBLE_M)
+        if not wrong.any():
+            return None
+        nearest = int(np.argmin(np.where(wrong, apart, np.inf)))
+        return self._violation(view, self.clearances.pairs[nearest], float(apart[nearest]))
+
+    def _frames(self, view: CellView, ahead_s: float) -> Array:
+        return np.concatenate([body.frames(view.arms[role], ahead_s) for role, body in self.bodies.items()])
+
+    def _violation(self, view: CellView, pair: Pair, apart_m: float) -> Violation:
+        too_near = apart_m < self.limit_m
+        limit_m = self.limit_m if too_near else self.slow_m
+        whose = "" if pair.other_arm is None else "its own " if pair.other_arm == pair.arm else f"{pair.other_arm}'s "
+        what = "limit" if too_near else "slow below"
+        return Violation(
+            self.name,
+            self.severity if too_near else Severity.LIMIT,
+            pair.arm,
+            f"{pair.part} is {1e3 * apart_m:.1f} mm from {whose}{pair.other}, {what} {1e3 * limit_m:g} mm",
+            view.now_ns,
+            value=apart_m,
+            limit=limit_m,
+            unit="m",
+            may_last=True,
+        )
+
+
+class ClearanceConfig(PlacedSettings):
+    """Least distance of every arm from the others, from the cell's ``obstacles:`` and from itself.
+
+    Nearer than ``slow_mm`` motion towards each other is slowed to a quarter, for as long as it lasts.
+    """
+
+    kind: Literal["clearance"]
+    limit_mm: PositiveFloat
+    slow_mm: PositiveFloat
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if self.slow_mm < self.limit_mm:
+            raise ValueError(f"slow_mm {self.slow_mm:g} is below limit_mm {self.limit_mm:g}")
+        return self
+
+    def build_placed(self, name: str, T_tcp_sensor: Mapping[str, Array], surroundings: Surroundings) -> Clearance:
+        """The rule. Raises ConfigError where there is nothing that could come near anything."""
+        bodies = surroundings.bodies
+        counts = {role: body.link_count + 2 for role, body in bodies.items()}
+        clearances = Clearances({role: body.capsules for role, body in bodies.items()}, counts, surroundings.boxes)
+        if not clearances.pairs:
+            raise ConfigError(
+                "there are no two things to be kept apart",
+                key=f"interlocks.{name}",
+                hint="give the arms a `body:`, or name `obstacles:`",
+            )
+        return Clearance(name, self.level, bodies, clearances, 1e-3 * self.limit_mm, 1e-3 * self.slow_mm)

@@ -1,0 +1,101 @@
+"""Interlocks about what an arm does with what it was sent."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import NonNegativeFloat, PositiveFloat
+
+from touchcell.control.interlocks.settings import LEAVE, InterlockSettings
+from touchcell.control.interlocks.snapshot import CellView
+from touchcell.control.interlocks.timers import Judgement, Lasting, Mark, Past, Reading, Sustained, TimedInterlock
+from touchcell.control.interlocks.violation import Severity, Violation
+from touchcell.geometry.types import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Standstill:
+    """An arm that was told to stand stays where it stood ``settle_s`` after, and ``settle_s`` after each violation."""
+
+    name: str
+    severity: Severity
+    limit_m: float
+    settle_s: float
+
+    def judge(self, view: CellView, past: Past) -> Judgement:
+        """The first arm that has drifted too far."""
+        marks: dict[str, Mark] = {}
+        found: Violation | None = None
+        for role, arm in view.arms.items():
+            if arm.sent is not None:
+                continue
+            position = arm.state.value.T_base_tcp[:3, 3]
+            mark = past.get(role, Mark(view.now_ns))
+            if not mark.values and view.now_ns - mark.since_ns >= round(1e9 * self.settle_s):
+                mark = Mark(mark.since_ns, values=tuple(position.tolist()))
+            drift_m = math.dist(position, mark.values) if mark.values else 0.0
+            # Told once: where it stands from now on is what counts, or nobody could ever reset this.
+            marks[role] = Mark(view.now_ns) if drift_m > self.limit_m else mark
+            if found is None and drift_m > self.limit_m:
+                reason = f"has drifted by {1e3 * drift_m:.2f} mm while told to stand, limit {1e3 * self.limit_m:g} mm"
+                found = Violation(
+                    self.name, self.severity, role, reason, view.now_ns, value=drift_m, limit=self.limit_m, unit="m"
+                )
+        return found, marks
+
+
+def _tracking_errors(view: CellView) -> Iterator[Reading]:
+    for role, arm in view.arms.items():
+        if arm.sent is not None:
+            error = arm.state.value.twist[:3] - arm.sent.command.twist[:3]
+            yield Reading(role, 1e3 * math.sqrt(float(error @ error)))
+
+
+def _limited(view: CellView) -> Mapping[str, str]:
+    return {
+        role: f"held back ({', '.join(adjustment.limit for adjustment in arm.sent.adjustments)})"
+        for role, arm in view.arms.items()
+        if arm.sent is not None and arm.sent.limited
+    }
+
+
+class StandstillConfig(InterlockSettings):
+    """How far an arm may drift while it is told to stand, and how long it may take to come to rest before."""
+
+    kind: Literal["standstill"]
+    limit_mm: PositiveFloat
+    settle_ms: NonNegativeFloat
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        return Standstill(name, self.level, 1e-3 * self.limit_mm, 1e-3 * self.settle_ms)
+
+
+class TrackingConfig(InterlockSettings):
+    """Largest difference between the velocity that was sent and the measured one, and how long it may be larger."""
+
+    kind: Literal["tracking"]
+    limit_mm_s: PositiveFloat
+    leave_mm_s: PositiveFloat | None = None
+    hold_ms: NonNegativeFloat
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        leave, hold_s = self.leave_mm_s or LEAVE * self.limit_mm_s, 1e-3 * self.hold_ms
+        return Sustained(
+            name, self.level, _tracking_errors, "off what was sent by", self.limit_mm_s, leave, "mm/s", hold_s
+        )
+
+
+class LimitedConfig(InterlockSettings):
+    """Longest time for which an arm's gate may hold back what the task asks for."""
+
+    kind: Literal["limited"]
+    limit_ms: PositiveFloat
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        return Lasting(name, self.level, _limited, 1e-3 * self.limit_ms)

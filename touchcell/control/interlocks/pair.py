@@ -1,0 +1,323 @@
+"""Interlocks about what sensors push or hold: do two keep step, does the object stay between them, and upright?
+
+Roles are those of the tasks with two arms: ``leader`` pushes, ``follower`` holds against it, each with its sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from touchcell.control.interlocks.planning_scene import PlacedSettings, Surroundings
+from touchcell.control.interlocks.settings import LEAVE
+from touchcell.control.interlocks.snapshot import CellView, SensorView
+from touchcell.control.interlocks.timers import (
+    AnyOf,
+    Judgement,
+    Mark,
+    Past,
+    Reading,
+    Sustained,
+    TimedInterlock,
+    overdue,
+    share,
+    shared,
+)
+from touchcell.control.interlocks.violation import Severity
+from touchcell.drivers.core.errors import ConfigError
+from touchcell.drivers.core.samples import TcpState
+from touchcell.geometry.types import Array
+
+_REFERENCE_DEPTH_M = 1e-3
+"""Contacts more shallow than this tell too little of a surface's direction to be a reference."""
+_RATE_S = 0.2
+"""Over about this time the rate of leaning is taken; a single frame's tilt is too noisy."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Carried:
+    """A sensor and where its arm stands: enough to see in the world what it feels.
+
+    Attributes:
+        role: of the sensor.
+        T_world_base: (4, 4) of its arm's base.
+        T_tcp_sensor: (4, 4) where it sits.
+    """
+
+    role: str
+    T_world_base: Array
+    T_tcp_sensor: Array
+
+    def contact(self, view: CellView) -> SensorView | None:
+        """Its contact, where it has one and an arm carries it."""
+        sensor = view.sensors.get(self.role)
+        return sensor if sensor is not None and sensor.T_s_f is not None and sensor.arm in view.arms else None
+
+    def pose(self, view: CellView, sensor: SensorView) -> Array:
+        """(4, 4) of the sensor in the world as measured."""
+        placed: Array = self.T_world_base @ _state(view, sensor).T_base_tcp @ self.T_tcp_sensor
+        return placed
+
+    def velocity(self, view: CellView, sensor: SensorView) -> Array:
+        """(3,) of its tip in the world as measured."""
+        state = _state(view, sensor)
+        x, y, z = (state.T_base_tcp[:3, :3] @ self.T_tcp_sensor[:3, 3]).tolist()
+        wx, wy, wz = state.twist[3:].tolist()
+        # np.cross takes ten times as long.
+        velocity = state.twist[:3] + np.array([wy * z - wz * y, wz * x - wx * z, wx * y - wy * x])
+        turned: Array = self.T_world_base[:3, :3] @ velocity
+        return turned
+
+
+def _state(view: CellView, sensor: SensorView) -> TcpState:
+    assert sensor.arm is not None
+    return view.arms[sensor.arm].state.value
+
+
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """Leader and follower, while the task is at work in one of ``states``, or in any if none are named."""
+
+    leader: Carried
+    follower: Carried
+    states: frozenset[str]
+
+    def contacts(self, view: CellView) -> tuple[SensorView, SensorView] | None:
+        """Both contacts, where both are made."""
+        if not view.works_in(self.states):
+            return None
+        leading, following = self.leader.contact(view), self.follower.contact(view)
+        return None if leading is None or following is None else (leading, following)
+
+    def closing(self, view: CellView) -> Iterator[Reading]:
+        """How fast, mm/s, the two tips come nearer to each other or part. What is rigid leaves them as far apart."""
+        if (contacts := self.contacts(view)) is not None:
+            way = self.leader.pose(view, contacts[0])[:3, 3] - self.follower.pose(view, contacts[1])[:3, 3]
+            distance_m = math.sqrt(float(way @ way))
+            if distance_m > 0.0:
+                apart_m_s = self.leader.velocity(view, contacts[0]) - self.follower.velocity(view, contacts[1])
+                closing_m_s = abs(float(way @ apart_m_s)) / distance_m
+                yield Reading(self.follower.role, 1e3 * closing_m_s, contacts[1].seq)
+
+    def uneven(self, view: CellView) -> Iterator[Reading]:
+        """How much deeper, mm, one of them is pressed in than the other."""
+        if (contacts := self.contacts(view)) is not None:
+            leading, following = contacts[0].depth_m, contacts[1].depth_m
+            if leading is not None and following is not None:
+                yield Reading(self.follower.role, 1e3 * abs(leading - following), contacts[1].seq)
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectLost:
+    """Once both sensors have touched it, what they hold is not missing from either for longer than allowed."""
+
+    name: str
+    severity: Severity
+    sensors: tuple[str, str]
+    limit_s: float
+    states: frozenset[str]
+
+    def judge(self, view: CellView, past: Past) -> Judgement:
+        """The sensor whose contact has been missing for longest, if too long."""
+        if not view.works_in(self.states):
+            return None, {}
+        touching = {role: role in view.sensors and view.sensors[role].in_contact for role in self.sensors}
+        if not past and not all(touching.values()):
+            return None, {}
+        marks = {role: Mark(view.now_ns) if touching[role] else past[role] for role in self.sensors}
+
+        def words(role: str) -> str:
+            other = self.sensors[1 - self.sensors.index(role)]
+            return f"no contact, and {other} still pushes" if touching[other] else "neither sensor has contact"
+
+        return overdue(self.name, self.severity, view, marks, self.limit_s, words), marks
+
+
+@dataclass(frozen=True, slots=True)
+class Toppling:
+    """What the sensors touch does not lean further, or faster, than allowed, nor slides up or down along them.
+
+    How far it leans is how far the surface under each sensor has turned from the horizontal direction that it had when
+    the contact was made, in the world, whatever the sensor did meanwhile. What faces the other way turns the other way,
+    so with two sensors it is the mean of both. Sliding is the part of the shear that is vertical in the world: it comes
+    before anything can be seen to lean.
+
+    Attributes:
+        sensors: the one that pushes first.
+        lean, rate, slide: limits, as rules over readings that are taken here.
+    """
+
+    name: str
+    severity: Severity
+    sensors: tuple[Carried, ...]
+    lean: Sustained
+    rate: Sustained
+    slide: Sustained
+    states: frozenset[str]
+
+    def judge(self, view: CellView, past: Past) -> Judgement:
+        """The first of lean, rate and slide that is too large for too long."""
+        if not view.works_in(self.states):
+            return None, {}
+        marks: dict[str, Mark] = {}
+        turned, slides, seq = [], [], None
+        for k, carried in enumerate(self.sensors):
+            if (sensor := carried.contact(view)) is None:
+                continue
+            assert sensor.T_s_f is not None
+            R = carried.pose(view, sensor)[:3, :3] @ sensor.T_s_f[:3, :3]
+            elevation = math.asin(max(-1.0, min(1.0, float(R[2, 2]))))
+            # Where the sensor has gone in the surface's frame.
+            shear = -sensor.T_s_f[:3, :3].T @ sensor.T_s_f[:3, 3]
+            slides.append(Reading(carried.role, 1e3 * abs(float(R[2, :2] @ shear[:2])), sensor.seq))
+            mark = past.get(carried.role)
+            if mark is None and (sensor.depth_m or 0.0) >= _REFERENCE_DEPTH_M:
+                mark = Mark(view.now_ns, values=(elevation,))
+            if mark is not None:
+                marks[carried.role] = mark
+                turned.append((-1.0 if k else 1.0) * (elevation - mark.values[0]))
+                seq = sensor.seq
+        readings: tuple[list[Reading], list[Reading], list[Reading]] = ([], [], slides)
+        if turned:
+            subject, lean_deg = self.sensors[0].role, math.degrees(sum(turned) / len(turned))
+            rate_deg_s, marks["smoothed"] = _rate(lean_deg, view.now_ns, past.get("smoothed"))
+            readings[0].append(Reading(subject, abs(lean_deg), seq))
+            readings[1].append(Reading(subject, abs(rate_deg_s), seq))
+        found = None
+        for k, rule in enumerate((self.lean, self.rate, self.slide)):
+            violation, left = rule.over(view, readings[k], share(past, k))
+            marks.update(shared(left, k))
+            found = found or violation
+        return found, marks
+
+
+def _rate(value: float, now_ns: int, mark: Mark | None) -> tuple[float, Mark]:
+    """Rate of ``value`` per second over about ``_RATE_S``, and the mark for the next cycle."""
+    if mark is None:
+        return 0.0, Mark(now_ns, values=(value,))
+    slow = mark.values[0]
+    rate = (value - slow) / _RATE_S
+    slow += (value - slow) * -math.expm1(-(now_ns - mark.since_ns) * 1e-9 / _RATE_S)
+    return rate, Mark(now_ns, values=(slow,))
+
+
+def _taken_elsewhere(view: CellView) -> tuple[Reading, ...]:
+    return ()
+
+
+class _PairSettings(PlacedSettings):
+    severity: Literal["limit", "trip", "fault"] = "trip"  # type: ignore[assignment]
+    leader_sensor: str = "leader_sensor"
+    follower_sensor: str = "follower_sensor"
+    states: tuple[str, ...] = ()
+
+
+class OutOfStepConfig(_PairSettings):
+    """Fastest change of the distance between leader's and follower's tips, and largest difference of their depths."""
+
+    kind: Literal["out_of_step"]
+    leader: str = "leader"
+    follower: str = "follower"
+    limit_mm_s: PositiveFloat
+    limit_mm: PositiveFloat
+    hold_ms: NonNegativeFloat
+
+    def build_placed(self, name: str, T_tcp_sensor: Mapping[str, Array], surroundings: Surroundings) -> TimedInterlock:
+        """The rule. Raises ConfigError for a sensor that the cell does not have."""
+        leader = _carried(name, "leader_sensor", self.leader_sensor, self.leader, T_tcp_sensor, surroundings)
+        follower = _carried(name, "follower_sensor", self.follower_sensor, self.follower, T_tcp_sensor, surroundings)
+        pair, hold_s = _Pair(leader, follower, frozenset(self.states)), 1e-3 * self.hold_ms
+        speed, depth = self.limit_mm_s, self.limit_mm
+        return AnyOf(
+            name,
+            self.level,
+            (
+                Sustained(
+                    name, self.level, pair.closing, "tips close or part at", speed, LEAVE * speed, "mm/s", hold_s
+                ),
+                Sustained(name, self.level, pair.uneven, "depths differ by", depth, LEAVE * depth, "mm", hold_s),
+            ),
+        )
+
+
+class ObjectLostConfig(_PairSettings):
+    """Longest time for which what both sensors had touched may be missing from either."""
+
+    kind: Literal["object_lost"]
+    severity: Literal["trip", "fault"] = "trip"
+    limit_ms: PositiveFloat
+
+    def build_placed(self, name: str, T_tcp_sensor: Mapping[str, Array], surroundings: Surroundings) -> TimedInterlock:
+        """The rule. Raises ConfigError for a sensor that the cell does not have."""
+        for key, role in (("leader_sensor", self.leader_sensor), ("follower_sensor", self.follower_sensor)):
+            _require_sensor(name, key, role, T_tcp_sensor)
+        sensors = (self.leader_sensor, self.follower_sensor)
+        return ObjectLost(name, self.level, sensors, 1e-3 * self.limit_ms, frozenset(self.states))
+
+
+class TopplingConfig(PlacedSettings):
+    """Largest angle and rate of leaning of what is touched, and largest shear up or down; how long each may be larger.
+
+    ``sensors`` are one that pushes, or the one that pushes and the one that holds against it, with the ``arms`` that
+    carry them.
+    """
+
+    kind: Literal["toppling"]
+    severity: Literal["limit", "trip", "fault"] = "trip"  # type: ignore[assignment]
+    sensors: tuple[str, ...] = Field(default=("leader_sensor", "follower_sensor"), min_length=1, max_length=2)
+    arms: tuple[str, ...] = Field(default=("leader", "follower"), min_length=1, max_length=2)
+    limit_deg: PositiveFloat
+    limit_deg_s: PositiveFloat
+    limit_mm: PositiveFloat
+    hold_ms: NonNegativeFloat
+    states: tuple[str, ...] = ()
+
+    def build_placed(self, name: str, T_tcp_sensor: Mapping[str, Array], surroundings: Surroundings) -> TimedInterlock:
+        """The rule. Raises ConfigError for a sensor that the cell does not have."""
+        if len(self.arms) < len(self.sensors):
+            raise ConfigError("names fewer arms than sensors", key=f"interlocks.{name}.arms", value=self.arms)
+        carried = tuple(
+            _carried(name, "sensors", sensor, arm, T_tcp_sensor, surroundings)
+            for sensor, arm in zip(self.sensors, self.arms, strict=False)
+        )
+
+        def rule(what: str, limit: float, unit: str) -> Sustained:
+            hold_s = 1e-3 * self.hold_ms
+            return Sustained(name, self.level, _taken_elsewhere, what, limit, LEAVE * limit, unit, hold_s)
+
+        return Toppling(
+            name,
+            self.level,
+            carried,
+            rule("leans by", self.limit_deg, "deg"),
+            rule("leans at", self.limit_deg_s, "deg/s"),
+            rule("slides up or down by", self.limit_mm, "mm"),
+            frozenset(self.states),
+        )
+
+
+def _carried(
+    name: str,
+    key: str,
+    sensor: str,
+    arm: str,
+    T_tcp_sensor: Mapping[str, Array],
+    surroundings: Surroundings,
+) -> Carried:
+    _require_sensor(name, key, sensor, T_tcp_sensor)
+    return Carried(sensor, surroundings.T_world_base.get(arm, np.eye(4)), T_tcp_sensor[sensor])
+
+
+def _require_sensor(name: str, key: str, sensor: str, T_tcp_sensor: Mapping[str, Array]) -> None:
+    if sensor not in T_tcp_sensor:
+        raise ConfigError(
+            f"the task has no sensor {sensor!r}",
+            key=f"interlocks.{name}.{key}",
+            value=sensor,
+            hint=f"sensors: {', '.join(sorted(T_tcp_sensor)) or 'none'}",
+        )

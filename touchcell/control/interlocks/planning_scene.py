@@ -1,0 +1,83 @@
+"""Where arms stand, what they look like and what stands around them, for rules about more than one of them."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from touchcell.control.interlocks.collision import Box, Capsule
+from touchcell.control.interlocks.settings import InterlockSettings
+from touchcell.control.interlocks.snapshot import ArmView
+from touchcell.drivers.kinematics.chain import DifferentialIk
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+
+if TYPE_CHECKING:
+    from touchcell.control.interlocks.config import Interlock
+    from touchcell.control.interlocks.timers import TimedInterlock
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """What an arm looks like, and where it stands.
+
+    Attributes:
+        T_world_base: pose (4, 4) of its base.
+        capsules: its parts; frame 0 is the base, frames from 1 on are the links, the last is the tool.
+        kinematics: of an arm whose links have capsules; None where only base and tool are frames.
+        link_count: how many links that are.
+    """
+
+    T_world_base: Array
+    capsules: Sequence[Capsule]
+    kinematics: Callable[[], DifferentialIk | None] = lambda: None
+    link_count: int = 0
+
+    def frames(self, arm: ArmView, ahead_s: float = 0.0) -> Array:
+        """(link_count + 2, 4, 4) in the world as measured, or as its command would move them within ``ahead_s``."""
+        T_base_tcp, twist = arm.state.value.T_base_tcp, arm.commanded_twist() if ahead_s else None
+        ik = self.kinematics()
+        T = np.empty((self.link_count + 2, 4, 4))
+        T[0] = np.eye(4)
+        if ik is not None:
+            if arm.joints is None:
+                raise ValueError("nobody has read the joints")
+            q = arm.joints.value.q
+            if twist is not None:
+                q = q + ahead_s * ik.solve(q, twist).dq
+            T[1:-1] = ik.chain.link_poses(q)
+        T[-1] = T_base_tcp
+        if twist is not None:
+            T[-1, :3, :3] = se3.exp(np.concatenate([np.zeros(3), ahead_s * twist[3:]]))[:3, :3] @ T_base_tcp[:3, :3]
+            T[-1, :3, 3] += ahead_s * twist[:3]
+        placed: Array = self.T_world_base @ T
+        return placed
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What rules about several things at once have to know besides the view.
+
+    Attributes:
+        T_world_base: pose (4, 4) of each arm's base, by role; one that is not named stands at the world's origin.
+        bodies: what the arms look like, by role, where a rule asks for it.
+        boxes: what stands around them.
+    """
+
+    T_world_base: Mapping[str, Array] = field(default_factory=dict)
+    bodies: Mapping[str, Body] = field(default_factory=dict)
+    boxes: Sequence[Box] = ()
+
+
+class PlacedSettings(InterlockSettings):
+    """Settings of a rule that has to know where things are."""
+
+    @abstractmethod
+    def build_placed(
+        self, name: str, T_tcp_sensor: Mapping[str, Array], surroundings: Surroundings
+    ) -> Interlock | TimedInterlock:
+        """The rule. Raises ConfigError for what is not there."""

@@ -1,0 +1,302 @@
+"""Interlocks that only touch can have: are the frames live, is the estimate worth anything, does the contact hold."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from touchcell.control.interlocks.settings import LEAVE, GradedSettings, InterlockSettings
+from touchcell.control.interlocks.snapshot import CellView
+from touchcell.control.interlocks.timers import (
+    Judgement,
+    Lasting,
+    Mark,
+    Past,
+    Reading,
+    Sustained,
+    TimedInterlock,
+    overdue,
+)
+from touchcell.control.interlocks.violation import Severity, Violation
+from touchcell.geometry.types import Array
+
+_BASELINE_FRAMES = 10
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFrozen:
+    """Frames change while time passes: by content where the image is looked at, else by number."""
+
+    name: str
+    severity: Severity
+    limit_s: float
+
+    def judge(self, view: CellView, past: Past) -> Judgement:
+        """The sensor whose picture has stood still for longest, if too long."""
+        marks = {}
+        for role, sensor in view.sensors.items():
+            identity = (float(sensor.seq if sensor.content is None else sensor.content),)
+            mark = past.get(role)
+            if mark is None or mark.values != identity:
+                mark = Mark(view.now_ns, values=identity)
+            marks[role] = mark
+        return overdue(self.name, self.severity, view, marks, self.limit_s, lambda _: "the same picture"), marks
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """The brightness of a sensor's frames stays near that of the first ten."""
+
+    name: str
+    severity: Severity
+    limit_percent: float
+
+    def judge(self, view: CellView, past: Past) -> Judgement:
+        """The first sensor whose frames have become too bright or too dark."""
+        marks = dict(past)
+        found: Violation | None = None
+        for role, sensor in view.sensors.items():
+            if sensor.brightness is None:
+                continue
+            mark = past.get(role, Mark(view.now_ns, count=0, values=(0.0,)))
+            if mark.count < _BASELINE_FRAMES:
+                if mark.seq != sensor.seq:
+                    mean = (mark.values[0] * mark.count + sensor.brightness) / (mark.count + 1)
+                    mark = Mark(view.now_ns, mark.count + 1, sensor.seq, (mean,))
+            else:
+                change = 100.0 * abs(sensor.brightness / max(mark.values[0], 1e-6) - 1.0)
+                if found is None and change > self.limit_percent:
+                    found = Violation(
+                        self.name,
+                        self.severity,
+                        role,
+                        f"brightness {sensor.brightness:.1f} is {change:.1f} % off the first frames' "
+                        f"{mark.values[0]:.1f}, limit {self.limit_percent:g} %",
+                        view.now_ns,
+                        value=change,
+                        limit=self.limit_percent,
+                        unit="%",
+                        frame_seq=sensor.seq,
+                    )
+            marks[role] = mark
+        return found, marks
+
+
+@dataclass(frozen=True, slots=True)
+class ContactLost:
+    """A contact that was made in one of ``states`` is not missing for longer than allowed while they last."""
+
+    name: str
+    severity: Severity
+    limit_s: float
+    states: frozenset[str]
+
+    def judge(self, view: CellView, past: Past) -> Judgement:
+        """The sensor whose contact has been missing for longest, if too long."""
+        if view.task_state not in self.states:
+            return None, {}
+        marks = {
+            role: Mark(view.now_ns) if sensor.in_contact else past[role]
+            for role, sensor in view.sensors.items()
+            if sensor.in_contact or role in past
+        }
+        words = f"no contact in {view.task_state}"
+        return overdue(self.name, self.severity, view, marks, self.limit_s, lambda _: words), marks
+
+
+def _depth_deviations(view: CellView) -> Iterator[Reading]:
+    for role, sensor in view.sensors.items():
+        if sensor.sigma_depth_m is not None:
+            yield Reading(role, 1e3 * sensor.sigma_depth_m, sensor.seq)
+
+
+def _innovations(view: CellView) -> Iterator[Reading]:
+    for role, sensor in view.sensors.items():
+        if sensor.nis is not None:
+            yield Reading(role, sensor.nis, sensor.seq)
+
+
+def _shears(view: CellView) -> Iterator[Reading]:
+    for role, sensor in view.sensors.items():
+        if sensor.shear_m is not None:
+            yield Reading(role, 1e3 * sensor.shear_m, sensor.seq)
+
+
+def _torsions(view: CellView) -> Iterator[Reading]:
+    for role, sensor in view.sensors.items():
+        if sensor.torsion_rad is not None:
+            yield Reading(role, math.degrees(abs(sensor.torsion_rad)), sensor.seq)
+
+
+def _markers_missing(view: CellView) -> Iterator[Reading]:
+    for role, sensor in view.sensors.items():
+        if sensor.markers is not None:
+            yield Reading(role, 100.0 * (1.0 - sensor.markers), sensor.seq)
+
+
+@dataclass(frozen=True, slots=True)
+class _ShearPerDepth:
+    """How far contacts are sheared for their depth, where they are deep enough for that to be known."""
+
+    min_depth_m: float
+    states: frozenset[str]
+
+    def __call__(self, view: CellView) -> Iterator[Reading]:
+        if not view.works_in(self.states):
+            return
+        for role, sensor in view.sensors.items():
+            if sensor.shear_m is not None and sensor.depth_m is not None and sensor.depth_m >= self.min_depth_m:
+                yield Reading(role, sensor.shear_m / sensor.depth_m, sensor.seq)
+
+
+def _out_of_range(view: CellView) -> Mapping[str, str]:
+    return {role: "outside the training range" for role, sensor in view.sensors.items() if not sensor.in_range}
+
+
+class FrameFrozenConfig(InterlockSettings):
+    """Longest time that a sensor's picture may stay the same, noise and all."""
+
+    kind: Literal["frame_frozen"]
+    limit_ms: PositiveFloat
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        return FrameFrozen(name, self.level, 1e-3 * self.limit_ms)
+
+
+class ExposureConfig(InterlockSettings):
+    """Largest change of a sensor's brightness."""
+
+    kind: Literal["exposure"]
+    limit_percent: PositiveFloat
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        return Exposure(name, self.level, self.limit_percent)
+
+
+class ContactLostConfig(InterlockSettings):
+    """Longest time without a contact that there was, while the task is in one of ``states``."""
+
+    kind: Literal["contact_lost"]
+    limit_ms: PositiveFloat
+    states: tuple[str, ...] = Field(default=("approach", "settle", "run"), min_length=1)
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        return ContactLost(name, self.level, 1e-3 * self.limit_ms, frozenset(self.states))
+
+
+class UncertainConfig(GradedSettings):
+    """Largest standard deviation of the estimated depth, and how long it may be larger."""
+
+    kind: Literal["uncertain"]
+    limit_mm: PositiveFloat
+    leave_mm: PositiveFloat | None = None
+    hold_ms: NonNegativeFloat = 0.0
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        leave, hold_s = self.leave_mm or LEAVE * self.limit_mm, 1e-3 * self.hold_ms
+        what = "standard deviation of the depth"
+        return Sustained(name, self.level, _depth_deviations, what, self.limit_mm, leave, "mm", hold_s)
+
+
+class OutOfRangeConfig(GradedSettings):
+    """Longest time outside the range that the network was trained on."""
+
+    kind: Literal["out_of_range"]
+    limit_ms: PositiveFloat
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        return Lasting(name, self.level, _out_of_range, 1e-3 * self.limit_ms)
+
+
+class InconsistentConfig(GradedSettings):
+    """Largest normalised innovation squared of the filter, and in how many frames on end it may be larger.
+
+    A consistent filter with six degrees of freedom exceeds 22.5 in one frame of a thousand.
+    """
+
+    kind: Literal["inconsistent"]
+    limit_nis: PositiveFloat
+    leave_nis: PositiveFloat | None = None
+    frames: PositiveInt
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        leave = self.leave_nis or LEAVE * self.limit_nis
+        what = "normalised innovation squared"
+        return Sustained(name, self.level, _innovations, what, self.limit_nis, leave, "", frames=self.frames)
+
+
+class ShearConfig(GradedSettings):
+    """Largest tangential shear of any contact: beyond it the skin saturates or slips."""
+
+    kind: Literal["shear"]
+    limit_mm: PositiveFloat
+    leave_mm: PositiveFloat | None = None
+    hold_ms: NonNegativeFloat = 0.0
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        leave, hold_s = self.leave_mm or LEAVE * self.limit_mm, 1e-3 * self.hold_ms
+        return Sustained(name, self.level, _shears, "sheared by", self.limit_mm, leave, "mm", hold_s)
+
+
+class TorsionConfig(GradedSettings):
+    """Largest rotation of any contact about the surface normal."""
+
+    kind: Literal["torsion"]
+    limit_deg: PositiveFloat
+    leave_deg: PositiveFloat | None = None
+    hold_ms: NonNegativeFloat = 0.0
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        leave, hold_s = self.leave_deg or LEAVE * self.limit_deg, 1e-3 * self.hold_ms
+        return Sustained(name, self.level, _torsions, "twisted by", self.limit_deg, leave, "deg", hold_s)
+
+
+class SlipConfig(GradedSettings):
+    """Largest tangential shear of a contact for its depth, while the task is at work in ``states``, or in any state.
+
+    On the real images estimates of shear fall behind the motion once shear exceeds depth: there the skin begins to
+    slide. Contacts more shallow than ``min_depth_mm`` are not judged.
+    """
+
+    kind: Literal["slip"]
+    limit_ratio: PositiveFloat
+    leave_ratio: PositiveFloat | None = None
+    hold_ms: NonNegativeFloat = 0.0
+    min_depth_mm: PositiveFloat = 1.0
+    states: tuple[str, ...] = ()
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        leave, hold_s = self.leave_ratio or LEAVE * self.limit_ratio, 1e-3 * self.hold_ms
+        measure = _ShearPerDepth(1e-3 * self.min_depth_mm, frozenset(self.states))
+        return Sustained(name, self.level, measure, "shear per depth", self.limit_ratio, leave, "", hold_s)
+
+
+class MarkersLostConfig(InterlockSettings):
+    """Largest share of the markers expected in view that may be missing, and in how many frames on end.
+
+    Only estimators that look at markers tell; for others it never trips.
+    """
+
+    kind: Literal["markers_lost"]
+    limit_percent: Annotated[float, Field(gt=0.0, lt=100.0)]
+    leave_percent: PositiveFloat | None = None
+    frames: PositiveInt = 1
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule."""
+        leave = self.leave_percent or LEAVE * self.limit_percent
+        what = "markers missing:"
+        return Sustained(name, self.level, _markers_missing, what, self.limit_percent, leave, "%", frames=self.frames)

@@ -1,0 +1,128 @@
+"""The latch: what has tripped stays tripped until a person resets it, and a reset never moves anything.
+
+    CLEAR -trip-> TRIPPED -fault-> FAULTED      TRIPPED | FAULTED <-> CAUSE_GONE -reset (at rest, idle)-> CLEAR
+
+Manual reset after IEC 60204-1 (9.2) and ISO 13849-1 (5.2.2): deliberate, refused while the cause is present, and not
+itself a start. It is not safety-rated: the hard-wired emergency stop and the arm's own controller are the protection.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+from touchcell.control.interlocks.violation import Severity, Violation
+from touchcell.drivers.core.device import OperatorToken
+
+
+class LatchState(Enum):
+    """Whether motion is allowed, and if not, what it takes."""
+
+    CLEAR = "clear"
+    TRIPPED = "tripped"
+    FAULTED = "faulted"
+    CAUSE_GONE = "cause gone"
+    """Still latched: a person may reset it now."""
+
+
+class Refusal(Enum):
+    """Why a reset was refused."""
+
+    NOT_LATCHED = "nothing is latched"
+    OLD_TOKEN = "the token was made before the latest violation or has been used"
+    CAUSE_PRESENT = "a cause is still present"
+    NOT_AT_REST = "the arm is not at rest"
+    MOTION_COMMANDED = "a motion is still commanded"
+
+
+@dataclass(frozen=True, slots=True)
+class ResetDone:
+    """The latch is clear. Nothing moves until somebody starts something.
+
+    Attributes:
+        operator: who asked.
+        causes: what had latched, the first cause first.
+    """
+
+    operator: str
+    causes: tuple[Violation, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ResetRefused:
+    """Nothing has changed.
+
+    Attributes:
+        reason: the first that applies, in the order of ``Refusal``.
+    """
+
+    reason: Refusal
+
+
+class Latch:
+    """Remembers violations. One thread only."""
+
+    def __init__(self) -> None:
+        self._state = LatchState.CLEAR
+        self._causes: dict[tuple[str, str], Violation] = {}
+        self._present = False
+        self._latest_ns = 0
+        self._used: OperatorToken | None = None
+
+    @property
+    def state(self) -> LatchState:
+        """Present state."""
+        gone = self._state is not LatchState.CLEAR and not self._present
+        return LatchState.CAUSE_GONE if gone else self._state
+
+    @property
+    def faulted(self) -> bool:
+        """Whether any of the causes is a fault, after which a device needs recovery."""
+        return self._state is LatchState.FAULTED
+
+    @property
+    def first_cause(self) -> Violation | None:
+        """What latched it, or None while it is clear."""
+        return next(iter(self._causes.values()), None)
+
+    @property
+    def causes(self) -> tuple[Violation, ...]:
+        """The first cause, then the first violation of every other interlock and subject since, in order of time."""
+        return tuple(self._causes.values())
+
+    def update(self, violations: Sequence[Violation]) -> None:
+        """Take in one cycle's violations; an empty sequence says that no cause is present any more."""
+        latching = [violation for violation in violations if violation.severity is not Severity.LIMIT]
+        self._present = bool(latching)
+        for violation in latching:
+            self._causes.setdefault((violation.interlock, violation.subject), violation)
+            self._latest_ns = max(self._latest_ns, violation.t_ns)
+            if violation.severity is Severity.FAULT:
+                self._state = LatchState.FAULTED
+            elif self._state is LatchState.CLEAR:
+                self._state = LatchState.TRIPPED
+
+    def reset(self, token: OperatorToken, *, at_rest: bool, commanded: bool) -> ResetDone | ResetRefused:
+        """Clear the latch if it may be cleared.
+
+        Args:
+            token: made by a person after the latest violation. Each works once, so a held button does nothing.
+            at_rest: whether every arm stands still.
+            commanded: whether anybody still asks for a motion.
+        """
+        refusals = {
+            Refusal.NOT_LATCHED: self._state is LatchState.CLEAR,
+            Refusal.OLD_TOKEN: token.t_ns < self._latest_ns or token == self._used,
+            Refusal.CAUSE_PRESENT: self._present,
+            Refusal.NOT_AT_REST: not at_rest,
+            Refusal.MOTION_COMMANDED: commanded,
+        }
+        for reason, applies in refusals.items():
+            if applies:
+                return ResetRefused(reason)
+        done = ResetDone(token.operator, self.causes)
+        self._state = LatchState.CLEAR
+        self._causes.clear()
+        self._used = token
+        return done

@@ -1,0 +1,124 @@
+"""Feedforward and feedback in six dimensions: paper eq. 19 (Lloyd & Lepora 2024, 3.3.1)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from touchcell.control.errors import ControlError
+from touchcell.geometry.finite import all_finite
+from touchcell.geometry.types import Array, ArrayLike
+
+SMOOTHING: Final = 0.5
+"""Weight of the newest error in the moving average before the derivative (the paper's decay coefficient)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PidGains:
+    """Gains and clips, checked once. Vectors become diagonal matrices; everything is kept as read-only arrays.
+
+    Attributes:
+        kp: proportional gain (6, 6) or its diagonal (6,), 1/s. Row i makes component i of the twist.
+        ki: integral gain, likewise, 1/s^2.
+        kd: derivative gain, likewise, dimensionless.
+        integral_limit: largest magnitude (6,) of each component of the integral term ``ki @ int(e)``, m/s and rad/s.
+        integral_zone: an error component (6,) larger than this is not integrated, m and rad: on the long way to a new
+            reference the integral would only gather what it has to give back as overshoot.
+        output_limit: largest magnitude (6,) of each component of the output, feedforward included, m/s and rad/s.
+
+    Raises:
+        ControlError: wrong shape, not finite, or a negative limit.
+    """
+
+    kp: Array
+    ki: Array
+    kd: Array
+    integral_limit: Array
+    integral_zone: Array
+    output_limit: Array
+
+    def __post_init__(self) -> None:
+        for name in ("kp", "ki", "kd"):
+            gain = _finite(name, getattr(self, name), (6,), (6, 6))
+            object.__setattr__(self, name, _frozen(np.diag(gain) if gain.ndim == 1 else gain))
+        for name in ("integral_limit", "integral_zone", "output_limit"):
+            limit = _finite(name, getattr(self, name), (6,))
+            if (limit < 0.0).any():
+                raise ControlError(name, "has a negative component", limit)
+            object.__setattr__(self, name, _frozen(limit))
+
+    @property
+    def controlled(self) -> NDArray[np.bool_]:
+        """(6,) bool: which components of the twist feedback acts on; a zero row leaves one alone."""
+        return np.asarray((self.kp != 0.0).any(axis=1) | (self.ki != 0.0).any(axis=1) | (self.kd != 0.0).any(axis=1))
+
+
+class Pid:
+    """``V = V_ff + Kp e + Ki int(e) + Kd de/dt``, backward Euler.
+
+    The error is smoothed by an exponentially weighted average before it is differentiated. It is the integral *term*
+    that is accumulated and clipped: with constant gains that is the paper's clipped integral, in units that people can
+    judge. Errors outside the integral zone do not add to it. After ``reset`` the first step has no derivative and no
+    history, so it starts without a kick.
+    """
+
+    def __init__(self, gains: PidGains) -> None:
+        self._gains = gains
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self._integral = np.zeros(6)
+        self._smoothed: Array | None = None
+
+    @property
+    def integral(self) -> Array:
+        """Present integral term, (6,) m/s and rad/s."""
+        return self._integral.copy()
+
+    def step(self, e: Array, V_ff: Array, dt_s: float) -> Array:
+        """The twist (6,) for error ``e`` (6,) and feedforward ``V_ff`` (6,), ``dt_s`` after the step before.
+
+        Raises:
+            ControlError: something is not finite or of the wrong shape, or ``dt_s`` is not positive. The state is as
+                before then.
+        """
+        e = _finite("e", e, (6,))
+        V_ff = _finite("V_ff", V_ff, (6,))
+        if not (math.isfinite(dt_s) and dt_s > 0.0):
+            raise ControlError("dt_s", f"is {dt_s}, not a positive time", dt_s)
+        gains = self._gains
+        before = e if self._smoothed is None else self._smoothed
+        with np.errstate(over="ignore", invalid="ignore"):
+            smoothed = SMOOTHING * e + (1.0 - SMOOTHING) * before
+            near = np.where(np.abs(e) <= gains.integral_zone, e, 0.0)
+            integral = _clipped(self._integral + gains.ki @ near * dt_s, gains.integral_limit)
+            output = V_ff + gains.kp @ e + integral + gains.kd @ ((smoothed - before) / dt_s)
+        if not all_finite(output):
+            raise ControlError("e", "is so large that the output overflows", e)
+        self._smoothed = smoothed
+        self._integral = integral
+        return _clipped(output, gains.output_limit)
+
+
+def _finite(name: str, value: ArrayLike, *shapes: tuple[int, ...]) -> Array:
+    array = np.array(value, dtype=np.float64)
+    if array.shape not in shapes:
+        raise ControlError(name, f"has shape {array.shape}, not {' or '.join(map(str, shapes))}", value)
+    if not all_finite(array):
+        raise ControlError(name, "is not finite", value)
+    return array
+
+
+def _clipped(array: Array, limit: Array) -> Array:
+    # np.clip takes several times as long for numbers this few.
+    return np.minimum(np.maximum(array, -limit), limit)
+
+
+def _frozen(array: Array) -> Array:
+    array.flags.writeable = False
+    return array

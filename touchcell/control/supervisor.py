@@ -1,0 +1,145 @@
+"""The supervisor: sees every command before the arms do, and decides whether anything may move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from touchcell.control.errors import SafetyTrip
+from touchcell.control.interlocks.config import Finite, Interlock
+from touchcell.control.interlocks.snapshot import CellView
+from touchcell.control.interlocks.timers import Past, TimedInterlock
+from touchcell.control.interlocks.violation import Severity, Violation
+from touchcell.control.latch import Latch, LatchState, ResetDone, ResetRefused
+from touchcell.drivers.core.device import OperatorToken
+
+LIMIT_FOR_NS: Final = 300_000_000
+"""A violation that only limits becomes a trip when it lasts longer (PEERS 4.2)."""
+
+REDUCED: Final = 0.25
+"""Share of the speed that is left while a violation limits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the supervisor says to one cycle.
+
+    Attributes:
+        allow: whether the commands may be sent. If not, every arm is told to stop.
+        speed: share of their speed with which they may be sent.
+        violations: what is wrong in this cycle.
+        trip: the first cause while the latch is not clear, as an error for whoever has to give up.
+    """
+
+    allow: bool
+    speed: float
+    violations: tuple[Violation, ...]
+    trip: SafetyTrip | None
+
+
+class _Remembered:
+    """A timed rule with its marks, to be asked like any other."""
+
+    def __init__(self, rule: TimedInterlock) -> None:
+        self.name = rule.name
+        self.severity = rule.severity
+        self._rule = rule
+        self._past: Past = {}
+
+    def check(self, view: CellView) -> Violation | None:
+        violation, self._past = self._rule.judge(view, self._past)
+        return violation
+
+
+class Supervisor:
+    """Applies the interlocks to each cycle and holds the latch.
+
+    That every number is finite is checked before anything else, whatever the configuration: a NaN passes every
+    comparison that the others would make. A rule that raises is a fault, not a pass. What timed rules remember from one
+    cycle to the next is kept in ``_Remembered``, and nowhere else.
+
+    Args:
+        interlocks: the configured rules.
+        latch: remembers what they find.
+        rest_m_s, rest_rad_s: an arm that measures at most these speeds is at rest.
+    """
+
+    def __init__(
+        self,
+        interlocks: Sequence[Interlock | TimedInterlock],
+        latch: Latch,
+        *,
+        rest_m_s: float = 1e-3,
+        rest_rad_s: float = 1e-2,
+    ) -> None:
+        self._finite = Finite()
+        # Told apart once: isinstance with a Protocol costs more than most rules.
+        self._rules = tuple(_Remembered(rule) if isinstance(rule, TimedInterlock) else rule for rule in interlocks)
+        self._latch = latch
+        self._rest_m_s = rest_m_s
+        self._rest_rad_s = rest_rad_s
+        self._limited_since_ns: dict[tuple[str, str], int] = {}
+
+    @property
+    def latch(self) -> Latch:
+        """The latch, to be read."""
+        return self._latch
+
+    def review(self, view: CellView, alarms: Sequence[Violation] = ()) -> Verdict:
+        """Check ``view``, latch what it shows, and say whether its commands may be sent. Never raises.
+
+        Args:
+            view: what is known in this cycle.
+            alarms: what others have found, the watchdog for one; taken as it is.
+        """
+        violations = (*alarms, *self._violations(view))
+        self._latch.update(violations)
+        first = self._latch.first_cause
+        return Verdict(
+            allow=self._latch.state is LatchState.CLEAR,
+            speed=REDUCED if violations else 1.0,
+            violations=violations,
+            trip=None if first is None else first.as_error(),
+        )
+
+    def reset(self, token: OperatorToken, view: CellView, alarms: Sequence[Violation] = ()) -> ResetDone | ResetRefused:
+        """Clear the latch on a person's request, judged on ``view`` and ``alarms`` as they are; nothing moves by it."""
+        self._latch.update((*alarms, *self._violations(view)))
+        return self._latch.reset(
+            token,
+            at_rest=all(self._at_rest(arm.state.value.twist) for arm in view.arms.values()),
+            commanded=any(arm.command is not None and np.any(arm.command.twist) for arm in view.arms.values()),
+        )
+
+    def _violations(self, view: CellView) -> tuple[Violation, ...]:
+        if (first := _checked(self._finite, view)) is not None:
+            return (first,)
+        found = [violation for rule in self._rules if (violation := _checked(rule, view)) is not None]
+        return self._escalated(found, view.now_ns)
+
+    def _escalated(self, found: Sequence[Violation], now_ns: int) -> tuple[Violation, ...]:
+        """``found``, with a trip in place of each limit that has lasted for too long."""
+        limiting = {(v.interlock, v.subject) for v in found if v.severity is Severity.LIMIT and not v.may_last}
+        self._limited_since_ns = {key: self._limited_since_ns.get(key, now_ns) for key in limiting}
+        lasting = {key for key, since_ns in self._limited_since_ns.items() if now_ns - since_ns > LIMIT_FOR_NS}
+        return tuple(
+            replace(v, severity=Severity.TRIP, reason=f"{v.reason}, limiting for over {1e-6 * LIMIT_FOR_NS:g} ms")
+            if (v.interlock, v.subject) in lasting
+            else v
+            for v in found
+        )
+
+    def _at_rest(self, twist: np.ndarray) -> bool:
+        linear, angular = np.linalg.norm(twist[:3]), np.linalg.norm(twist[3:])
+        return bool(linear <= self._rest_m_s and angular <= self._rest_rad_s)
+
+
+def _checked(interlock: Interlock, view: CellView) -> Violation | None:
+    try:
+        return interlock.check(view)
+    except Exception as error:
+        reason = f"the rule could not be applied: {error!r}"
+        return Violation(interlock.name, Severity.FAULT, "cell", reason, view.now_ns)

@@ -1,0 +1,301 @@
+"""What arms share whose motors hang on a bus and leave Cartesian control to the host.
+
+One loop, on a thread of the driver, turns the setpoint into goals, collects the answers, and latches what is wrong.
+"""
+
+from __future__ import annotations
+
+import threading
+from abc import abstractmethod
+from collections import deque
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from touchcell.drivers.core.arm import LimitsConfig
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.device import DeactivatePolicy
+from touchcell.drivers.core.errors import (
+    CommandRejected,
+    ConfigError,
+    ConnectError,
+    DeviceError,
+    DeviceFault,
+    DeviceGone,
+    FaultClass,
+    LifecycleError,
+    Rejection,
+    Remedy,
+    TransportTimeout,
+)
+from touchcell.drivers.core.joint_arm import JointArm
+from touchcell.drivers.core.joint_setpoint import JointSetpoint
+from touchcell.drivers.core.protocols import StopCategory
+from touchcell.drivers.core.samples import JointState, Stamped
+from touchcell.drivers.core.spec import DriverConfig
+from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain, Tool
+from touchcell.drivers.kinematics.joint_limits import JointLimitsConfig
+from touchcell.geometry.types import Array
+
+Positive = Annotated[float, Field(gt=0.0)]
+
+_REST_SPEED_RAD_S = 0.03
+_FIRST_SAMPLE_S = 1.0
+_MISS_WINDOW = 50
+_PARK_SPEED_FRACTION = 0.5
+
+
+class BusArmConfig(DriverConfig):
+    """Keys that such arms share. ``chain`` is a shipped description or a YAML file.
+
+    A joint that is ``tracking_error_deg`` off its setpoint, an answer older than ``max_silence_s``, or more than
+    ``max_missed_fraction`` of the cycles without all answers is a fault.
+    """
+
+    chain: str
+    tool: Tool = Tool()
+    rate_hz: Positive
+    max_silence_s: Positive = 0.1
+    max_missed_fraction: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.25
+    tracking_error_deg: Positive = 8.0
+
+    limits: LimitsConfig = LimitsConfig()
+    joint_limits: JointLimitsConfig = JointLimitsConfig()
+
+    park_deg: tuple[float, ...] | None = None
+    park_tolerance_deg: Positive = 5.0
+    on_disconnect: Literal["hold", "park_then_off"] = "hold"
+
+    @property
+    @abstractmethod
+    def joint_count(self) -> int:
+        """How many motors are listed."""
+
+    @model_validator(mode="after")
+    def _can_park(self) -> Self:
+        if self.park_deg is not None and len(self.park_deg) != self.joint_count:
+            raise ValueError(f"park_deg has {len(self.park_deg)} angles for {self.joint_count} joints")
+        if self.on_disconnect == "park_then_off" and self.park_deg is None:
+            raise ValueError("on_disconnect: park_then_off needs park_deg")
+        return self
+
+    def named_chain(self, key: str) -> ChainDescription:
+        """The arm, as its chain tells it.
+
+        Raises:
+            ConfigError: there is none, or it has another number of joints than motors are listed under ``key``.
+        """
+        found = ChainDescription.named(self.chain)
+        if len(found.joints) != self.joint_count:
+            raise ConfigError(f"chain {found.name!r} has {len(found.joints)} joints", key=key, value=self.joint_count)
+        return found
+
+    def require_park_within(self, chain: ChainDescription) -> None:
+        """Raises ConfigError: the park pose is outside the limits of a joint."""
+        for index, (joint, angle_deg) in enumerate(zip(chain.joints, self.park_deg or (), strict=False)):
+            if not joint.lower_deg <= angle_deg <= joint.upper_deg:
+                raise ConfigError(
+                    f"is outside the limits of joint {joint.name!r}", key=f"park_deg[{index}]", value=angle_deg
+                )
+
+
+class BusArm(JointArm):
+    """One arm on a bus. A subclass gives the bus, the cycle, and how its motors are switched off.
+
+    Args:
+        name: the device's name in the cell.
+        config: checked configuration.
+        clock: real time; the loop is a thread and cannot run on a virtual clock.
+        chain: of its joints.
+    """
+
+    _config: BusArmConfig
+
+    def __init__(self, name: str, config: BusArmConfig, clock: Clock, chain: SerialChain) -> None:
+        super().__init__(name, clock, config.limits.build(), max_state_age_s=config.max_silence_s)
+        self._config = config
+        self._chain = chain
+        self._ik = DifferentialIk(chain, config.joint_limits.settings())
+        self._setpoint = JointSetpoint(chain, self._ik, self.limits)
+        self._thread: threading.Thread | None = None
+        self._closing = threading.Event()
+        # Held by the loop for one cycle, and by whoever needs the bus or changes what the loop sends.
+        self._lock = threading.RLock()
+        self._forget()
+
+    def _forget(self) -> None:
+        """Start without samples and without trouble."""
+        self._trouble: DeviceError | None = None
+        self._enabled = [False] * self._chain.joint_count
+        self._joints: Stamped[JointState] | None = None
+        self._seq = 0
+        self._implausible = 0
+        self._overruns = 0
+        self._latest_s = 0.0
+        self._missed: deque[bool] = deque(maxlen=_MISS_WINDOW)
+        self._follows_until_ns = 0
+
+    def at_rest(self) -> bool:
+        """Whether setpoint and joints stand still, as far as the joints' speeds can be told."""
+        sample = self._joints
+        fresh = sample is not None and sample.age_s(self._clock.now_ns()) <= self._config.max_silence_s
+        # A twist that has just been taken over moves the setpoint in the next cycle only.
+        due = self._clock.now_ns() < self._follows_until_ns
+        if sample is None or not fresh or due or self._setpoint.moving:
+            return False
+        return bool((np.abs(sample.value.dq) <= _REST_SPEED_RAD_S).all())
+
+    def health(self) -> dict[str, float | int | str | bool]:
+        """Counters of the loop, and what limits the motion."""
+        return {
+            "implausible": self._implausible,
+            "overruns": self._overruns,
+            "latest_cycle_s": self._latest_s,
+            "enabled": sum(self._enabled),
+            "limited_by": ", ".join(adjustment.limit for adjustment in self._setpoint.adjustments),
+        }
+
+    @abstractmethod
+    def _open_bus(self) -> None:
+        """Open the bus; nothing runs yet."""
+
+    @abstractmethod
+    def _close_bus(self) -> None:
+        """Close the bus; the loop has ended."""
+
+    @abstractmethod
+    def _cycle(self, now_ns: int, dt_s: float, until_ns: int) -> None:
+        """Send goals ``dt_s`` after those before, and take answers until ``until_ns``. The lock is held."""
+
+    @abstractmethod
+    def _switch_off(self) -> None:
+        """Take the power off all motors."""
+
+    def _hold(self) -> None:
+        """Leave the motors to hold by themselves, where they can."""
+
+    def _open(self) -> None:
+        self._forget()
+        self._open_bus()
+        self._closing.clear()
+        self._thread = threading.Thread(target=self._run, name=f"{self.name} bus", daemon=True)
+        self._thread.start()
+        deadline_ns = self._clock.now_ns() + round(_FIRST_SAMPLE_S * 1e9)
+        while self._joints is None:
+            if self._clock.now_ns() >= deadline_ns or not self._thread.is_alive():
+                causes = [self._trouble] if self._trouble is not None else []
+                raise ConnectError(self.name, f"no complete state within {_FIRST_SAMPLE_S:g} s", causes)
+            self._clock.sleep_until_ns(self._clock.now_ns() + 1_000_000)
+
+    def _close(self) -> None:
+        self._closing.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self._close_bus()
+
+    def _require_loop(self) -> None:
+        if self._thread is None or not self._thread.is_alive():
+            raise DeviceGone(self.name, "the bus has gone", hint="disconnect and connect again")
+
+    def _after_rest(self, policy: DeactivatePolicy) -> None:
+        if policy is DeactivatePolicy.BRAKE:
+            raise LifecycleError(
+                self.name, "brake", self.state.value, ["an arm with brakes"], hint="choose hold or park"
+            )
+        if policy is DeactivatePolicy.HOLD:
+            self._hold()
+            return
+        if policy is DeactivatePolicy.PARK_THEN_OFF:
+            self._park()
+        if not self._parked():
+            raise LifecycleError(
+                self.name, "switch off", self.state.value, ["its park pose"], hint="without power this arm falls"
+            )
+        self._switch_off()
+
+    def _disconnect_policy(self) -> DeactivatePolicy:
+        return DeactivatePolicy(self._config.on_disconnect)
+
+    def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
+        if self._trouble is not None:
+            raise CommandRejected(self.name, Rejection.MODE, "device is faulted", hint=str(self._trouble))
+        expires_ns = now_ns + round(ttl_s * 1e9)
+        self._setpoint.follow(twist_base, expires_ns)
+        self._follows_until_ns = expires_ns if twist_base.any() else 0
+
+    def _begin_stop(self, category: StopCategory) -> None:
+        self._follows_until_ns = 0
+        self._setpoint.stop()
+
+    def _park(self) -> None:
+        if self._config.park_deg is None:
+            raise LifecycleError(
+                self.name, "park", self.state.value, ["configured with park_deg"], hint="add park_deg to the cell file"
+            )
+        self._setpoint.go_to(np.deg2rad(self._config.park_deg), _PARK_SPEED_FRACTION)
+        while not self.at_rest():
+            if self._trouble is not None:
+                raise self._trouble
+            self._clock.sleep_until_ns(self._clock.now_ns() + 5_000_000)
+
+    def _parked(self) -> bool:
+        """Whether every joint is near the park pose; never where there is none."""
+        if self._config.park_deg is None:
+            return False
+        away = np.abs(self.joints().value.q - np.deg2rad(self._config.park_deg))
+        return bool((away <= np.deg2rad(self._config.park_tolerance_deg)).all())
+
+    def _run(self) -> None:
+        period_ns = round(1e9 / self._config.rate_hz)
+        last_ns = self._clock.now_ns() - period_ns
+        next_ns = self._clock.now_ns()
+        while not self._closing.is_set():
+            try:
+                with self._lock:
+                    now_ns = self._clock.now_ns()
+                    if self._trouble is not None:
+                        self._latch(self._trouble)
+                    self._cycle(now_ns, min(now_ns - last_ns, 2 * period_ns) * 1e-9, now_ns + period_ns * 3 // 4)
+            except DeviceGone as error:
+                self._latch(error)
+                return
+            except DeviceError as error:
+                self._latch(error)
+            except Exception as error:
+                self._latch(DeviceFault(self.name, f"the loop of its bus died: {error!r}", needs=Remedy.SERVICE))
+                return
+            last_ns = now_ns
+            next_ns += period_ns
+            late_ns = self._clock.now_ns() - next_ns
+            self._latest_s = max(self._latest_s, late_ns * 1e-9)
+            if late_ns > 0:
+                self._overruns += 1
+                next_ns += late_ns
+            self._clock.sleep_until_ns(next_ns)
+
+    def _check_missed(self) -> None:
+        """Latch when too many of the latest cycles went without all answers."""
+        full = len(self._missed) == self._missed.maxlen
+        if full and sum(self._missed) > self._config.max_missed_fraction * len(self._missed):
+            what = f"complete state in {sum(self._missed)} of {len(self._missed)} cycles"
+            self._latch(
+                TransportTimeout(self.name, what, 1.0 / self._config.rate_hz, hint="check wiring, supply and load")
+            )
+
+    def _check_tracking(self, q: Array, due: Array) -> None:
+        """Latch when an enabled joint of ``q`` is too far from where it was ``due``, both (n,) rad."""
+        error = np.where(self._enabled, np.abs(q - due), 0.0)
+        worst = int(np.argmax(error))
+        if error[worst] > np.deg2rad(self._config.tracking_error_deg):
+            # Hold where the arm is, so that whatever blocks it is no longer pushed against.
+            self._setpoint.reset(q)
+            self._latch(
+                DeviceFault(
+                    self.name,
+                    f"joint {self._chain.joint_names[worst]} is {np.rad2deg(error[worst]):.1f} deg off its setpoint",
+                    fault_class=FaultClass.MOTION,
+                    hint="look for a collision, a load or tool that is too heavy, or a wrong offset",
+                )
+            )

@@ -1,0 +1,297 @@
+"""What all live cameras have in common: the newest frame or an error that says why there is none.
+
+The queue of frames is emptied when somebody reads, only the newest is kept, and it is decoded once, when it is wanted.
+So no reader thread is needed where a queue can be emptied without blocking and is deep enough for the longest pause
+between two reads. After a longer one it is full of old frames, which is seen and answered by waiting for the next.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Literal, Self, final
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.device import Device, Lifecycle, OperatorToken
+from touchcell.drivers.core.errors import ConfigError, CorruptMessage, DeviceError, StaleData, TransportTimeout
+from touchcell.drivers.core.frame_monitor import FrameWatch
+from touchcell.drivers.core.samples import Frame, Quality, Stamped
+from touchcell.drivers.core.spec import DriverConfig
+from touchcell.geometry.types import ImageArray
+
+_FIRST_FRAME_S = 5.0
+_UNREAD_PERIODS = 4.0
+_STALL_PERIODS = 3
+_SHORTEST_WAIT_S = 1e-3
+
+
+class CameraConfig(DriverConfig):
+    """Settings that every live camera has. Each is read back; a camera that gives something else is refused.
+
+    Attributes:
+        device: node of the camera. Names under /dev/v4l/by-id or by-path stay with the camera; /dev/videoN may not.
+        width_px, height_px: picture size.
+        pixel_format: MJPG saves USB bandwidth; YUYV and GREY are not compressed.
+        rate_hz: frames per second.
+        color: what ``Frame.image`` holds, grey (height, width) or BGR (height, width, 3).
+        exposure_us: exposure time in steps of 100 us, or None to keep the camera's own. Automatic exposure is switched
+            off either way.
+        gain: gain in the camera's own units, or None to keep its own.
+        stall_s: silence after which the camera counts as failed; at least three periods.
+    """
+
+    device: str = Field(min_length=1)
+    width_px: int = Field(default=640, gt=0, le=8192)
+    height_px: int = Field(default=480, gt=0, le=8192)
+    pixel_format: Literal["MJPG", "YUYV", "GREY"] = "MJPG"
+    rate_hz: float = Field(default=30.0, gt=0.0, le=1000.0)
+    color: Literal["grey", "bgr"] = "grey"
+    exposure_us: int | None = Field(default=None, gt=0, multiple_of=100)
+    gain: int | None = Field(default=None, ge=0)
+    stall_s: float = Field(default=0.5, gt=0.0, le=10.0)
+
+    @model_validator(mode="after")
+    def _silence_is_longer_than_the_period(self) -> Self:
+        if self.stall_s * self.rate_hz < _STALL_PERIODS:
+            raise ValueError(f"stall_s must be at least {_STALL_PERIODS} periods, {_STALL_PERIODS / self.rate_hz:g} s")
+        return self
+
+
+class SettingRefused(ConfigError):
+    """The camera did not take a setting.
+
+    Attributes:
+        device: name of the camera in the cell.
+        setting: key of the setting.
+        asked: what the configuration says.
+        given: what reads back from the device; None when it has no such setting.
+    """
+
+    def __init__(self, device: str, setting: str, asked: object, given: object) -> None:
+        reason = "the camera has no such setting" if given is None else f"the camera gives {given}"
+        super().__init__(
+            f"{asked} refused, {reason}",
+            key=f"{device}.{setting}",
+            value=asked,
+            hint="leave it out" if given is None else "`v4l2-ctl --list-ctrls --list-formats-ext` shows what it offers",
+        )
+        self.device = device
+        self.setting = setting
+        self.asked = asked
+        self.given = given
+
+
+@dataclass(frozen=True, slots=True)
+class RawFrame:
+    """A frame as it came, not decoded.
+
+    Attributes:
+        data: its bytes, in the configured pixel format.
+        t_ns: stamp.
+        seq: number, going on over restarts of the stream.
+        t_device_ns: the device's own stamp where it is not the one in ``t_ns``.
+        quality: SUSPECT without a trustworthy stamp.
+    """
+
+    data: bytes
+    t_ns: int
+    seq: int
+    t_device_ns: int | None = None
+    quality: Quality = Quality.GOOD
+
+
+class Camera(Device):
+    """A live camera; use it from one thread.
+
+    Frames flow from READY on: a camera moves nothing, so ACTIVE adds no more. Nothing is set before ``configure``.
+    FAULTED is reached when the camera has gone, is silent for ``stall_s``, or sends more than 10 bad frames in 30.
+
+    Args:
+        name: the device's name in the cell.
+        clock: injected time; must be CLOCK_MONOTONIC for a device whose frames the kernel stamps.
+        config: settings.
+    """
+
+    def __init__(self, name: str, clock: Clock, config: CameraConfig) -> None:
+        super().__init__(name, clock)
+        self._config = config
+        self._watch = FrameWatch()
+        self._newest: RawFrame | None = None
+        self._last_seq = -1
+        self._decoded: Stamped[Frame] | None = None
+        self._since_ns = 0
+        self._overflowed = False
+
+    @final
+    def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
+        """Newest frame.
+
+        Never blocks, except after a pause so long that the queue overflowed: then up to four periods for a new frame.
+
+        Raises:
+            StaleData: it is older than ``max_age_s``, or than ``stall_s`` where that is None.
+            CorruptMessage: it cannot be decoded; it is counted as bad.
+            DeviceGone: the camera has gone and is now FAULTED, as it is after ``stall_s`` of silence (TransportTimeout)
+                and after too many bad frames (CorruptMessage).
+            LifecycleError: not READY or ACTIVE.
+        """
+        self._require("read frames", Lifecycle.READY, Lifecycle.ACTIVE)
+        self._attempt(self._refresh)
+        age_s = self._age_s()
+        limit_s = self._config.stall_s if max_age_s is None else max_age_s
+        if self._newest is None or age_s > limit_s:
+            raise StaleData(self.name, age_s, limit_s, self._last_seq)
+        return self._read(self._newest)
+
+    @final
+    def next(self, after_seq: int, timeout_s: float) -> Stamped[Frame]:
+        """Newest frame if ``seq > after_seq``, else the next one.
+
+        Raises:
+            TransportTimeout: none came within ``timeout_s``.
+            CorruptMessage: it cannot be decoded; it is counted as bad.
+            DeviceGone: the camera has gone and is now FAULTED, as it is after ``stall_s`` of silence (TransportTimeout)
+                and after too many bad frames (CorruptMessage).
+            LifecycleError: not READY or ACTIVE.
+        """
+        self._require("read frames", Lifecycle.READY, Lifecycle.ACTIVE)
+        self._attempt(lambda: self._await_after(after_seq, timeout_s, self._config.stall_s))
+        if self._newest is None or self._newest.seq <= after_seq:
+            raise TransportTimeout(self.name, f"frame after {after_seq}", timeout_s)
+        return self._read(self._newest)
+
+    @final
+    def health(self) -> dict[str, float | int | str | bool]:
+        """Counters of good, lost, unread, frozen and bad frames, brightness and its drift, settings as read back."""
+        if self._state in (Lifecycle.READY, Lifecycle.ACTIVE):
+            try:
+                self._refresh()
+            except DeviceError as error:
+                self._to_faulted(error)
+        return {
+            "state": self._state.value,
+            "frame_age_s": self._age_s(),
+            **self._watch.readings(),
+            **self._settings(),
+        }
+
+    def _begin_stream(self) -> None:
+        """To be called once frames flow: waits for the first good one. Raises TransportTimeout, DeviceGone."""
+        self._watch.forgive()
+        self._overflowed = False
+        self._since_ns = self._clock.now_ns()
+        before = self._last_seq
+        self._await_after(before, _FIRST_FRAME_S, _FIRST_FRAME_S)
+        if self._last_seq == before:
+            raise TransportTimeout(self.name, "first frame", _FIRST_FRAME_S, hint="does it stream elsewhere?")
+
+    def _keep(self, frame: RawFrame) -> None:
+        """To be called by ``_collect`` with each good frame, in order."""
+        self._newest = frame
+        self._last_seq = frame.seq
+
+    def _age_s(self) -> float:
+        t_ns = self._newest.t_ns if self._newest else self._since_ns
+        return (self._clock.now_ns() - t_ns) * 1e-9
+
+    def _refresh(self) -> None:
+        self._empty_queue()
+        self._judge(self._config.stall_s)
+
+    def _silence_s(self) -> float:
+        # At most since it could deliver: the newest frame may be from before a recovery or an overflow.
+        return min(self._age_s(), (self._clock.now_ns() - self._since_ns) * 1e-9)
+
+    def _empty_queue(self) -> None:
+        now_ns = self._clock.now_ns()
+        give_up_ns = now_ns + round(_UNREAD_PERIODS / self._config.rate_hz * 1e9)
+        overflowed = self._collect()
+        if overflowed and not self._overflowed:
+            # A full queue silences the camera, so its silence counts from now.
+            self._since_ns = now_ns
+        while overflowed and (left_ns := give_up_ns - self._clock.now_ns()) > 0:
+            self._wait(left_ns * 1e-9)
+            overflowed = self._collect()
+        self._overflowed = overflowed
+
+    def _await_after(self, after_seq: int, timeout_s: float, stall_s: float) -> None:
+        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        self._empty_queue()
+        self._judge(stall_s)
+        while self._newest is None or self._newest.seq <= after_seq:
+            left_s = (deadline_ns - self._clock.now_ns()) * 1e-9
+            if left_s <= 0.0:
+                return
+            self._wait(min(left_s, max(stall_s - self._silence_s(), _SHORTEST_WAIT_S)))
+            self._collect()
+            self._judge(stall_s)
+
+    def _judge(self, stall_s: float) -> None:
+        if self._watch.out_of_budget:
+            worst = max(self._watch.bad, key=lambda reason: self._watch.bad[reason])
+            raise CorruptMessage(
+                self.name, f"too many bad frames, most of them {worst}", hint="check the cable and the USB bandwidth"
+            )
+        if self._silence_s() > stall_s:
+            raise TransportTimeout(self.name, "good frame", stall_s, hint="the camera hangs; plug it in again")
+
+    def _read(self, raw: RawFrame) -> Stamped[Frame]:
+        if self._decoded is None or self._decoded.seq != raw.seq:
+            try:
+                image = self._decode(raw)
+            except CorruptMessage:
+                self._watch.refuse("undecodable")
+                self._newest = None
+                raise
+            self._watch.look(image)
+            frame = Frame(image, *self._exposure_and_gain())
+            self._decoded = Stamped(frame, raw.t_ns, raw.seq, raw.t_device_ns, raw.quality)
+        return self._decoded
+
+    def _decode(self, raw: RawFrame) -> ImageArray:
+        config = self._config
+        grey = config.color == "grey"
+        pixels = np.frombuffer(raw.data, np.uint8)
+        if config.pixel_format != "MJPG":
+            pixels = pixels.reshape(config.height_px, config.width_px, -1)
+            if grey:
+                return pixels[:, :, 0].copy()
+        import cv2
+
+        if config.pixel_format == "GREY":
+            return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR), np.uint8)
+        if config.pixel_format == "YUYV":
+            return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_YUV2BGR_YUYV), np.uint8)
+        image = cv2.imdecode(pixels, cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
+        if image is None or image.shape[:2] != (config.height_px, config.width_px):
+            raise CorruptMessage(self.name, f"frame {raw.seq} cannot be decoded")
+        return np.asarray(image, np.uint8)
+
+    @final
+    def _recover(self, token: OperatorToken) -> None:
+        self._close()
+        try:
+            self._open()
+            self._configure()
+        except BaseException:
+            self._close()
+            raise
+
+    @abstractmethod
+    def _collect(self) -> bool:
+        """Take every waiting frame and ``_keep`` the good ones; True if the newest was followed by an overflow."""
+
+    @abstractmethod
+    def _wait(self, timeout_s: float) -> None:
+        """Return when a frame waits or after ``timeout_s``. Raises DeviceGone."""
+
+    @abstractmethod
+    def _exposure_and_gain(self) -> tuple[float | None, float | None]:
+        """Exposure time in s and gain, as read back, where known."""
+
+    @abstractmethod
+    def _settings(self) -> dict[str, float | int | str | bool]:
+        """Settings as read back, and warnings, for ``health``."""

@@ -1,0 +1,70 @@
+"""Commands that say in which frame they hold and for how long."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from touchcell.geometry.types import Array
+
+C = TypeVar("C")
+
+
+class TwistFrame(Enum):
+    """Along whose axes a twist's two vectors are given. Its reference point is always the tool centre point."""
+
+    TCP = "tcp"
+    BASE = "base"
+
+
+@dataclass(frozen=True, slots=True)
+class TwistCommand:
+    """Move the tool centre point with a velocity, for at most ``ttl_s``, then stop.
+
+    Attributes:
+        twist: (6,) [vx vy vz wx wy wz], m/s and rad/s: linear velocity of the tool centre point, angular velocity.
+        frame: whose axes.
+        t_ns: when the command was computed; it has expired at ``t_ns + ttl_s``.
+        ttl_s: how long the arm may move on it without another.
+        t_cause_ns: capture stamp of the sample that caused it, so that sensor-to-command age is measurable.
+    """
+
+    twist: Array
+    frame: TwistFrame
+    t_ns: int
+    ttl_s: float
+    t_cause_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Adjustment:
+    """One reason why what was sent is not what was asked for."""
+
+    limit: str
+    asked: float
+    allowed: float
+
+
+@dataclass(frozen=True, slots=True)
+class Sent(Generic[C]):
+    """What really went to the device, and why it differs from what was asked for."""
+
+    command: C
+    t_ns: int
+    adjustments: tuple[Adjustment, ...] = ()
+
+    @property
+    def limited(self) -> bool:
+        """Whether any limit changed the command."""
+        return bool(self.adjustments)
+
+
+def in_base_axes(command: TwistCommand, T_base_tcp: Array) -> Array:
+    """The command's twist along base axes, (6,): both vectors turned by the tool's orientation where needed."""
+    if command.frame is TwistFrame.BASE:
+        return command.twist
+    R = T_base_tcp[:3, :3]
+    return np.concatenate([R @ command.twist[:3], R @ command.twist[3:]])

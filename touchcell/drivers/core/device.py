@@ -1,0 +1,194 @@
+"""The lifecycle that every device has. Drivers fill in the hooks; the transitions themselves are final.
+
+    DISCONNECTED -connect-> PASSIVE -configure-> READY -activate-> ACTIVE -deactivate-> READY
+    any -(fault)-> FAULTED -recover-> READY          any -disconnect-> DISCONNECTED
+
+PASSIVE only reads: nothing that changes power, mode or zero has been sent. ``activate`` alone energises.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import Enum
+from types import TracebackType
+from typing import Self, final
+
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.errors import CommandRejected, DeviceError, LifecycleError, TransportError
+
+
+class Lifecycle(Enum):
+    """State of a device."""
+
+    DISCONNECTED = "disconnected"
+    PASSIVE = "passive"
+    READY = "ready"
+    ACTIVE = "active"
+    FAULTED = "faulted"
+
+
+class DeactivatePolicy(Enum):
+    """What an arm does when it is deactivated. The cell file must choose one."""
+
+    HOLD = "hold"
+    BRAKE = "brake"
+    PARK_THEN_OFF = "park_then_off"
+    OFF = "off"
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorToken:
+    """Proof that a person asked: made by the command line or a panel, never by a task."""
+
+    operator: str
+    t_ns: int
+
+
+class Device(ABC):
+    """A thing that is connected, configured, activated, and given back.
+
+    Args:
+        name: the device's name in the cell.
+        clock: injected time.
+
+    A hook that raises rolls the transition back: the device is closed and left DISCONNECTED if ``connect`` failed, and
+    stays in its former state otherwise. Use it as a context manager to be sure that it is disconnected.
+    """
+
+    def __init__(self, name: str, clock: Clock) -> None:
+        self.name = name
+        self._clock = clock
+        self._state = Lifecycle.DISCONNECTED
+        self._fault_error: DeviceError | None = None
+
+    @property
+    def state(self) -> Lifecycle:
+        """Present lifecycle state."""
+        return self._state
+
+    @property
+    def fault(self) -> DeviceError | None:
+        """What put the device into FAULTED, or None."""
+        return self._fault_error
+
+    @final
+    def connect(self) -> None:
+        """DISCONNECTED -> PASSIVE: open the transport and read. Never changes power, mode or zero."""
+        self._require("connect", Lifecycle.DISCONNECTED)
+        try:
+            self._open()
+        except BaseException:
+            self._close()
+            raise
+        self._state = Lifecycle.PASSIVE
+
+    @final
+    def configure(self) -> None:
+        """PASSIVE -> READY: check and set parameters; nothing is energised."""
+        self._require("configure", Lifecycle.PASSIVE)
+        self._configure()
+        self._enter(Lifecycle.READY)
+
+    @final
+    def activate(self) -> None:
+        """READY -> ACTIVE: the only call that energises; the setpoint starts at the present state."""
+        self._require("activate", Lifecycle.READY)
+        self._activate()
+        self._enter(Lifecycle.ACTIVE)
+
+    @final
+    def deactivate(self, policy: DeactivatePolicy = DeactivatePolicy.HOLD) -> None:
+        """ACTIVE -> READY: come to rest, then do as ``policy`` says. From READY it does nothing."""
+        if self._state is Lifecycle.READY:
+            return
+        self._require("deactivate", Lifecycle.ACTIVE)
+        self._deactivate(policy)
+        self._enter(Lifecycle.READY)
+
+    @final
+    def recover(self, token: OperatorToken) -> None:
+        """FAULTED -> READY, on a person's request; never on to ACTIVE. Raises if the cause is still there."""
+        self._require("recover", Lifecycle.FAULTED)
+        self._recover(token)
+        self._fault_error = None
+        self._state = Lifecycle.READY
+
+    @final
+    def disconnect(self) -> None:
+        """Any state -> DISCONNECTED, stopping first if ACTIVE. Never raises for a device that is already gone."""
+        if self._state is Lifecycle.DISCONNECTED:
+            return
+        try:
+            if self._state is Lifecycle.ACTIVE:
+                # A device that cannot be reached cannot be stopped from here either.
+                with suppress(TransportError):
+                    self._deactivate(self._disconnect_policy())
+        finally:
+            self._state = Lifecycle.DISCONNECTED
+            self._fault_error = None
+            self._close()
+
+    def __enter__(self) -> Self:
+        if self._state is Lifecycle.DISCONNECTED:
+            self.connect()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.disconnect()
+
+    def _require(self, operation: str, *allowed: Lifecycle) -> None:
+        if self._state not in allowed:
+            hint = str(self._fault_error) if self._fault_error else ""
+            raise LifecycleError(self.name, operation, self._state.value, [s.value for s in allowed], hint=hint)
+
+    def _enter(self, state: Lifecycle) -> None:
+        """Enter ``state``, unless a thread of the driver has latched a fault on the way: then raise that."""
+        if self._fault_error is not None:
+            raise self._fault_error
+        self._state = state
+
+    def _to_faulted(self, error: DeviceError) -> DeviceError:
+        """Latch the first fault; returns it so that callers can raise it."""
+        if self._state is not Lifecycle.FAULTED:
+            # The error first: who reads the state from another thread finds it.
+            self._fault_error = error
+            self._state = Lifecycle.FAULTED
+        return error
+
+    def _attempt(self, step: Callable[[], None]) -> None:
+        """Run a step and latch FAULTED if the device fails in it; a refused command is no failure."""
+        try:
+            step()
+        except CommandRejected:
+            raise
+        except DeviceError as error:
+            raise self._to_faulted(error) from None
+
+    @abstractmethod
+    def _open(self) -> None:
+        """Open the transport, read only. Raise ConnectError."""
+
+    @abstractmethod
+    def _close(self) -> None:
+        """Release everything; called also after a failed ``_open``; must not raise for what was never opened."""
+
+    def _configure(self) -> None:
+        """Check and set parameters."""
+
+    def _activate(self) -> None:
+        """Energise, with the setpoint at the present state."""
+
+    def _deactivate(self, policy: DeactivatePolicy) -> None:
+        """Come to rest and obey ``policy``."""
+
+    def _recover(self, token: OperatorToken) -> None:
+        """Clear the fault, verify by mode that it is gone."""
+
+    def _disconnect_policy(self) -> DeactivatePolicy:
+        """What to do when disconnected while ACTIVE."""
+        return DeactivatePolicy.HOLD

@@ -1,0 +1,98 @@
+"""Judging a stream of camera frames: lost, frozen, damaged, drifting. Pure bookkeeping, no I/O."""
+
+from __future__ import annotations
+
+import zlib
+from collections import deque
+
+import numpy as np
+
+from touchcell.geometry.types import ImageArray
+
+_BUDGET_FRAMES = 30
+_BUDGET_BAD = 10
+_FINGERPRINT_BYTES = 65536
+_BASELINE_FRAMES = 60
+_SMOOTHING = 0.1
+_BRIGHTNESS_STEP = 8
+
+
+class FrameWatch:
+    """Counts what is wrong with the frames of one camera.
+
+    A frame is *lost* when the sequence number jumps, *unread* when it was lost because nobody emptied the queue,
+    *frozen* when its bytes equal those of the frame before (sensor noise makes that next to impossible on a live
+    sensor), and *bad* when it was refused. Brightness is compared with that of the first 60 frames that were read.
+    """
+
+    def __init__(self) -> None:
+        self.good = 0
+        self.lost = 0
+        self.unread = 0
+        self.frozen = 0
+        self.frozen_run = 0
+        self.bad: dict[str, int] = {}
+        self._recent_bad: deque[bool] = deque(maxlen=_BUDGET_FRAMES)
+        self._fingerprint: int | None = None
+        self._baseline: list[float] = []
+        self._brightness = 0.0
+
+    @property
+    def out_of_budget(self) -> bool:
+        """Whether more than 10 of the last 30 frames were bad."""
+        return sum(self._recent_bad) > _BUDGET_BAD
+
+    def miss(self, frames: int, *, overrun: bool) -> None:
+        """Count ``frames`` that never came; with ``overrun`` the queue was full, so that it was the reader's fault."""
+        if overrun:
+            self.unread += frames
+        else:
+            self.lost += frames
+
+    def admit(self, data: bytes) -> None:
+        """Count a good frame; ``data`` are its bytes as they came."""
+        self.good += 1
+        # All over the picture, as its rim may be black without noise; an odd stride meets both bytes of YUYV.
+        fingerprint = zlib.crc32(data[:: len(data) // _FINGERPRINT_BYTES | 1])
+        if fingerprint == self._fingerprint:
+            self.frozen += 1
+            self.frozen_run += 1
+        else:
+            self.frozen_run = 0
+        self._fingerprint = fingerprint
+        self._recent_bad.append(False)
+
+    def refuse(self, reason: str) -> None:
+        """Count a frame that was refused for ``reason``, a word such as "short"."""
+        self.bad[reason] = self.bad.get(reason, 0) + 1
+        self._recent_bad.append(True)
+
+    def look(self, image: ImageArray) -> None:
+        """Note the brightness of a frame that somebody read."""
+        brightness = float(np.mean(image[::_BRIGHTNESS_STEP, ::_BRIGHTNESS_STEP]))
+        if len(self._baseline) < _BASELINE_FRAMES:
+            self._baseline.append(brightness)
+            self._brightness = brightness
+        else:
+            self._brightness += _SMOOTHING * (brightness - self._brightness)
+
+    def forgive(self) -> None:
+        """Begin a new stream: its first frame follows nothing, and its budget is whole. Counters go on."""
+        self._recent_bad.clear()
+        self._fingerprint = None
+        self.frozen_run = 0
+
+    def readings(self) -> dict[str, float | int | str | bool]:
+        """Named readings for ``health``."""
+        baseline = sum(self._baseline) / len(self._baseline) if self._baseline else 0.0
+        return {
+            "frames_good": self.good,
+            "frames_lost": self.lost,
+            "frames_unread": self.unread,
+            "frames_frozen": self.frozen,
+            "frozen_run": self.frozen_run,
+            "frames_bad": sum(self.bad.values()),
+            **{f"frames_bad_{reason}": count for reason, count in sorted(self.bad.items())},
+            "brightness": self._brightness,
+            "brightness_drift": (self._brightness - baseline) / baseline if baseline > 0.0 else 0.0,
+        }

@@ -1,0 +1,221 @@
+"""The last check before an arm: finite, shape, frame, lease, mode, freshness, limits, in that order.
+
+``min``, ``max`` and ``np.clip`` turn NaN into full speed or let it pass, so whatever is not finite is refused before
+any limit is applied. Acceleration and jerk are those of one command after another, never of the measured state; where
+the joints are is measured.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.commands import Adjustment, Sent, TwistCommand, TwistFrame, in_base_axes
+from touchcell.drivers.core.device import Lifecycle
+from touchcell.drivers.core.errors import CommandRejected, Rejection
+from touchcell.drivers.core.lease import Lease, LeaseDesk
+from touchcell.drivers.kinematics.chain import LocalIk
+from touchcell.geometry.finite import all_finite
+from touchcell.geometry.types import Array
+
+
+@dataclass(frozen=True, slots=True)
+class TwistLimits:
+    """Largest speeds, accelerations and jerks of the tool centre point (norms of the linear and the angular part)."""
+
+    speed_m_s: float
+    accel_m_s2: float
+    rot_speed_rad_s: float
+    rot_accel_rad_s2: float
+    jerk_m_s3: float
+    rot_jerk_rad_s3: float
+
+
+Follow = Callable[[Array], tuple[Array, tuple[Adjustment, ...]]]
+"""What an arm can follow of a twist (6,) along base axes, and why that differs."""
+
+
+def _follow_all(twist: Array) -> tuple[Array, tuple[Adjustment, ...]]:
+    return twist, ()
+
+
+def _no_joints() -> LocalIk | None:
+    return None
+
+
+class TwistGate:
+    """Checks and limits the twists of one arm.
+
+    Args:
+        device: name for errors.
+        limits: of the tool centre point.
+        desk: the arm's lease desk.
+        clock: injected time.
+        max_ttl_s: longest time-to-live accepted.
+    """
+
+    def __init__(
+        self, device: str, limits: TwistLimits, desk: LeaseDesk, clock: Clock, *, max_ttl_s: float = 1.0
+    ) -> None:
+        self._device = device
+        self._limits = limits
+        self._desk = desk
+        self._clock = clock
+        self._max_ttl_s = max_ttl_s
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last command: the next one is limited as if from rest."""
+        self._last = np.zeros(6)
+        self._last_accel = np.zeros(6)
+        self._last_ns = self._clock.now_ns() - round(self._max_ttl_s * 1e9)
+        self._expires_ns = self._last_ns
+
+    def admit(
+        self,
+        command: TwistCommand,
+        lease: Lease,
+        state: Lifecycle,
+        T_base_tcp: Array,
+        follow: Follow = _follow_all,
+        joints: Callable[[], LocalIk | None] = _no_joints,
+    ) -> Sent[TwistCommand]:
+        """Refuse the command or return what may be sent, along base axes, with every adjustment named.
+
+        Args:
+            command: what is asked for.
+            lease: of whoever asks.
+            state: of the arm.
+            T_base_tcp: (4, 4) for commands along tool axes.
+            follow: asked first what the arm can follow at all.
+            joints: tells where the joints are, asked once the command is found fit; None: they are not limited here.
+
+        Raises:
+            CommandRejected: with the first reason that applies; nothing may be sent.
+        """
+        now_ns = self._clock.now_ns()
+        self._check(command, lease, state, now_ns)
+        wanted, lost = follow(in_base_axes(command, T_base_tcp))
+        adjustments = list(lost)
+        if now_ns > self._expires_ns:
+            # After a silence longer than the time-to-live the arm stands: limit from rest.
+            self._last, self._last_accel = np.zeros(6), np.zeros(6)
+        dt_s = max(min(command.ttl_s, (now_ns - self._last_ns) * 1e-9), _SHORTEST_STEP_S)
+        limits, local = self._limits, joints()
+        wanted = _limited(wanted, limits.speed_m_s, limits.rot_speed_rad_s, adjustments)
+        if local is not None:
+            wanted = _within(local, wanted, adjustments)
+        step = self._step(wanted - self._last, dt_s, adjustments)
+        if local is not None:
+            share, why = local.acceleration_scale(step, dt_s)
+            step = share * step
+            adjustments.extend(why)
+        # Nothing that smoothes a motion may carry it over the limits that end it.
+        allowed = _limited(self._last + step, limits.speed_m_s, limits.rot_speed_rad_s, adjustments)
+        if local is not None:
+            allowed = _within(local, allowed, adjustments)
+        self._last_accel = (allowed - self._last) / dt_s
+        self._last = allowed
+        self._last_ns = now_ns
+        self._expires_ns = now_ns + round(command.ttl_s * 1e9)
+        return Sent(replace(command, twist=allowed, frame=TwistFrame.BASE), now_ns, tuple(adjustments))
+
+    def _step(self, way: Array, dt_s: float, adjustments: list[Adjustment]) -> Array:
+        """Change of the twist within ``dt_s`` on the ``way`` (6,) to the wanted one.
+
+        The acceleration points along the way, as large as allowed and as can still be taken off before the way ends; it
+        changes by no more than the jerk allows.
+        """
+        limits, last = self._limits, self._last_accel
+        accels, jerks = (limits.accel_m_s2, limits.rot_accel_rad_s2), (limits.jerk_m_s3, limits.rot_jerk_rad_s3)
+        lefts = _norms(way)
+        rate = smooth = 1.0 / dt_s
+        for name, left, most, jerk in zip(_PARTS, lefts, accels, jerks, strict=True):
+            if left > most * dt_s:
+                adjustments.append(Adjustment(f"tcp {name} acceleration", left / dt_s, most))
+                rate = min(rate, most / left)
+            if left > _NEGLIGIBLE:
+                # The largest acceleration that the jerk can take off again before the way ends.
+                braked = math.sqrt(2.0 * jerk / left) - 0.5 * jerk * dt_s / left
+                smooth = min(smooth, max(braked, min(1.0 / dt_s, jerk * dt_s / left)))
+        change = min(rate, smooth) * way - last
+        share = 1.0
+        for name, left, step, jerk in zip(_PARTS, lefts, _norms(change), jerks, strict=True):
+            asked = max(step, rate * left if smooth < rate else 0.0) / dt_s
+            if asked > jerk * _ROUNDING:
+                adjustments.append(Adjustment(f"tcp {name} jerk", asked, jerk))
+            if step > jerk * dt_s:
+                share = min(share, jerk * dt_s / step)
+        if share == 1.0 and min(rate, smooth) * dt_s == 1.0:
+            return way
+        return (last + share * change) * dt_s
+
+    def _check(self, command: TwistCommand, lease: Lease, state: Lifecycle, now_ns: int) -> None:
+        twist = np.asarray(command.twist, dtype=np.float64)
+        if not (all_finite(twist) and math.isfinite(command.ttl_s)):
+            raise self._rejected(Rejection.NON_FINITE, "twist or time-to-live is not finite", command.twist)
+        if twist.shape != (6,):
+            raise self._rejected(Rejection.SHAPE, f"twist has shape {twist.shape}, not (6,)", twist.shape, (6,))
+        if not isinstance(command.frame, TwistFrame):
+            raise self._rejected(Rejection.FRAME, f"unknown frame {command.frame!r}", command.frame)
+        self._desk.check(lease)
+        if state is not Lifecycle.ACTIVE:
+            raise self._rejected(Rejection.MODE, f"device is {state.value}, not active", state)
+        if not 0.0 < command.ttl_s <= self._max_ttl_s:
+            raise self._rejected(
+                Rejection.LIMIT,
+                f"time-to-live {command.ttl_s:g} s is not in (0, {self._max_ttl_s:g}]",
+                command.ttl_s,
+                self._max_ttl_s,
+            )
+        age_s = (now_ns - command.t_ns) * 1e-9
+        if not 0.0 <= age_s <= command.ttl_s:
+            raise self._rejected(
+                Rejection.EXPIRED,
+                f"computed {age_s:.4f} s ago, lives {command.ttl_s:g} s",
+                age_s,
+                command.ttl_s,
+            )
+
+    def _rejected(self, reason: Rejection, message: str, value: object, limit: object = None) -> CommandRejected:
+        return CommandRejected(self._device, reason, message, value=value, limit=limit)
+
+
+def _limited(twist: Array, max_linear: float, max_angular: float, adjustments: list[Adjustment]) -> Array:
+    """``twist`` scaled by one factor so that neither part exceeds its speed.
+
+    One factor for both parts: scaling them apart would bend the motion of whatever sits on a lever, and a tactile
+    sensor that turns about its contact would be torn off it.
+    """
+    scale = 1.0
+    for part, size, limit in zip(_PARTS, _norms(twist), (max_linear, max_angular), strict=True):
+        if size > limit * _ROUNDING:
+            adjustments.append(Adjustment(f"tcp {part} speed", size, limit))
+        if size > limit:
+            scale = min(scale, limit / size)
+    return twist if scale == 1.0 else twist * scale
+
+
+def _within(local: LocalIk, twist: Array, adjustments: list[Adjustment]) -> Array:
+    """``twist`` scaled so that no joint exceeds its limits; each joint is named once."""
+    _, scale, why = local.limited(twist)
+    if why:
+        named = {adjustment.limit for adjustment in adjustments}
+        adjustments.extend(adjustment for adjustment in why if adjustment.limit not in named)
+    return twist if scale == 1.0 else scale * twist
+
+
+def _norms(twist: Array) -> tuple[float, float]:
+    """Of the linear and of the angular part; NumPy takes longer for numbers this few."""
+    x, y, z, a, b, c = twist.tolist()
+    return math.sqrt(x * x + y * y + z * z), math.sqrt(a * a + b * b + c * c)
+
+
+_PARTS = ("linear", "angular")
+_NEGLIGIBLE = 1e-12
+_SHORTEST_STEP_S = 1e-6
+_ROUNDING = 1.0 + 1e-6

@@ -1,0 +1,71 @@
+"""What arms share whose driver owns the joints: a loop of theirs publishes joint states and latches trouble."""
+
+from __future__ import annotations
+
+from touchcell.drivers.core.arm import Arm
+from touchcell.drivers.core.device import Lifecycle
+from touchcell.drivers.core.errors import CommandRejected, DeviceError, Rejection, StaleData
+from touchcell.drivers.core.joint_setpoint import JointSetpoint
+from touchcell.drivers.core.lease import Lease
+from touchcell.drivers.core.samples import JointState, Stamped, TcpState
+from touchcell.drivers.kinematics.chain import DifferentialIk, LocalIk, SerialChain
+from touchcell.geometry.types import Array
+
+
+class JointArm(Arm):
+    """An arm with a chain, a setpoint in joint space, and a loop that sets ``_joints`` and ``_trouble``.
+
+    Subclasses make the attributes below before the loop starts.
+    """
+
+    _chain: SerialChain
+    _ik: DifferentialIk
+    _setpoint: JointSetpoint
+    _joints: Stamped[JointState] | None
+    _trouble: DeviceError | None
+
+    def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
+        """Newest joint states, stamped when they were asked for. Raises StaleData."""
+        sample = self._joints
+        if sample is None:
+            raise StaleData(self.name, float("inf"), max_age_s or 0.0, 0, hint="not all joints have answered yet")
+        age_s = sample.age_s(self._clock.now_ns())
+        if max_age_s is not None and not age_s <= max_age_s:
+            raise StaleData(self.name, age_s, max_age_s, sample.seq)
+        return sample
+
+    def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
+        """Newest tool pose and twist, from measured joint angles. Raises StaleData."""
+        sample = self.joints(max_age_s)
+        T_base_tcp, J = self._chain.forward_and_jacobian(sample.value.q)
+        state = TcpState(T_base_tcp, J @ sample.value.dq)
+        return Stamped(state, sample.t_ns, sample.seq, quality=sample.quality)
+
+    def go_to_joints(self, q: Array, lease: Lease, *, speed_fraction: float = 0.1) -> None:
+        """Start moving to ``q`` (n,) rad in a straight line in joint space, within the limits of the tool centre point.
+
+        Raises:
+            CommandRejected: not finite, wrong shape, no lease, not active, outside the joint limits.
+        """
+        q = self._admitted_joint_goal(
+            q, lease, speed_fraction, self._chain.lower, self._chain.upper, self._chain.joint_count
+        )
+        if self._trouble is not None:
+            raise CommandRejected(self.name, Rejection.MODE, f"in trouble: {self._trouble}")
+        self._setpoint.go_to(q, speed_fraction)
+
+    def kinematics(self) -> DifferentialIk:
+        """Of its joints."""
+        return self._ik
+
+    def _local_ik(self) -> LocalIk:
+        return self._ik_at(self._ik, self.joints(self._max_state_age_s).value.q)
+
+    def _latch(self, error: DeviceError) -> None:
+        """Keep the first trouble, stop the setpoint, and be FAULTED."""
+        if self._trouble is None:
+            self._trouble = error
+            self._setpoint.stop()
+        # A transition that was under way in another thread may have overwritten the state: every cycle asserts it.
+        if self.state not in (Lifecycle.DISCONNECTED, Lifecycle.FAULTED):
+            self._to_faulted(self._trouble)

@@ -1,0 +1,73 @@
+"""What devices deliver: values with the time and the number of the sample they came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Generic, TypeVar
+
+from touchcell.geometry.types import Array, ImageArray
+
+T = TypeVar("T")
+
+
+class Quality(Enum):
+    """How far a sample may be trusted."""
+
+    GOOD = "good"
+    SUSPECT = "suspect"
+
+
+@dataclass(frozen=True, slots=True)
+class Stamped(Generic[T]):
+    """A value and when it was true.
+
+    Attributes:
+        value: the sample.
+        t_ns: CLOCK_MONOTONIC (or injected clock) time of capture where the device tells, else of reception.
+        seq: number of the sample at its source; a gap means that samples were lost.
+        t_device_ns: the device's own clock, where it has one.
+        quality: SUSPECT when the device itself doubts the sample.
+    """
+
+    value: T
+    t_ns: int
+    seq: int
+    t_device_ns: int | None = None
+    quality: Quality = Quality.GOOD
+
+    def age_s(self, now_ns: int) -> float:
+        """Seconds from the sample's stamp to ``now_ns``."""
+        return (now_ns - self.t_ns) * 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A camera image: uint8, (height, width) grey or (height, width, 3) BGR."""
+
+    image: ImageArray
+    exposure: float | None = None
+    gain: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class JointState:
+    """Joint positions (n,) rad, velocities (n,) rad/s, and torques (n,) N m where the arm measures them."""
+
+    q: Array
+    dq: Array
+    tau: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TcpState:
+    """Where the tool centre point is and how it moves.
+
+    Attributes:
+        T_base_tcp: pose (4, 4).
+        twist: (6,) [v, w] of the tool centre point: linear velocity of that point and angular velocity, both along
+            base axes (as ``TwistFrame.BASE``).
+    """
+
+    T_base_tcp: Array
+    twist: Array

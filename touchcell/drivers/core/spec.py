@@ -1,0 +1,107 @@
+"""Which drivers exist and what each can do, known without connecting and without any vendor SDK installed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from touchcell import registry as entry_points
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.device import Device
+from touchcell.geometry.types import Array
+
+GROUP = "touchcell.drivers"
+
+
+class DriverConfig(BaseModel):
+    """Base of every driver's configuration: unknown keys refused, values frozen, units in the names."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Capabilities:
+    """What a driver promises, as data. The conformance suite holds it to every entry.
+
+    Attributes:
+        kind: "arm" or "camera".
+        abilities: names of the Protocols in ``touchcell.drivers.core.protocols`` that its devices satisfy.
+        state_rate_hz: rate at which new samples appear.
+        min_command_rate_hz: slowest stream of twists that keeps it moving smoothly; 0 for devices without commands.
+        command_latency_s: typical time from call to wire.
+        stop_categories: IEC 60204-1 categories it can do in software.
+        max_watchdog_s: longest silence after which the device stops by itself; None when only the host's time-to-live
+            stops it.
+        twist_axes: which of [vx vy vz wx wy wz] it can follow.
+        has_brakes: whether it stays up without power.
+        falls_on_power_loss: whether power loss lets it sink.
+        seen_on_metal: False while the driver has only met emulators.
+        virtual_time: whether it runs on an injected clock; real hardware does not.
+    """
+
+    kind: Literal["arm", "camera"]
+    abilities: frozenset[str]
+    state_rate_hz: float
+    min_command_rate_hz: float = 0.0
+    command_latency_s: float = 0.0
+    stop_categories: frozenset[int] = frozenset()
+    max_watchdog_s: float | None = None
+    twist_axes: tuple[bool, bool, bool, bool, bool, bool] = (True, True, True, True, True, True)
+    has_brakes: bool = False
+    falls_on_power_loss: bool = False
+    seen_on_metal: bool = False
+    virtual_time: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class DriverContext:
+    """What a driver may need beyond its own configuration.
+
+    Attributes:
+        clock: injected time.
+        devices: devices of the cell that are built already, by name.
+        scene: the simulated scene, for simulated devices; None in a real cell.
+        seed: seed of everything random.
+        bases: T_world_base (4, 4) of arms by name, where a cell file says where they stand.
+    """
+
+    clock: Clock
+    devices: Mapping[str, Device] = field(default_factory=dict)
+    scene: Any = None
+    seed: int = 0
+    bases: Mapping[str, Array] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class DriverSpec:
+    """A driver's entry point. Its module imports no SDK: that happens when a device is opened.
+
+    Attributes:
+        name: the word in the cell file.
+        summary: one line for ``touchcell list``.
+        config: pydantic model of its configuration.
+        capabilities: the static record.
+        build: makes a DISCONNECTED device from name, configuration and context.
+        extra: the optional extra that brings its SDK, or None.
+    """
+
+    name: str
+    summary: str
+    config: type[DriverConfig]
+    capabilities: Capabilities
+    build: Callable[[str, Any, DriverContext], Device]
+    extra: str | None = None
+
+
+def installed() -> dict[str, EntryPoint]:
+    """Entry points of all installed drivers by name; nothing is imported."""
+    return entry_points.installed(GROUP)
+
+
+def spec(name: str) -> DriverSpec:
+    """The spec of driver ``name``. Raises ConfigError with a suggestion for an unknown one."""
+    return entry_points.load(GROUP, "driver", name, DriverSpec)

@@ -1,0 +1,1 @@
+"""Arms of Damiao motors on CAN."""

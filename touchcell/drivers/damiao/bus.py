@@ -1,0 +1,391 @@
+"""Requests to Damiao motors and their answers, over any python-can bus.
+
+A motor answers only when addressed, so one thread that sends a cycle's requests and collects the answers owns the bus:
+no receive thread is needed, nothing can overflow unseen, and an answer is never waited for twice.
+
+Answers carry no time. Each is stamped with the moment at which its request was sent, so its age is never understated: a
+motor's requests wait in a queue and its answers come in order (CAN keeps the order of one sender). After a loss the
+queue would stay one entry too long; then a register is read as well, whose answer names itself and so marks the place.
+Of such fences a motor has one under way at a time, and they take turns among four registers: an answer that comes after
+its fence was given up is not taken for the next.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+from touchcell.drivers.core import can_errors
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.errors import (
+    CodecError,
+    ConnectError,
+    DeviceFault,
+    DeviceGone,
+    FaultClass,
+    Remedy,
+    TransportTimeout,
+)
+from touchcell.drivers.damiao import codec
+from touchcell.drivers.damiao.codec import Feedback, Ranges, Register
+
+_ANSWER_S = 0.1
+_TRIES = 3
+_SETTLE_NS = 20_000_000
+_FENCES = (Register.TIMEOUT, Register.CTRL_MODE, Register.MST_ID, Register.ESC_ID)
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """CAN ids of one motor: it listens to ``esc_id`` and answers on ``mst_id``."""
+
+    esc_id: int
+    mst_id: int
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A motor's state, and when it was asked for (its age is at most the time since)."""
+
+    feedback: Feedback
+    t_ns: int
+
+
+@dataclass(slots=True)
+class Counters:
+    """What has been seen on the bus since it was opened."""
+
+    sent: int = 0
+    answered: int = 0
+    missed: int = 0
+    corrupt: int = 0
+    unexpected: int = 0
+    not_sent: int = 0
+    error_frames: int = 0
+
+    def as_dict(self) -> dict[str, int]:
+        """By name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+@dataclass(slots=True, eq=False)
+class _Pending:
+    """A request under way; ``fence`` is the register that it reads, or None if it is answered by the motor's state."""
+
+    t_ns: int
+    fence: Register | None = None
+
+
+class MotorBus:
+    """The motors of one arm on one CAN bus. One thread at a time.
+
+    Args:
+        device: name for errors.
+        addresses: the motors.
+        connect: opens the python-can bus.
+        clock: injected time.
+        max_silence_s: a motor silent for longer is given up by the caller; requests twice as old are forgotten.
+        fd: send CAN FD frames with bit rate switching.
+
+    Attributes:
+        counters: messages seen and lost.
+        last_error: the newest error frame in words, or "".
+        timeout_ticks: the motors' timeout as last read after a loss, or None; it tells a motor that lost power.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        addresses: Sequence[Address],
+        connect: Callable[[], Any],
+        clock: Clock,
+        *,
+        max_silence_s: float,
+        fd: bool = False,
+    ) -> None:
+        self._device = device
+        self._addresses = tuple(addresses)
+        self._by_mst_id = {address.mst_id: index for index, address in enumerate(addresses)}
+        self._connect = connect
+        self._clock = clock
+        self._forget_after_ns = round(2e9 * max_silence_s)
+        self._fence_lost_after_ns = round(0.5e9 * max_silence_s)
+        self._fd = fd
+        self._bus: Any = None
+        self._forget()
+
+    def _forget(self) -> None:
+        """Start as on a bus that was never open."""
+        n = len(self._addresses)
+        self._ranges: list[Ranges | None] = [None] * n
+        self._pending: list[deque[_Pending]] = [deque() for _ in range(n)]
+        self._newest: list[Answer | None] = [None] * n
+        self._wanted_register: tuple[int, int, bool] | None = None
+        self._replies: list[codec.RegisterReply] = []
+        self._bus_off = False
+        self._fences: list[_Pending | None] = [None] * n
+        self._fence_turns = [0] * n
+        self.counters = Counters()
+        self.last_error = ""
+        self.timeout_ticks: list[int | None] = [None] * n
+
+    @property
+    def state(self) -> str:
+        """Controller state as python-can and error frames tell it: active, passive, error or closed."""
+        if self._bus is None:
+            return "closed"
+        return "error" if self._bus_off else str(self._bus.state.name).lower()
+
+    def open(self) -> None:
+        """Open the bus and read the full scales of every motor; changes nothing in them.
+
+        Raises:
+            ConnectError: no bus, or motors that do not answer or not as configured; ``causes`` names each.
+        """
+        self._forget()
+        self._bus = self._connect()
+        causes: list[Exception] = []
+        for index, address in enumerate(self._addresses):
+            try:
+                self._ranges[index] = self._read_ranges(index)
+                if (found := self.read(index, Register.MST_ID)) != address.mst_id:
+                    raise ConnectError(self._device, f"motor {address.esc_id} answers on {found}, not {address.mst_id}")
+            except (TransportTimeout, CodecError, ConnectError) as error:
+                causes.append(error)
+        if causes:
+            raise ConnectError(
+                self._device, "motors are missing", causes, hint="is the arm powered, and are ids and bit rates right?"
+            )
+
+    def close(self) -> None:
+        """Leave the bus; without effect on one that was never opened."""
+        if self._bus is not None:
+            self._bus.shutdown()
+            self._bus = None
+
+    def ranges(self, index: int) -> Ranges:
+        """Full scales of a motor, as it told."""
+        ranges = self._ranges[index]
+        assert ranges is not None, "open the bus first"
+        return ranges
+
+    def read(self, index: int, register: int) -> float | int:
+        """A register of a motor. Raises TransportTimeout, DeviceGone, CodecError."""
+        return self._ask(index, register, codec.read_register(self._addresses[index].esc_id, register))
+
+    def write(self, index: int, register: int, value: float | int) -> float | int:
+        """Change a register until the next power cycle; returns what a read afterwards says."""
+        self._ask(index, register, codec.write_register(self._addresses[index].esc_id, register, value), written=True)
+        return self.read(index, register)
+
+    def command(self, index: int, data: bytes) -> Feedback:
+        """Send one frame to one motor until it answers, a few times. Raises TransportTimeout, DeviceGone."""
+        self._settle()
+        for _ in range(_TRIES):
+            self._send(index, self._addresses[index].esc_id, data)
+            until_ns = self._clock.now_ns() + round(_ANSWER_S * 1e9)
+            while (answer := self._newest[index]) is None and self._receive(until_ns):
+                pass
+            if answer is not None:
+                return answer.feedback
+        raise self._no_answer(index)
+
+    def exchange(self, data: Sequence[bytes | None], until_ns: int) -> list[Answer | None]:
+        """Send every motor its frame, or a request for its state where there is none, and collect answers.
+
+        Returns as soon as all have answered this very request, and at ``until_ns`` at the latest, with the newest
+        answer that came from each meanwhile.
+
+        Raises:
+            DeviceGone: the bus has gone.
+            DeviceFault: the controller is bus-off.
+        """
+        self._newest = [None] * len(self._addresses)
+        self._fence()
+        start_ns = self._clock.now_ns()
+        for index, (address, frame) in enumerate(zip(self._addresses, data, strict=True)):
+            if frame is None:
+                self._send(index, codec.PARAMETER_ID, codec.request_feedback(address.esc_id))
+            else:
+                self._send(index, address.esc_id, frame)
+        while not self._all_since(start_ns) and self._receive(until_ns):
+            pass
+        self.counters.missed += sum(answer is None for answer in self._newest)
+        if self._bus_off:
+            raise DeviceFault(
+                self._device,
+                "bus-off",
+                vendor_code="bus-off",
+                fault_class=FaultClass.COMMUNICATION,
+                needs=Remedy.OPERATOR,
+                hint="check wiring, termination and bit rates, then restart the interface",
+            )
+        return list(self._newest)
+
+    def _all_since(self, start_ns: int) -> bool:
+        return all(answer is not None and answer.t_ns >= start_ns for answer in self._newest)
+
+    def _read_ranges(self, index: int) -> Ranges:
+        return Ranges(
+            float(self.read(index, Register.PMAX)),
+            float(self.read(index, Register.VMAX)),
+            float(self.read(index, Register.TMAX)),
+        )
+
+    def _ask(self, index: int, register: int, request: bytes, *, written: bool = False) -> float | int:
+        self._settle()
+        self._replies.clear()
+        self._wanted_register = (index, register, written)
+        try:
+            for _ in range(_TRIES):
+                self._put(codec.PARAMETER_ID, request)
+                until_ns = self._clock.now_ns() + round(_ANSWER_S * 1e9)
+                while not self._replies and self._receive(until_ns):
+                    pass
+                if self._replies:
+                    return self._replies[0].value
+        finally:
+            self._wanted_register = None
+        raise self._no_answer(index)
+
+    def _no_answer(self, index: int) -> TransportTimeout:
+        what = f"answer of motor {self._addresses[index].esc_id}"
+        return TransportTimeout(self._device, what, _TRIES * _ANSWER_S)
+
+    def _settle(self) -> None:
+        """Take in what is under way, so that the next answer belongs to the next request."""
+        until_ns = self._clock.now_ns() + _SETTLE_NS
+        while any(self._pending) and self._receive(until_ns):
+            pass
+        for queue in self._pending:
+            queue.clear()
+        self._newest = [None] * len(self._addresses)
+
+    def _fence(self) -> None:
+        now_ns = self._clock.now_ns()
+        for index, queue in enumerate(self._pending):
+            while queue and now_ns - queue[0].t_ns > self._forget_after_ns:
+                queue.popleft()
+            fence = self._fences[index]
+            under_way = fence in queue and fence is not None and now_ns - fence.t_ns <= self._fence_lost_after_ns
+            if queue and not under_way:
+                self._fence_turns[index] += 1
+                register = _FENCES[self._fence_turns[index] % len(_FENCES)]
+                fence = self._fences[index] = _Pending(now_ns, register)
+                queue.append(fence)
+                self._put(codec.PARAMETER_ID, codec.read_register(self._addresses[index].esc_id, register))
+
+    def _send(self, index: int, arbitration_id: int, data: bytes) -> None:
+        now_ns = self._clock.now_ns()
+        if self._put(arbitration_id, data):
+            self._pending[index].append(_Pending(now_ns))
+
+    def _put(self, arbitration_id: int, data: bytes) -> bool:
+        import can
+
+        message = can.Message(
+            arbitration_id=arbitration_id,
+            is_extended_id=False,
+            data=data,
+            is_fd=self._fd,
+            bitrate_switch=self._fd,
+            check=False,
+        )
+        try:
+            self._bus.send(message)
+        except can.CanOperationError as error:
+            if error.error_code == errno.ENOBUFS:
+                self.counters.not_sent += 1
+                return False
+            raise self._gone(error) from None
+        except (can.CanError, OSError, ValueError) as error:
+            raise self._gone(error) from None
+        self.counters.sent += 1
+        return True
+
+    def _receive(self, until_ns: int) -> bool:
+        """Take in one frame; False when none came in time."""
+        import can
+
+        left_s = (until_ns - self._clock.now_ns()) * 1e-9
+        try:
+            message = self._bus.recv(max(left_s, 0.0))
+        except (can.CanError, OSError, ValueError) as error:
+            raise self._gone(error) from None
+        if message is None:
+            return False
+        if message.is_error_frame:
+            self._note_error(message.arbitration_id)
+        elif not message.is_extended_id and not message.is_remote_frame:
+            self._take(message.arbitration_id, bytes(message.data))
+        return True
+
+    def _take(self, arbitration_id: int, data: bytes) -> None:
+        index = self._by_mst_id.get(arbitration_id)
+        if index is None:
+            self.counters.unexpected += 1
+            return
+        if self._take_wanted(index, data) or self._take_fence(index, data):
+            return
+        if codec.is_register_reply(data, self._addresses[index].esc_id):
+            self.counters.unexpected += 1
+        else:
+            self._take_feedback(index, data)
+
+    def _take_wanted(self, index: int, data: bytes) -> bool:
+        wanted = self._wanted_register
+        if wanted is None or wanted[0] != index:
+            return False
+        reply = codec.decode_register_reply(data, self._addresses[index].esc_id, wanted[1])
+        # A second answer to a repeated write must not pass for the read that proves it.
+        if reply is None or reply.written != wanted[2]:
+            return False
+        self._replies.append(reply)
+        return True
+
+    def _take_fence(self, index: int, data: bytes) -> bool:
+        queue, fence = self._pending[index], self._fences[index]
+        if fence is None or fence.fence is None or fence not in queue:
+            return False
+        reply = codec.decode_register_reply(data, self._addresses[index].esc_id, fence.fence)
+        if reply is None:
+            return False
+        if fence.fence is Register.TIMEOUT:
+            self.timeout_ticks[index] = int(reply.value)
+        # Whatever was asked for before has been answered or lost.
+        while queue.popleft() is not fence:
+            pass
+        return True
+
+    def _take_feedback(self, index: int, data: bytes) -> None:
+        ranges = self._ranges[index]
+        if ranges is None:
+            self.counters.unexpected += 1
+            return
+        try:
+            feedback = codec.decode_feedback(data, self._addresses[index].esc_id, ranges)
+        except CodecError:
+            self.counters.corrupt += 1
+            return
+        queue = self._pending[index]
+        while queue and queue[0].fence is not None:
+            queue.popleft()
+        if not queue:
+            self.counters.unexpected += 1
+            return
+        self.counters.answered += 1
+        self._newest[index] = Answer(feedback, queue.popleft().t_ns)
+
+    def _note_error(self, arbitration_id: int) -> None:
+        self.counters.error_frames += 1
+        self.last_error = can_errors.describe(arbitration_id)
+        if arbitration_id & can_errors.BUS_OFF:
+            self._bus_off = True
+        elif arbitration_id & can_errors.RESTARTED:
+            self._bus_off = False
+
+    def _gone(self, error: Exception) -> DeviceGone:
+        return DeviceGone(self._device, f"the CAN bus has gone: {error}", hint="check the adapter, then connect again")

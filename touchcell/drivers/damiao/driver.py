@@ -1,0 +1,445 @@
+"""Arms of Damiao motors in MIT mode on CAN (OpenArm, YAM, reBot and home-made ones), over python-can.
+
+The makers give no Cartesian control, so this driver owns it: a loop of its own turns expiring twists into joint
+setpoints (``touchcell.drivers.core.joint_setpoint``), adds the torques that carry the arm's weight, and sends every
+motor a position, a velocity and a torque. The same loop collects the answers; motors speak only when asked, so one
+thread is enough.
+
+What stops the arm: an expired twist, by slowing down in the loop; a dead host process, by each motor holding its last
+position and then, after its own timeout, letting go. **An arm without brakes sinks then**, and whenever it is disabled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from touchcell.drivers.core.bus_arm import BusArm, BusArmConfig
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.device import Lifecycle, OperatorToken
+from touchcell.drivers.core.errors import (
+    ConfigError,
+    ConnectError,
+    DeviceError,
+    DeviceFault,
+    DeviceGone,
+    FaultClass,
+    LifecycleError,
+    Remedy,
+    TransportTimeout,
+)
+from touchcell.drivers.core.protocols import StopCategory
+from touchcell.drivers.core.samples import JointState, Stamped
+from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
+from touchcell.drivers.damiao import codec
+from touchcell.drivers.damiao.bus import Address, Answer, MotorBus
+from touchcell.drivers.damiao.codec import MitCommand, Register
+from touchcell.drivers.kinematics.chain import GRAVITY_M_S2, ChainDescription, SerialChain, Vector3
+from touchcell.geometry.types import Array
+
+_MAX_BUS_LOAD = 0.8
+_PLAUSIBLE_JUMP_RAD = 0.1
+
+_DOES_NOT_ENABLE = codec.StatusCode(
+    "does not enable", FaultClass.INTERNAL, Remedy.OPERATOR, "check power and emergency stop"
+)
+_DISABLED_ITSELF = codec.StatusCode(
+    "disabled itself", FaultClass.ELECTRICAL, Remedy.OPERATOR, "did it lose power, or has it a second host?"
+)
+
+
+class MotorConfig(BaseModel):
+    """One joint's motor. The joint's angle is ``direction`` times the motor's angle, plus ``offset_deg``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    esc_id: int = Field(ge=1, le=0x7F)
+    mst_id: int = Field(ge=1, le=0x7FE)
+    direction: Literal[1, -1] = 1
+    offset_deg: float = 0.0
+    kp_n_m_rad: Annotated[float, Field(gt=0.0, le=codec.KP_MAX)] = 40.0
+    kd_n_m_s_rad: Annotated[float, Field(gt=0.0, le=codec.KD_MAX)] = 1.5
+
+
+class DamiaoCanConfig(BusArmConfig):
+    """Configuration of one arm.
+
+    ``interface``, ``channel`` and ``bus_options`` go to python-can; bit rates are those of the bus, which the adapter
+    or ``ip link`` sets.
+    """
+
+    interface: str = "socketcan"
+    channel: str = "can0"
+    bus_options: dict[str, str | int | float | bool] = Field(default_factory=dict)
+    fd: bool = False
+    bitrate: int = Field(default=1_000_000, gt=0)
+    data_bitrate: int = Field(default=5_000_000, gt=0)
+
+    chain: str = "generic_6r"
+    gravity_m_s2: Vector3 = GRAVITY_M_S2
+    motors: tuple[MotorConfig, ...] = Field(min_length=1)
+
+    rate_hz: Annotated[float, Field(ge=50.0, le=1000.0)] = 250.0
+    watchdog_s: Annotated[float, Field(ge=0.02, le=0.4)] = 0.1
+
+    @property
+    def joint_count(self) -> int:
+        """How many motors are listed."""
+        return len(self.motors)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for field in ("esc_id", "mst_id"):
+            numbers = [getattr(motor, field) for motor in self.motors]
+            if len(set(numbers)) < len(numbers):
+                raise ValueError(f"two motors share one {field}: {numbers}")
+        if self.bus_load > _MAX_BUS_LOAD:
+            raise ValueError(
+                f"{len(self.motors)} motors at {self.rate_hz:g} Hz would load the bus to {self.bus_load:.0%}, "
+                f"more than {_MAX_BUS_LOAD:.0%}: lower rate_hz or use CAN FD"
+            )
+        if self.watchdog_s * self.rate_hz < 4:
+            raise ValueError(f"watchdog_s {self.watchdog_s:g} is less than four cycles of {self.rate_hz:g} Hz")
+        return self
+
+    @property
+    def bus_load(self) -> float:
+        """Largest part of the bus that commands and answers take."""
+        return codec.bus_load(len(self.motors), self.rate_hz, self.bitrate, self.data_bitrate if self.fd else None)
+
+    def describe(self) -> ChainDescription:
+        """The arm.
+
+        Raises:
+            ConfigError: there is none, it has another number of joints, or the park pose is outside their limits.
+        """
+        found = self.named_chain("motors")
+        self.require_park_within(found)
+        return found
+
+
+class DamiaoCanArm(BusArm):
+    """One arm; see the module for what stops it and what then happens.
+
+    Args:
+        name: the device's name in the cell.
+        config: checked configuration.
+        clock: real time; the loop is a thread and cannot run on a virtual clock.
+    """
+
+    _config: DamiaoCanConfig
+
+    def __init__(self, name: str, config: DamiaoCanConfig, clock: Clock) -> None:
+        super().__init__(name, config, clock, SerialChain(config.describe(), config.tool, config.gravity_m_s2))
+        motors = config.motors
+        self._direction = np.array([motor.direction for motor in motors], dtype=np.float64)
+        self._offset = np.deg2rad([motor.offset_deg for motor in motors])
+        addresses = [Address(motor.esc_id, motor.mst_id) for motor in motors]
+        self._bus = MotorBus(
+            name,
+            addresses,
+            partial(_open_bus, name, config),
+            clock,
+            max_silence_s=config.max_silence_s,
+            fd=config.fd,
+        )
+
+    def _forget(self) -> None:
+        super()._forget()
+        self._answers: list[Answer | None] = [None] * len(self._config.motors)
+
+    def watchdog_s(self) -> float:
+        """Silence after which the motors let go, as read back from them; the longest of them."""
+        known = [ticks for ticks in self._bus.timeout_ticks if ticks is not None]
+        if len(known) < len(self._enabled):
+            raise LifecycleError(self.name, "tell the watchdog", self.state.value, [Lifecycle.READY.value])
+        return max(known) * codec.TIMEOUT_TICK_S
+
+    def health(self) -> dict[str, float | int | str | bool]:
+        """Counters of the bus and the loop, temperatures, status, what limits the motion."""
+        readings: dict[str, float | int | str | bool] = dict(self._bus.counters.as_dict())
+        readings |= {
+            "bus_state": self._bus.state,
+            "bus_error": self._bus.last_error,
+            "bus_load": self._config.bus_load,
+        }
+        readings |= super().health()
+        for joint, answer in zip(self._chain.joint_names, self._answers, strict=True):
+            if answer is not None:
+                readings[f"{joint}_status"] = answer.feedback.status
+                readings[f"{joint}_mos_c"] = answer.feedback.mos_c
+                readings[f"{joint}_rotor_c"] = answer.feedback.rotor_c
+        return readings
+
+    def _open_bus(self) -> None:
+        self._bus.open()
+
+    def _close_bus(self) -> None:
+        self._switch_off()
+        self._bus.close()
+
+    def _configure(self) -> None:
+        with self._lock:
+            for index, motor in enumerate(self._config.motors):
+                if (mode := self._bus.read(index, Register.CTRL_MODE)) != codec.MIT_MODE:
+                    raise ConfigError(
+                        f"motor {motor.esc_id} is in control mode {mode}, not MIT (1)",
+                        key="motors",
+                        value=mode,
+                        hint="set register 10 to 1 with the maker's tool; a driver does not change modes",
+                    )
+                self._check_ranges(index)
+                self._set_watchdog(index)
+
+    def _activate(self) -> None:
+        with self._lock:
+            if self._trouble is not None:
+                raise self._trouble
+            q = self.joints(self._config.max_silence_s).value.q
+            outside = (q < self._chain.lower) | (q > self._chain.upper)
+            if outside.any():
+                joint = self._chain.joint_names[int(np.argmax(outside))]
+                raise DeviceFault(
+                    self.name,
+                    f"joint {joint} is outside its limits",
+                    fault_class=FaultClass.MOTION,
+                    needs=Remedy.OPERATOR,
+                    hint="move it back by hand, or correct offset_deg and direction",
+                )
+            for index in range(len(self._enabled)):
+                self._check_watchdog(index, int(self._bus.read(index, Register.TIMEOUT)))
+            if all(self._enabled):
+                return
+            # Motors that hold already keep their setpoint, whatever load makes them sag.
+            self._setpoint.reset(np.where(self._enabled, self._setpoint.q, q))
+            self._enable([index for index, on in enumerate(self._enabled) if not on])
+
+    def _recover(self, token: OperatorToken) -> None:
+        self._require_loop()
+        with self._lock:
+            answers = [self._fresh_answer(index) for index in range(len(self._enabled))]
+            for index, motor in enumerate(self._config.motors):
+                status = answers[index].feedback.status
+                if codec.fault(status) is not None:
+                    status = self._bus.command(index, codec.CLEAR_ERROR).status
+                if (code := codec.fault(status)) is not None:
+                    raise _motor_fault(self.name, motor.esc_id, status, code)
+                self._enabled[index] = self._enabled[index] and status == codec.ENABLED
+            self._configure()
+            self._missed.clear()
+            self._trouble = None
+
+    def _fresh_answer(self, index: int) -> Answer:
+        """The loop's newest answer. Waiting for a silent motor here would let the others' timeouts run out."""
+        answer, limit_s = self._answers[index], self._config.max_silence_s
+        if answer is None or (self._clock.now_ns() - answer.t_ns) * 1e-9 > limit_s:
+            raise TransportTimeout(self.name, f"answer of motor {self._config.motors[index].esc_id}", limit_s)
+        return answer
+
+    def _check_ranges(self, index: int) -> None:
+        motor, ranges = self._config.motors[index], self._bus.ranges(index)
+        ends = self._direction[index] * (
+            np.array([self._chain.lower[index], self._chain.upper[index]]) - self._offset[index]
+        )
+        joint = self._chain.joint_names[index]
+        if np.abs(ends).max() > ranges.position_rad:
+            raise ConfigError(
+                f"joint {joint} reaches {np.abs(ends).max():.2f} rad, its motor tells {ranges.position_rad:.2f}",
+                key=f"motors[{index}]",
+            )
+        if self._chain.speed[index] > ranges.velocity_rad_s:
+            raise ConfigError(
+                f"joint {joint} may turn at {self._chain.speed[index]:.2f} rad/s, "
+                f"its motor's full scale is {ranges.velocity_rad_s:.2f}",
+                key=f"motors[{index}]",
+            )
+        push = motor.kp_n_m_rad * float(np.deg2rad(self._config.tracking_error_deg))
+        if push > min(self._chain.torque[index], ranges.torque_n_m):
+            raise ConfigError(
+                f"kp of joint {joint} pushes with {push:.1f} N m before tracking_error_deg trips, more than its torque",
+                key=f"motors[{index}].kp_n_m_rad",
+                value=motor.kp_n_m_rad,
+            )
+
+    def _set_watchdog(self, index: int) -> None:
+        ticks = round(self._config.watchdog_s / codec.TIMEOUT_TICK_S)
+        self._check_watchdog(index, int(self._bus.write(index, Register.TIMEOUT, ticks)))
+        self._bus.timeout_ticks[index] = ticks
+
+    def _check_watchdog(self, index: int, ticks: int) -> None:
+        wanted = round(self._config.watchdog_s / codec.TIMEOUT_TICK_S)
+        if ticks != wanted:
+            raise DeviceFault(
+                self.name,
+                f"motor {self._config.motors[index].esc_id} has a timeout of {ticks * codec.TIMEOUT_TICK_S:g} s, "
+                f"not {self._config.watchdog_s:g} s",
+                vendor_code="TIMEOUT",
+                fault_class=FaultClass.CONFIGURATION,
+                hint="did it lose power? configure again; without the timeout a dead host leaves the arm pushing",
+            )
+
+    def _enable(self, indices: list[int]) -> None:
+        """Enable these motors at the setpoint; if one does not obey, none of them stays enabled."""
+        frames = self._frames(self._setpoint.q, np.zeros_like(self._setpoint.q))
+        try:
+            for index in indices:
+                self._enabled[index] = True
+                self._bus.command(index, codec.ENABLE)
+                # Enabled without gains the motor is limp: give it its setpoint before the next one is enabled.
+                status = self._bus.command(index, frames[index]).status
+                if status != codec.ENABLED:
+                    code = codec.fault(status) or _DOES_NOT_ENABLE
+                    raise _motor_fault(self.name, self._config.motors[index].esc_id, status, code)
+        except DeviceError:
+            self._disable(indices)
+            raise
+
+    def _switch_off(self) -> None:
+        self._disable(range(len(self._enabled)))
+
+    def _disable(self, indices: Sequence[int]) -> None:
+        """Disable these motors as far as they can still be reached."""
+        with self._lock:
+            for index in indices:
+                if not self._enabled[index]:
+                    continue
+                self._enabled[index] = False
+                try:
+                    self._bus.command(index, codec.DISABLE)
+                except DeviceGone:
+                    return
+                except TransportTimeout:
+                    # Its own timeout disables a motor that does not hear us.
+                    continue
+
+    def _cycle(self, now_ns: int, dt_s: float, until_ns: int) -> None:
+        frames: list[bytes | None] = [None] * len(self._enabled)
+        if any(self._enabled):
+            q, dq = self._setpoint.step(now_ns, dt_s)
+            commands = self._frames(q, dq)
+            frames = [command if on else None for command, on in zip(commands, self._enabled, strict=True)]
+        self._take(self._bus.exchange(frames, until_ns))
+
+    def _frames(self, q: Array, dq: Array) -> list[bytes]:
+        strongest = np.minimum(self._chain.torque, [self._bus.ranges(i).torque_n_m for i in range(len(q))])
+        tau = np.clip(self._chain.gravity_torques(q), -strongest, strongest)
+        motor_q = self._direction * (q - self._offset)
+        motor_dq, motor_tau = self._direction * dq, self._direction * tau
+        return [
+            codec.encode_mit(
+                MitCommand(motor_q[i], motor_dq[i], motor.kp_n_m_rad, motor.kd_n_m_s_rad, motor_tau[i]),
+                self._bus.ranges(i),
+            )
+            for i, motor in enumerate(self._config.motors)
+        ]
+
+    def _take(self, answers: list[Answer | None]) -> None:
+        good = [self._plausible(index, answer) for index, answer in enumerate(answers)]
+        for index, answer in enumerate(good):
+            if answer is not None:
+                self._answers[index] = answer
+                self._check_status(index, answer.feedback.status)
+        known = [answer for answer in self._answers if answer is not None]
+        if len(known) == len(good) and all(answer is not None for answer in good):
+            self._publish(known)
+        self._missed.append(any(answer is None for answer in good))
+        self._check_silence()
+        self._check_fences()
+        if self._joints is not None:
+            self._check_tracking(self._joints.value.q, self._setpoint.q)
+
+    def _plausible(self, index: int, answer: Answer | None) -> Answer | None:
+        """The answer, unless the motor cannot have turned that far since the last one."""
+        before = self._answers[index]
+        if answer is None or before is None:
+            return answer
+        elapsed_s = max(answer.t_ns - before.t_ns, 0) * 1e-9
+        reach = self._bus.ranges(index).velocity_rad_s * elapsed_s + _PLAUSIBLE_JUMP_RAD
+        if abs(answer.feedback.q - before.feedback.q) <= reach:
+            return answer
+        self._implausible += 1
+        return None
+
+    def _publish(self, answers: list[Answer]) -> None:
+        told = np.array([(a.feedback.q, a.feedback.dq, a.feedback.tau) for a in answers])
+        state = JointState(
+            self._direction * told[:, 0] + self._offset, self._direction * told[:, 1], self._direction * told[:, 2]
+        )
+        self._seq += 1
+        self._joints = Stamped(state, min(answer.t_ns for answer in answers), self._seq)
+
+    def _check_status(self, index: int, status: int) -> None:
+        esc_id = self._config.motors[index].esc_id
+        code = codec.fault(status)
+        if code is None and self._enabled[index] and status == codec.DISABLED:
+            code = _DISABLED_ITSELF
+        if code is not None:
+            self._enabled[index] = False
+            self._latch(_motor_fault(self.name, esc_id, status, code))
+
+    def _check_silence(self) -> None:
+        now_ns = self._clock.now_ns()
+        limit_s = self._config.max_silence_s
+        for motor, answer in zip(self._config.motors, self._answers, strict=True):
+            if answer is not None and (now_ns - answer.t_ns) * 1e-9 > limit_s:
+                self._latch(TransportTimeout(self.name, f"answer of motor {motor.esc_id}", limit_s))
+        self._check_missed()
+
+    def _check_fences(self) -> None:
+        if self.state in (Lifecycle.READY, Lifecycle.ACTIVE):
+            for index, ticks in enumerate(self._bus.timeout_ticks):
+                if ticks is not None:
+                    self._check_watchdog(index, ticks)
+
+
+def _open_bus(device: str, config: DamiaoCanConfig) -> Any:
+    import can
+
+    try:
+        return can.Bus(interface=config.interface, channel=config.channel, fd=config.fd, **config.bus_options)
+    except (can.CanError, OSError, ValueError) as error:
+        raise ConnectError(
+            device,
+            f"cannot open CAN {config.interface} {config.channel}: {error}",
+            hint="is the interface up? `ip link set can0 up type can bitrate 1000000`",
+        ) from None
+
+
+def _motor_fault(device: str, esc_id: int, status: int, code: codec.StatusCode) -> DeviceFault:
+    return DeviceFault(
+        device,
+        f"motor {esc_id}: {code.name}",
+        vendor_code=status,
+        fault_class=code.fault_class,
+        needs=code.needs,
+        hint=code.hint,
+    )
+
+
+def _build(name: str, config: DamiaoCanConfig, context: DriverContext) -> DamiaoCanArm:
+    return DamiaoCanArm(name, config, context.clock)
+
+
+SPEC = DriverSpec(
+    name="damiao_can",
+    summary="arm of Damiao MIT-mode motors on CAN or CAN FD (OpenArm, YAM, reBot class), over python-can",
+    config=DamiaoCanConfig,
+    capabilities=Capabilities(
+        kind="arm",
+        abilities=frozenset(
+            {"TcpSource", "JointSource", "TwistSink", "Stoppable", "JointGoal", "HealthSource", "NativeWatchdog"}
+        ),
+        state_rate_hz=250.0,
+        min_command_rate_hz=20.0,
+        command_latency_s=0.004,
+        stop_categories=frozenset({int(StopCategory.STOP_AND_HOLD)}),
+        max_watchdog_s=0.4,
+        has_brakes=False,
+        falls_on_power_loss=True,
+    ),
+    build=_build,
+)

@@ -1,0 +1,413 @@
+"""An arm of Damiao motors on an emulated CAN bus: registers, MIT impedance control, in-motor timeout, faults.
+
+Each motor is a second-order system (inertia, viscous friction, the weight of the arm that the chain description gives)
+integrated in steps of 0.5 ms. Inertias are constant and uncoupled: this proves protocol and fault handling, not
+dynamics. Until a motor is first enabled the arm lies on its stand; afterwards a disabled joint sinks against friction.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import math
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import can
+import numpy as np
+
+from touchcell.drivers.core import can_errors
+from touchcell.drivers.damiao import codec
+from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain, Tool
+from touchcell.geometry.types import Array
+from touchcell.testing.emulation.base import CommandOnset, Emulator
+from touchcell.testing.emulation.can_hub import Hub
+
+_STEP_S = 0.5e-3
+_TICK_S = 2e-3
+_GRAVITY_EVERY = 8
+_ROOM_TEMPERATURE_C = 35.0
+_OVER_TEMPERATURE_C = 100.0
+
+MODELS: Mapping[str, codec.Ranges] = {
+    "4310": codec.Ranges(12.5, 30.0, 10.0),
+    "4340": codec.Ranges(12.5, 10.0, 28.0),
+    "8009": codec.Ranges(12.5, 45.0, 54.0),
+}
+"""Full scales as the makers of damiao-motor and i2rt publish them."""
+
+FACTORY_TIMEOUT_TICKS = 8000
+
+
+class Motor:
+    """Registers and status of one motor; its mechanics are integrated by the arm.
+
+    Args:
+        esc_id: id that it listens to.
+        mst_id: id that it answers on.
+        ranges: full scales.
+    """
+
+    def __init__(self, esc_id: int, mst_id: int, ranges: codec.Ranges) -> None:
+        self.esc_id = esc_id
+        self.mst_id = mst_id
+        self.ranges = ranges
+        self.rotor_c = _ROOM_TEMPERATURE_C
+        self.power_up()
+
+    def power_up(self) -> None:
+        """As after switching on: disabled, saved registers."""
+        self.status = codec.DISABLED
+        self.command = codec.MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
+        self.heard_s = -math.inf
+        self.registers: dict[int, float | int] = {
+            codec.Register.MST_ID: self.mst_id,
+            codec.Register.ESC_ID: self.esc_id,
+            codec.Register.TIMEOUT: FACTORY_TIMEOUT_TICKS,
+            codec.Register.CTRL_MODE: codec.MIT_MODE,
+            14: 5017,
+            35: 4,
+            codec.Register.PMAX: self.ranges.position_rad,
+            codec.Register.VMAX: self.ranges.velocity_rad_s,
+            codec.Register.TMAX: self.ranges.torque_n_m,
+        }
+
+    @property
+    def timeout_s(self) -> float:
+        """Longest silence while enabled; 0 is off."""
+        return float(self.registers[codec.Register.TIMEOUT]) * codec.TIMEOUT_TICK_S
+
+
+class DamiaoArm(Emulator):
+    """Emulates an arm; ``q`` of motor i is joint i of the chain, without offset.
+
+    Args:
+        path: of the hub's socket.
+        chain: the arm, for its weight, its mechanical stops and the tool's true position.
+        models: motor model per joint, a key of ``MODELS``.
+        start_deg: angles on the stand.
+        first_id: ``esc_id`` of the first motor; master ids are 0x10 higher.
+        inertia: (n,) kg m^2 at the output shafts.
+        friction: (n,) N m s/rad, which is also what brakes a disabled joint.
+    """
+
+    faults: ClassVar[Mapping[str, str]] = {
+        "pause": "no motor listens or answers",
+        "silent": "this motor (index from 0) neither listens nor answers",
+        "drop": "lose this many answers",
+        "delay": "answers come this many seconds late",
+        "corrupt": "invert every bit of this many answers, as a broken adapter might",
+        "foreign": "this many answers carry another motor's id in their data",
+        "out_of_order": "this many answers are overtaken by the same motor's next one",
+        "unplug": "the adapter vanishes",
+        "bus_off": "the controller goes bus-off and passes nothing",
+        "error_frames": "report this many bus errors",
+        "fault_bits": "[motor index, status nibble]: the motor reports it and lets go",
+        "hot": "[motor index, degrees Celsius] of the winding; at 100 the motor lets go",
+        "push": "[motor index, N m]: somebody pushes that joint",
+        "refuse": "this motor (index from 0) does not enable",
+        "nan": "the full-scale registers read as NaN",
+        "restart": "the motors lose power for a moment",
+        "reset": "everything is as it was when the emulator started",
+    }
+
+    def __init__(
+        self,
+        path: Path,
+        chain: SerialChain,
+        models: list[str],
+        start_deg: list[float],
+        first_id: int = 1,
+        inertia: Array | None = None,
+        friction: Array | None = None,
+    ) -> None:
+        super().__init__()
+        self._chain = chain
+        self._hub = Hub(path, self._on_frame)
+        self.motors = [Motor(first_id + i, first_id + i + 0x10, MODELS[model]) for i, model in enumerate(models)]
+        n = len(self.motors)
+        self._start_q = np.deg2rad(np.array(start_deg, dtype=np.float64))
+        self._inertia = np.geomspace(0.25, 0.02, n) if inertia is None else inertia
+        self._friction = np.geomspace(0.6, 0.1, n) if friction is None else friction
+        self._steps = 0
+        self._start_s = 0.0
+        self._ticker: asyncio.Task[None] | None = None
+        self._under_way: set[asyncio.TimerHandle] = set()
+        self._reset()
+
+    def _reset(self) -> None:
+        for handle in self._under_way:
+            handle.cancel()
+        self._under_way.clear()
+        for motor in self.motors:
+            motor.power_up()
+            motor.rotor_c = _ROOM_TEMPERATURE_C
+        self._q = self._start_q.copy()
+        self._dq = np.zeros_like(self._q)
+        self._tau = np.zeros_like(self._q)
+        self._weight = self._chain.gravity_torques(self._q)
+        self._on_stand = True
+        self._held_back: dict[int, can.Message] = {}
+        self._energising = 0
+        self._commands = 0
+        self._onset = CommandOnset()
+        self._last_command_s: float | None = None
+        self._let_go_position: list[float] | None = None
+
+    async def start(self) -> None:
+        """Open the hub and let time run."""
+        self._start_s = self._now_s()
+        self._hub.open()
+        self._ticker = asyncio.create_task(self._tick())
+
+    async def stop(self) -> None:
+        """Close the hub."""
+        if self._ticker is not None:
+            self._ticker.cancel()
+        self._hub.close()
+
+    def state(self) -> dict[str, Any]:
+        """The truth: angles, tool position, what is energised, what was received."""
+        self._hub.drain()
+        self._integrate()
+        T_base_tcp = self._chain.forward(self._q)
+        return {
+            "q_rad": self._q.tolist(),
+            "dq_rad_s": self._dq.tolist(),
+            "tau_n_m": self._tau.tolist(),
+            "position_m": T_base_tcp[:3, 3].tolist(),
+            "T_base_tcp": T_base_tcp.tolist(),
+            "still": bool((np.abs(self._dq) < 5e-3).all()),
+            "energised": any(motor.status == codec.ENABLED for motor in self.motors),
+            "enabled": sum(motor.status == codec.ENABLED for motor in self.motors),
+            "status": [motor.status for motor in self.motors],
+            "energising": self._energising,
+            "watchdog_s": [motor.timeout_s for motor in self.motors],
+            "kp": [motor.command.kp for motor in self.motors],
+            "target_rad": [motor.command.q for motor in self.motors],
+            "commands": self._commands,
+            "command_onset_ns": self._onset.t_ns,
+            "last_command_age_s": None if self._last_command_s is None else self._now_s() - self._last_command_s,
+            "let_go_position_m": self._let_go_position,
+            "clients": self._hub.client_count,
+            "faults": sorted(self.active),
+        }
+
+    def on_fault(self, fault: str, value: Any) -> None:
+        """Faults that act at once."""
+        if fault == "unplug":
+            self._hub.close()
+        elif fault == "bus_off":
+            self._hub.send(_error_frame(can_errors.BUS_OFF))
+        elif fault == "error_frames":
+            while self.spend(fault):
+                self._hub.send(_error_frame(can_errors.BUS_ERROR))
+        elif fault == "fault_bits":
+            index, status = value
+            self._let_go(self.motors[index], status)
+        elif fault == "hot":
+            index, celsius = value
+            self.motors[index].rotor_c = float(celsius)
+            if celsius >= _OVER_TEMPERATURE_C:
+                self._let_go(self.motors[index], 0xC)
+        elif fault == "restart":
+            for motor in self.motors:
+                motor.power_up()
+            del self.active[fault]
+        elif fault == "reset":
+            for name in list(self.active):
+                self.end(name)
+            self._reset()
+
+    def on_clear(self, fault: str) -> None:
+        """Plug in again; leave bus-off."""
+        if fault == "unplug":
+            self._hub.open()
+        elif fault == "bus_off":
+            self._hub.send(_error_frame(can_errors.RESTARTED))
+
+    def _now_s(self) -> float:
+        return asyncio.get_running_loop().time()
+
+    async def _tick(self) -> None:
+        while True:
+            await asyncio.sleep(_TICK_S)
+            # A late emulator must not take its own lateness for the host's silence.
+            self._hub.drain()
+            self._check_timeouts()
+            self._integrate()
+
+    def _check_timeouts(self) -> None:
+        now_s = self._now_s()
+        for motor in self.motors:
+            overdue = motor.timeout_s > 0.0 and now_s - motor.heard_s > motor.timeout_s
+            if motor.status == codec.ENABLED and overdue:
+                self._let_go(motor, codec.LOST_COMMUNICATION)
+
+    def _let_go(self, motor: Motor, status: int) -> None:
+        if self._let_go_position is None:
+            self._let_go_position = self._chain.forward(self._q)[:3, 3].tolist()
+        motor.status = status
+
+    def _integrate(self) -> None:
+        due = int((self._now_s() - self._start_s) / _STEP_S)
+        if self._on_stand:
+            self._steps = due
+            return
+        enabled = np.array([motor.status == codec.ENABLED for motor in self.motors])
+        commands = [motor.command for motor in self.motors]
+        q_set, dq_set, kp, kd, feed = np.array([[c.q, c.dq, c.kp, c.kd, c.tau] for c in commands]).T
+        strongest = np.array([motor.ranges.torque_n_m for motor in self.motors])
+        lowest, highest = self._chain.lower - 0.05, self._chain.upper + 0.05
+        pushed = np.zeros(len(self.motors))
+        if "push" in self.active:
+            index, pushed_n_m = self.active["push"]
+            pushed[index] = pushed_n_m
+        while self._steps < due:
+            if self._steps % _GRAVITY_EVERY == 0:
+                self._weight = self._chain.gravity_torques(self._q)
+            wanted = kp * (q_set - self._q) + kd * (dq_set - self._dq) + feed
+            self._tau = np.where(enabled, np.clip(wanted, -strongest, strongest), 0.0)
+            acceleration = (self._tau + pushed - self._weight - self._friction * self._dq) / self._inertia
+            self._dq = self._dq + _STEP_S * acceleration
+            self._q = self._q + _STEP_S * self._dq
+            stopped = (self._q < lowest) | (self._q > highest)
+            self._dq = np.where(stopped, 0.0, self._dq)
+            self._q = np.clip(self._q, lowest, highest)
+            self._steps += 1
+
+    def _on_frame(self, message: can.Message) -> None:
+        if "bus_off" in self.active or message.is_error_frame or message.is_extended_id:
+            return
+        if "pause" in self.active or message.is_remote_frame or len(message.data) != 8:
+            return
+        data = bytes(message.data)
+        number = message.arbitration_id
+        parameter = number == codec.PARAMETER_ID
+        if parameter:
+            number = codec.decode_parameter_request(data)[0]
+        for index, motor in enumerate(self.motors):
+            if motor.esc_id == number and self.active.get("silent") != index:
+                self._integrate()
+                motor.heard_s = self._now_s()
+                answer = self._on_parameter(index, data) if parameter else self._on_command(index, data)
+                if answer is not None:
+                    self._reply(index, answer, message)
+
+    def _on_command(self, index: int, data: bytes) -> bytes:
+        motor = self.motors[index]
+        self._last_command_s = self._now_s()
+        self._commands += 1
+        if data[:7] == codec.ENABLE[:7] and data[7] >= codec.CLEAR_ERROR[7]:
+            self._energising += 1
+            self._on_special(index, data)
+        elif motor.status == codec.ENABLED:
+            motor.command = codec.decode_mit(data, motor.ranges)
+            self._onset.note(index, data[:5])
+        return self._feedback(index)
+
+    def _on_special(self, index: int, data: bytes) -> None:
+        motor = self.motors[index]
+        if data == codec.ENABLE and self.active.get("refuse") == index:
+            return
+        if data == codec.ENABLE and motor.status in (codec.DISABLED, codec.ENABLED):
+            motor.status = codec.ENABLED
+            motor.command = codec.MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
+            self._on_stand = False
+        elif data == codec.DISABLE:
+            motor.status = codec.DISABLED if motor.status == codec.ENABLED else motor.status
+        elif data == codec.CLEAR_ERROR and not self._cause_remains(index):
+            motor.status = codec.ENABLED if motor.status == codec.ENABLED else codec.DISABLED
+        elif data == codec.SET_ZERO:
+            self._q[index] = 0.0
+
+    def _cause_remains(self, index: int) -> bool:
+        held = self.active.get("fault_bits", (-1, 0))
+        return bool(held[0] == index or self.motors[index].rotor_c >= _OVER_TEMPERATURE_C)
+
+    def _on_parameter(self, index: int, data: bytes) -> bytes | None:
+        motor = self.motors[index]
+        _, operation, register, raw = codec.decode_parameter_request(data)
+        if operation == 0xCC:
+            return self._feedback(index)
+        if operation == 0xAA:
+            return data[:4] + bytes(4)
+        if operation not in (0x33, 0x55) or register not in motor.registers:
+            return None
+        if operation == 0x55:
+            is_float = isinstance(motor.registers[register], float)
+            motor.registers[register] = struct.unpack("<f" if is_float else "<I", raw)[0]
+            self._energising += register == codec.Register.CTRL_MODE
+        value = motor.registers[register]
+        if "nan" in self.active and isinstance(value, float):
+            value = math.nan
+        return codec.encode_register_reply(motor.esc_id, register, value, write=operation == 0x55)
+
+    def _feedback(self, index: int) -> bytes:
+        motor, ranges = self.motors[index], self.motors[index].ranges
+        shown = codec.Feedback(
+            motor=motor.esc_id & 0xF,
+            status=motor.status,
+            q=_within(self._q[index], ranges.position_rad),
+            dq=_within(self._dq[index], ranges.velocity_rad_s),
+            tau=_within(self._tau[index], ranges.torque_n_m),
+            mos_c=33,
+            rotor_c=round(motor.rotor_c),
+        )
+        return codec.encode_feedback(shown, ranges)
+
+    def _reply(self, index: int, data: bytes, request: can.Message) -> None:
+        if self.spend("drop"):
+            return
+        if self.spend("corrupt"):
+            data = bytes(byte ^ 0xFF for byte in data)
+        elif self.spend("foreign"):
+            data = bytes([data[0] & 0xF0 | (data[0] + 1) & 0xF]) + data[1:]
+        answer = can.Message(
+            arbitration_id=self.motors[index].mst_id,
+            is_extended_id=False,
+            data=data,
+            is_fd=request.is_fd,
+            bitrate_switch=request.bitrate_switch,
+        )
+        delay_s = float(self.active.get("delay", 0.0))
+        if index not in self._held_back and self.spend("out_of_order"):
+            self._held_back[index] = answer
+            return
+        overtaken = self._held_back.pop(index, None)
+        for message in (answer, overtaken):
+            if message is not None and delay_s > 0.0:
+                self._under_way.add(asyncio.get_running_loop().call_later(delay_s, self._hub.send, message))
+            elif message is not None:
+                self._hub.send(message)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Command line of ``touchcell emulate damiao``."""
+    parser.add_argument("path", type=Path, help="socket of the hub; clients use it as python-can channel")
+    parser.add_argument("--chain", default="generic_6r", help="shipped chain description, or a YAML file")
+    parser.add_argument("--tool", help='tool as JSON, e.g. \'{"origin_mm": [0, 0, 80], "mass_kg": 0.2}\'')
+    parser.add_argument("--models", nargs="+", choices=sorted(MODELS), help="motor model per joint")
+    parser.add_argument("--start-deg", type=float, nargs="+", default=[0.0, 40.0, 90.0, 0.0, 50.0, 0.0])
+    parser.add_argument("--first-id", type=int, default=1)
+
+
+def build(arguments: argparse.Namespace) -> DamiaoArm:
+    """Make the emulator from its command line."""
+    is_file = Path(arguments.chain).suffix == ".yaml"
+    read = ChainDescription.read(Path(arguments.chain)) if is_file else ChainDescription.shipped(arguments.chain)
+    tool = Tool.model_validate_json(arguments.tool) if arguments.tool else None
+    chain = SerialChain(read, tool)
+    n = chain.joint_count
+    models = arguments.models or ["4340"] * min(3, n) + ["4310"] * max(0, n - 3)
+    return DamiaoArm(arguments.path, chain, models, arguments.start_deg, arguments.first_id)
+
+
+def _within(value: float, limit: float) -> float:
+    return min(max(float(value), -limit), limit)
+
+
+def _error_frame(error_class: int) -> can.Message:
+    return can.Message(arbitration_id=error_class, is_error_frame=True, is_extended_id=False, dlc=8, data=bytes(8))

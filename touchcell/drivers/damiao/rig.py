@@ -1,0 +1,72 @@
+"""The ``damiao_can`` driver on six emulated motors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from touchcell.drivers.damiao import driver as damiao_can
+from touchcell.testing.emulation.process import EmulatorProcess
+from touchcell.testing.emulation.rig import Rig
+
+PARK_DEG = (0.0, -60.0, 130.0, 0.0, 20.0, 0.0)
+TOOL = {"origin_mm": [0, 0, 80], "mass_kg": 0.15, "com_mm": [0, 0, 40]}
+
+
+def config(channel: Path, **changes: object) -> damiao_can.DamiaoCanConfig:
+    """Six motors on the hub at ``channel``; slow and patient enough for a busy machine."""
+    stiff = [90.0, 90.0, 90.0, 40.0, 40.0, 30.0]
+    motors = [
+        {"esc_id": i + 1, "mst_id": i + 0x11, "kp_n_m_rad": kp, "kd_n_m_s_rad": 3.0 if i < 3 else 1.5}
+        for i, kp in enumerate(stiff)
+    ]
+    settings: dict[str, object] = {
+        "interface": "touchcell_hub",
+        "channel": str(channel),
+        "motors": motors,
+        "tool": TOOL,
+        "park_deg": PARK_DEG,
+        "rate_hz": 125.0,
+        "watchdog_s": 0.35,
+        "max_silence_s": 0.5,
+        "max_missed_fraction": 0.9,
+    }
+    return damiao_can.DamiaoCanConfig.model_validate(settings | changes)
+
+
+def rig(folder: Path, address: int) -> Rig:
+    """One arm on a hub of its own in ``folder``; ``address`` tells several apart."""
+    channel = folder / f"can-{address}"
+
+    def start() -> EmulatorProcess:
+        tool = config(channel).tool.model_dump_json()
+        return EmulatorProcess("damiao", str(channel), "--tool", tool).start()
+
+    return Rig(
+        spec=damiao_can.SPEC,
+        start=start,
+        build=lambda clock: damiao_can.DamiaoCanArm("arm", config(channel), clock),
+        config=config(channel),
+        state_rate_hz=125.0,
+        pose="T_base_tcp",
+        reset="reset",
+        faults={
+            "drop": (3, "transient"),
+            "corrupt": (3, "transient"),
+            "foreign": (3, "transient"),
+            "out_of_order": (3, "transient"),
+            "error_frames": (3, "transient"),
+            "delay": (1.0, "fault"),
+            "pause": (True, "fault"),
+            "silent": (2, "fault"),
+            "fault_bits": ([1, 0xA], "fault"),
+            "hot": ([4, 110], "fault"),
+            "bus_off": (True, "fault"),
+            "restart": (True, "fault"),
+            "unplug": (True, "fault"),
+        },
+        notes=(
+            "a motor that loses communication lets go; that its windings then brake is not assumed",
+            "any frame to a motor, also a request for its state, feeds its timeout",
+            "registers can be read while a motor is enabled",
+        ),
+    )

@@ -1,0 +1,264 @@
+"""Requests to Feetech servos and their answers, over a half-duplex serial line.
+
+Servos speak only when asked, so one thread at a time owns the line and no receive thread is needed. An answer carries
+neither time nor number. It is stamped with the moment at which it was asked for, so its age is never understated, and
+the requests for states ask for blocks of sixteen lengths in turn: an answer that comes cycles too late has the wrong
+length and is counted as late instead of being taken for a fresh one.
+"""
+
+from __future__ import annotations
+
+import select
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.errors import CodecError, ConnectError, CorruptMessage, DeviceGone, TransportTimeout
+from touchcell.drivers.feetech import codec
+from touchcell.drivers.feetech.codec import Identity, Packet, Register, ServoState
+
+_TRIES = 3
+_ANSWER_TIMEOUT_S = 0.1
+_QUIET_S = 0.01
+_LONGEST_NOISE_S = 0.2
+_READ_SIZE = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A servo's state, and when it was asked for (its age is at most the time since)."""
+
+    state: ServoState
+    t_ns: int
+
+
+@dataclass(slots=True)
+class Counters:
+    """What has been seen on the line since it was opened."""
+
+    sent: int = 0
+    answered: int = 0
+    missed: int = 0
+    corrupt: int = 0
+    late: int = 0
+    unexpected: int = 0
+    not_sent: int = 0
+
+    def as_dict(self) -> dict[str, int]:
+        """By name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+class ServoBus:
+    """The servos of one arm on one line. Every public call takes the line for itself while it lasts.
+
+    Args:
+        device: name for errors.
+        ids: the servos, in the order of the joints.
+        connect: opens the pyserial port, non-blocking.
+        clock: injected time.
+        echo: whether the adapter hears what it sends.
+
+    Attributes:
+        counters: messages seen and lost.
+    """
+
+    def __init__(
+        self, device: str, ids: Sequence[int], connect: Callable[[], Any], clock: Clock, *, echo: bool = False
+    ) -> None:
+        self._device = device
+        self._ids = tuple(ids)
+        self._connect = connect
+        self._clock = clock
+        self._echo = echo
+        self._port: Any = None
+        self._buffer = b""
+        self._lock = threading.RLock()
+        self._turn = 0
+        self._identities: dict[int, Identity] = {}
+        self.counters = Counters()
+
+    def open(self) -> None:
+        """Open the port and ask every servo who it is; changes nothing in them.
+
+        Raises:
+            ConnectError: no port, or servos that do not answer; ``causes`` names each.
+        """
+        self._port = self._connect()
+        self._buffer = b""
+        self._identities = {}
+        self.counters = Counters()
+        causes: list[Exception] = []
+        for servo in self._ids:
+            try:
+                data = self.read(servo, Register.FIRMWARE, codec.IDENTITY_LENGTH)
+                self._identities[servo] = codec.decode_identity(data)
+            except (TransportTimeout, CodecError) as error:
+                causes.append(error)
+        if causes:
+            raise ConnectError(
+                self._device, "servos are missing", causes, hint="is the arm powered, and are ids and baud rate right?"
+            )
+
+    def close(self) -> None:
+        """Leave the line; without effect on one that was never opened."""
+        with self._lock:
+            if self._port is not None:
+                self._port.close()
+                self._port = None
+
+    def identity(self, servo: int) -> Identity:
+        """What the servo told when the line was opened."""
+        return self._identities[servo]
+
+    def read(self, servo: int, register: int, length: int) -> bytes:
+        """Registers of one servo. Raises TransportTimeout, DeviceGone, ConnectError for an unexpected echo."""
+        return self._ask(servo, codec.read(servo, register, length), length)
+
+    def write(self, servo: int, register: int, data: bytes) -> None:
+        """Write to one servo and see in its registers that it was done.
+
+        Raises:
+            TransportTimeout: it does not answer.
+            CorruptMessage: its registers say otherwise.
+            DeviceGone: the adapter has gone.
+        """
+        with self._lock:
+            self._ask(servo, codec.write(servo, register, data), 0)
+            if (found := self.read(servo, register, len(data))) != data:
+                raise CorruptMessage(
+                    self._device, f"servo {servo} has {found.hex(' ')} in register {register}, not {data.hex(' ')}"
+                )
+
+    def write_goals(self, goals: Mapping[int, tuple[int, int]]) -> None:
+        """Send each servo its goal in ticks and its speed there in its own unit; none answers."""
+        data = {servo: codec.goal(ticks, speed) for servo, (ticks, speed) in goals.items()}
+        with self._lock:
+            self._send(codec.sync_write(Register.GOAL_POSITION, data))
+
+    def read_states(self, until_ns: int) -> list[Answer | None]:
+        """Ask all servos for their state; returns when all have answered, and at ``until_ns`` at the latest.
+
+        Raises:
+            DeviceGone: the adapter has gone.
+        """
+        with self._lock:
+            self._turn = (self._turn + 1) % len(codec.STATE_STARTS)
+            start = codec.STATE_STARTS[self._turn]
+            length = codec.state_length(start)
+            self._drain()
+            asked_ns = self._clock.now_ns()
+            answers: dict[int, Answer] = {}
+            if self._send(codec.sync_read(self._ids, start, length)):
+                while len(answers) < len(self._ids):
+                    packets = self._receive(until_ns, codec.state_length(codec.STATE_STARTS[0]))
+                    if packets is None:
+                        break
+                    for packet in packets:
+                        self._take_state(packet, length, asked_ns, answers)
+            self.counters.answered += len(answers)
+            self.counters.missed += len(self._ids) - len(answers)
+            return [answers.get(servo) for servo in self._ids]
+
+    def _take_state(self, packet: Packet, length: int, asked_ns: int, answers: dict[int, Answer]) -> None:
+        if packet.servo in self._ids and len(packet.data) != length:
+            self.counters.late += 1
+            return
+        if packet.servo not in self._ids or packet.servo in answers:
+            self.counters.unexpected += 1
+            return
+        try:
+            answers[packet.servo] = Answer(codec.decode_state(packet.data), asked_ns)
+        except CodecError:
+            self.counters.corrupt += 1
+
+    def _ask(self, servo: int, request: bytes, length: int) -> bytes:
+        with self._lock:
+            self._drain()
+            for _ in range(_TRIES):
+                if not self._send(request):
+                    continue
+                until_ns = self._clock.now_ns() + round(_ANSWER_TIMEOUT_S * 1e9)
+                while (packets := self._receive(until_ns, codec.IDENTITY_LENGTH)) is not None:
+                    for packet in packets:
+                        if codec.encode(packet) == request:
+                            raise ConnectError(
+                                self._device, "the adapter hears what it sends", hint="set echo: true in the cell file"
+                            )
+                        if packet.servo == servo and len(packet.data) == length:
+                            return packet.data
+                        self.counters.unexpected += 1
+                self._await_quiet()
+            raise TransportTimeout(self._device, f"answer of servo {servo}", _ANSWER_TIMEOUT_S)
+
+    def _drain(self) -> None:
+        """Forget what came since the last answer that was waited for."""
+        found = codec.split(self._buffer + self._read(0.0))
+        self.counters.late += len(found.packets)
+        self.counters.corrupt += found.damaged + bool(found.rest)
+        self._buffer = b""
+
+    def _await_quiet(self) -> None:
+        """Wait until nobody speaks, so that the next answer belongs to the next request."""
+        deadline_ns = self._clock.now_ns() + round(_LONGEST_NOISE_S * 1e9)
+        self._drain()
+        while self._clock.now_ns() < deadline_ns and (late := self._read(_QUIET_S)):
+            self._buffer = late
+            self._drain()
+
+    def _send(self, data: bytes) -> bool:
+        """Whether it went out (and came back, where the adapter echoes)."""
+        import serial
+
+        try:
+            self._port.write(data)
+        except serial.SerialTimeoutException:
+            self.counters.not_sent += 1
+            return False
+        except (serial.SerialException, OSError) as error:
+            raise self._gone(error) from None
+        self.counters.sent += 1
+        return self._skip_echo(data) if self._echo else True
+
+    def _skip_echo(self, data: bytes) -> bool:
+        until_ns = self._clock.now_ns() + round(_ANSWER_TIMEOUT_S * 1e9)
+        while len(self._buffer) < len(data):
+            heard = self._read((until_ns - self._clock.now_ns()) * 1e-9)
+            if not heard:
+                break
+            self._buffer += heard
+        if self._buffer.startswith(data):
+            self._buffer = self._buffer[len(data) :]
+            return True
+        # Somebody else spoke at the same time, or the echo is damaged: so was perhaps what the servos heard.
+        self.counters.corrupt += 1
+        self._buffer = b""
+        return False
+
+    def _receive(self, until_ns: int, longest: int) -> tuple[Packet, ...] | None:
+        """The packets that are there, maybe none yet; None when nothing more came in time."""
+        if not self._buffer or not (found := codec.split(self._buffer, longest)).packets:
+            heard = self._read(max(until_ns - self._clock.now_ns(), 0) * 1e-9)
+            if not heard:
+                return None
+            self._buffer += heard
+            found = codec.split(self._buffer, longest)
+        self._buffer = found.rest
+        self.counters.corrupt += found.damaged
+        return found.packets
+
+    def _read(self, timeout_s: float) -> bytes:
+        import serial
+
+        try:
+            ready, _, _ = select.select([self._port], [], [], max(timeout_s, 0.0))
+            return bytes(self._port.read(_READ_SIZE)) if ready else b""
+        except (serial.SerialException, OSError, ValueError) as error:
+            raise self._gone(error) from None
+
+    def _gone(self, error: Exception) -> DeviceGone:
+        return DeviceGone(
+            self._device, f"the serial port has gone: {error}", hint="check the adapter, then connect again"
+        )

@@ -1,0 +1,75 @@
+"""The ``feetech_serial`` driver on five emulated servos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from touchcell.drivers.feetech import driver as feetech_serial
+from touchcell.testing.emulation.process import EmulatorProcess
+from touchcell.testing.emulation.rig import Rig
+
+PARK_DEG = (0.0, -60.0, 140.0, 60.0, 0.0)
+TOOL = {"origin_mm": [0, 0, 40]}
+ZERO_TICKS = (2048, 2100, 1250, 1990, 2048)
+DIRECTION = (1, -1, 1, 1, -1)
+
+
+def config(port: Path, **changes: object) -> feetech_serial.FeetechSerialConfig:
+    """Five servos at ``port``; slow and patient enough for a busy machine."""
+    servos = [
+        {"id": number, "zero_ticks": zero, "direction": direction}
+        for number, (zero, direction) in enumerate(zip(ZERO_TICKS, DIRECTION, strict=True), start=1)
+    ]
+    settings: dict[str, object] = {
+        "port": str(port),
+        "servos": servos,
+        "tool": TOOL,
+        "park_deg": PARK_DEG,
+        "rate_hz": 40.0,
+        "max_silence_s": 0.4,
+    }
+    return feetech_serial.FeetechSerialConfig.model_validate(settings | changes)
+
+
+def emulator(port: Path, *arguments: str) -> EmulatorProcess:
+    """The servos that ``config`` describes, not yet started."""
+    return EmulatorProcess(
+        "feetech",
+        *("--link", str(port), "--tool", config(port).tool.model_dump_json()),
+        *("--zero-ticks", *map(str, ZERO_TICKS), "--direction", *map(str, DIRECTION)),
+        *arguments,
+    )
+
+
+def rig(folder: Path, address: int) -> Rig:
+    """One arm on a pseudo-terminal of its own, linked in ``folder``; ``address`` tells several apart."""
+    port = folder / f"servos-{address}"
+    return Rig(
+        spec=feetech_serial.SPEC,
+        start=lambda: emulator(port).start(),
+        build=lambda clock: feetech_serial.FeetechSerialArm("arm", config(port), clock),
+        config=config(port),
+        pose="T_base_tcp",
+        reset="reset",
+        state_rate_hz=40.0,
+        faults={
+            "drop": (3, "transient"),
+            "corrupt": (3, "transient"),
+            "short": (3, "transient"),
+            "wild": (3, "transient"),
+            "jump": (3, "transient"),
+            "foreign": (3, "transient"),
+            "out_of_order": (3, "transient"),
+            "delay": (0.6, "fault"),
+            "pause": (True, "fault"),
+            "silent": (2, "fault"),
+            "fault_bits": ([1, 0x20], "fault"),
+            "restart": (True, "fault"),
+            "unplug": (True, "fault"),
+        },
+        notes=(
+            "an overloaded servo reports it until its torque is switched off",
+            "a servo that loses power for a moment comes back without torque and with the factory's limits",
+            "reading further registers in the same sync read does no harm",
+        ),
+    )

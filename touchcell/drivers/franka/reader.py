@@ -1,0 +1,210 @@
+"""Reads a Franka arm in a thread of its own.
+
+franky's ``state`` waits for the next packet while the arm rests, for a whole second if the arm is frozen; nobody who
+controls a second arm can wait for that. And a motion that dies while nobody asks is silent: the thread asks.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.errors import CorruptMessage, DeviceError, DeviceGone
+from touchcell.drivers.franka.errors import BY_NAME
+from touchcell.geometry.types import Array
+
+PERIOD_S = 0.002
+_BAD_IN_A_ROW = 50
+_JOIN_S = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What one state packet says, in SI units along base axes.
+
+    Attributes:
+        t_ns: start of the read before the one that found it: it cannot have come earlier, so no age is understated.
+        device_ms: the controller's own time.
+        T_base_tcp: (4, 4).
+        twist: (6,) of the tool centre point, from measured joint velocities.
+        q, dq, tau: joints (7,).
+        wrench: (6,) what the world exerts on the tool centre point.
+        mode: franky's name of the robot mode.
+        errors: names of the errors that are present.
+        last_errors: names of those that ended the last motion.
+        success_rate: share of the last 100 command packets that arrived in time.
+    """
+
+    t_ns: int
+    device_ms: int
+    T_base_tcp: Array
+    twist: Array
+    q: Array
+    dq: Array
+    tau: Array
+    wrench: Array
+    mode: str
+    errors: tuple[str, ...]
+    last_errors: tuple[str, ...]
+    success_rate: float
+
+    def is_finite(self) -> bool:
+        """Whether every number is one."""
+        arrays = (self.T_base_tcp, self.twist, self.q, self.dq, self.tau, self.wrench)
+        return all(bool(np.isfinite(array).all()) for array in arrays)
+
+
+class StateReader:
+    """Keeps the newest good reading and whatever went wrong.
+
+    Args:
+        device: name for errors.
+        franky: the vendor's module.
+        robot: franky's robot, connected.
+        clock: injected time.
+    """
+
+    def __init__(self, device: str, franky: Any, robot: Any, clock: Clock) -> None:
+        self._device = device
+        self._franky = franky
+        self._robot = robot
+        self._clock = clock
+        self._newest: Reading | None = None
+        self._failure: DeviceError | None = None
+        self._aborted: str | None = None
+        self._in_motion = False
+        self._looked_ns = 0
+        self._bad = 0
+        self._bad_in_a_row = 0
+        self._states = 0
+        self._device_ms = -1
+        self._read_ns = clock.now_ns()
+        self._halt = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"{device} reader", daemon=True)
+
+    @property
+    def newest(self) -> Reading | None:
+        """Newest reading whose numbers are all finite."""
+        return self._newest
+
+    @property
+    def failure(self) -> DeviceError | None:
+        """Why the thread has ended, if it has."""
+        return self._failure
+
+    @property
+    def aborted(self) -> str | None:
+        """What franky said when a motion died, until ``forget``."""
+        return self._aborted
+
+    @property
+    def in_motion(self) -> bool:
+        """Whether a motion was running when it last looked."""
+        return self._in_motion
+
+    @property
+    def looked_ns(self) -> int:
+        """When it last looked whether a motion was running."""
+        return self._looked_ns
+
+    @property
+    def bad(self) -> int:
+        """States that were not readable or not finite."""
+        return self._bad
+
+    @property
+    def states(self) -> int:
+        """Different states seen."""
+        return self._states
+
+    def start(self) -> None:
+        """Begin to read."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread, wait for it and let go of the robot, which disconnects when nobody holds it."""
+        self._halt.set()
+        if self._thread.is_alive():
+            self._thread.join(_JOIN_S)
+        self._robot = None
+
+    def forget(self) -> None:
+        """Forget a motion that died."""
+        self._aborted = None
+
+    def _run(self) -> None:
+        try:
+            while not self._halt.is_set():
+                self._read()
+                self._halt.wait(PERIOD_S)
+        except DeviceError as error:
+            self._failure = error
+        except Exception as error:
+            self._failure = DeviceGone(
+                self._device, f"reading has ended: {error!r}", hint="disconnect and connect again"
+            )
+
+    def _read(self) -> None:
+        last_ns, self._read_ns = self._read_ns, self._clock.now_ns()
+        franky = self._franky
+        said = None
+        try:
+            self._robot.poll_motion()
+        except (franky.ControlException, franky.CommandException, franky.ProtocolException) as error:
+            said = str(error)
+        looked_ns = self._clock.now_ns()
+        self._in_motion = self._robot.is_in_control
+        self._looked_ns = looked_ns
+        try:
+            self._take(self._robot.state, last_ns)
+        except franky.ProtocolException as error:
+            self._count_bad(str(error))
+        # Only now, so that the newest reading tells why the motion died.
+        if said is not None:
+            self._aborted = said
+
+    def _take(self, state: Any, t_ns: int) -> None:
+        device_ms = state.time.to_msec()
+        if device_ms == self._device_ms:
+            return
+        self._device_ms = device_ms
+        self._states += 1
+        reading = self._convert(state, t_ns, device_ms)
+        if not reading.is_finite():
+            self._count_bad("state with numbers that are not finite")
+            return
+        self._bad_in_a_row = 0
+        self._newest = reading
+
+    def _convert(self, state: Any, t_ns: int, device_ms: int) -> Reading:
+        dq = np.asarray(state.dq)
+        J = self._robot.model.zero_jacobian(self._franky.Frame.EndEffector, state)
+        return Reading(
+            t_ns=t_ns,
+            device_ms=device_ms,
+            T_base_tcp=np.asarray(state.O_T_EE.matrix),
+            twist=np.asarray(J @ dq),
+            q=np.asarray(state.q),
+            dq=dq,
+            tau=np.asarray(state.tau_J),
+            # Franka counts what the arm exerts on the world as positive.
+            wrench=-np.asarray(state.O_F_ext_hat_K),
+            mode=state.robot_mode.name,
+            errors=_present(state.current_errors),
+            last_errors=_present(state.last_motion_errors),
+            success_rate=float(state.control_command_success_rate),
+        )
+
+    def _count_bad(self, what: str) -> None:
+        self._bad += 1
+        self._bad_in_a_row += 1
+        if self._bad_in_a_row >= _BAD_IN_A_ROW:
+            raise CorruptMessage(self._device, f"{_BAD_IN_A_ROW} bad states in a row, the last: {what}")
+
+
+def _present(errors: Any) -> tuple[str, ...]:
+    return tuple(name for name in BY_NAME if getattr(errors, name))

@@ -1,0 +1,53 @@
+"""The Franka driver beside an emulated controller."""
+
+from __future__ import annotations
+
+from ipaddress import IPv4Address
+from pathlib import Path
+
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.franka.driver import SPEC, FrankaArm, FrankaConfig
+from touchcell.testing.emulation.process import EmulatorProcess
+from touchcell.testing.emulation.rig import Rig
+
+
+def host_of(address: int) -> str:
+    """The loopback address of emulator ``address``: libfranka's port is fixed, so each needs its own."""
+    return str(IPv4Address("127.96.0.1") + address)
+
+
+def rig(folder: Path, address: int) -> Rig:
+    """An arm at a loopback address of its own; it keeps nothing in ``folder``."""
+    host = host_of(address)
+    # Emulators run where no real-time kernel is.
+    config = FrankaConfig(host=host, enforce_realtime=False)
+
+    def start() -> EmulatorProcess:
+        return EmulatorProcess("franka", "--host", host).start()
+
+    def build(clock: Clock) -> FrankaArm:
+        return FrankaArm("arm", config, clock)
+
+    return Rig(
+        spec=SPEC,
+        start=start,
+        build=build,
+        config=config,
+        time="t_s",
+        pose="T_base_ee",
+        faults={
+            "drop_states": (5, "unseen"),
+            "out_of_order": (5, "unseen"),
+            "nan": (3, "transient"),
+            "pause": (True, "fault"),
+            "unplug": (True, "fault"),
+            "restart": (True, "fault"),
+            "reflex": ("cartesian_reflex", "fault"),
+            "user_stop": (True, "fault"),
+        },
+        notes=(
+            "reflex thresholds, modes and recovery are as Franka documents them; a real arm brakes, this one stops",
+            "a state packet cut short is counted while the arm rests, but ends a motion: libfranka gives up",
+            "20 lost command packets stop the arm, as Franka documents it",
+        ),
+    )

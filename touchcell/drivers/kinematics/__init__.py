@@ -1,0 +1,1 @@
+"""Kinematics of serial arms: chains, inverse kinematics and joint limits."""

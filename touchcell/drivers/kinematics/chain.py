@@ -1,0 +1,422 @@
+"""Kinematics of serial arms whose makers give none: forward, differential inverse, and the torques of gravity.
+
+A chain is described in YAML (``touchcell/drivers/kinematics/chains``): per joint its placement in the link before it,
+its axis, its limits, and the mass and centre of mass of the link that it moves. All joints turn (no slides). Numpy
+only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Self
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from touchcell.drivers.core.commands import Adjustment
+from touchcell.drivers.core.errors import ConfigError, DeviceFault, FaultClass, Remedy
+from touchcell.drivers.kinematics.joint_limits import (
+    IkSettings,
+    off_singularity,
+    speed_bounds,
+    within_acceleration,
+    within_bounds,
+)
+from touchcell.geometry import se3
+from touchcell.geometry.errors import GeometryError
+from touchcell.geometry.types import Array
+
+Vector3 = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+
+GRAVITY_M_S2 = (0.0, 0.0, -9.80665)
+"""Standard gravity (ISO 80000-3) along the axes of a base that stands upright."""
+
+
+class _Description(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Placement(_Description):
+    """Pose of a frame in the one before it; the angles are extrinsic xyz, R = Rz Ry Rx."""
+
+    origin_mm: Vector3 = (0.0, 0.0, 0.0)
+    rotation_deg: Vector3 = (0.0, 0.0, 0.0)
+
+    def pose(self) -> Array:
+        """As a (4, 4) pose."""
+        T = np.eye(4)
+        for axis, angle_deg in zip(np.eye(3), self.rotation_deg, strict=True):
+            T[:3, :3] = _rotation(axis, np.deg2rad(angle_deg)) @ T[:3, :3]
+        T[:3, 3] = np.array(self.origin_mm) * 1e-3
+        return T
+
+
+class CapsuleShape(_Description):
+    """A part of a link as a capsule: all that lies within a radius of a segment, in the frame that it is fixed to."""
+
+    from_mm: Vector3
+    to_mm: Vector3
+    radius_mm: Positive
+
+
+class Joint(Placement):
+    """A revolute joint and the link that it moves.
+
+    The joint frame sits at ``origin_mm`` and ``rotation_deg`` in the link before it when the joint is at zero;
+    ``axis``, ``com_mm`` and ``capsules`` are given in the joint frame.
+    """
+
+    name: str
+    axis: Vector3 = (0.0, 0.0, 1.0)
+    lower_deg: float
+    upper_deg: float
+    speed_deg_s: Positive
+    accel_deg_s2: Positive = 400.0
+    torque_n_m: Positive
+    mass_kg: NotNegative = 0.0
+    com_mm: Vector3 = (0.0, 0.0, 0.0)
+    capsules: tuple[CapsuleShape, ...] = ()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.lower_deg >= self.upper_deg:
+            raise ValueError(f"joint {self.name!r}: lower_deg {self.lower_deg} is not below upper_deg {self.upper_deg}")
+        if not np.linalg.norm(self.axis) > 0.0:
+            raise ValueError(f"joint {self.name!r}: axis has no length")
+        return self
+
+
+class Tool(Placement):
+    """What is screwed to the flange: pose of the tool centre point, and mass and centre of mass in the flange frame."""
+
+    mass_kg: NotNegative = 0.0
+    com_mm: Vector3 = (0.0, 0.0, 0.0)
+
+
+class ChainDescription(_Description):
+    """A serial arm, base to flange; ``base_capsules`` are in the base frame."""
+
+    name: str
+    base_capsules: tuple[CapsuleShape, ...] = ()
+    joints: tuple[Joint, ...] = Field(min_length=1)
+    flange: Placement = Placement()
+
+    @classmethod
+    def read(cls, path: Path) -> ChainDescription:
+        """Read a YAML file. Raises ConfigError with the file and what is wrong in it."""
+        try:
+            return cls.model_validate(yaml.safe_load(path.read_text()))
+        except (OSError, yaml.YAMLError, ValidationError) as error:
+            raise ConfigError(f"is no chain description: {error}", file=str(path)) from None
+
+    @classmethod
+    def shipped(cls, name: str) -> ChainDescription:
+        """One of the descriptions that come with touchcell. Raises ConfigError for an unknown name."""
+        folder = Path(str(files("drivers") / "chains"))
+        known = sorted(path.stem for path in folder.glob("*.yaml"))
+        if name not in known:
+            raise ConfigError(f"unknown chain {name!r}", key="chain", value=name, hint=f"known: {', '.join(known)}")
+        return cls.read(folder / f"{name}.yaml")
+
+    @classmethod
+    def named(cls, chain: str) -> ChainDescription:
+        """A YAML file, or one that ships, as a cell file says it. Raises ConfigError."""
+        return cls.read(Path(chain)) if Path(chain).suffix in (".yaml", ".yml") else cls.shipped(chain)
+
+    def narrowed(self, ranges_deg: Array) -> ChainDescription:
+        """The same arm with each joint's range narrowed to ``ranges_deg`` (n, 2), lower and upper."""
+        joints = [
+            joint.model_copy(
+                update={
+                    "lower_deg": max(joint.lower_deg, float(lower)),
+                    "upper_deg": min(joint.upper_deg, float(upper)),
+                }
+            )
+            for joint, (lower, upper) in zip(self.joints, ranges_deg, strict=True)
+        ]
+        return self.model_copy(update={"joints": tuple(joints)})
+
+
+class SerialChain:
+    """Kinematics of one described arm with one tool.
+
+    Args:
+        description: the arm.
+        tool: what its flange carries; without one the tool centre point is the flange.
+        gravity_m_s2: (3,) along base axes, for arms that hang or stand on a wall.
+
+    Attributes:
+        description, tool: the arm, and what its flange carries.
+        joint_names, lower, upper, speed, accel, torque: (n,) per joint, rad, rad, rad/s, rad/s2, N m.
+    """
+
+    def __init__(
+        self, description: ChainDescription, tool: Tool | None = None, gravity_m_s2: Vector3 = GRAVITY_M_S2
+    ) -> None:
+        self.description = description
+        joints = description.joints
+        self.tool = tool = tool or Tool()
+        self.joint_names = tuple(joint.name for joint in joints)
+        self.lower = np.deg2rad([joint.lower_deg for joint in joints])
+        self.upper = np.deg2rad([joint.upper_deg for joint in joints])
+        self.speed = np.deg2rad([joint.speed_deg_s for joint in joints])
+        self.accel = np.deg2rad([joint.accel_deg_s2 for joint in joints])
+        self.torque = np.array([joint.torque_n_m for joint in joints])
+        self._axes = np.array([np.array(joint.axis) / np.linalg.norm(joint.axis) for joint in joints])
+        # Rodrigues' formula, split to place all joints at once: T(q) = fixed + sin q * sine + (1 - cos q) * cosine.
+        self._fixed = np.array([joint.pose() for joint in joints])
+        skew = np.zeros((len(joints), 4, 4))
+        skew[:, :3, :3] = [_skew(axis) for axis in self._axes]
+        self._sine = self._fixed @ skew
+        self._cosine = self._sine @ skew
+        T_joint_flange = description.flange.pose()
+        self._T_joint_tcp = T_joint_flange @ tool.pose()
+        self._mass, self._com = _links(joints, T_joint_flange, tool)
+        self._gravity = np.array(gravity_m_s2)
+
+    @property
+    def joint_count(self) -> int:
+        """Number of joints n."""
+        return len(self.joint_names)
+
+    def forward(self, q: Array) -> Array:
+        """Pose ``T_base_tcp`` (4, 4) at joint angles ``q`` (n,) rad. Raises GeometryError for a wrong shape or NaN."""
+        return self._place(q)[1]
+
+    def link_poses(self, q: Array) -> Array:
+        """Poses (n, 4, 4) of the joint frames along base axes, each turned by its joint. Raises GeometryError."""
+        return self._place(q)[0]
+
+    def jacobian(self, q: Array) -> Array:
+        """Geometric Jacobian (6, n): [v, w] of the tool centre point along base axes per joint velocity."""
+        return self.forward_and_jacobian(q)[1]
+
+    def forward_and_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """Both at once, for control loops."""
+        T_base_joint, T_base_tcp = self._place(q)
+        axes = self._axes_in_base(T_base_joint)
+        J = np.empty((6, len(axes)))
+        J[:3] = _cross(axes, T_base_tcp[:3, 3] - T_base_joint[:, :3, 3]).T
+        J[3:] = axes.T
+        return T_base_tcp, J
+
+    def gravity_torques(self, q: Array) -> Array:
+        """Motor torques (n,) N m that hold the arm and its tool still at ``q``."""
+        T_base_joint, _ = self._place(q)
+        origins = T_base_joint[:, :3, 3]
+        moments = self._mass[:, None] * (np.einsum("nij,nj->ni", T_base_joint[:, :3, :3], self._com) + origins)
+        # Joint i carries every link from i outwards.
+        carried_mass = np.cumsum(self._mass[::-1])[::-1]
+        carried_moment = np.cumsum(moments[::-1], axis=0)[::-1]
+        lever = carried_moment - carried_mass[:, None] * origins
+        held: Array = np.einsum("ni,ni->n", self._axes_in_base(T_base_joint), _cross(lever, -self._gravity[None, :]))
+        return held
+
+    def _axes_in_base(self, T_base_joint: Array) -> Array:
+        axes: Array = np.matmul(T_base_joint[:, :3, :3], self._axes[:, :, None])[:, :, 0]
+        return axes
+
+    def _place(self, q: Array) -> tuple[Array, Array]:
+        q = np.asarray(q, dtype=np.float64)
+        if q.shape != (self.joint_count,):
+            raise GeometryError("SerialChain", "q", f"has shape {q.shape}, not ({self.joint_count},)")
+        if not np.isfinite(q).all():
+            raise GeometryError("SerialChain", "q", "is not finite")
+        T_base_joint = (
+            self._fixed + np.sin(q)[:, None, None] * self._sine + (1.0 - np.cos(q))[:, None, None] * self._cosine
+        )
+        for i in range(1, len(q)):
+            T_base_joint[i] = T_base_joint[i - 1] @ T_base_joint[i]
+        return T_base_joint, T_base_joint[-1] @ self._T_joint_tcp
+
+
+def require_same_arm(device: str, chain: SerialChain, q: Array, T_base_tcp: Array) -> None:
+    """Hold a chain against what a controller says of its own arm.
+
+    Args:
+        device: name for the error.
+        chain: how we describe it.
+        q: (n,) rad, told together with ...
+        T_base_tcp: ... this pose (4, 4).
+
+    Raises:
+        DeviceFault: the poses lie further apart than two arms of one model.
+    """
+    apart = se3.compose(se3.inverse(chain.forward(q)), T_base_tcp)
+    away_m, turned_rad = float(np.linalg.norm(apart[:3, 3])), float(np.linalg.norm(se3.log(apart)[3:]))
+    if away_m > _SAME_ARM_M or turned_rad > _SAME_ARM_RAD:
+        raise DeviceFault(
+            device,
+            f"its tool is {1e3 * away_m:.0f} mm and {np.rad2deg(turned_rad):.1f} deg from where the chain puts it",
+            fault_class=FaultClass.CONFIGURATION,
+            needs=Remedy.OPERATOR,
+            hint="name the chain of this arm's model, and the tool that it carries",
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class JointMotion:
+    """Joint velocities for a twist, and how well they follow it.
+
+    Attributes:
+        dq: (n,) rad/s, within every limit.
+        twist: (6,) what the tool centre point will really do, along base axes.
+        scale: share of the motion that the limits left.
+        smallest_singular_value: of the Jacobian with its angular rows times the characteristic length, m.
+        adjustments: which limits made ``twist`` differ from what was asked for.
+    """
+
+    dq: Array
+    twist: Array
+    scale: float
+    smallest_singular_value: float
+    adjustments: tuple[Adjustment, ...]
+
+
+class DifferentialIk:
+    """Twists of the tool centre point to joint velocities, by damped least squares.
+
+    Each direction is damped by its own singular value (numerical filtering, after Maciejewski & Klein 1988), so that
+    directions far from singular are followed exactly. A redundant arm moves a joint that meets a limit as fast as it
+    may and makes up for it with the others (saturation in the null space, Flacco et al. 2012); what still exceeds a
+    limit slows the whole motion, so that the tool keeps its direction instead of being pushed off its path.
+
+    Args:
+        chain: the arm.
+        settings: treatment of limits.
+    """
+
+    def __init__(self, chain: SerialChain, settings: IkSettings | None = None) -> None:
+        self.chain = chain
+        self.settings = settings or IkSettings()
+        self._weights = np.array([1.0, 1.0, 1.0, *[self.settings.characteristic_length_m] * 3])
+
+    def solve(self, q: Array, twist: Array) -> JointMotion:
+        """Joint velocities at ``q`` (n,) rad for ``twist`` (6,) [v, w] along base axes.
+
+        Raises:
+            GeometryError: an argument has the wrong shape or is not finite.
+        """
+        twist = np.asarray(twist, dtype=np.float64)
+        if twist.shape != (6,) or not np.isfinite(twist).all():
+            raise GeometryError("DifferentialIk.solve", "twist", "is not six finite numbers")
+        return self.at(q).motion(twist)
+
+    def at(self, q: Array) -> LocalIk:
+        """The same for several twists at one ``q`` (n,) rad. Raises GeometryError for a wrong shape or NaN."""
+        return LocalIk(self, q, self._weights)
+
+
+class LocalIk:
+    """Differential inverse kinematics at one place.
+
+    Args:
+        ik: arm and settings.
+        q: (n,) rad.
+        weights: (6,) of a twist's components.
+    """
+
+    def __init__(self, ik: DifferentialIk, q: Array, weights: Array) -> None:
+        self._chain = ik.chain
+        self._settings = ik.settings
+        self._q = q
+        self._weights = weights
+        self._J = self._weighted_jacobian(q)
+        self._inverse, self._smallest = self._inverted(self._J)
+        chain, margin_rad = ik.chain, ik.settings.limit_margin_rad
+        self._bounds = speed_bounds(q, chain.lower, chain.upper, chain.speed, margin_rad)
+
+    def acceleration_scale(self, step: Array, dt_s: float) -> tuple[float, tuple[Adjustment, ...]]:
+        """Share of the change of twist ``step`` (6,) within ``dt_s`` that no joint is too slow for, and why."""
+        ddq = self._inverse @ (self._weights * step) / dt_s
+        return within_acceleration(ddq, self._chain.accel, self._chain.joint_names)
+
+    def motion(self, twist: Array) -> JointMotion:
+        """Joint velocities for ``twist`` (6,), within every limit."""
+        dq, scale, adjustments = self.limited(twist)
+        return JointMotion(dq, (self._J @ dq) / self._weights, scale, self._smallest, adjustments)
+
+    def limited(self, twist: Array) -> tuple[Array, float, tuple[Adjustment, ...]]:
+        """Joint velocities (n,) for ``twist`` (6,), within every limit, what share of it that is, and why."""
+        chain, settings = self._chain, self._settings
+        lowest, highest = self._bounds
+        dq = self._inverse @ (self._weights * twist)
+        if settings.goes_round and len(dq) > 6:
+            dq = self._saturated(dq, self._weights * twist, lowest, highest)
+        scale, adjustments = within_bounds(dq, lowest, highest, chain.joint_names)
+        # Rounding must not lead beyond a limit either.
+        dq = np.clip(dq * scale, lowest, highest)
+        if self._smallest < settings.singular_value_m and dq.any():
+            left, why = self._off_singularity(dq)
+            scale, dq, adjustments = scale * left, dq * left, adjustments + why
+        return dq, scale, adjustments
+
+    def _weighted_jacobian(self, q: Array) -> Array:
+        J = self._chain.jacobian(q)
+        J *= self._weights[:, None]
+        return J
+
+    def _inverted(self, J: Array) -> tuple[Array, float]:
+        """Damped inverse (n, 6) of ``J`` (6, n), and its smallest singular value."""
+        settings = self._settings
+        U, s, Vt = np.linalg.svd(J, full_matrices=False)
+        short = np.maximum(1.0 - (s / settings.singular_value_m) ** 2, 0.0)
+        gain = s / np.maximum(s**2 + settings.damping_m**2 * short, np.finfo(np.float64).tiny)
+        return (Vt.T * gain) @ U.T, float(s[-1])
+
+    def _saturated(self, dq: Array, wanted: Array, lowest: Array, highest: Array) -> Array:
+        free = np.ones(len(dq), dtype=bool)
+        while np.count_nonzero(free) > 6:
+            excess = np.where(free, np.maximum(dq - highest, lowest - dq), 0.0)
+            worst = int(np.argmax(excess))
+            if excess[worst] <= 0.0:
+                break
+            dq[worst] = np.clip(dq[worst], lowest[worst], highest[worst])
+            free[worst] = False
+            dq[free] = self._inverted(self._J[:, free])[0] @ (wanted - self._J[:, ~free] @ dq[~free])
+        return dq
+
+    def _off_singularity(self, dq: Array) -> tuple[float, tuple[Adjustment, ...]]:
+        step_s = 1e-5 / float(np.abs(dq).max())
+        ahead = np.linalg.svd(self._weighted_jacobian(self._q + step_s * dq), compute_uv=False)[-1]
+        closing_m_s = (self._smallest - float(ahead)) / step_s
+        fastest = float(np.max(np.abs(dq) / self._chain.speed))
+        return off_singularity(self._smallest, closing_m_s, fastest, self._settings)
+
+
+def _links(joints: tuple[Joint, ...], T_joint_flange: Array, tool: Tool) -> tuple[Array, Array]:
+    """Masses (n,) kg and centres of mass (n, 3) m in joint frames, the tool counted with the last link."""
+    mass = np.array([joint.mass_kg for joint in joints])
+    com = np.array([joint.com_mm for joint in joints]) * 1e-3
+    tool_com = T_joint_flange[:3, :3] @ (np.array(tool.com_mm) * 1e-3) + T_joint_flange[:3, 3]
+    if total := mass[-1] + tool.mass_kg:
+        com[-1] = (mass[-1] * com[-1] + tool.mass_kg * tool_com) / total
+    mass[-1] = total
+    return mass, com
+
+
+def _skew(v: Array) -> Array:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def _rotation(axis: Array, angle: float) -> Array:
+    K = _skew(axis)
+    R: Array = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K)
+    return R
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Row-wise cross products (n, 3); np.cross takes five times as long on arrays this small."""
+    product: Array = a[:, _YZX] * b[:, _ZXY] - a[:, _ZXY] * b[:, _YZX]
+    return product
+
+
+_SAME_ARM_M = 0.02
+_SAME_ARM_RAD = np.deg2rad(2.0)
+_YZX = np.array([1, 2, 0])
+_ZXY = np.array([2, 0, 1])

@@ -1,0 +1,1 @@
+"""Descriptions of arms for ``touchcell.drivers.kinematics.chain``."""

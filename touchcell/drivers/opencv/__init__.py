@@ -1,0 +1,1 @@
+"""Cameras that only OpenCV can open."""

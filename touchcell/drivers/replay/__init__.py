@@ -1,0 +1,1 @@
+"""Labelled data sets on disk, and devices that replay them."""

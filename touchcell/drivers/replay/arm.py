@@ -1,0 +1,81 @@
+"""An arm that is only remembered: the poses at which a labelled data set was collected, beside a replay camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.device import Device, Lifecycle
+from touchcell.drivers.core.errors import ConnectError, DataError, StaleData
+from touchcell.drivers.core.samples import Stamped, TcpState
+from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
+from touchcell.drivers.replay.dataset import natural_order, read_split
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+
+
+class ReplayArmConfig(DriverConfig):
+    """Which data set, and how fast; the same as those of the camera beside it."""
+
+    data: Path
+    split: str
+    rate_hz: float = Field(default=30.0, gt=0.0, le=1000.0)
+
+
+class ReplayArm(Device):
+    """Tells where the sensor was for each labelled image: ``T_f_s`` of the label, so its base is the surface frame.
+
+    Pose k is reached k periods after ``connect``, in natural order of the images' names, like the replay camera's; the
+    arm stays at the last.
+
+    Args:
+        name: the device's name in the cell.
+        config: checked configuration.
+        clock: injected time.
+    """
+
+    def __init__(self, name: str, config: ReplayArmConfig, clock: Clock) -> None:
+        super().__init__(name, clock)
+        self._config = config
+        self._period_ns = round(1e9 / config.rate_hz)
+        self._start_ns = 0
+        self._poses: Array = np.empty((0, 4, 4))
+
+    def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
+        """Pose of the newest image. Raises StaleData."""
+        self._require("tell its pose", Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
+        now_ns = self._clock.now_ns()
+        seq = min((now_ns - self._start_ns) // self._period_ns, len(self._poses) - 1)
+        t_ns = self._start_ns + seq * self._period_ns
+        if max_age_s is not None and (age_s := (now_ns - t_ns) * 1e-9) > max_age_s:
+            raise StaleData(self.name, age_s, max_age_s, seq)
+        return Stamped(TcpState(self._poses[seq].copy(), np.zeros(6)), t_ns, seq)
+
+    def _open(self) -> None:
+        try:
+            split = read_split(self._config.data, self._config.split)
+        except DataError as error:
+            raise ConnectError(self.name, "the data set cannot be read", [error]) from None
+        order = sorted(range(len(split.images)), key=lambda i: natural_order(split.images[i]))
+        self._poses = se3.from_euler_mm_deg(split.contact_mm_deg[order])
+        self._start_ns = self._clock.now_ns()
+
+    def _close(self) -> None:
+        self._poses = np.empty((0, 4, 4))
+
+
+def _build(name: str, config: Any, context: DriverContext) -> ReplayArm:
+    return ReplayArm(name, config, context.clock)
+
+
+SPEC = DriverSpec(
+    name="replay_arm",
+    summary="remembers the poses at which a labelled data set was collected",
+    config=ReplayArmConfig,
+    capabilities=Capabilities(kind="arm", abilities=frozenset({"TcpSource"}), state_rate_hz=30.0, virtual_time=True),
+    build=_build,
+)

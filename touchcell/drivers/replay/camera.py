@@ -1,0 +1,173 @@
+"""A camera that plays a folder of images, on the injected clock: for recorded and for public data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from pydantic import Field
+
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.device import Device, Lifecycle
+from touchcell.drivers.core.errors import (
+    ConnectError,
+    CorruptMessage,
+    DeviceGone,
+    EndOfStream,
+    StaleData,
+    TransportTimeout,
+)
+from touchcell.drivers.core.samples import Frame, Stamped
+from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
+from touchcell.drivers.replay.dataset import IMAGE_FOLDER, natural_order
+from touchcell.geometry.types import ImageArray
+
+CAPABILITIES = Capabilities(
+    kind="camera",
+    abilities=frozenset({"FrameSource", "HealthSource"}),
+    state_rate_hz=30.0,
+    virtual_time=True,
+)
+
+_READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
+# How a complete file ends: decoders fill what a truncated one lacks with grey and say nothing.
+_ENDINGS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+
+
+class ReplayCameraConfig(DriverConfig):
+    """Which images, and how fast.
+
+    Attributes:
+        data: a folder of images, or with ``split`` the root of a data set in the public layout.
+        split: train, val or test.
+        rate_hz: images per second.
+    """
+
+    data: Path
+    split: str | None = None
+    rate_hz: float = Field(default=30.0, gt=0.0, le=1000.0)
+
+
+class ReplayCamera(Device):
+    """Plays PNG and JPEG images in natural name order, image_2 before image_10.
+
+    Image k is exposed k periods after ``connect``. Like a camera's, images that nobody reads in time are lost; they are
+    not even opened. All images have to be of one size.
+
+    Args:
+        name: the device's name in the cell.
+        config: checked configuration.
+        clock: injected time.
+    """
+
+    def __init__(self, name: str, config: ReplayCameraConfig, clock: Clock) -> None:
+        super().__init__(name, clock)
+        self._folder = config.data / config.split / IMAGE_FOLDER if config.split else config.data
+        self._period_ns = round(1e9 / config.rate_hz)
+        self._files: list[Path] = []
+        self._start_ns = 0
+        self._size: tuple[int, ...] | None = None
+        self._newest: Stamped[Frame] | None = None
+        self._read = 0
+
+    def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
+        """Newest image. Raises StaleData, EndOfStream a period after the last image, CorruptMessage, DeviceGone."""
+        self._require("deliver frames", *_READABLE)
+        now_ns = self._clock.now_ns()
+        seq = (now_ns - self._start_ns) // self._period_ns
+        self._refuse_end(seq)
+        age_s = (now_ns - self._exposed_ns(seq)) * 1e-9
+        if max_age_s is not None and age_s > max_age_s:
+            raise StaleData(self.name, age_s, max_age_s, seq)
+        return self._load(seq)
+
+    def next(self, after_seq: int, timeout_s: float) -> Stamped[Frame]:
+        """Newest image if its ``seq > after_seq``, else the first that is.
+
+        Raises:
+            TransportTimeout: it is not due within ``timeout_s``.
+            EndOfStream: there are no more.
+            CorruptMessage: the file is no whole image, or of another size than the ones before.
+            DeviceGone: the file has disappeared.
+        """
+        self._require("deliver frames", *_READABLE)
+        now_ns = self._clock.now_ns()
+        seq = max((now_ns - self._start_ns) // self._period_ns, after_seq + 1)
+        self._refuse_end(seq)
+        deadline_ns = now_ns + round(timeout_s * 1e9)
+        if self._exposed_ns(seq) > deadline_ns:
+            self._clock.sleep_until_ns(deadline_ns)
+            raise TransportTimeout(self.name, f"frame after {after_seq}", timeout_s)
+        self._clock.sleep_until_ns(self._exposed_ns(seq))
+        return self._load(seq)
+
+    def health(self) -> dict[str, float | int | str | bool]:
+        """How many images there are and how many were read."""
+        return {"images": len(self._files), "images_read": self._read}
+
+    def _exposed_ns(self, seq: int) -> int:
+        return self._start_ns + seq * self._period_ns
+
+    def _refuse_end(self, seq: int) -> None:
+        if seq >= len(self._files):
+            raise EndOfStream(self.name, f"all {len(self._files)} images of {self._folder} have been played")
+
+    def _load(self, seq: int) -> Stamped[Frame]:
+        if self._newest is None or self._newest.seq != seq:
+            image = self._decode(self._files[seq])
+            if self._size is None:
+                self._size = image.shape
+            if image.shape != self._size:
+                raise CorruptMessage(
+                    self.name,
+                    f"{self._files[seq].name} has shape {image.shape}, the images before it {self._size}",
+                    hint="a camera does not change its image size; sort the images into folders",
+                )
+            self._newest = Stamped(Frame(image), self._exposed_ns(seq), seq)
+            self._read += 1
+        return self._newest
+
+    def _decode(self, file: Path) -> ImageArray:
+        try:
+            data = file.read_bytes()
+        except OSError as error:
+            raise DeviceGone(self.name, f"cannot read {file}: {error.strerror}") from None
+        if not data.rstrip(b"\0").endswith(_ENDINGS[file.suffix.lower()]):
+            raise CorruptMessage(self.name, f"{file} is truncated or no {file.suffix} image", hint="copy it again")
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR)
+        if image is None:
+            raise CorruptMessage(self.name, f"{file} is no readable image")
+        return np.asarray(image, dtype=np.uint8)
+
+    def _open(self) -> None:
+        if not self._folder.is_dir():
+            raise ConnectError(
+                self.name,
+                f"{self._folder} is no folder",
+                hint="give the folder that holds the images, or the data set and its split",
+            )
+        files = (file for file in self._folder.iterdir() if file.suffix.lower() in _ENDINGS)
+        self._files = sorted(files, key=natural_order)
+        if not self._files:
+            raise ConnectError(self.name, f"{self._folder} holds no PNG or JPEG images")
+        self._start_ns = self._clock.now_ns()
+
+    def _close(self) -> None:
+        self._files = []
+        self._size = None
+        self._newest = None
+
+
+def _build(name: str, config: Any, context: DriverContext) -> ReplayCamera:
+    return ReplayCamera(name, config, context.clock)
+
+
+SPEC = DriverSpec(
+    name="replay_camera",
+    summary="plays a folder of images as a camera",
+    config=ReplayCameraConfig,
+    capabilities=CAPABILITIES,
+    build=_build,
+)

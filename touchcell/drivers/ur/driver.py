@@ -1,0 +1,632 @@
+"""Universal Robots e-Series arms (PolyScope 5) over ur-rtde: twists of the tool, joint goals, state, wrench.
+
+What stops the arm, from the fastest: a zero twist from whoever calls ``stop``; the device's own thread once a twist's
+time-to-live has passed; the controller's watchdog once this process has been silent for ``1 / watchdog_hz``; the safety
+system and the buttons of the robot, which alone are rated for it. ``docs/devices/ur.md`` has the bench side.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from touchcell.drivers.core.arm import Arm, LimitsConfig
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
+from touchcell.drivers.core.errors import (
+    CommandRejected,
+    ConnectError,
+    CorruptMessage,
+    DeviceError,
+    DeviceFault,
+    DeviceGone,
+    FaultClass,
+    LifecycleError,
+    Rejection,
+    Remedy,
+    StaleData,
+    TransportError,
+    TransportTimeout,
+)
+from touchcell.drivers.core.lease import Lease
+from touchcell.drivers.core.protocols import StopCategory
+from touchcell.drivers.core.samples import JointState, Stamped, TcpState
+from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
+from touchcell.drivers.kinematics.chain import (
+    ChainDescription,
+    DifferentialIk,
+    LocalIk,
+    SerialChain,
+    Tool,
+    require_same_arm,
+)
+from touchcell.drivers.kinematics.joint_limits import JointLimitsConfig
+from touchcell.drivers.ur import codec as ur_codec
+from touchcell.drivers.ur.control import ControlLink
+from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyMode, power_fault, program_fault, safety_fault
+from touchcell.drivers.ur.registers import RtdeWire
+from touchcell.drivers.ur.sdk import dashboard
+from touchcell.drivers.ur.state import RATE_HZ, VARIABLES, Snapshot, StateReader
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+
+JOINTS = 6
+_MIN_WATCHDOG_HZ = 5.0
+_OLDEST_POLYSCOPE = (5, 6)
+_KEEPER_PERIOD_S = 0.004
+_KEEPER_JOIN_S = 10.0
+_CLOCK_WARM_UP_S = 0.03
+_FIRST_STATE_S = 2.0
+_MODE_CHANGE_S = 20.0
+_RECOVER_S = 5.0
+_POLL_NS = 2_000_000
+_EXPLANATION_NS = 20_000_000
+_STILL_TARGET_RAD_S = 1e-6
+_STILL_ACTUAL_RAD_S = 0.01
+_MAX_JOINT_GOAL_RAD = 2.0 * math.pi
+
+_STOPS = frozenset(StopCategory)
+
+Positive = Annotated[float, Field(gt=0.0)]
+
+
+class UrConfig(DriverConfig):
+    """Configuration of one arm.
+
+    Attributes:
+        host: address of the controller.
+        chain: the model: ``ur3e``, ``ur5e``, ``ur10e`` or a YAML file; checked against the arm when it is activated.
+        flange_to_tcp_mm_deg: [x y z alpha beta gamma] of the tool centre point in the flange's frame, extrinsic xyz.
+        limits: of the tool centre point.
+        joint_limits: margins to the chain's joint limits and to singularities.
+        stop_accel_m_s2: how hard it brakes, m/s2 and rad/s2; no gentler than the accelerations above.
+        joint_speed_deg_s, joint_accel_deg_s2: of a joint goal at ``speed_fraction`` 1.
+        watchdog_hz: the controller stops the program after silence of ``1 / watchdog_hz``.
+        state_timeout_s: silence of the state stream that is a fault.
+        connect_timeout_s: for the first answer of the controller.
+    """
+
+    host: str = Field(min_length=1)
+    flange_to_tcp_mm_deg: tuple[float, float, float, float, float, float]
+    chain: str = "ur5e"
+    limits: LimitsConfig = LimitsConfig()
+    joint_limits: JointLimitsConfig = JointLimitsConfig()
+    stop_accel_m_s2: Annotated[float, Field(gt=0.0, le=10.0)] = 3.0
+    joint_speed_deg_s: Annotated[float, Field(gt=0.0, le=180.0)] = 30.0
+    joint_accel_deg_s2: Annotated[float, Field(gt=0.0, le=800.0)] = 60.0
+    watchdog_hz: Annotated[float, Field(ge=_MIN_WATCHDOG_HZ, le=50.0)] = 10.0
+    state_timeout_s: Annotated[float, Field(ge=0.02, le=1.0)] = 0.1
+    connect_timeout_s: Positive = 2.0
+
+    @model_validator(mode="after")
+    def _brakes_hard_enough(self) -> Self:
+        if self.stop_accel_m_s2 < self.accel:
+            raise ValueError(
+                f"stop_accel_m_s2 {self.stop_accel_m_s2:g} is gentler than the acceleration allowed, {self.accel:g}"
+            )
+        return self
+
+    @property
+    def accel(self) -> float:
+        """The one acceleration that speedL takes, m/s2 and rad/s2: large enough for both limits of the gate."""
+        return max(self.limits.tcp_accel_m_s2, self.limits.tcp_rot_accel_rad_s2)
+
+
+class UrArm(Arm):
+    """A UR arm.
+
+    Until it is activated, ``tcp`` tells the pose of the tool centre point that is set on the pendant, because only a
+    running program may set another; from then on that of ``flange_to_tcp_mm_deg``, read back.
+
+    One thread, started by ``connect`` and joined by ``disconnect``, checks the state every 4 ms, ends expired twists,
+    keeps the watchdog quiet and latches faults. It cannot run while another thread holds the interpreter's lock; then
+    the watchdog stops the arm.
+
+    Args:
+        name: the device's name in the cell.
+        config: its configuration.
+        clock: injected time.
+    """
+
+    def __init__(self, name: str, config: UrConfig, clock: Clock) -> None:
+        super().__init__(name, clock, config.limits.build(), stop_categories=_STOPS)
+        self._config = config
+        self._flange_to_tcp = _pose_vector(se3.from_euler_mm_deg(np.array(config.flange_to_tcp_mm_deg)))
+        tool = Tool(
+            origin_mm=config.flange_to_tcp_mm_deg[:3],
+            rotation_deg=config.flange_to_tcp_mm_deg[3:],
+        )
+        self._chain = SerialChain(ChainDescription.named(config.chain), tool)
+        self._ik = DifferentialIk(self._chain, config.joint_limits.settings(own_controller=True))
+        self._receive: Any = None
+        self._reader: StateReader | None = None
+        self._link: ControlLink | None = None
+        self._keeper: threading.Thread | None = None
+        self._ending = threading.Event()
+        self._supervised_from_seq: int | None = None
+        self._power_off_by: StopCategory | None = None
+        self._model = ""
+        self._proven_watchdog_s: float | None = None
+        self._ttl_stops = 0
+        self._dropping = threading.Lock()
+        self._program_is_ours = False
+
+    def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
+        """Pose and twist of the tool centre point. Raises StaleData if it is older than ``max_age_s``."""
+        snapshot = self._newest(max_age_s)
+        state = TcpState(_pose(snapshot.tcp_pose), snapshot.tcp_speed.copy())
+        return Stamped(state, snapshot.t_ns, snapshot.seq, snapshot.t_device_ns)
+
+    def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
+        """Joint angles and speeds. Raises StaleData if they are older than ``max_age_s``."""
+        snapshot = self._newest(max_age_s)
+        state = JointState(snapshot.q.copy(), snapshot.qd.copy())
+        return Stamped(state, snapshot.t_ns, snapshot.seq, snapshot.t_device_ns)
+
+    def wrench(self, max_age_s: float | None = None) -> Stamped[Array]:
+        """(6,) [force N, torque N m] on the tool centre point along base axes, as the controller compensates it."""
+        snapshot = self._newest(max_age_s)
+        return Stamped(snapshot.tcp_force.copy(), snapshot.t_ns, snapshot.seq, snapshot.t_device_ns)
+
+    def at_rest(self) -> bool:
+        """Whether no joint is asked to move and none does. Raises TransportError when the state is too old to tell."""
+        snapshot = self._newest(None)
+        age_s = snapshot.age_s(self._clock.now_ns())
+        if age_s > self._config.state_timeout_s:
+            raise self._silence(snapshot, age_s)
+        link = self._link
+        return (
+            float(np.abs(snapshot.qd_target).max()) < _STILL_TARGET_RAD_S
+            and float(np.abs(snapshot.qd).max()) < _STILL_ACTUAL_RAD_S
+            and not (link is not None and link.goal_running())
+        )
+
+    def go_to_joints(self, q: Array, lease: Lease, *, speed_fraction: float = 0.1) -> None:
+        """Start moving to ``q`` (6,) rad in a straight line in joint space; the arm must be at rest.
+
+        The goal has no time-to-live, but ends like everything else when the host falls silent.
+
+        Raises:
+            CommandRejected: nothing was sent.
+        """
+        target = self._admitted_joint_goal(q, lease, speed_fraction, -_MAX_JOINT_GOAL_RAD, _MAX_JOINT_GOAL_RAD, JOINTS)
+        link = self._link
+        if link is None:
+            raise CommandRejected(self.name, Rejection.MODE, "the control program is gone")
+        if not self.at_rest():
+            raise CommandRejected(self.name, Rejection.MODE, "the arm is moving", hint="stop it first")
+        speed = math.radians(self._config.joint_speed_deg_s) * speed_fraction
+        accel = math.radians(self._config.joint_accel_deg_s2)
+        self._attempt(lambda: link.move_joints(target, speed, accel, self._config.stop_accel_m_s2))
+
+    def kinematics(self) -> DifferentialIk:
+        """Of its joints."""
+        return self._ik
+
+    def watchdog_s(self) -> float:
+        """Silence after which the controller stops the arm, proven at activation. Raises LifecycleError before it."""
+        if self._proven_watchdog_s is None:
+            raise LifecycleError(self.name, "tell the watchdog's period", self.state.value, [Lifecycle.ACTIVE.value])
+        return self._proven_watchdog_s
+
+    def health(self) -> dict[str, float | int | str | bool]:
+        """Modes, age of the state, dropped packets, temperatures, speed slider, watchdog."""
+        snapshot = self._newest(None)
+        reader = self._opened()
+        link = self._link
+        return {
+            "model": self._model,
+            "robot_mode": snapshot.robot_mode.name,
+            "safety_mode": snapshot.safety_mode.name,
+            "runtime_state": snapshot.runtime_state.name,
+            "connected": reader.connected,
+            "state_age_s": snapshot.age_s(self._clock.now_ns()),
+            "corrupt_packets": reader.corrupt,
+            "out_of_order_packets": reader.out_of_order,
+            "max_joint_temperature_c": float(snapshot.temperatures.max()),
+            "speed_fraction": snapshot.speed_fraction,
+            "tool_set": link is not None,
+            "watchdog_hz": self._config.watchdog_hz,
+            "watchdog_trip_s": link.trip_s if link is not None else 0.0,
+            "ttl_stops": self._ttl_stops + (link.ttl_stops if link is not None else 0),
+        }
+
+    def _open(self) -> None:
+        try:
+            import rtde_receive  # noqa: F401
+        except ImportError as error:
+            raise ConnectError(
+                self.name, "ur-rtde is not installed", [error], hint="pip install touchcell[ur]"
+            ) from None
+        version = _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
+        if not _OLDEST_POLYSCOPE <= version[:2] < (6, 0):
+            raise ConnectError(
+                self.name,
+                f"PolyScope {'.'.join(map(str, version))} is not supported",
+                hint="this driver needs PolyScope 5.6 or later of version 5",
+            )
+        self._start_receiving()
+        with dashboard(self.name, self._config.host) as client:
+            self._model = f"{client.getRobotModel()}, PolyScope {client.polyscopeVersion()}"
+        self._ending.clear()
+        self._keeper = threading.Thread(target=self._keep, name=f"{self.name} keeper", daemon=True)
+        self._keeper.start()
+
+    def _close(self) -> None:
+        self._ending.set()
+        keeper, self._keeper = self._keeper, None
+        if keeper is not None:
+            keeper.join(_KEEPER_JOIN_S)
+        # The thread may have latched a fault while the state was already DISCONNECTED.
+        self._state = Lifecycle.DISCONNECTED
+        self._fault_error = None
+        self._drop_program()
+        if self._power_off_by is not None:
+            with suppress(DeviceError), dashboard(self.name, self._config.host) as client:
+                client.powerOff()
+        self._power_off_by = None
+        self._stop_receiving()
+
+    def _configure(self) -> None:
+        self._refuse_if_unsafe()
+
+    def _activate(self) -> None:
+        self._refuse_if_unsafe()
+        if self._power_off_by is not None:
+            raise LifecycleError(self.name, "activate", "being powered off", [Lifecycle.READY.value])
+        self._require_remote_control()
+        self._require_no_program()
+        self._power_on()
+        _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
+        link = ControlLink(self.name, self._config.host, self._clock, self._config.watchdog_hz)
+        self._link = link
+        self._program_is_ours = True
+        try:
+            link.open(self._flange_to_tcp)
+            snapshot = self._await(
+                lambda state: state.runtime_state is RuntimeState.PLAYING, _FIRST_STATE_S, "state of the program"
+            )
+            require_same_arm(self.name, self._chain, snapshot.q, _pose(snapshot.tcp_pose))
+        except BaseException:
+            self._drop_program()
+            raise
+        self._proven_watchdog_s = 1.0 / self._config.watchdog_hz
+        self._supervised_from_seq = snapshot.seq
+
+    def _after_rest(self, policy: DeactivatePolicy) -> None:
+        if policy is DeactivatePolicy.PARK_THEN_OFF:
+            raise LifecycleError(
+                self.name,
+                "park then power off",
+                self.state.value,
+                [p.value for p in DeactivatePolicy if p is not policy],
+                hint="no park pose here: send a joint goal, then deactivate with BRAKE",
+            )
+        self._drop_program()
+        if policy in (DeactivatePolicy.BRAKE, DeactivatePolicy.OFF):
+            self._power_off()
+
+    def _recover(self, token: OperatorToken) -> None:
+        self._drop_program()
+        if not self._opened().connected:
+            _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
+            # The old reader serves the thread until the new one has its first state.
+            self._start_receiving()
+        self._opened().forget()
+        if self._program_is_ours:
+            self._end_program()
+        if self._fresh().safety_mode is SafetyMode.PROTECTIVE_STOP:
+            self._unlock()
+        self._refuse_if_unsafe()
+
+    def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
+        link = self._link
+        try:
+            if link is None or self.state is not Lifecycle.ACTIVE:
+                raise CommandRejected(self.name, Rejection.MODE, "the arm has just been given up")
+            expires_ns = now_ns + round(ttl_s * 1e9)
+            link.speed(twist_base, self._config.accel, self._config.stop_accel_m_s2, expires_ns)
+        except CommandRejected:
+            self._gate.reset()
+            raise
+        except DeviceError as error:
+            raise self._to_faulted(self._explained(error)) from None
+
+    def _local_ik(self) -> LocalIk:
+        return self._ik_at(self._ik, self.joints(self._max_state_age_s).value.q)
+
+    def _begin_stop(self, category: StopCategory) -> None:
+        link = self._link
+        if category is not StopCategory.STOP_AND_HOLD:
+            self._supervised_from_seq = None
+            self._power_off_by = category
+        if link is not None:
+            self._attempt(lambda: link.halt(self._config.stop_accel_m_s2))
+
+    def _keep(self) -> None:
+        try:
+            while not self._ending.wait(_KEEPER_PERIOD_S):
+                self._keep_once()
+        except BaseException as error:
+            self._to_faulted(
+                DeviceFault(
+                    self.name,
+                    f"its own thread died: {error!r}",
+                    fault_class=FaultClass.INTERNAL,
+                    needs=Remedy.POWER_CYCLE,
+                    hint="the watchdog stops the arm; disconnect and report this",
+                )
+            )
+
+    def _keep_once(self) -> None:
+        # The state before the flag: a program that was seen stopped after the flag was raised is a fault.
+        snapshot = self._newest(None)
+        supervised_from_seq = self._supervised_from_seq
+        trouble = self._trouble(snapshot, supervised_from_seq)
+        link = self._link
+        if trouble is None and link is not None:
+            try:
+                link.tick()
+            except DeviceError as error:
+                trouble = self._explained(error) if self._supervised_from_seq is not None else None
+        if trouble is not None and self.state is not Lifecycle.DISCONNECTED:
+            self._to_faulted(trouble)
+        if self.state is Lifecycle.FAULTED:
+            self._drop_program()
+        if self._power_off_by is not None:
+            self._obey_power_off()
+
+    def _trouble(self, snapshot: Snapshot, supervised_from_seq: int | None) -> DeviceError | None:
+        reader = self._opened()
+        age_s = snapshot.age_s(self._clock.now_ns())
+        if age_s > self._config.state_timeout_s or not reader.connected:
+            return self._silence(snapshot, age_s)
+        if reader.over_budget:
+            return CorruptMessage(
+                self.name, f"too many bad state packets: {reader.corrupt} corrupt, {reader.out_of_order} out of order"
+            )
+        if self.state in (Lifecycle.READY, Lifecycle.ACTIVE):
+            fault = safety_fault(self.name, snapshot.safety_mode, snapshot.safety_bits)
+            if fault is not None:
+                return fault
+        if self.state is Lifecycle.ACTIVE and supervised_from_seq is not None and snapshot.seq >= supervised_from_seq:
+            return power_fault(self.name, snapshot.robot_mode) or program_fault(self.name, snapshot.runtime_state)
+        return None
+
+    def _explained(self, error: DeviceError) -> DeviceError:
+        """The state's own word for why a command was not taken, which may be a packet behind; else ``error``."""
+        deadline_ns = self._clock.now_ns() + _EXPLANATION_NS
+        while (trouble := self._trouble(self._newest(None), self._supervised_from_seq)) is None:
+            if self._clock.now_ns() > deadline_ns:
+                return error
+            self._clock.sleep_until_ns(self._clock.now_ns() + _POLL_NS)
+        return trouble
+
+    def _silence(self, snapshot: Snapshot, age_s: float) -> DeviceError:
+        error: DeviceError
+        if self._opened().connected:
+            error = TransportTimeout(
+                self.name, "good state", self._config.state_timeout_s, hint="the controller or the network hangs"
+            )
+        else:
+            error = DeviceGone(self.name, "the state connection is gone", hint="check the cable and the controller")
+        error.__cause__ = StaleData(self.name, age_s, self._config.state_timeout_s, snapshot.seq)
+        return error
+
+    def _obey_power_off(self) -> None:
+        with suppress(DeviceError):
+            if self._power_off_by is StopCategory.STOP_THEN_REMOVE_POWER and not self.at_rest():
+                return
+            with dashboard(self.name, self._config.host) as client:
+                client.powerOff()
+        self._drop_program()
+        self._power_off_by = None
+
+    def _drop_program(self) -> None:
+        self._supervised_from_seq = None
+        self._proven_watchdog_s = None
+        with self._dropping:
+            link, self._link = self._link, None
+            if link is not None:
+                link.close()
+                self._ttl_stops += link.ttl_stops
+
+    def _start_receiving(self) -> None:
+        from rtde_receive import RTDEReceiveInterface
+
+        try:
+            self._receive = RTDEReceiveInterface(self._config.host, RATE_HZ, list(VARIABLES))
+        except RuntimeError as error:
+            raise DeviceGone(self.name, f"RTDE state of {self._config.host}: {error}") from error
+        reader = StateReader(self._receive, self._clock)
+        deadline_ns = self._clock.now_ns() + round(_FIRST_STATE_S * 1e9)
+        warm_ns = self._clock.now_ns() + round(_CLOCK_WARM_UP_S * 1e9)
+        while reader.poll() is None or self._clock.now_ns() < warm_ns:
+            if self._clock.now_ns() > deadline_ns:
+                raise TransportTimeout(self.name, "good state", _FIRST_STATE_S)
+            self._clock.sleep_until_ns(self._clock.now_ns() + _POLL_NS // 4)
+        self._reader = reader
+
+    def _stop_receiving(self) -> None:
+        # Dropping the last reference closes the connection. Its own ``disconnect`` would leave descriptors behind.
+        self._reader = None
+        self._receive = None
+
+    def _opened(self) -> StateReader:
+        if self._reader is None:
+            raise LifecycleError(self.name, "read", self.state.value, ["connected"])
+        return self._reader
+
+    def _newest(self, max_age_s: float | None) -> Snapshot:
+        snapshot = self._opened().poll()
+        assert snapshot is not None, "connect waits for the first"
+        if max_age_s is not None:
+            age_s = snapshot.age_s(self._clock.now_ns())
+            if age_s > max_age_s:
+                raise StaleData(self.name, age_s, max_age_s, snapshot.seq)
+        return snapshot
+
+    def _fresh(self) -> Snapshot:
+        snapshot = self._newest(None)
+        age_s = snapshot.age_s(self._clock.now_ns())
+        if age_s > self._config.state_timeout_s:
+            raise self._silence(snapshot, age_s)
+        return snapshot
+
+    def _refuse_if_unsafe(self) -> None:
+        snapshot = self._fresh()
+        fault = safety_fault(self.name, snapshot.safety_mode, snapshot.safety_bits)
+        if fault is not None:
+            raise fault
+        if snapshot.speed_fraction <= 0.0:
+            raise DeviceFault(
+                self.name,
+                "the speed slider stands at zero",
+                fault_class=FaultClass.CONFIGURATION,
+                needs=Remedy.OPERATOR,
+                hint="move the slider on the pendant; twists are scaled by it",
+            )
+
+    def _require_remote_control(self) -> None:
+        with dashboard(self.name, self._config.host) as client:
+            if not client.isInRemoteControl():
+                raise DeviceFault(
+                    self.name,
+                    "the pendant is in local control",
+                    fault_class=FaultClass.CONFIGURATION,
+                    needs=Remedy.OPERATOR,
+                    hint="enable remote control in the settings and choose Remote at the top of the pendant",
+                )
+
+    def _require_no_program(self) -> None:
+        snapshot = self._fresh()
+        if snapshot.runtime_state is not RuntimeState.STOPPED:
+            raise DeviceFault(
+                self.name,
+                f"another program is {snapshot.runtime_state.name}",
+                vendor_code=f"runtime_state {int(snapshot.runtime_state)}",
+                fault_class=FaultClass.CONFIGURATION,
+                needs=Remedy.OPERATOR,
+                hint="stop it on the pendant; this driver does not end other people's programs",
+            )
+
+    def _power_on(self) -> None:
+        if self._fresh().robot_mode is RobotMode.RUNNING:
+            return
+        with dashboard(self.name, self._config.host) as client:
+            client.powerOn()
+            self._await(lambda state: state.robot_mode in (RobotMode.IDLE, RobotMode.RUNNING), _MODE_CHANGE_S, "power")
+            client.brakeRelease()
+            self._await(lambda state: state.robot_mode is RobotMode.RUNNING, _MODE_CHANGE_S, "release of the brakes")
+
+    def _power_off(self) -> None:
+        with dashboard(self.name, self._config.host) as client:
+            client.powerOff()
+        self._await(lambda state: state.robot_mode is RobotMode.POWER_OFF, _MODE_CHANGE_S, "power-off")
+
+    def _end_program(self) -> None:
+        # It may have survived the fault if nobody could be reached then.
+        if self._fresh().runtime_state is not RuntimeState.STOPPED:
+            with dashboard(self.name, self._config.host) as client:
+                client.stop()
+        self._await(lambda state: state.runtime_state is RuntimeState.STOPPED, _RECOVER_S, "end of the program")
+        self._program_is_ours = False
+
+    def _unlock(self) -> None:
+        with dashboard(self.name, self._config.host) as client:
+            try:
+                client.unlockProtectiveStop()
+            except RuntimeError as error:
+                raise DeviceFault(
+                    self.name,
+                    f"the protective stop stays: {error}",
+                    fault_class=FaultClass.CONTACT,
+                    needs=Remedy.RECOVER,
+                    hint="wait until 5 s after the stop, and look at the arm first",
+                ) from error
+        self._await(
+            lambda state: state.safety_mode is not SafetyMode.PROTECTIVE_STOP,
+            _RECOVER_S,
+            "release of the protective stop",
+        )
+
+    def _await(self, condition: Callable[[Snapshot], bool], timeout_s: float, what: str) -> Snapshot:
+        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        while not condition(snapshot := self._fresh()):
+            if self._clock.now_ns() > deadline_ns:
+                raise TransportTimeout(self.name, what, timeout_s)
+            self._clock.sleep_until_ns(self._clock.now_ns() + _POLL_NS)
+        return snapshot
+
+
+def _ask_version(device: str, host: str, timeout_s: float) -> tuple[int, int, int, int]:
+    """The controller's version by a connection of our own: ur-rtde's constructors wait for ever on a frozen one."""
+    try:
+        wire = RtdeWire(device, host, timeout_s)
+        try:
+            if not ur_codec.parse_accepted(wire.ask(ur_codec.version_request()).payload):
+                raise ConnectError(device, f"RTDE of {host} does not speak version {ur_codec.PROTOCOL_VERSION}")
+            answer = wire.ask(ur_codec.Packet(ur_codec.PacketType.GET_URCONTROL_VERSION))
+            return ur_codec.parse_controller_version(answer.payload)
+        finally:
+            wire.close()
+    except (OSError, TransportError) as error:
+        raise ConnectError(
+            device,
+            f"no RTDE at {host}:{ur_codec.PORT}",
+            [error],
+            hint=f"is {host} the controller, powered and reachable?",
+        ) from error
+
+
+def _pose_vector(T: Array) -> Array:
+    """Universal Robots' pose (6,) [x y z rx ry rz] of a pose (4, 4): metres and a rotation vector."""
+    return np.concatenate([T[:3, 3], se3.log(T)[3:]])
+
+
+def _pose(vector: Array) -> Array:
+    """Pose (4, 4) of Universal Robots' [x y z rx ry rz]."""
+    T = se3.exp(np.concatenate([np.zeros(3), vector[3:]]))
+    T[:3, 3] = vector[:3]
+    return T
+
+
+def _build(name: str, config: UrConfig, context: DriverContext) -> UrArm:
+    return UrArm(name, config, context.clock)
+
+
+SPEC = DriverSpec(
+    name="ur",
+    summary="Universal Robots e-Series (PolyScope 5) over ur-rtde",
+    config=UrConfig,
+    capabilities=Capabilities(
+        kind="arm",
+        abilities=frozenset(
+            {
+                "TcpSource",
+                "JointSource",
+                "WrenchSource",
+                "TwistSink",
+                "Stoppable",
+                "JointGoal",
+                "HealthSource",
+                "NativeWatchdog",
+            }
+        ),
+        state_rate_hz=RATE_HZ,
+        min_command_rate_hz=10.0,
+        command_latency_s=0.0001,
+        stop_categories=_STOPS,
+        max_watchdog_s=1.0 / _MIN_WATCHDOG_HZ,
+        has_brakes=True,
+        falls_on_power_loss=False,
+    ),
+    build=_build,
+    extra="ur",
+)

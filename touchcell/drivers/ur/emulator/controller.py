@@ -1,0 +1,275 @@
+"""The inside of an emulated UR controller: power, safety, the program, the registers and the arm, every 2 ms."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter, deque
+
+import numpy as np
+
+from touchcell.drivers.ur.codec import Value
+from touchcell.drivers.ur.emulator import kinematics as ur_model
+from touchcell.drivers.ur.emulator.motion import ArmState, Brake, Motion
+from touchcell.drivers.ur.emulator.program import NAMES, PERIOD_S, ControlProgram, ProgramError
+from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyBits, SafetyMode
+from touchcell.geometry.types import Array
+from touchcell.testing.emulation.base import CommandOnset
+
+HOME_Q = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])
+_STOP_PROGRAM_DECEL_RAD_S2 = 4.0
+_SAFETY_DECEL_RAD_S2 = 12.0
+_JOINT_SPEED_LIMIT_RAD_S = math.radians(191.0)
+_START_S = 0.02
+_POWER_S = 0.05
+
+_BITS = {
+    SafetyMode.NORMAL: SafetyBits.NORMAL_MODE,
+    SafetyMode.REDUCED: SafetyBits.REDUCED_MODE,
+    SafetyMode.PROTECTIVE_STOP: SafetyBits.PROTECTIVE_STOPPED | SafetyBits.STOPPED_DUE_TO_SAFETY,
+    SafetyMode.RECOVERY: SafetyBits.RECOVERY_MODE,
+    SafetyMode.SAFEGUARD_STOP: SafetyBits.SAFEGUARD_STOPPED | SafetyBits.STOPPED_DUE_TO_SAFETY,
+    SafetyMode.SYSTEM_EMERGENCY_STOP: SafetyBits.SYSTEM_EMERGENCY_STOPPED | SafetyBits.EMERGENCY_STOPPED,
+    SafetyMode.ROBOT_EMERGENCY_STOP: SafetyBits.ROBOT_EMERGENCY_STOPPED | SafetyBits.EMERGENCY_STOPPED,
+    SafetyMode.VIOLATION: SafetyBits.VIOLATION,
+    SafetyMode.FAULT: SafetyBits.FAULT,
+}
+_PAUSING = (SafetyMode.PROTECTIVE_STOP, SafetyMode.SAFEGUARD_STOP, SafetyMode.AUTOMATIC_MODE_SAFEGUARD_STOP)
+
+
+class Controller:
+    """State of the controller; ``step`` advances it by one control period.
+
+    Args:
+        unlock_after_s: how long a protective stop cannot be unlocked (5 s on the real controller).
+    """
+
+    def __init__(self, unlock_after_s: float = 5.0) -> None:
+        self._unlock_after_s = unlock_after_s
+        self.energising = 0
+        self.commands: Counter[str] = Counter()
+        self.onset = CommandOnset()
+        self.messages: deque[str] = deque(maxlen=20)
+        self.watchdog_trips = 0
+        self.remote_control = True
+        self.speed_slider = 1.0
+        self.wrench = np.zeros(6)
+        self.arm = ArmState(HOME_Q)
+        self.inputs: dict[str, Value] = {}
+        self._boot(RobotMode.RUNNING)
+
+    def _boot(self, robot_mode: RobotMode) -> None:
+        self.t_s = 0.0
+        self.robot_mode = robot_mode
+        self.safety_mode = SafetyMode.NORMAL
+        self.runtime_state = RuntimeState.STOPPED
+        self.outputs: dict[str, Value] = {}
+        self.motion: Motion | None = None
+        self.watchdog_hz = 0.0
+        self._program: ControlProgram | None = None
+        self._foreign_program = False
+        self._starting: tuple[float, int] | None = None
+        self._powering: tuple[float, RobotMode] | None = None
+        self._input_s = 0.0
+        self._input_travel_m = 0.0
+        self._stopped_s = -math.inf
+
+    @property
+    def energised(self) -> bool:
+        """Whether the brakes are off."""
+        return self.robot_mode is RobotMode.RUNNING
+
+    @property
+    def last_input_age_s(self) -> float:
+        """Seconds since input_int_register_0 (or 24) was last written."""
+        return self.t_s - self._input_s
+
+    @property
+    def travel_since_input_m(self) -> float:
+        """How far the tool has moved since then."""
+        return self.arm.travel_m - self._input_travel_m
+
+    def step(self) -> None:
+        """Let one control period pass."""
+        self.t_s += PERIOD_S
+        if self._powering is not None and self.t_s >= self._powering[0]:
+            self.robot_mode = self._powering[1]
+            self._powering = None
+        if self._starting is not None and self.t_s >= self._starting[0]:
+            self._program = ControlProgram(self, self._starting[1])
+            self._starting = None
+            self.runtime_state = RuntimeState.PLAYING
+        self._watch()
+        self._run_program()
+        if self.motion is not None and self.energised:
+            self.arm.move_to(self.motion.advance(self.arm, PERIOD_S, self.speed_slider), PERIOD_S)
+            if float(np.abs(self.arm.qd).max()) > _JOINT_SPEED_LIMIT_RAD_S:
+                self.protective_stop()
+            elif self.motion.done:
+                self.motion = None
+        elif self.arm.qd.any():
+            self.arm.move_to(self.arm.q, PERIOD_S)
+
+    def _watch(self) -> None:
+        late = self.watchdog_hz > 0.0 and self.last_input_age_s > 1.0 / self.watchdog_hz
+        if late and self.runtime_state is RuntimeState.PLAYING:
+            self.watchdog_trips += 1
+            self.log(f"no input for {self.last_input_age_s:.3f} s: program stopped by its watchdog")
+            self.stop_program()
+
+    def _run_program(self) -> None:
+        if self._program is None or self.runtime_state is not RuntimeState.PLAYING:
+            return
+        try:
+            if not self._program.step():
+                self.stop_program()
+        except ProgramError as error:
+            self.log(f"program stopped: {error}")
+            self.stop_program()
+
+    def write_inputs(self, values: dict[str, Value]) -> None:
+        """Take over a data packet. Registers keep their values when a program stops or a client goes."""
+        self.inputs.update(values)
+        speeds = tuple(value for name, value in values.items() if "double" in name)
+        if speeds:
+            self.onset.note("arm", speeds)
+        for register in ("input_int_register_0", "input_int_register_24"):
+            command = values.get(register)
+            if isinstance(command, int):
+                self._input_s = self.t_s
+                self._input_travel_m = self.arm.travel_m
+                self.commands[NAMES.get(command, str(command))] += 1
+
+    def start_program(self, text: str) -> None:
+        """Run an uploaded script, if it is ur-rtde's, the arm is powered, safe, and in remote control."""
+        if not (self.remote_control and self.energised and self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED)):
+            self.log("script refused: not in remote control, not powered or not safe")
+        elif not re.match(r"\s*def rtde_control\(\):", text) or "rtde_set_watchdog" not in text or "$" in text:
+            self.log("script refused: not the control script of ur-rtde, or not made for this version")
+        else:
+            self.energising += 1
+            self.commands["script"] += 1
+            self.stop_program()
+            offset = re.search(r"reg_offset_int = *#[^\n]*\n\s*(\d+)", text)
+            self._starting = (self.t_s + _START_S, int(offset[1]) if offset else 0)
+
+    def play_foreign_program(self) -> None:
+        """Somebody else's program is running."""
+        self._foreign_program = True
+        self.runtime_state = RuntimeState.PLAYING
+
+    def stop_program(self) -> None:
+        """End whatever program runs; the arm slows down and holds."""
+        self._program = None
+        self._starting = None
+        self._foreign_program = False
+        self.watchdog_hz = 0.0
+        self.runtime_state = RuntimeState.STOPPED
+        if self.motion is not None:
+            self.motion = Brake(_STOP_PROGRAM_DECEL_RAD_S2, linear=False)
+
+    def play(self) -> bool:
+        """Resume a paused program; on a real controller, too, it goes on with what it was doing."""
+        if self.runtime_state is not RuntimeState.PAUSED or self.safety_mode is not SafetyMode.NORMAL:
+            return False
+        self.energising += 1
+        self.runtime_state = RuntimeState.PLAYING
+        return True
+
+    def protective_stop(self) -> None:
+        """Brake hard and pause the program."""
+        self.stop_by_safety(SafetyMode.PROTECTIVE_STOP)
+
+    def stop_by_safety(self, mode: SafetyMode) -> None:
+        """Enter a safety mode: pausing ones pause the program, the others end it and cut the power."""
+        self.safety_mode = mode
+        self._stopped_s = self.t_s
+        if mode in (SafetyMode.NORMAL, SafetyMode.REDUCED):
+            return
+        if self.motion is not None:
+            self.motion = Brake(_SAFETY_DECEL_RAD_S2, linear=False)
+        if mode in _PAUSING:
+            if self.runtime_state is RuntimeState.PLAYING:
+                self.runtime_state = RuntimeState.PAUSED
+        else:
+            self.stop_program()
+            self._powering = (self.t_s + 0.5, RobotMode.POWER_OFF)
+
+    def unlock_protective_stop(self) -> bool:
+        """Leave a protective stop; too early after it, it stays."""
+        if self.safety_mode is not SafetyMode.PROTECTIVE_STOP:
+            return True
+        if self.t_s - self._stopped_s < self._unlock_after_s:
+            return False
+        self.energising += 1
+        self.safety_mode = SafetyMode.NORMAL
+        return True
+
+    def power(self, mode: RobotMode) -> None:
+        """Power on (IDLE), release the brakes (RUNNING) or power off."""
+        if mode is RobotMode.POWER_OFF:
+            self.stop_program()
+            self.motion = None
+            self.robot_mode = mode
+        elif self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED):
+            self.energising += 1
+            self._powering = (self.t_s + _POWER_S, mode)
+
+    def restart(self) -> None:
+        """Start the controller anew: its clock from 0, no program, the arm powered off where it stands."""
+        self.arm.move_to(self.arm.q, PERIOD_S)
+        self._boot(RobotMode.POWER_OFF)
+        self.inputs.clear()
+
+    def set_tool(self, T_flange_tcp: Array) -> None:
+        """Change the tool centre point."""
+        self.energising += 1
+        self.arm.T_flange_tcp = T_flange_tcp
+        self.arm.refresh()
+
+    def set_watchdog(self, min_hz: float) -> None:
+        """Stop the program when inputs come more slowly than ``min_hz``; 0 switches it off."""
+        self.watchdog_hz = min_hz
+        self._input_s = self.t_s
+
+    def log(self, message: str) -> None:
+        """Note something for whoever reads the state."""
+        self.messages.append(f"{self.t_s:.3f} {message}")
+
+    def values(self) -> dict[str, Value]:
+        """Every variable that RTDE can stream, except registers."""
+        arm = self.arm
+        pose = _six(ur_model.pose_vector(arm.T_base_tcp))
+        twist, q, qd = _six(arm.twist), _six(arm.q), _six(arm.qd)
+        playing = self.runtime_state is RuntimeState.PLAYING
+        powered = self.robot_mode >= RobotMode.POWER_ON
+        return {
+            "timestamp": self.t_s,
+            "actual_q": q,
+            "target_q": q,
+            "actual_qd": qd,
+            "target_qd": qd,
+            "actual_TCP_pose": pose,
+            "target_TCP_pose": pose,
+            "actual_TCP_speed": twist,
+            "target_TCP_speed": twist,
+            "actual_TCP_force": _six(self.wrench),
+            "ft_raw_wrench": _six(self.wrench),
+            "robot_mode": int(self.robot_mode),
+            "safety_mode": int(self.safety_mode),
+            "safety_status": int(self.safety_mode),
+            "safety_status_bits": int(_BITS.get(self.safety_mode, SafetyBits.STOPPED_DUE_TO_SAFETY)),
+            "robot_status_bits": int(powered) | int(playing) << 1,
+            "runtime_state": int(self.runtime_state),
+            "speed_scaling": self.speed_slider,
+            "target_speed_fraction": self.speed_slider,
+            "joint_mode": (253,) * 6 if self.energised else (249,) * 6,
+            "joint_temperatures": (31.0,) * 6,
+            "actual_main_voltage": 48.0,
+            "actual_robot_voltage": 48.0,
+            "payload": 0.0,
+        }
+
+
+def _six(values: Array) -> tuple[float, ...]:
+    return tuple(values.tolist())

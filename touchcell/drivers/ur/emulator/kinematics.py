@@ -1,0 +1,82 @@
+"""Kinematics of a UR5e: where the flange is for given joint angles, and how fast it moves.
+
+Denavit-Hartenberg parameters: Universal Robots, "DH parameters for calculations of kinematics and dynamics", UR5e. A
+real arm differs by millimetres, because each carries its own calibration.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+
+JOINTS = 6
+_D_M = (0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996)
+_A_M = (0.0, -0.425, -0.3922, 0.0, 0.0, 0.0)
+_ALPHA = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
+_SIN_ALPHA = tuple(math.sin(alpha) for alpha in _ALPHA)
+_COS_ALPHA = tuple(math.cos(alpha) for alpha in _ALPHA)
+_DAMPING = 1e-3
+
+
+def forward(q: Array, T_flange_tcp: Array) -> tuple[Array, Array]:
+    """Pose ``T_base_tcp`` (4, 4), and Jacobian (6, 6) from joint speeds to [v, w] of the TCP along base axes."""
+    T = np.eye(4)
+    origins = np.empty((JOINTS, 3))
+    axes = np.empty((JOINTS, 3))
+    for i in range(JOINTS):
+        origins[i] = T[:3, 3]
+        axes[i] = T[:3, 2]
+        c, s = math.cos(q[i]), math.sin(q[i])
+        ca, sa = _COS_ALPHA[i], _SIN_ALPHA[i]
+        T = T @ np.array(
+            [[c, -s * ca, s * sa, _A_M[i] * c], [s, c * ca, -c * sa, _A_M[i] * s], [0, sa, ca, _D_M[i]], [0, 0, 0, 1]]
+        )
+    T = T @ T_flange_tcp
+    arms = T[:3, 3] - origins
+    J = np.empty((6, JOINTS))
+    J[0] = axes[:, 1] * arms[:, 2] - axes[:, 2] * arms[:, 1]
+    J[1] = axes[:, 2] * arms[:, 0] - axes[:, 0] * arms[:, 2]
+    J[2] = axes[:, 0] * arms[:, 1] - axes[:, 1] * arms[:, 0]
+    J[3:] = axes.T
+    return T, J
+
+
+def joint_speeds(J: Array, twist: Array) -> Array:
+    """Joint speeds (6,) for a twist (6,) along base axes; damped, so they stay finite at a singularity."""
+    return np.asarray(J.T @ np.linalg.solve(J @ J.T + _DAMPING**2 * np.eye(6), twist))
+
+
+def inverse(T_base_tcp: Array, q_near: Array, T_flange_tcp: Array) -> Array | None:
+    """Joint angles (6,) near ``q_near`` that reach the pose to 1 nm and 1 nrad, or None if Newton's steps do not."""
+    q = q_near.copy()
+    for _ in range(50):
+        T, J = forward(q, T_flange_tcp)
+        error = np.concatenate([T_base_tcp[:3, 3] - T[:3, 3], rotation_vector(T_base_tcp[:3, :3] @ T[:3, :3].T)])
+        if float(np.abs(error).max()) < 1e-9:
+            return q
+        step = joint_speeds(J, error)
+        q = q + step * min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-12))
+    return None
+
+
+def rotation_vector(R: Array) -> Array:
+    """Rotation vector (3,) of a rotation matrix."""
+    T = np.eye(4)
+    T[:3, :3] = R
+    return np.asarray(se3.log(T)[3:])
+
+
+def pose_vector(T: Array) -> Array:
+    """Universal Robots' pose (6,) [x y z rx ry rz]: metres and a rotation vector."""
+    return np.concatenate([T[:3, 3], rotation_vector(T[:3, :3])])
+
+
+def from_pose_vector(p: Array) -> Array:
+    """Pose (4, 4) of [x y z rx ry rz]."""
+    T = np.asarray(se3.exp(np.concatenate([np.zeros(3), p[3:]])))
+    T[:3, 3] = p[:3]
+    return T

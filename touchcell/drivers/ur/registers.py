@@ -1,0 +1,147 @@
+"""A connection to the registers through which a UR controller and its control program talk. No threads, no retries."""
+
+from __future__ import annotations
+
+import selectors
+import socket
+import time
+
+from touchcell.drivers.core.errors import CorruptMessage, DeviceGone, TransportTimeout
+from touchcell.drivers.ur import codec as ur_codec
+from touchcell.drivers.ur.codec import Packet, PacketType, Recipe, Value
+
+RATE_HZ = 500.0
+OUTPUTS = (
+    "runtime_state",
+    "output_int_register_0",
+    "output_int_register_2",
+    *(f"output_double_register_{i}" for i in range(6)),
+)
+COMMAND = ("input_int_register_0", "input_int_register_1", *(f"input_double_register_{i}" for i in range(8)))
+KICK = ("input_int_register_0",)
+_LARGEST_READ = 1 << 16
+
+
+class RtdeWire:
+    """One RTDE connection: request and answer while it is being set up.
+
+    Args:
+        device: name for errors.
+        host: address of the controller.
+        timeout_s: for the connection and for each answer.
+
+    Raises:
+        OSError: it cannot be reached.
+    """
+
+    def __init__(self, device: str, host: str, timeout_s: float) -> None:
+        self._device = device
+        self._timeout_s = timeout_s
+        self._stream = b""
+        self._socket = socket.create_connection((host, ur_codec.PORT), timeout_s)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setblocking(False)
+
+    def close(self) -> None:
+        """End the connection; may be called again."""
+        self._socket.close()
+
+    def ask(self, request: Packet) -> Packet:
+        """The answer to ``request``. Raises TransportTimeout, DeviceGone, CorruptMessage."""
+        self.send(request)
+        deadline_s = time.monotonic() + self._timeout_s
+        while (left_s := deadline_s - time.monotonic()) > 0.0:
+            for packet in self.receive(left_s):
+                if packet.kind is request.kind:
+                    return packet
+        raise TransportTimeout(self._device, f"answer to {request.kind.name}", self._timeout_s)
+
+    def send(self, packet: Packet) -> None:
+        """Send at once or raise DeviceGone: a controller that does not read is as good as gone."""
+        data = ur_codec.encode(packet)
+        try:
+            sent = self._socket.send(data)
+        except OSError as error:
+            raise DeviceGone(self._device, f"RTDE connection: {error}") from error
+        if sent != len(data):
+            raise DeviceGone(self._device, "RTDE connection: the controller does not read")
+
+    def receive(self, timeout_s: float) -> list[Packet]:
+        """Packets that have come, waiting for the first up to ``timeout_s``. Raises DeviceGone, CorruptMessage."""
+        if timeout_s > 0.0:
+            with selectors.DefaultSelector() as selector:
+                selector.register(self._socket, selectors.EVENT_READ)
+                selector.select(timeout_s)
+        try:
+            piece = self._socket.recv(_LARGEST_READ)
+        except BlockingIOError:
+            return []
+        except OSError as error:
+            raise DeviceGone(self._device, f"RTDE connection: {error}") from error
+        if not piece:
+            raise DeviceGone(self._device, "RTDE connection: closed by the controller")
+        packets, self._stream = ur_codec.split(self._stream + piece)
+        return packets
+
+
+class Registers:
+    """The control program's registers, claimed for us.
+
+    Raises on construction:
+        DeviceGone: unreachable, or closed.
+        TransportTimeout: no answer.
+        CorruptMessage: the registers are not there, or belong to somebody else.
+    """
+
+    def __init__(self, device: str, host: str, timeout_s: float) -> None:
+        self._device = device
+        try:
+            self._wire = RtdeWire(device, host, timeout_s)
+        except OSError as error:
+            raise DeviceGone(device, f"RTDE of {host}: {error}") from error
+        try:
+            self._wire.ask(ur_codec.version_request())
+            self._outputs = self._recipe(ur_codec.setup_outputs(RATE_HZ, OUTPUTS), OUTPUTS)
+            self._command = self._recipe(ur_codec.setup_inputs(COMMAND), COMMAND)
+            self._kick = self._recipe(ur_codec.setup_inputs(KICK), KICK)
+            self._wire.ask(Packet(PacketType.START))
+        except BaseException:
+            self._wire.close()
+            raise
+        self._values: dict[str, Value] = {}
+
+    def close(self) -> None:
+        """Give the registers back; may be called again."""
+        self._wire.close()
+
+    def command(self, number: int, doubles: list[float], asynchronous: bool = False) -> None:
+        """Write a command and its arguments (up to eight) in one packet. Raises DeviceGone."""
+        arguments = doubles + [0.0] * (len(COMMAND) - 2 - len(doubles))
+        values = dict(zip(COMMAND, (number, int(asynchronous), *arguments), strict=True))
+        self._wire.send(Packet(PacketType.DATA, self._command.pack(values)))
+
+    def kick(self) -> None:
+        """Write "no command", which tells the watchdog that we live. Raises DeviceGone."""
+        self._wire.send(Packet(PacketType.DATA, self._kick.pack({KICK[0]: 0})))
+
+    def read(self, timeout_s: float = 0.0) -> dict[str, Value]:
+        """Newest outputs by name, waiting up to ``timeout_s`` for newer ones; empty before the first.
+
+        Raises:
+            DeviceGone, CorruptMessage: the connection is of no more use.
+        """
+        for packet in self._wire.receive(timeout_s):
+            if packet.kind is PacketType.DATA:
+                self._values = self._outputs.unpack(packet.payload)
+        return self._values
+
+    def _recipe(self, request: Packet, names: tuple[str, ...]) -> Recipe:
+        answer = self._wire.ask(request)
+        types = ur_codec.parse_names(answer.payload[1:])
+        if ur_codec.IN_USE in types:
+            raise CorruptMessage(
+                self._device,
+                "the RTDE registers are in use by another client",
+                hint="disable EtherNet/IP, PROFINET and MODBUS on the controller, or stop the other client",
+            )
+        return ur_codec.parse_recipe_answer(answer.payload, names)

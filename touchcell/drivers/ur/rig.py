@@ -1,0 +1,73 @@
+"""The ``ur`` driver beside its emulated controller."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.device import Device
+from touchcell.drivers.core.spec import DriverContext
+from touchcell.drivers.ur.driver import SPEC, UrConfig
+from touchcell.testing.emulation.process import EmulatorProcess
+from touchcell.testing.emulation.rig import Rig
+
+UNLOCK_AFTER_S = 0.1
+"""A real controller keeps a protective stop locked for 5 s; nobody wants to wait for that in a test."""
+
+
+def host_of(address: int) -> str:
+    """The loopback address of emulator ``address``, below 11 000 000: its ports are fixed, so each needs its own."""
+    high, low = divmod(address, 250)
+    return f"127.{64 + high // 250}.{high % 250}.{low + 1}"
+
+
+def config_of(address: int) -> UrConfig:
+    """The configuration with which the rig's driver finds emulator ``address``.
+
+    Patient, because test machines are busy: whoever cannot run for a tenth of a second loses the arm by default.
+    """
+    return UrConfig(
+        host=host_of(address),
+        flange_to_tcp_mm_deg=(0.0, 0.0, 100.0, 0.0, 0.0, 0.0),
+        watchdog_hz=5.0,
+        state_timeout_s=0.3,
+    )
+
+
+def rig(folder: Path, address: int) -> Rig:
+    """The rig on its own loopback address; it keeps nothing in ``folder``."""
+    host = host_of(address)
+
+    def start() -> EmulatorProcess:
+        return EmulatorProcess("ur", "--host", host, "--unlock-after", str(UNLOCK_AFTER_S)).start()
+
+    def build(clock: Clock) -> Device:
+        return SPEC.build("ur", config_of(address), DriverContext(clock))
+
+    return Rig(
+        spec=SPEC,
+        start=start,
+        build=build,
+        config=config_of(address),
+        time="t_s",
+        pose="T_base_tcp",
+        faults={
+            "drop": (5, "unseen"),
+            "corrupt": (5, "transient"),
+            "nan": (5, "transient"),
+            "out_of_order": (5, "unseen"),
+            "delay": (0.5, "fault"),
+            "pause": (True, "fault"),
+            "unplug": (True, "fault"),
+            "restart": (True, "fault"),
+            "protective_stop": (True, "fault"),
+            "emergency_stop": (True, "fault"),
+            "program_stop": (True, "fault"),
+            "power_off": (True, "fault"),
+        },
+        notes=(
+            "how fast the controller stops the arm after its watchdog has stopped the program",
+            "that speedl's time argument only says when it returns",
+            "that registers keep their values when a program or a client ends",
+        ),
+    )

@@ -1,0 +1,228 @@
+"""What a UR controller says about itself, checked before anyone may believe it.
+
+ur-rtde's receive thread keeps the newest packet and nothing else: no reception time, no queue, and values of different
+packets where it overtakes the reader. So the reader takes a packet only whole (its timestamp is the same before and
+after), places it in time by the controller's own clock, and drops whatever is not finite, out of range, or older than
+what it has. RTDE has no checksum: a wrong value within the ranges below cannot be told from a right one.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyMode
+from touchcell.geometry.types import Array
+
+RATE_HZ = 500.0
+VARIABLES = (
+    "timestamp",
+    "actual_q",
+    "actual_qd",
+    "target_qd",
+    "actual_TCP_pose",
+    "actual_TCP_speed",
+    "actual_TCP_force",
+    "robot_mode",
+    "safety_mode",
+    "safety_status_bits",
+    "runtime_state",
+    "target_speed_fraction",
+    "joint_temperatures",
+)
+
+_MAX_JOINT_SPEED_RAD_S = 2.0 * math.pi
+# Largest magnitudes that can be true, in the order in which StateReader reads: far beyond what the arm can do.
+_BOUNDS = np.array(
+    [
+        1e9,  # timestamp, s
+        *[3.0] * 3,  # position, m
+        *[2.0 * math.pi] * 3,  # rotation vector, rad
+        *[20.0] * 6,  # speed of the tool, m/s and rad/s
+        *[2000.0] * 6,  # wrench, N and N m
+        1.0,  # speed slider
+        *[2.0 * math.pi + 0.1] * 6,  # joints, rad
+        *[_MAX_JOINT_SPEED_RAD_S] * 12,  # actual and target joint speeds
+        *[200.0] * 6,  # temperatures, Celsius
+    ]
+)
+_JUMP_SLACK_RAD = 0.02
+_ATTEMPTS = 3
+# Two quartz clocks differ by less; see _place.
+_MAX_CLOCK_DRIFT = 200e-6
+_BUDGET_WINDOW = 50
+_BUDGET_MISSES = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """One packet of state: SI units, base axes.
+
+    Attributes:
+        t_ns: when it was true, on the host's clock.
+        t_device_ns: the controller's clock.
+        seq: number of its control period.
+        q, qd, qd_target: joint angles and speeds (6,).
+        tcp_pose: [x y z rx ry rz] of the active tool centre point, a rotation vector.
+        tcp_speed: [v, w] of it along base axes.
+        tcp_force: [f, t] on it along base axes.
+        temperatures: of the joints, Celsius.
+        speed_fraction: position of the speed slider.
+    """
+
+    t_ns: int
+    t_device_ns: int
+    seq: int
+    q: Array
+    qd: Array
+    qd_target: Array
+    tcp_pose: Array
+    tcp_speed: Array
+    tcp_force: Array
+    temperatures: Array
+    robot_mode: RobotMode
+    safety_mode: SafetyMode
+    safety_bits: int
+    runtime_state: RuntimeState
+    speed_fraction: float
+
+    def age_s(self, now_ns: int) -> float:
+        """Seconds since it was true."""
+        return (now_ns - self.t_ns) * 1e-9
+
+
+class StateReader:
+    """Turns ur-rtde's receive interface into checked snapshots. Any thread may poll.
+
+    Args:
+        receive: ``RTDEReceiveInterface`` that streams ``VARIABLES``.
+        clock: the host's clock.
+
+    Attributes:
+        corrupt: packets dropped because of their values.
+        out_of_order: packets dropped because a newer one had been seen.
+    """
+
+    def __init__(self, receive: Any, clock: Clock) -> None:
+        self._receive = receive
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._newest: Snapshot | None = None
+        self._seen_s = math.nan
+        self._offset_ns: float | None = None
+        self._offset_at_ns = 0
+        self._misses: deque[bool] = deque(maxlen=_BUDGET_WINDOW)
+        self.corrupt = 0
+        self.out_of_order = 0
+
+    @property
+    def connected(self) -> bool:
+        """Whether the connection stands."""
+        return bool(self._receive.isConnected())
+
+    @property
+    def over_budget(self) -> bool:
+        """Whether more packets are being dropped than a healthy link explains: over 10 of the last 50."""
+        return sum(self._misses) > _BUDGET_MISSES
+
+    def forget(self) -> None:
+        """Start the budget and the comparison of the clocks anew, after a person has looked at the fault."""
+        with self._lock:
+            self._misses.clear()
+            self._offset_ns = None
+
+    def poll(self) -> Snapshot | None:
+        """Newest good snapshot, or None before the first."""
+        with self._lock:
+            for _ in range(_ATTEMPTS):
+                timestamp_s = self._receive.getTimestamp()
+                if timestamp_s == self._seen_s:
+                    break
+                if not math.isfinite(timestamp_s):
+                    self._miss_corrupt()
+                    break
+                values = self._values()
+                if self._receive.getTimestamp() == timestamp_s:
+                    self._seen_s = timestamp_s
+                    self._take(timestamp_s, values)
+                    break
+            return self._newest
+
+    def _values(self) -> tuple[list[float], list[float], tuple[int, ...]]:
+        receive = self._receive
+        tool = [*receive.getActualTCPPose(), *receive.getActualTCPSpeed(), *receive.getActualTCPForce()]
+        joints = [
+            *receive.getActualQ(),
+            *receive.getActualQd(),
+            *receive.getTargetQd(),
+            *receive.getJointTemperatures(),
+        ]
+        modes = (
+            receive.getRobotMode(),
+            receive.getSafetyMode(),
+            receive.getSafetyStatusBits(),
+            receive.getRuntimeState(),
+        )
+        return [*tool, receive.getTargetSpeedFraction()], joints, modes
+
+    def _take(self, timestamp_s: float, values: tuple[list[float], list[float], tuple[int, ...]]) -> None:
+        tool, joints, (robot_mode, safety_mode, safety_bits, runtime_state) = values
+        numbers = np.array([timestamp_s, *tool, *joints])
+        # Written so that NaN fails.
+        if not (np.abs(numbers) <= _BOUNDS).all() or timestamp_s < 0.0:
+            return self._miss_corrupt()
+        t_device_ns = round(timestamp_s * 1e9)
+        q = numbers[20:26]
+        newest = self._newest
+        if newest is not None:
+            passed_ns = t_device_ns - newest.t_device_ns
+            if passed_ns <= 0:
+                self.out_of_order += 1
+                self._misses.append(True)
+                return None
+            reach = _MAX_JOINT_SPEED_RAD_S * passed_ns * 1e-9 + _JUMP_SLACK_RAD
+            if not (np.abs(q - newest.q) <= reach).all():
+                return self._miss_corrupt()
+        try:
+            modes = RobotMode(robot_mode), SafetyMode(safety_mode), RuntimeState(runtime_state)
+        except ValueError:
+            return self._miss_corrupt()
+        self._misses.append(False)
+        self._newest = Snapshot(
+            t_ns=self._place(t_device_ns),
+            t_device_ns=t_device_ns,
+            seq=round(timestamp_s * RATE_HZ),
+            q=q,
+            qd=numbers[26:32],
+            qd_target=numbers[32:38],
+            tcp_pose=numbers[1:7],
+            tcp_speed=numbers[7:13],
+            tcp_force=numbers[13:19],
+            temperatures=numbers[38:44],
+            robot_mode=modes[0],
+            safety_mode=modes[1],
+            safety_bits=safety_bits,
+            runtime_state=modes[2],
+            speed_fraction=float(numbers[19]),
+        )
+        return None
+
+    def _miss_corrupt(self) -> None:
+        self.corrupt += 1
+        self._misses.append(True)
+
+    def _place(self, t_device_ns: int) -> int:
+        # The smallest delay ever seen is the best guess of the clocks' offset. Letting it grow as fast as clocks may
+        # drift apart keeps it true for days, and a packet that was read late never looks fresh.
+        now_ns = self._clock.now_ns()
+        offset_ns = float(now_ns - t_device_ns)
+        if self._offset_ns is not None:
+            offset_ns = min(offset_ns, self._offset_ns + _MAX_CLOCK_DRIFT * (now_ns - self._offset_at_ns))
+        self._offset_ns, self._offset_at_ns = offset_ns, now_ns
+        return t_device_ns + round(offset_ns)

@@ -1,0 +1,1 @@
+"""TacTip cameras over Video4Linux2."""

@@ -1,0 +1,240 @@
+"""TacTip cameras through Video4Linux2: kernel stamps, sequence numbers, settings that are read back.
+
+Source: the kernel's "Video for Linux API", chapters "Streaming I/O (Memory Mapping)" and "User Controls".
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, SettingRefused
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.device import Device
+from touchcell.drivers.core.errors import ConnectError, DeviceGone, TransportError
+from touchcell.drivers.core.samples import Quality
+from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
+from touchcell.drivers.v4l2 import codec
+from touchcell.drivers.v4l2.node import KernelCalls, SystemCalls, VideoNode
+
+_LONGEST_PAUSE_S = 0.5
+_FEWEST_BUFFERS = 4
+_RATE_TOLERANCE = 0.01
+_FUTURE_NS = 1_000_000
+_CLOCK_TOLERANCE_NS = 1_000_000_000
+_BYTES_PER_PIXEL = {"YUYV": 2, "GREY": 1}
+
+
+class V4l2Config(CameraConfig):
+    """Settings of a V4L2 camera; see ``CameraConfig``."""
+
+
+class V4l2Camera(Camera):
+    """A camera behind a video node.
+
+    The queue holds half a second of frames (at most 32, the kernel's limit), so any control loop that reads more often
+    than that gets the newest frame without a reader thread.
+
+    Args:
+        name: the device's name in the cell.
+        clock: injected time; must run on CLOCK_MONOTONIC, as the kernel's stamps do.
+        config: settings.
+        calls: system calls; the kernel's unless an emulator stands in.
+    """
+
+    def __init__(self, name: str, clock: Clock, config: V4l2Config, calls: SystemCalls | None = None) -> None:
+        super().__init__(name, clock, config)
+        self._calls = calls or KernelCalls()
+        self._node: VideoNode | None = None
+        self._identity = ("", "")
+        self._buffers = 0
+        self._overrun = False
+        self._previous: codec.Arrival | None = None
+        self._number = -1
+        self._queue_empty_ns = 0
+        self._exposure_us: int | None = None
+        self._gain: int | None = None
+
+    def _open(self) -> None:
+        if abs(self._clock.now_ns() - time.monotonic_ns()) > _CLOCK_TOLERANCE_NS:
+            raise ConnectError(
+                self.name,
+                "the kernel stamps frames on CLOCK_MONOTONIC, the cell's clock is another",
+                hint="use a simulated or replayed camera with a virtual clock",
+            )
+        self._node = VideoNode(self.name, self._config.device, self._calls)
+        self._identity = (self._node.card, self._node.bus)
+
+    def _close(self) -> None:
+        if self._node is not None:
+            self._node.close()
+            self._node = None
+
+    def _configure(self) -> None:
+        node = self._opened()
+        self._set_picture(node)
+        self._set_controls(node)
+        try:
+            depth = math.ceil(_LONGEST_PAUSE_S * self._config.rate_hz)
+            self._buffers = node.start(min(max(depth, _FEWEST_BUFFERS), codec.MAX_BUFFERS))
+            if self._buffers < 2:
+                raise ConnectError(
+                    self.name, f"the camera grants {self._buffers} buffers", hint="at least two are needed"
+                )
+            self._previous = None
+            self._overrun = False
+            self._queue_empty_ns = self._clock.now_ns()
+            self._begin_stream()
+        except BaseException:
+            node.stop()
+            raise
+
+    def _set_picture(self, node: VideoNode) -> None:
+        config = self._config
+        picture = node.set_picture(config.pixel_format, config.width_px, config.height_px)
+        for setting, given in (
+            ("pixel_format", picture.pixel_format),
+            ("width_px", picture.width_px),
+            ("height_px", picture.height_px),
+        ):
+            if given != getattr(config, setting):
+                raise SettingRefused(self.name, setting, getattr(config, setting), given)
+        line = config.width_px * _BYTES_PER_PIXEL.get(config.pixel_format, 0)
+        if line and picture.bytes_per_line != line:
+            raise SettingRefused(
+                self.name, "pixel_format", config.pixel_format, f"lines of {picture.bytes_per_line} bytes"
+            )
+        rate_hz = node.set_rate(config.rate_hz)
+        if not math.isclose(rate_hz, config.rate_hz, rel_tol=_RATE_TOLERANCE):
+            raise SettingRefused(self.name, "rate_hz", config.rate_hz, rate_hz)
+
+    def _set_controls(self, node: VideoNode) -> None:
+        for identity, setting, value in (
+            (codec.CID_EXPOSURE_AUTO, "automatic exposure", codec.EXPOSURE_MANUAL),
+            (codec.CID_AUTOGAIN, "automatic gain", 0),
+        ):
+            if node.has_control(identity):
+                self._expect(setting, value, node.set_control(identity, value))
+        config = self._config
+        unit = codec.EXPOSURE_UNIT_US
+        steps = None if config.exposure_us is None else config.exposure_us // unit
+        steps = self._set_value(node, codec.CID_EXPOSURE_ABSOLUTE, "exposure_us", steps, unit)
+        self._exposure_us = None if steps is None else steps * unit
+        self._gain = self._set_value(node, codec.CID_GAIN, "gain", config.gain, 1)
+
+    def _set_value(self, node: VideoNode, identity: int, setting: str, value: int | None, unit: int) -> int | None:
+        if not node.has_control(identity):
+            if value is not None:
+                raise SettingRefused(self.name, setting, value * unit, None)
+            return None
+        if value is None:
+            return node.control(identity)
+        given = node.set_control(identity, value)
+        self._expect(setting, value * unit, given * unit)
+        return given
+
+    def _expect(self, setting: str, asked: int, given: int) -> None:
+        if asked != given:
+            raise SettingRefused(self.name, setting, asked, given)
+
+    def _collect(self) -> bool:
+        node = self._opened()
+        taken = 0
+        # Bounded: a camera that is faster than this loop must not keep the caller for ever.
+        while taken < 2 * self._buffers:
+            try:
+                arrival = node.take()
+            except DeviceGone:
+                raise
+            except TransportError:
+                # DQBUF may fail with EIO for one frame (signal lost) and go on with the next.
+                self._watch.refuse("unreadable")
+                break
+            if arrival is None:
+                break
+            taken += 1
+            data = node.data(arrival)
+            node.give_back(arrival.index)
+            self._examine(arrival, data)
+            if taken >= self._buffers:
+                self._overrun = True
+        self._queue_empty_ns = self._clock.now_ns()
+        return self._overrun
+
+    def _examine(self, arrival: codec.Arrival, data: bytes) -> None:
+        previous = self._previous
+        step = 1 if previous is None else codec.sequence_step(previous.sequence, arrival.sequence)
+        if step <= 0 or (previous is not None and arrival.stamp_ns <= previous.stamp_ns):
+            self._watch.refuse("out_of_order")
+            return
+        if arrival.monotonic and arrival.stamp_ns > self._clock.now_ns() + _FUTURE_NS:
+            self._watch.refuse("from_the_future")
+            return
+        self._previous = arrival
+        self._number += step
+        self._watch.miss(step - 1, overrun=self._overrun)
+        self._overrun = False
+        if arrival.damaged:
+            self._watch.refuse("marked_damaged")
+        elif codec.damage(data, self._config.pixel_format, self._config.width_px, self._config.height_px):
+            self._watch.refuse("damaged")
+        else:
+            self._watch.admit(data)
+            self._keep(self._stamped(arrival, data))
+
+    def _stamped(self, arrival: codec.Arrival, data: bytes) -> RawFrame:
+        if arrival.monotonic:
+            return RawFrame(data, arrival.stamp_ns, self._number)
+        # All that is known of its age is that it was not there when the queue was last empty.
+        return RawFrame(data, self._queue_empty_ns, self._number, arrival.stamp_ns, Quality.SUSPECT)
+
+    def _wait(self, timeout_s: float) -> None:
+        self._opened().wait(timeout_s)
+
+    def _exposure_and_gain(self) -> tuple[float | None, float | None]:
+        return (
+            None if self._exposure_us is None else self._exposure_us * 1e-6,
+            None if self._gain is None else float(self._gain),
+        )
+
+    def _settings(self) -> dict[str, float | int | str | bool]:
+        readings: dict[str, float | int | str | bool] = {
+            "card": self._identity[0],
+            "bus": self._identity[1],
+            "buffers": self._buffers,
+            "stable_name": is_stable_name(self._config.device),
+        }
+        if self._previous is not None:
+            readings["kernel_stamps"] = self._previous.monotonic
+            readings["stamp_marks"] = "start of exposure" if self._previous.start_of_exposure else "end of frame"
+        if self._exposure_us is not None:
+            readings["exposure_us"] = self._exposure_us
+        if self._gain is not None:
+            readings["gain"] = self._gain
+        if not readings["stable_name"]:
+            readings["warning"] = f"{self._config.device} may be another camera after a restart, use /dev/v4l/by-id"
+        return readings
+
+    def _opened(self) -> VideoNode:
+        assert self._node is not None, "the lifecycle lets nobody read a closed camera"
+        return self._node
+
+
+def is_stable_name(path: str) -> bool:
+    """Whether a node's name stays with the camera (by-id) or the socket (by-path) over restarts."""
+    return path.startswith(("/dev/v4l/by-id/", "/dev/v4l/by-path/"))
+
+
+def build(name: str, config: Any, context: DriverContext) -> Device:
+    """Make a DISCONNECTED camera."""
+    return V4l2Camera(name, context.clock, config)
+
+
+SPEC = DriverSpec(
+    name="v4l2",
+    summary="TacTip camera through Video4Linux2, with kernel stamps and sequence numbers",
+    config=V4l2Config,
+    capabilities=Capabilities(kind="camera", abilities=frozenset({"FrameSource", "HealthSource"}), state_rate_hz=30.0),
+    build=build,
+)

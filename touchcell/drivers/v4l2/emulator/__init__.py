@@ -1,0 +1,1 @@
+"""An emulated Video4Linux2 camera."""

@@ -1,0 +1,291 @@
+"""One open video node: the system calls of a camera, with errors as types. No policy, no threads."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import fcntl
+import mmap
+import os
+import select
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Protocol
+
+from touchcell.drivers.core.errors import ConnectError, DeviceError, DeviceGone, TransportError
+from touchcell.drivers.v4l2 import codec
+
+_GONE = (errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN, errno.EPIPE)
+
+
+class SystemCalls(Protocol):
+    """The five calls that a camera needs. Real cameras use ``KernelCalls``; an emulator may stand in its own."""
+
+    def open(self, path: str) -> int:
+        """File descriptor, read-write and non-blocking."""
+        ...
+
+    def ioctl(self, fd: int, request: int, argument: ctypes.Structure | ctypes.c_int32) -> None:
+        """Control request, changing ``argument`` in place. Raises OSError."""
+        ...
+
+    def map(self, fd: int, length: int, offset: int) -> mmap.mmap:
+        """Shared mapping of a buffer."""
+        ...
+
+    def poll(self, fd: int, timeout_s: float) -> int:
+        """Bits of poll(2) among POLLIN, POLLERR, POLLHUP; 0 after the timeout."""
+        ...
+
+    def close(self, fd: int) -> None:
+        """Close it."""
+        ...
+
+
+class KernelCalls:
+    """The kernel's."""
+
+    def open(self, path: str) -> int:
+        return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+
+    def ioctl(self, fd: int, request: int, argument: ctypes.Structure | ctypes.c_int32) -> None:
+        fcntl.ioctl(fd, request, argument, True)
+
+    def map(self, fd: int, length: int, offset: int) -> mmap.mmap:
+        return mmap.mmap(fd, length, mmap.MAP_SHARED, mmap.PROT_READ | mmap.PROT_WRITE, offset=offset)
+
+    def poll(self, fd: int, timeout_s: float) -> int:
+        poller = select.poll()
+        poller.register(fd, select.POLLIN)
+        events = poller.poll(max(timeout_s, 0.0) * 1e3)
+        return events[0][1] if events else 0
+
+    def close(self, fd: int) -> None:
+        os.close(fd)
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """Format that a device really uses.
+
+    Attributes:
+        pixel_format: four characters.
+        width_px, height_px: size.
+        bytes_per_line: row pitch of raw formats.
+    """
+
+    pixel_format: str
+    width_px: int
+    height_px: int
+    bytes_per_line: int
+
+
+class VideoNode:
+    """An open capture node that streams into memory-mapped buffers.
+
+    Args:
+        device: name of the device in the cell, for errors.
+        path: video node, or a link to it.
+        calls: system calls.
+
+    Raises:
+        ConnectError: there is no such node, it may not be opened, or it is no streaming camera.
+    """
+
+    def __init__(self, device: str, path: str, calls: SystemCalls) -> None:
+        self._device = device
+        self._calls = calls
+        self._buffers: list[mmap.mmap] = []
+        try:
+            self._fd = calls.open(path)
+        except OSError as error:
+            raise ConnectError(
+                device, f"cannot open {path}: {error.strerror}", [error], hint=_open_hint(error, path)
+            ) from None
+        try:
+            self._capability = self._query_capability(path)
+        except BaseException:
+            calls.close(self._fd)
+            raise
+
+    @property
+    def card(self) -> str:
+        """Product name as the device tells it."""
+        return bytes(self._capability.card).decode("utf-8", "replace")
+
+    @property
+    def bus(self) -> str:
+        """Where it is plugged in, as the driver tells it."""
+        return bytes(self._capability.bus_info).decode("utf-8", "replace")
+
+    def pixel_formats(self) -> list[str]:
+        """Four-character names of what it can deliver. Raises TransportError, DeviceGone."""
+        names: list[str] = []
+        while True:
+            description = codec.FormatDescription(index=len(names), type=codec.VIDEO_CAPTURE)
+            try:
+                self._calls.ioctl(self._fd, codec.ENUM_FMT, description)
+            except OSError as error:
+                if error.errno == errno.EINVAL:
+                    return names
+                raise self._error(error, "list the picture formats") from None
+            names.append(codec.fourcc_text(description.pixelformat))
+
+    def set_picture(self, pixel_format: str, width_px: int, height_px: int) -> Picture:
+        """Ask for a format and return what the device chose. Raises TransportError, DeviceGone."""
+        request = codec.Format(type=codec.VIDEO_CAPTURE)
+        request.pix.width, request.pix.height = width_px, height_px
+        request.pix.pixelformat, request.pix.field = codec.fourcc(pixel_format), codec.FIELD_NONE
+        self._ask(codec.S_FMT, request, "set the picture format")
+        pix = request.pix
+        return Picture(codec.fourcc_text(pix.pixelformat), pix.width, pix.height, pix.bytesperline)
+
+    def set_rate(self, rate_hz: float) -> float:
+        """Ask for a frame rate and return what the device chose, Hz. Raises TransportError, DeviceGone."""
+        request = codec.StreamParameters(type=codec.VIDEO_CAPTURE)
+        request.timeperframe = codec.Fraction(1000, round(rate_hz * 1000))
+        self._ask(codec.S_PARM, request, "set the frame rate")
+        period = request.timeperframe
+        return period.denominator / period.numerator if period.numerator else 0.0
+
+    def has_control(self, identity: int) -> bool:
+        """Whether the device has a usable control of that number. Raises TransportError, DeviceGone."""
+        query = codec.QueryControl(id=identity)
+        try:
+            self._calls.ioctl(self._fd, codec.QUERYCTRL, query)
+        except OSError as error:
+            if error.errno in (errno.EINVAL, errno.ENOTTY):
+                return False
+            raise self._error(error, "query a control") from None
+        return not query.flags & codec.CTRL_DISABLED
+
+    def control(self, identity: int) -> int:
+        """Present value of a control. Raises TransportError, DeviceGone."""
+        request = codec.Control(id=identity)
+        self._ask(codec.G_CTRL, request, "read a control")
+        return int(request.value)
+
+    def set_control(self, identity: int, value: int) -> int:
+        """Set a control and return what reads back afterwards; the device may refuse silently.
+
+        Raises:
+            TransportError, DeviceGone: the device failed for another reason than the value.
+        """
+        try:
+            self._calls.ioctl(self._fd, codec.S_CTRL, codec.Control(id=identity, value=value))
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.ERANGE, errno.EACCES, errno.EBUSY):
+                raise self._error(error, "set a control") from None
+        return self.control(identity)
+
+    def start(self, buffers: int) -> int:
+        """Map and queue buffers and start to stream; returns how many the device granted.
+
+        Raises:
+            ConnectError: another program streams from it.
+            TransportError, DeviceGone: it failed.
+        """
+        request = codec.RequestBuffers(count=buffers, type=codec.VIDEO_CAPTURE, memory=codec.MEMORY_MMAP)
+        self._ask(codec.REQBUFS, request, "ask for buffers")
+        for index in range(request.count):
+            buffer = codec.Buffer(index=index, type=codec.VIDEO_CAPTURE, memory=codec.MEMORY_MMAP)
+            self._ask(codec.QUERYBUF, buffer, "query a buffer")
+            self._buffers.append(self._calls.map(self._fd, buffer.length, buffer.offset))
+            self.give_back(index)
+        self._ask(codec.STREAMON, ctypes.c_int32(codec.VIDEO_CAPTURE), "start to stream")
+        return int(request.count)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether a frame is there, waiting for it at most ``timeout_s``. Raises DeviceGone."""
+        bits = self._calls.poll(self._fd, timeout_s)
+        if bits & (select.POLLERR | select.POLLHUP | select.POLLNVAL):
+            raise DeviceGone(self._device, "the camera has gone", hint="plug it in and recover")
+        return bool(bits & select.POLLIN)
+
+    def take(self) -> codec.Arrival | None:
+        """Next filled buffer, to be given back, or None if none is waiting. Raises TransportError, DeviceGone."""
+        buffer = codec.Buffer(type=codec.VIDEO_CAPTURE, memory=codec.MEMORY_MMAP)
+        try:
+            self._calls.ioctl(self._fd, codec.DQBUF, buffer)
+        except OSError as error:
+            if error.errno == errno.EAGAIN:
+                return None
+            raise self._error(error, "take a frame") from None
+        if buffer.index >= len(self._buffers) or buffer.bytesused > len(self._buffers[buffer.index]):
+            raise TransportError(self._device, f"{buffer.bytesused} bytes in buffer {buffer.index} are impossible")
+        return codec.arrival(buffer)
+
+    def data(self, arrival: codec.Arrival) -> bytes:
+        """Copy of a taken frame's bytes; only valid until the buffer is given back."""
+        return self._buffers[arrival.index][: arrival.bytes_used]
+
+    def give_back(self, index: int) -> None:
+        """Queue a buffer for the next frame. Raises TransportError, DeviceGone."""
+        buffer = codec.Buffer(index=index, type=codec.VIDEO_CAPTURE, memory=codec.MEMORY_MMAP)
+        self._ask(codec.QBUF, buffer, "give a buffer back")
+
+    def stop(self) -> None:
+        """Stop streaming and free the buffers; never raises, as a camera that has gone has stopped."""
+        for buffer in self._buffers:
+            buffer.close()
+        self._buffers.clear()
+        none = codec.RequestBuffers(type=codec.VIDEO_CAPTURE, memory=codec.MEMORY_MMAP)
+        with suppress(OSError):
+            self._calls.ioctl(self._fd, codec.STREAMOFF, ctypes.c_int32(codec.VIDEO_CAPTURE))
+            self._calls.ioctl(self._fd, codec.REQBUFS, none)
+
+    def close(self) -> None:
+        """Stop and close; never raises."""
+        self.stop()
+        self._calls.close(self._fd)
+
+    def _query_capability(self, path: str) -> codec.Capability:
+        capability = codec.Capability()
+        try:
+            self._calls.ioctl(self._fd, codec.QUERYCAP, capability)
+        except OSError as error:
+            raise ConnectError(self._device, f"{path} is no video device: {error.strerror}", [error]) from None
+        able = capability.device_caps if capability.capabilities & codec.CAP_DEVICE_CAPS else capability.capabilities
+        missing = [
+            word
+            for word, bit in (("video capture", codec.CAP_VIDEO_CAPTURE), ("streaming", codec.CAP_STREAMING))
+            if not able & bit
+        ]
+        if missing:
+            raise ConnectError(
+                self._device,
+                f"{path} offers no {' and no '.join(missing)}",
+                hint="many cameras have a second node for metadata; take the one whose by-id name ends in index0",
+            )
+        return capability
+
+    def _ask(self, request: int, argument: ctypes.Structure | ctypes.c_int32, what: str) -> None:
+        try:
+            self._calls.ioctl(self._fd, request, argument)
+        except OSError as error:
+            raise self._error(error, what) from None
+
+    def _error(self, error: OSError, what: str) -> DeviceError:
+        if error.errno in _GONE:
+            return DeviceGone(self._device, f"the camera has gone (cannot {what})", hint="plug it in and recover")
+        if error.errno == errno.EBUSY:
+            return ConnectError(self._device, f"cannot {what}: busy", [error], hint="close the program that uses it")
+        return TransportError(self._device, f"cannot {what}: {error.strerror}")
+
+
+def _open_hint(error: OSError, path: str) -> str:
+    if error.errno == errno.EACCES:
+        return "add yourself to the group that owns the node, usually video: sudo usermod -aG video $USER"
+    if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
+        return f"plug it in; `touchcell devices` lists cameras ({_neighbours(path)})"
+    return ""
+
+
+def _neighbours(path: str) -> str:
+    folder = os.path.dirname(path) or "."
+    try:
+        names: Sequence[str] = sorted(name for name in os.listdir(folder) if "video" in name)
+    except OSError:
+        names = ()
+    return f"in {folder}: {', '.join(names) or 'none'}"

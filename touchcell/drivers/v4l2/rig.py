@@ -1,0 +1,50 @@
+"""The V4L2 driver beside an emulated camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.device import Device
+from touchcell.drivers.v4l2.driver import SPEC, V4l2Camera, V4l2Config
+from touchcell.drivers.v4l2.emulator.shim import ShimCalls
+from touchcell.testing.emulation.process import EmulatorProcess
+from touchcell.testing.emulation.rig import Rig
+
+_RATE_HZ = 60.0
+
+
+def rig(folder: Path, address: int) -> Rig:
+    """A camera at /dev/video``address`` whose sockets live in ``folder``."""
+    config = V4l2Config(
+        device=f"/dev/v4l/by-id/usb-TacTip_{address:04d}-video-index0", rate_hz=_RATE_HZ, exposure_us=15700, gain=10
+    )
+
+    def start() -> EmulatorProcess:
+        return EmulatorProcess("v4l2", "--folder", str(folder), "--minor", str(address)).start()
+
+    def build(clock: Clock) -> Device:
+        return V4l2Camera("tip", clock, config, ShimCalls(folder))
+
+    return Rig(
+        spec=SPEC,
+        start=start,
+        build=build,
+        config=config,
+        position=None,
+        state_rate_hz=_RATE_HZ,
+        faults={
+            "drop": (2, "transient"),
+            "corrupt": (2, "transient"),
+            "error_flag": (2, "transient"),
+            "out_of_order": (2, "transient"),
+            "delay": (0.2, "stale"),
+            "pause": (True, "fault"),
+            "unplug": (True, "fault"),
+            "restart": (0.2, "fault"),
+        },
+        notes=(
+            "frame pacing, exposure latency and error frames of real uvcvideo cameras are known from documents only",
+            "stamps of the emulated camera have no transport delay; a USB camera delivers about one frame time later",
+        ),
+    )

@@ -1,0 +1,138 @@
+"""Which marker is where in the images of a data set, found without its labels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from touchcell.drivers.replay.dataset import Split, read_image, read_split
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array, ImageArray
+from touchcell.perception.calibration.marker_learning import learn_markers
+from touchcell.perception.calibration.tip_fit import MarkedContacts
+from touchcell.perception.errors import ImageError
+from touchcell.perception.markers.detection import MarkerSize, detect_markers, typical_size
+from touchcell.perception.markers.matching import MarkerField, MarkerMatcher
+from touchcell.perception.networks.marker_training import preprocessing_for
+from touchcell.perception.runtime.preprocessing import Preprocessing
+from touchcell.simulation.render import FRAME_SIZE, PUBLIC_CROP
+
+_BELIEVED = 0.97
+
+Told = Callable[[str, int, int], None]
+"""Told (what is done, how much of it, of how much)."""
+
+
+@dataclass(frozen=True)
+class SensorMarkers:
+    """Finds the markers of one sensor.
+
+    Attributes:
+        preprocessing: camera image to black and white.
+        size: of a marker.
+        matcher: discs to markers.
+        origin: (2,) px, where the images' first pixel lies in the 640x480 frame.
+        disc_radius_px: of a circle with the median area of the discs.
+    """
+
+    preprocessing: Preprocessing
+    size: MarkerSize
+    matcher: MarkerMatcher
+    origin: Array
+    disc_radius_px: float
+
+    @property
+    def reference(self) -> Array:
+        """(m, 2) px of the undeformed lattice in the 640x480 frame."""
+        reference: Array = self.matcher.model.reference + self.origin
+        return reference
+
+    def field(self, image: ImageArray) -> MarkerField:
+        """Markers of one image, in its own pixels."""
+        return self.matcher.match(detect_markers(self.preprocessing.reduce(image), self.size))
+
+    def contacts(self, split: Split, which: Array, told: Told | None = None) -> tuple[MarkedContacts, Array]:
+        """Those of some images whose match can be believed, in the 640x480 frame, and which they are.
+
+        Args:
+            split: labelled images.
+            which: (n,) their numbers.
+            told: of the images done.
+        """
+        kept, pixels, seen = [], [], []
+        for i, number in enumerate(which):
+            field = self.field(read_image(split.images[int(number)]))
+            if field.valid and field.score >= _BELIEVED:
+                kept.append(int(number))
+                pixels.append(field.positions + self.origin)
+                seen.append(field.seen)
+            if told is not None:
+                told("matched", i + 1, len(which))
+        labels = se3.from_euler_mm_deg(split.contact_mm_deg[kept])
+        return MarkedContacts(labels, np.array(pixels), np.array(seen, bool)), np.array(kept)
+
+
+def frame_origin(size: tuple[int, int]) -> Array:
+    """(2,) px, where the first pixel of images of this (height, width) lies in the 640x480 frame.
+
+    Raises:
+        ImageError: they are neither whole frames nor the public crop.
+    """
+    left, top, right, bottom = PUBLIC_CROP
+    if size == FRAME_SIZE[::-1]:
+        return np.zeros(2)
+    if size == (bottom - top, right - left):
+        return np.array([left, top], dtype=np.float64)
+    expected = f"{FRAME_SIZE[::-1]} or the public crop {(bottom - top, right - left)}"
+    raise ImageError("size", expected, size, hint="record whole 640x480 frames")
+
+
+def learn_sensor(
+    data: Path, *, images: int, rings: int, guess_steps: int = 600, seed: int = 0, told: Told | None = None
+) -> SensorMarkers:
+    """Learn to find the markers from evenly chosen images of ``data/train``; their labels are not looked at.
+
+    Args:
+        data: data set.
+        images: how many.
+        rings: of the lattice.
+        guess_steps: as of ``marker_learning.learn_markers``.
+        seed: of everything random.
+        told: of what has been done.
+
+    Raises:
+        DataError: the data set is damaged.
+        TrainingError: as ``marker_learning.learn_markers``.
+        ImageError: the images are neither whole frames nor the public crop.
+    """
+    split = read_split(data, "train")
+    chosen = [split.images[i] for i in evenly(len(split.images), images)]
+    first = read_image(chosen[0])
+    origin = frame_origin((first.shape[0], first.shape[1]))
+    preprocessing = preprocessing_for(first)
+    size = typical_size(preprocessing.reduce(first))
+    discs = []
+    for i, path in enumerate(chosen):
+        discs.append(detect_markers(preprocessing.reduce(read_image(path)), size))
+        if told is not None:
+            told("images", i + 1, len(chosen))
+    learned = learn_markers(
+        discs,
+        preprocessing.output_size,
+        rings=rings,
+        guess_steps=guess_steps,
+        seed=seed,
+        told=None if told is None else lambda done, total: told("markers learned", done, total),
+    )
+    area = float(np.median(np.concatenate([each.areas for each in discs])))
+    return SensorMarkers(preprocessing, size, learned.matcher, origin, float(np.sqrt(area / np.pi)))
+
+
+def evenly(n: int, wanted: int) -> list[int]:
+    """``wanted`` numbers below ``n``, evenly spread and neither the first nor the last where there is a choice."""
+    if wanted >= n:
+        return list(range(n))
+    return [int(each) for each in np.linspace(0, n - 1, wanted + 2).round()[1:-1]]

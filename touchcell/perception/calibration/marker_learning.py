@@ -1,0 +1,319 @@
+"""Learning how a sensor's markers move from its images alone, without labels.
+
+The start is the analytic tip of the simulation, swept over contacts and laid onto the sensor's lattice: near enough
+to pair most markers of most real frames. What was paired well teaches a better model of this very sensor, which
+pairs the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from touchcell.geometry.types import Array
+from touchcell.perception.errors import TrainingError
+from touchcell.perception.markers.detection import Discs, lattice, ring_numbers
+from touchcell.perception.markers.matching import (
+    DisplacementModel,
+    FirstGuess,
+    MarkerField,
+    MarkerMatcher,
+    disc_density,
+    pair,
+    quality,
+)
+
+GRID = 32
+GUESS_HIDDEN = 256
+_GUESS_BATCH = 128
+_CANDIDATES = 60
+_BANK = 2000
+_LAST_STEPS = 100
+_SURE = 0.96
+_SPREADS = 2
+_ALIKE = 8
+_SWEEP = 2000
+
+Told = Callable[[int, int], None]
+"""Told (frames done, frames in all)."""
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What the frames of a sensor taught.
+
+    Attributes:
+        matcher: for further frames of this sensor.
+        guess: its first guess.
+        bank: (b, k) its coefficients to try.
+        least_score, most_rms_px: its limits.
+        fields: of all frames that it was taught with.
+    """
+
+    matcher: MarkerMatcher
+    guess: FirstGuess
+    bank: Array
+    least_score: float
+    most_rms_px: float
+    fields: list[MarkerField]
+
+
+def fit_lattice(discs: Discs, rings: int) -> tuple[Array, float]:
+    """The lattice laid over the discs of an undeformed, or hardly deformed, tip.
+
+    A similarity with a scale that is a polynomial of the ring number, for the dome and the lens. Which of its six
+    equal directions is the first does not show in an image, and makes no difference.
+
+    Args:
+        discs: of one image.
+        rings: of the lattice.
+
+    Returns:
+        (m, 2) px marker places, and the root mean square px of the discs from them; infinite when nothing fits.
+    """
+    centres = discs.centres
+    flat = lattice(rings)
+    if len(centres) < len(flat) // 2:
+        return flat, np.inf
+    radius = ring_numbers(rings) / rings
+    z = (flat[:, 0] + 1j * flat[:, 1]) / rings
+    terms = np.column_stack([np.ones(len(z)), z, z * radius**2, z * radius**4])
+    middle = np.median(centres, axis=0)
+    reach = np.percentile(np.linalg.norm(centres - middle, axis=1), 85) / np.percentile(np.abs(z), 85)
+    seen_at = centres[:, 0] + 1j * centres[:, 1]
+    best: tuple[float, Array, float] = (-np.inf, flat, np.inf)
+    for turn in np.arange(12) * np.pi / 36:
+        placed = complex(*middle) + reach * np.exp(1j * turn) * z
+        for step in range(16):
+            points = np.column_stack([placed.real, placed.imag])
+            partner, paired = pair(points, centres, (0.8 if step < 6 else 0.4) * reach / rings)
+            used = 2 if step < 6 else 4
+            if paired.sum() < 2 * used:
+                break
+            solution = np.linalg.lstsq(terms[paired, :used], seen_at[partner[paired]], rcond=None)[0]
+            placed = terms[:, :used] @ solution
+        points = np.column_stack([placed.real, placed.imag])
+        partner, paired = pair(points, centres, 0.4 * reach / rings)
+        if paired.any():
+            rms = float(np.sqrt((np.abs(placed - seen_at[partner])[paired] ** 2).mean()))
+            quality = paired.mean() - rms * rings / reach
+            if quality > best[0]:
+                best = (quality, points, rms if paired.mean() > 0.9 else np.inf)
+    return best[1], best[2]
+
+
+def find_reference(frames: Sequence[Discs], rings: int) -> Array:
+    """(m, 2) px lattice of that frame whose tip is deformed least.
+
+    Raises:
+        TrainingError: no frame shows a lattice of that many rings.
+    """
+    step = max(1, len(frames) // _CANDIDATES)
+    fits = [fit_lattice(discs, rings) for discs in frames[::step]]
+    points, rms = min(fits, key=lambda fit: fit[1])
+    if not np.isfinite(rms):
+        raise TrainingError(
+            f"no image shows a lattice of {rings} rings of markers",
+            hint="take images of the tip out of contact, and check threshold, crop and the number of rings",
+        )
+    return points
+
+
+def analytic_displacements(reference: Array, rings: int, seed: int, n: int = _SWEEP) -> Array:
+    """(n, m, 2) px displacements of the simulated tip in random contacts, laid onto a sensor's lattice."""
+    from touchcell.simulation.contact import ContactLaw, contact_at
+    from touchcell.simulation.samples import random_poses
+    from touchcell.simulation.tip import Tip, TipParameters
+
+    tip = Tip(TipParameters(rings=rings))
+    poses = random_poses(n, np.random.default_rng(seed), (0.0, 6.5))
+    law = ContactLaw()
+    pixels = tip.pixels(np.stack([contact_at(pose, law).T_f_s for pose in poses]))
+    rest = tip.project(tip.rest_positions)
+    from_tip = (rest - rest.mean(axis=0)) @ np.array([1.0, 1j])
+    to_sensor = (reference - reference.mean(axis=0)) @ np.array([1.0, 1j])
+    turn = np.vdot(from_tip, to_sensor) / np.vdot(from_tip, from_tip)
+    moved = ((pixels - rest) @ np.array([1.0, 1j])) * turn
+    return np.stack([moved.real, moved.imag], axis=-1)
+
+
+def learn_markers(
+    frames: Sequence[Discs],
+    image_size: tuple[int, int],
+    *,
+    rings: int = 10,
+    modes: int = 24,
+    reference: Array | None = None,
+    rounds: int = 2,
+    guess_steps: int = 1200,
+    seed: int = 0,
+    told: Told | None = None,
+) -> Learned:
+    """Learn to match the frames of one sensor.
+
+    Args:
+        frames: discs of each training image; they should cover the contacts that will be met.
+        image_size: (height, width) px.
+        rings: of the sensor's lattice.
+        modes: ways of moving that are kept.
+        reference: (m, 2) px lattice out of contact; None finds the least deformed frame.
+        rounds: of matching and learning anew.
+        guess_steps: of the training of the first guess, each round; threefold in the last.
+        seed: of everything random.
+        told: of the frames that have been matched.
+
+    Raises:
+        TrainingError: there is no such lattice in the frames, or too few of them can be matched.
+    """
+    if reference is None:
+        reference = find_reference(frames, rings)
+    displacements = analytic_displacements(reference, rings, seed)
+    everything = np.ones(displacements.shape[:2], bool)
+    model = DisplacementModel.fit(reference, displacements, everything, modes)
+    coefficients = (displacements.reshape(len(displacements), -1) - model.mean) @ model.basis.T
+    # The simulated tip is 2.5 px off the real one on average, and its coefficients scatter too little.
+    guess = train_guess(model, coefficients, everything, noise_px=2.0, scatter=0.15, steps=guess_steps, seed=seed)
+    least_score, most_rms_px = 0.9, 0.2 * model.spacing_px
+    bank = _bank(coefficients)
+    matcher = MarkerMatcher(model, guess, image_size, bank=bank, least_score=least_score, most_rms_px=most_rms_px)
+    density = np.stack([guess.density(discs.centres) for discs in frames])
+    for number in range(rounds):
+        fields = []
+        for i, discs in enumerate(frames):
+            fields.append(matcher.match(discs))
+            if told is not None:
+                told(number * len(frames) + i + 1, (rounds + 1) * len(frames))
+        for _ in range(_SPREADS):
+            _spread(matcher, frames, fields, density)
+        good = [field for field in fields if _surely(field)]
+        if len(good) < max(2 * modes, len(frames) // 4):
+            raise TrainingError(
+                f"only {len(good)} of {len(frames)} images could be matched",
+                hint="check threshold, crop, mask and the number of rings",
+            )
+        if number > 0:
+            # A later round's misfits are outliers rather than a coarse model's.
+            limit = 3.0 * float(np.median([field.rms_px for field in good]))
+            good = [field for field in good if field.rms_px <= limit]
+        displacements, seen = stacked(good)
+        model = DisplacementModel.fit(reference, displacements, seen, modes)
+        coefficients = (displacements.reshape(len(good), -1) - model.mean) @ model.basis.T
+        noise_px = float(np.median([field.rms_px for field in good]))
+        steps = guess_steps if number + 1 < rounds else 3 * guess_steps
+        guess = train_guess(model, coefficients, seen, noise_px=noise_px, scatter=0.05, steps=steps, seed=seed)
+        bank = _bank(coefficients)
+        matcher = MarkerMatcher(model, guess, image_size, bank=bank, least_score=least_score, most_rms_px=most_rms_px)
+    fields = match_all(matcher, frames, None if told is None else lambda i, n: told(rounds * n + i, (rounds + 1) * n))
+    _spread(matcher, frames, fields, density)
+    return Learned(matcher, guess, bank, least_score, most_rms_px, fields)
+
+
+def train_guess(
+    model: DisplacementModel,
+    coefficients: Array,
+    seen: NDArray[np.bool_],
+    *,
+    noise_px: float,
+    scatter: float,
+    steps: int,
+    seed: int,
+    hidden: int = GUESS_HIDDEN,
+) -> FirstGuess:
+    """Teach the first guess with fields made from ``coefficients``: mixed, scattered, with markers lost.
+
+    Deep contacts push whole groups of markers together or out of view. A guess that was taught with markers lost
+    one by one was off by half a spacing in 10 % of the validation images, one that loses them as the frames did in 1 %.
+
+    Args:
+        model: whose coefficients are guessed.
+        coefficients: (n, k) of real or simulated contacts.
+        seen: (n, m) their markers that have discs.
+        noise_px: of each marker about the model.
+        scatter: of the coefficients, relative to their standard deviations.
+        steps: of 128 fields each.
+        seed: of everything random.
+        hidden: units.
+    """
+    import torch
+    from torch import nn
+
+    rng = np.random.default_rng(seed)
+    span = np.ptp(model.reference, axis=0).max()
+    cell_px = 1.2 * span / GRID
+    low = model.reference.mean(axis=0) - 0.6 * span
+    k, m = len(model.sd), len(model.reference)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = nn.Sequential(nn.Linear(GRID * GRID, hidden), nn.ReLU(), nn.Linear(hidden, k))
+        optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-3)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total_steps=steps)
+        # The wide ways of moving decide which marker a disc is; the narrow ones are found once that is known.
+        weights = torch.from_numpy((model.sd / model.sd[0]).astype(np.float32))
+        squares: list[NDArray[np.float32]] = []
+        # Far contacts are few and hard, so they come more often.
+        far = 0.5 + ((coefficients / model.sd) ** 2).mean(axis=1)
+        often = far / far.sum()
+        for _ in range(steps):
+            one = rng.choice(len(coefficients), _GUESS_BATCH, p=often)
+            other = rng.integers(0, len(coefficients), _GUESS_BATCH)
+            share = rng.uniform(-0.2, 0.5, (_GUESS_BATCH, 1)) * (rng.random((_GUESS_BATCH, 1)) < 0.5)
+            chosen = coefficients[one] + share * (coefficients[other] - coefficients[one])
+            # What could not be matched so far lies beyond what could.
+            chosen = rng.uniform(0.8, 1.2, (_GUESS_BATCH, 1)) * chosen
+            chosen = chosen + rng.normal(0.0, scatter, chosen.shape) * model.sd
+            positions = model.positions(chosen) + rng.normal(0.0, noise_px, (_GUESS_BATCH, m, 2))
+            present = (seen[one] & (rng.random((_GUESS_BATCH, m)) < 0.98)).astype(np.float64)
+            density = disc_density(positions, present, low, cell_px, GRID)
+            aim = torch.from_numpy((chosen / model.sd).astype(np.float32))
+            square = (network(torch.from_numpy(density)) - aim).square()
+            loss = (weights * square).mean()
+            squares.append(square.detach().mean(dim=0).numpy())
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+    hidden_weight, hidden_bias, weight, bias = (parameter.detach().numpy().copy() for parameter in network.parameters())
+    sd = np.sqrt(np.mean(squares[-_LAST_STEPS:], axis=0)) * model.sd
+    return FirstGuess(low, float(cell_px), hidden_weight, hidden_bias, weight, bias, sd)
+
+
+def match_all(matcher: MarkerMatcher, frames: Sequence[Discs], told: Told | None = None) -> list[MarkerField]:
+    """Every frame from a cold start."""
+    fields = []
+    for i, discs in enumerate(frames):
+        fields.append(matcher.match(discs))
+        if told is not None:
+            told(i + 1, len(frames))
+    return fields
+
+
+def stacked(fields: Sequence[MarkerField]) -> tuple[Array, NDArray[np.bool_]]:
+    """Displacements (n, m, 2) px and seen markers (n, m)."""
+    return np.stack([field.displacements for field in fields]), np.stack([field.seen for field in fields])
+
+
+def _surely(field: MarkerField) -> bool:
+    return field.valid and field.score > _SURE
+
+
+def _spread(
+    matcher: MarkerMatcher, frames: Sequence[Discs], fields: list[MarkerField], density: NDArray[np.float32]
+) -> None:
+    """Match the frames that failed from those that succeeded and look most alike, in place."""
+    sure = np.flatnonzero([_surely(field) for field in fields])
+    if not len(sure):
+        return
+    for i, field in enumerate(fields):
+        if not _surely(field) and len(frames[i]):
+            apart = ((density[sure] - density[i]) ** 2).sum(axis=1)
+            alike = sure[np.argsort(apart)[:_ALIKE]]
+            again = matcher.match_from(frames[i], [fields[j].coefficients for j in alike])
+            fields[i] = max(field, again, key=quality)
+
+
+def _bank(coefficients: Array) -> Array:
+    """Evenly chosen coefficients, as many as a model file should hold."""
+    return coefficients[:: -(-len(coefficients) // _BANK)]

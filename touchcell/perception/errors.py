@@ -1,0 +1,74 @@
+"""What can go wrong with data sets, images, models and trainings, as types with attributes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from touchcell.geometry.errors import TouchcellError
+
+
+class ImageError(TouchcellError, ValueError):
+    """An image is not the kind that a preprocessing was made for.
+
+    Attributes:
+        attribute: "size", "channels", "dtype" or "type".
+        expected: what the preprocessing wants.
+        found: what the image has.
+    """
+
+    def __init__(self, attribute: str, expected: Any, found: Any, *, hint: str = "") -> None:
+        super().__init__(f"image {attribute} is {found}, expected {expected}", hint=hint)
+        self.attribute = attribute
+        self.expected = expected
+        self.found = found
+
+
+class ArrayError(TouchcellError, ValueError):
+    """An array is not what a compiled kernel can work on.
+
+    Attributes:
+        function: the kernel that refused.
+        argument: the name of the offending argument.
+    """
+
+    def __init__(self, function: str, argument: str, reason: str, *, hint: str = "") -> None:
+        super().__init__(f"{function}: {argument} {reason}", hint=hint)
+        self.function = function
+        self.argument = argument
+
+
+class KernelsMissing(TouchcellError):
+    """The C extension that markers are found and matched with was not built."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "perception's C extension was not built",
+            hint="install a C compiler and install touchcell again; models of kind gdn and cnn do without",
+        )
+
+
+class ModelError(TouchcellError, ValueError):
+    """A model file cannot be used.
+
+    Attributes:
+        file: the file.
+        key: the header field or tensor concerned, or "".
+    """
+
+    def __init__(self, file: Path, reason: str, *, key: str = "", hint: str = "") -> None:
+        super().__init__(f"{file}: {key + ': ' if key else ''}{reason}", hint=hint)
+        self.file = file
+        self.key = key
+
+
+class TrainingError(TouchcellError):
+    """A training cannot start or go on; no model was written.
+
+    Attributes:
+        epoch: the epoch (1-based) in which it stopped, or 0 when it never started.
+    """
+
+    def __init__(self, reason: str, *, epoch: int = 0, hint: str = "") -> None:
+        super().__init__(f"epoch {epoch}: {reason}" if epoch else reason, hint=hint)
+        self.epoch = epoch

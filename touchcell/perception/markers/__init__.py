@@ -1,0 +1,1 @@
+"""Finding and matching the markers of a TacTip, and estimating a contact from them."""

@@ -1,0 +1,81 @@
+"""What a marker model looks like: the part of its file that says which tensors there are."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from touchcell.perception.markers.detection import MarkerSize
+
+Count = Annotated[int, Field(gt=0)]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+
+LOG_PRECISION_BOUNDS = (-3.0, 6.0)
+"""Bounds of the logarithms of inverse standard deviations, in label half-ranges."""
+
+
+class MarkerArchitecture(BaseModel):
+    """Markers are detected, matched to a lattice, and their displacements given to several small networks, of whose
+    Gaussians mean and variance are taken.
+
+    Attributes:
+        kind: markers.
+        input_size: (height, width) of the preprocessed, black and white image; markers keep their pixels.
+        size: which white discs are markers.
+        rings: of the lattice, beside its centre; ring k holds 6k markers.
+        modes: in which the markers move together.
+        bank: contacts that are kept to start a match from.
+        grid: cells along each side of what the first guess sees.
+        guess_low_px: (u, v) where that grid begins.
+        guess_cell_px: side of its cells.
+        guess_hidden: units of the first guess.
+        least_score: matches below are not believed.
+        most_rms_px: matches that leave more are not believed.
+        hidden: units of the layers of each displacement network.
+        networks: how many there are.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["markers"] = "markers"
+    input_size: tuple[int, int]
+    size: MarkerSize
+    rings: Count = 10
+    modes: Count = 24
+    bank: Count
+    grid: Count = 32
+    guess_low_px: tuple[Number, Number]
+    guess_cell_px: float = Field(gt=0.0, allow_inf_nan=False)
+    guess_hidden: Count = 256
+    least_score: float = Field(ge=0.0, le=1.0)
+    most_rms_px: float = Field(gt=0.0, allow_inf_nan=False)
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (384, 512, 512, 256)
+    networks: Count = 2
+
+    @property
+    def markers(self) -> int:
+        """In the lattice."""
+        return 1 + 3 * self.rings * (self.rings + 1)
+
+    def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of the tensors of a model file."""
+        m, k = self.markers, self.modes
+        shapes: dict[str, tuple[int, ...]] = {
+            "lattice": (m, 2),
+            "displacement.mean": (2 * m,),
+            "displacement.basis": (k, 2 * m),
+            "displacement.sd": (k,),
+            "bank": (self.bank, k),
+            "guess.hidden.weight": (self.guess_hidden, self.grid**2),
+            "guess.hidden.bias": (self.guess_hidden,),
+            "guess.output.weight": (k, self.guess_hidden),
+            "guess.output.bias": (k,),
+            "guess.sd": (k,),
+        }
+        before = 2 * m
+        for i, units in enumerate((*self.hidden, 12)):
+            shapes[f"layer{i}.weight"] = (self.networks, before, units)
+            shapes[f"layer{i}.bias"] = (self.networks, 1, units)
+            before = units
+        return shapes

@@ -1,0 +1,180 @@
+"""Contact pose and shear from the markers of one image, in a running cell: NumPy and the compiled kernels alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from touchcell.drivers.core.samples import Frame, Stamped
+from touchcell.geometry.types import Array, ImageArray
+from touchcell.perception.errors import ModelError
+from touchcell.perception.markers.architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture
+from touchcell.perception.markers.detection import Discs, detect_markers
+from touchcell.perception.markers.matching import DisplacementModel, FirstGuess, MarkerField, MarkerMatcher
+from touchcell.perception.runtime import kernels
+from touchcell.perception.runtime.inference import RANGE_TOLERANCE, Prediction
+from touchcell.perception.runtime.model_file import Header, Labels, Model, load_model
+
+if TYPE_CHECKING:
+    from touchcell.perception.runtime.camera_change import CameraChange
+
+
+class MarkerEstimator:
+    """A trained marker model, ready to predict.
+
+    Images that follow each other are matched faster, as each starts from the one before; the result is the same. Not
+    safe for use from two threads at once.
+
+    Attributes:
+        header: of the model file.
+        reference: preprocessed image out of contact, or None.
+        field: the markers of the last image, None before the first.
+        change: between this camera and the one that taught the model, in pixels of the crop; None for none.
+    """
+
+    def __init__(self, model: Model) -> None:
+        """
+        Raises:
+            TypeError: the model is of another kind.
+        """
+        architecture = model.header.architecture
+        if not isinstance(architecture, MarkerArchitecture):
+            raise TypeError(f"a model of kind {architecture.kind}, not markers")
+        self.header: Header = model.header
+        self.reference: ImageArray | None = model.reference
+        self.field: MarkerField | None = None
+        self.change: CameraChange | None = None
+        self._size = architecture.size
+        self._matcher = matcher_of(model, architecture)
+        self._networks = architecture.networks
+        self._layers = [
+            (model.tensors[f"layer{i}.weight"], model.tensors[f"layer{i}.bias"][:, 0])
+            for i in range(len(architecture.hidden) + 1)
+        ]
+        # One long product is faster than several short ones that read the same input.
+        first, bias = self._layers.pop(0)
+        self._first = np.ascontiguousarray(first.transpose(1, 0, 2)).reshape(first.shape[1], -1)
+        self._first_bias = bias.reshape(-1)
+
+    @classmethod
+    def load(cls, path: Path) -> MarkerEstimator:
+        """Open a model file.
+
+        Raises:
+            ModelError: as ``model_file.load_model``, or the model is of another kind.
+        """
+        model = load_model(path)
+        if model.header.architecture.kind != "markers":
+            raise ModelError(path, f"is {model.header.architecture.kind}, expected markers", key="architecture.kind")
+        return cls(model)
+
+    def reduce(self, image: ImageArray) -> ImageArray:
+        """The model's preprocessing, uint8 (height, width): black and white, in the camera's resolution.
+
+        Raises:
+            ImageError: the image is not what the model's preprocessing was made for.
+        """
+        return self.header.preprocessing.reduce(image)
+
+    def predict(self, image: ImageArray) -> Prediction:
+        """Contact in one camera image. Raises as ``reduce``."""
+        return self.predict_reduced(self.reduce(image))
+
+    def predict_reduced(self, reduced: ImageArray) -> Prediction:
+        """Contact in an image that ``reduce`` made.
+
+        Where the markers cannot be matched with certainty, ``in_range`` is False and sigmas are as wide as the taught
+        range. Where next to nothing can be, the prediction is the middle of that range.
+        """
+        field = self.match(self.find(reduced))
+        return self.decode(field, *self.infer(field))
+
+    def find(self, reduced: ImageArray) -> Discs:
+        """First step of ``predict_reduced``: the discs of an image, where the camera that taught the model saw them."""
+        discs = detect_markers(reduced, self._size)
+        return discs if self.change is None else Discs(self.change.points(discs.centres), discs.areas)
+
+    def match(self, discs: Discs) -> MarkerField:
+        """Second step: which disc is which marker."""
+        self.field = self._matcher.match(discs, self.field)
+        return self.field
+
+    def infer(self, field: MarkerField) -> tuple[Array, Array]:
+        """Third step: mean (6,) in label half-ranges, and standard deviations (6,) in label units, of the mixture of
+        all networks' Gaussians; the middle of the range where no marker was seen."""
+        if not field.seen.any():
+            return np.zeros(6), np.ones(6)
+        x = kernels.affine(self._first, self._first_bias, field.displacements.ravel().astype(np.float32))
+        x = x.reshape(self._networks, -1)
+        for weight, bias in self._layers:
+            # Below -80 the exponential overflows, and the product is zero to float32 anyway.
+            active = x / (1.0 + np.exp(-np.maximum(x, np.float32(-80.0))))
+            x = np.stack([kernels.affine(*each) for each in zip(weight, bias, active, strict=True)])
+        outputs = x.astype(np.float64)
+        log_precision = np.clip(outputs[:, 6:], *LOG_PRECISION_BOUNDS)
+        return mixed(outputs[:, :6], log_precision, self.header.labels)
+
+    def decode(self, field: MarkerField, mean: Array, sigma: Array) -> Prediction:
+        """Last step: what ``infer`` told, as a Gaussian over xi."""
+        labels = self.header.labels
+        if not field.seen.any():
+            return Prediction(*labels.xi_gaussian(mean, sigma), in_range=False, markers=0.0)
+        in_range = field.valid and bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
+        calibrated = self.header.calibrated(sigma)
+        # The networks know how sure to be of markers that were matched, and of no others.
+        xi, covariance = labels.xi_gaussian(mean, calibrated if field.valid else np.maximum(calibrated, 1.0))
+        return Prediction(xi, covariance, in_range, markers=field.score)
+
+    def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:
+        """``predict`` of a camera's sample; the prediction keeps the stamp, number and quality of the frame."""
+        return Stamped(
+            self.predict(sample.value.image), sample.t_ns, sample.seq, sample.t_device_ns, quality=sample.quality
+        )
+
+
+def mixed(means: Array, log_precisions: Array, labels: Labels) -> tuple[Array, Array]:
+    """Mean and standard deviations of an even mixture of Gaussians.
+
+    Args:
+        means: (networks, ..., 6) in label half-ranges.
+        log_precisions: (networks, ..., 6) logarithms of inverse standard deviations, along ``labels.aligned``.
+        labels: of the model.
+
+    Returns:
+        (..., 6) and (..., 6).
+    """
+    mean = means.mean(axis=0)
+    apart = labels.aligned(means - mean, mean)
+    variance = np.exp(-2.0 * log_precisions).mean(axis=0) + np.square(apart).mean(axis=0)
+    return mean, np.sqrt(variance)
+
+
+def displacement_model_of(model: Model) -> DisplacementModel:
+    """How the markers of a marker model move."""
+    reference, mean, basis, sd = (
+        model.tensors[name].astype(np.float64)
+        for name in ("lattice", "displacement.mean", "displacement.basis", "displacement.sd")
+    )
+    return DisplacementModel(reference, mean, basis, sd)
+
+
+def matcher_of(model: Model, architecture: MarkerArchitecture) -> MarkerMatcher:
+    """The matcher that a marker model describes."""
+    return MarkerMatcher(
+        displacement_model_of(model),
+        FirstGuess(
+            low=np.array(architecture.guess_low_px),
+            cell_px=architecture.guess_cell_px,
+            hidden_weight=model.tensors["guess.hidden.weight"],
+            hidden_bias=model.tensors["guess.hidden.bias"],
+            weight=model.tensors["guess.output.weight"],
+            bias=model.tensors["guess.output.bias"],
+            sd=model.tensors["guess.sd"].astype(np.float64),
+        ),
+        architecture.input_size,
+        bank=model.tensors["bank"].astype(np.float64),
+        least_score=architecture.least_score,
+        most_rms_px=architecture.most_rms_px,
+    )

@@ -1,0 +1,381 @@
+"""Which disc of an image is which marker of the lattice.
+
+A marker's displacement says little by itself, as markers move further than half their spacing. All together move in few
+ways: a linear model with some two dozen coefficients leaves less than a pixel. So the coefficients are found, and the
+markers with them, by turns: predict the markers, pair each with its nearest disc, fit anew. From a near start (the
+frame before) this converges in two or three turns. Without one a small network looks at where the discs are dense, and
+guesses the coefficients; when the guess leads nowhere, learned contacts whose discs lie alike are tried.
+
+Pairing and fitting are in C (``kernels.py``); what is here decides where to begin and what to believe. Other products
+are written as ``einsum``, which never leaves its thread: a linear algebra library would spread products of this size
+over all cores, and wait for a busy core far longer than the product takes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from touchcell.geometry.types import Array
+from touchcell.perception.markers.detection import Discs
+from touchcell.perception.runtime import kernels
+
+_FIT_SD_PX = 0.7
+_TURNS = 12
+_SETTLED_PX = 0.1
+_CONVINCING = 0.965
+_COMPLETE = 0.985
+_STILL_THERE = 0.6
+_BANKED_AT_ONCE = 32
+_NEAR = 0.3  # Spacings that a first guess may be off; those that fail are off by more.
+_ALIKE = 6
+_MOST_STARTS = 2
+_RINGS_GROWN = 6
+_NEIGHBOURS = 7
+_ONWARD = 1.2
+
+
+@dataclass(frozen=True, slots=True)
+class DisplacementModel:
+    """The ways in which the markers of a sensor move together.
+
+    Attributes:
+        reference: (m, 2) px, markers of the undeformed tip.
+        mean: (2 m,) px, mean displacement (u, v, u, v, ...).
+        basis: (k, 2 m) orthonormal rows, the widest way first.
+        sd: (k,) px, standard deviations of the coefficients.
+    """
+
+    reference: Array
+    mean: Array
+    basis: Array
+    sd: Array
+
+    @property
+    def base(self) -> Array:
+        """(2 m,) px, marker positions with all coefficients zero."""
+        base: Array = self.reference.ravel() + self.mean
+        return base
+
+    @property
+    def spacing_px(self) -> float:
+        """Median distance of a reference marker from its nearest neighbour."""
+        distances = np.linalg.norm(self.reference[:, None] - self.reference[None], axis=2)
+        np.fill_diagonal(distances, np.inf)
+        return float(np.median(distances.min(axis=1)))
+
+    def positions(self, coefficients: Array) -> Array:
+        """(..., m, 2) px of coefficients (..., k)."""
+        flat: Array = self.base + np.einsum("...k,kj->...j", coefficients, self.basis)
+        return flat.reshape(*flat.shape[:-1], -1, 2)
+
+    @classmethod
+    def fit(cls, reference: Array, displacements: Array, seen: NDArray[np.bool_], modes: int) -> DisplacementModel:
+        """Principal components of displacements of which some are missing.
+
+        Args:
+            reference: (m, 2) px.
+            displacements: (n, m, 2) px; those of unseen markers are taken for a first guess.
+            seen: (n, m).
+            modes: how many components are kept, at most n - 1.
+        """
+        flat = displacements.reshape(len(displacements), -1).astype(np.float64)
+        known = np.repeat(seen, 2, axis=1)
+        filled = flat.copy()
+        for _ in range(3):
+            mean = filled.mean(axis=0)
+            centred = filled - mean
+            # The matrix of 2m x 2m moments is smaller than thousands of frames.
+            values, vectors = np.linalg.eigh(centred.T @ centred / len(flat))
+            basis = vectors[:, ::-1][:, : min(modes, len(flat) - 1)].T
+            filled = np.where(known, flat, mean + (centred @ basis.T) @ basis)
+        sd = np.sqrt(np.maximum(values[::-1][: len(basis)], 1e-12))
+        return cls(reference, mean, np.ascontiguousarray(basis), sd)
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerField:
+    """Where all markers of a lattice are in one image.
+
+    Attributes:
+        positions: (m, 2) px; of unseen markers as the displacement model fills them in.
+        displacements: (m, 2) px from the reference.
+        seen: (m,) markers that have a disc of their own.
+        coefficients: (k,) px, of the displacement model.
+        score: markers seen over those expected in view, or over the discs among them where these are more; 1 is best.
+        rms_px: of the seen markers from the displacement model.
+        valid: the match can be believed.
+    """
+
+    positions: Array
+    displacements: Array
+    seen: NDArray[np.bool_]
+    coefficients: Array
+    score: float
+    rms_px: float
+    valid: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FirstGuess:
+    """A network with one hidden layer from the density of discs to the coefficients of a displacement model.
+
+    Attributes:
+        low: (2,) px, corner of the square that is looked at.
+        cell_px: side of a cell of its grid.
+        hidden_weight, hidden_bias: (hidden, grid * grid), (hidden,).
+        weight, bias: (k, hidden), (k,); outputs are in standard deviations of the coefficients.
+        sd: (k,) px, how far its guesses are off.
+    """
+
+    low: Array
+    cell_px: float
+    hidden_weight: NDArray[np.float32]
+    hidden_bias: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    bias: NDArray[np.float32]
+    sd: Array
+
+    def density(self, centres: Array) -> NDArray[np.float32]:
+        """(..., grid * grid) what it looks at, of discs (..., n, 2)."""
+        grid = math.isqrt(self.hidden_weight.shape[1])
+        batch = centres.reshape(-1, *centres.shape[-2:])
+        density = disc_density(batch, np.ones(batch.shape[:2]), self.low, self.cell_px, grid)
+        return density.reshape(*centres.shape[:-2], -1)
+
+    def __call__(self, density: NDArray[np.float32]) -> Array:
+        """(k,) coefficients over their standard deviations, of a density (grid * grid,)."""
+        hidden = np.maximum(np.einsum("ij,j->i", self.hidden_weight, density) + self.hidden_bias, 0.0)
+        guess: Array = (np.einsum("ij,j->i", self.weight, hidden) + self.bias).astype(np.float64)
+        return guess
+
+
+def disc_density(centres: Array, weights: Array, low: Array, cell_px: float, grid: int) -> NDArray[np.float32]:
+    """How many discs lie in each cell of a grid, each shared bilinearly among the four cells around it.
+
+    Args:
+        centres: (b, n, 2) px.
+        weights: (b, n), zero for a disc that is not there.
+        low: (2,) px, where the grid begins.
+        cell_px: side of a cell.
+        grid: cells along each side.
+
+    Returns:
+        (b, grid * grid).
+    """
+    density = kernels.density(centres, weights, low, cell_px, grid)
+    return density.reshape(len(centres), -1).astype(np.float32)
+
+
+class MarkerMatcher:
+    """Matches the discs of one frame after the other.
+
+    Args:
+        model: how the markers move.
+        guess: a start for frames without a near frame before them.
+        image_size: (height, width) px.
+        bank: (b, k) learned coefficients, one or more. Those whose discs lie alike are tried where the guess leads
+            nowhere.
+        least_score: below this a match is not believed.
+        most_rms_px: above this a match is not believed.
+    """
+
+    def __init__(
+        self,
+        model: DisplacementModel,
+        guess: FirstGuess,
+        image_size: tuple[int, int],
+        *,
+        bank: Array,
+        least_score: float = 0.9,
+        most_rms_px: float = 2.0,
+    ) -> None:
+        self.model = model
+        self._guess = guess
+        self._size = np.array(image_size[::-1], dtype=np.float64)
+        self._bank = bank
+        self._least_score = least_score
+        self._most_rms_px = most_rms_px
+        self._base = model.base
+        self._modes = kernels.Modes(model.base, model.basis)
+        self._spacing_px = model.spacing_px
+        self._reach = 0.3 * self._spacing_px
+        apart = np.linalg.norm(model.reference[:, None] - model.reference[None], axis=2)
+        nearest = np.argsort(apart, axis=1)[:, 1 : _NEIGHBOURS + 1]
+        # Markers of the rim have fewer neighbours: the number of markers stands for nobody.
+        is_near = np.take_along_axis(apart, nearest, axis=1) < 1.5 * self._spacing_px
+        self._neighbours = np.where(is_near, nearest, len(apart))
+        # Where a contact is far from those that taught it, a guess is off by more than its own standard deviation.
+        self._guess_sd = np.hypot(3.0 * guess.sd, 0.1 * model.sd)
+        # All at once would take 100 MB for a moment, which a process does not give back.
+        parts = range(0, len(bank), _BANKED_AT_ONCE)
+        self._bank_density = np.concatenate(
+            [_in_bytes(guess.density(model.positions(bank[i : i + _BANKED_AT_ONCE]))) for i in parts]
+        )
+
+    def match(self, discs: Discs, previous: MarkerField | None = None) -> MarkerField:
+        """Markers of the image in which ``discs`` were found.
+
+        Args:
+            discs: what was found in the image.
+            previous: of the frame before, when there was one; an invalid one is not used.
+        """
+        if not len(self.model.reference) // 4 <= len(discs) <= 4 * len(self.model.reference):
+            return self._nothing()
+        centres = discs.centres
+        if previous is not None and previous.valid and self._is_near(previous, centres):
+            field = self._refine(previous.coefficients, centres, self.model.sd, near=True)
+            if _convincing(field):
+                return field
+        tried: list[MarkerField] = []
+        for start, prior_sd in self._starts(centres):
+            tried.append(self._refine(start, centres, prior_sd))
+            # Of 2000 real images 21 scored between this and _CONVINCING; other starts gained none of them 0.01.
+            if tried[-1].valid:
+                break
+        return max(tried, key=quality)
+
+    def _is_near(self, previous: MarkerField, centres: Array) -> bool:
+        """Whether most markers of the frame before still have a disc close by."""
+        _, square, _ = kernels.pair(self.model.positions(previous.coefficients), centres)
+        return float(np.mean(square < self._reach**2)) > _STILL_THERE
+
+    def match_from(self, discs: Discs, starts: Iterable[Array]) -> MarkerField:
+        """Best of the matches that begin at other contacts' coefficients (k,), far from the right ones maybe."""
+        prior_sd = 0.4 * self.model.sd
+        return max((self._refine(start, discs.centres, prior_sd) for start in starts), key=quality)
+
+    def _starts(self, centres: Array) -> Iterator[tuple[Array, Array]]:
+        """Coefficients (k,) to start a match from, the most promising first, with their uncertainties (k,).
+
+        A start is looked at once before it is followed: one that leads nowhere costs ten times as much.
+        """
+        density = self._guess.density(centres)
+        guess = self._guess(density) * self.model.sd
+        off = self._off(guess, centres)
+        if off < _NEAR * self._spacing_px:
+            yield guess, self._guess_sd
+        alike = self._alike(density)
+        offs = [self._off(start, centres) for start in alike]
+        order = np.argsort(offs)[:_MOST_STARTS]
+        if _NEAR * self._spacing_px <= off <= offs[order[0]]:
+            yield guess, self._guess_sd
+        for i in order:
+            yield alike[i], 0.4 * self.model.sd
+
+    def _off(self, coefficients: Array, centres: Array) -> float:
+        """Median distance px of the predicted markers from their nearest discs."""
+        _, square, _ = kernels.pair(self.model.positions(coefficients), centres)
+        return math.sqrt(float(np.median(square)))
+
+    def _alike(self, density: NDArray[np.float32]) -> Array:
+        """(s, k) coefficients of the learned contacts whose discs are dense where this image's are."""
+        apart = kernels.bytes_apart(self._bank_density, _in_bytes(density))
+        return self._bank[np.argsort(apart)[:_ALIKE]]
+
+    def _refine(self, start: Array, centres: Array, prior_sd: Array, *, near: bool = False) -> MarkerField:
+        ridge = (_FIT_SD_PX / prior_sd) ** 2
+        coefficients = self._settle(start, start, ridge, centres, self._reach if near else 2.0 * self._reach)
+        field = self._field(coefficients, centres)
+        if near or field.score >= _COMPLETE or field.seen.mean() < 0.5:
+            return field
+        # Where a part of the rim is off by half a spacing, the part that is right leads on to it.
+        grown = self._grow(coefficients, start, ridge, centres)
+        again = self._field(self._settle(grown, start, ridge, centres, self._reach), centres)
+        return max(field, again, key=quality)
+
+    def _settle(self, coefficients: Array, start: Array, ridge: Array, centres: Array, reach: float) -> Array:
+        return self._modes.settle(
+            coefficients,
+            start,
+            ridge,
+            centres,
+            reach_px=reach,
+            least_reach_px=self._reach,
+            settled_px=_SETTLED_PX,
+            turns=_TURNS,
+        )
+
+    def _grow(self, coefficients: Array, start: Array, ridge: Array, centres: Array) -> Array:
+        """Coefficients after markers without a disc were looked for where their neighbours' discs point."""
+        predicted = self.model.positions(coefficients)
+        partner, paired = pair(predicted, centres, self._reach)
+        off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
+        nobody = np.zeros((1, 2))
+        for _ in range(_RINGS_GROWN):
+            near_by = np.append(paired, False)[self._neighbours].sum(axis=1)
+            expected: Array = (
+                np.concatenate([off, nobody])[self._neighbours].sum(axis=1) / np.maximum(near_by, 1.0)[:, None]
+            )
+            corrected = predicted + np.where(paired[:, None], off, _ONWARD * expected)
+            before = int(paired.sum())
+            partner, paired = pair(corrected, centres, 1.3 * self._reach)
+            paired &= near_by >= 2
+            off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
+            if int(paired.sum()) <= before:
+                break
+        return coefficients + self._modes.fit(paired.astype(np.float64), off, start - coefficients, ridge)
+
+    def _field(self, coefficients: Array, centres: Array) -> MarkerField:
+        predicted = self.model.positions(coefficients)
+        partner, square, own = kernels.pair(predicted, centres)
+        paired = own & (square < self._reach**2)
+        positions = np.where(paired[:, None], centres[partner], predicted)
+        left_over = np.ones(len(centres), bool)
+        left_over[partner[paired]] = False
+        among = 0
+        if left_over.any():
+            _, apart, _ = kernels.pair(centres[left_over], predicted)
+            among = int((apart < self._spacing_px**2).sum())
+        margin = 0.5 * self._spacing_px
+        in_view = ((predicted >= margin) & (predicted <= self._size - 1.0 - margin)).all(axis=1)
+        found = int(paired.sum())
+        expected = max(int((in_view | paired).sum()), found + among, 1)
+        rms = float(np.sqrt(square[paired].mean())) if found else np.inf
+        score = found / expected
+        return MarkerField(
+            positions=positions,
+            displacements=positions - self.model.reference,
+            seen=paired,
+            coefficients=coefficients,
+            score=score,
+            rms_px=rms,
+            valid=score >= self._least_score and rms <= self._most_rms_px and found >= len(positions) // 2,
+        )
+
+    def _nothing(self) -> MarkerField:
+        positions = self._base.reshape(-1, 2)
+        coefficients = np.zeros(len(self.model.sd))
+        shift = positions - self.model.reference
+        return MarkerField(positions.copy(), shift, np.zeros(len(shift), bool), coefficients, 0.0, np.inf, False)
+
+
+def _in_bytes(density: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Densities to a hundredth of a disc, in a quarter of the memory."""
+    rounded: NDArray[np.uint8] = np.minimum(100.0 * density + 0.5, 255.0).astype(np.uint8)
+    return rounded
+
+
+def _convincing(field: MarkerField) -> bool:
+    return field.valid and field.score >= _CONVINCING
+
+
+def quality(field: MarkerField) -> tuple[bool, float]:
+    """Orders matches of one image, the better the greater."""
+    return field.valid, field.score - 0.05 * min(field.rms_px, 20.0)
+
+
+def pair(places: Array, points: Array, reach: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """(m,) point nearest to each place, and whether it is within reach and nearest to no other place.
+
+    Args:
+        places: (m, 2) px.
+        points: (n, 2) px.
+        reach: px.
+    """
+    nearest, square, own = kernels.pair(places, points)
+    return nearest, own & (square < reach * reach)

@@ -1,0 +1,1 @@
+"""Training and evaluating estimators. Needs the extra ``train`` (PyTorch)."""

@@ -1,0 +1,132 @@
+"""The displacement networks in PyTorch, for training. A running cell never imports this module."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from touchcell.geometry.types import Array
+from touchcell.perception.markers.architecture import LOG_PRECISION_BOUNDS
+from touchcell.perception.markers.matching import DisplacementModel
+from touchcell.perception.networks.contact_network import Alignment
+
+_DISPLACEMENT_PX = 8.0
+_NARROWEST = 0.02
+
+
+class DisplacementNetwork(nn.Module):
+    """Marker displacements (networks, n, 2 m) px to outputs (networks, n, 18), in label half-ranges.
+
+    Outputs are six means, the logarithms of their inverse Laplace scales, which only the training uses, and the
+    logarithms of their inverse standard deviations. Each network sees the displacements and, on an equal footing, the
+    displacement model's coefficients: the narrow ways of moving tell tilt and depth.
+
+    Args:
+        model: of the displacements.
+        hidden: units of each layer.
+        networks: how many, trained side by side and independently.
+    """
+
+    mean: Tensor
+    scaled: Tensor
+
+    def __init__(self, model: DisplacementModel, hidden: tuple[int, ...], networks: int) -> None:
+        super().__init__()
+        features = features_of(model)
+        scaled = features[:, len(model.mean) :]
+        self.register_buffer("mean", torch.from_numpy(model.mean.astype(np.float32)), persistent=False)
+        self.register_buffer("scaled", torch.from_numpy(scaled.astype(np.float32)), persistent=False)
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        before = features.shape[1]
+        for units in (*hidden, 18):
+            bound = 1.0 / math.sqrt(before)
+            self.weights.append(nn.Parameter(torch.empty(networks, before, units).uniform_(-bound, bound)))
+            self.biases.append(nn.Parameter(torch.empty(networks, 1, units).uniform_(-bound, bound)))
+            before = units
+        with torch.no_grad():
+            self.weights[-1][:, :, 6:] *= 0.1
+
+    def forward(self, displacements: Tensor, noise: float = 0.0) -> Tensor:
+        moved = displacements - self.mean
+        x = torch.cat([moved / _DISPLACEMENT_PX, moved @ self.scaled], dim=-1)
+        if noise:
+            x = x + noise * torch.randn_like(x)
+        for weight, bias in zip(list(self.weights)[:-1], list(self.biases)[:-1], strict=True):
+            x = functional.silu(torch.baddbmm(bias, x, weight))
+        # The standard deviations are read off what the means have taught, and change nothing about it.
+        weight, bias = self.weights[-1], self.biases[-1]
+        outputs = torch.baddbmm(bias[:, :, :12], x, weight[:, :, :12])
+        spread = torch.baddbmm(bias[:, :, 12:], x.detach(), weight[:, :, 12:])
+        low, high = LOG_PRECISION_BOUNDS
+        return torch.cat([outputs[..., :6], outputs[..., 6:].clamp(low, high), spread.clamp(low, high)], dim=-1)
+
+    def folded(self) -> dict[str, NDArray[np.float32]]:
+        """Tensors of a model file: the first layer takes pixels, the last gives means and standard deviations."""
+        weights = [weight.detach().double() for weight in self.weights]
+        biases = [bias.detach().double() for bias in self.biases]
+        m = len(self.mean)
+        weights[0] = weights[0][:, :m] / _DISPLACEMENT_PX + self.scaled.double() @ weights[0][:, m:]
+        biases[0] = biases[0] - (self.mean.double() @ weights[0])[:, None]
+        kept = [*range(6), *range(12, 18)]
+        weights[-1], biases[-1] = weights[-1][:, :, kept], biases[-1][:, :, kept]
+        tensors: dict[str, NDArray[np.float32]] = {}
+        for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+            tensors[f"layer{i}.weight"] = np.ascontiguousarray(weight.float().numpy())
+            tensors[f"layer{i}.bias"] = np.ascontiguousarray(bias.float().numpy().reshape(len(bias), 1, -1))
+        return tensors
+
+
+def features_of(model: DisplacementModel) -> Array:
+    """(2 m, f) what first layers learn from: markers alone, and together the ways in which they move."""
+    scaled = model.basis.T / np.maximum(model.sd, _NARROWEST * model.sd[0])
+    return np.concatenate([np.eye(len(model.mean)) / _DISPLACEMENT_PX, scaled], axis=1)
+
+
+class Jitter:
+    """Displacements as a camera that moved, turned and zoomed a little sees them.
+
+    Args:
+        reference: (m, 2) px, the markers at rest.
+        shift_px, turn_rad, zoom: standard deviations.
+    """
+
+    def __init__(self, reference: Array, shift_px: float, turn_rad: float, zoom: float) -> None:
+        self._around_middle = torch.from_numpy((reference - reference.mean(axis=0)).astype(np.float32))
+        self._shift_px, self._turn_rad, self._zoom = shift_px, turn_rad, zoom
+
+    def __call__(self, displacements: Tensor) -> Tensor:
+        """Displacements (networks, n, 2 m) px, each of another camera."""
+        networks, n, _ = displacements.shape
+        place = self._around_middle + displacements.view(networks, n, -1, 2)
+        across = torch.stack([-place[..., 1], place[..., 0]], dim=-1)
+        moved = self._shift_px * torch.randn(networks, n, 1, 2)
+        moved = moved + self._turn_rad * torch.randn(networks, n, 1, 1) * across
+        moved = moved + self._zoom * torch.randn(networks, n, 1, 1) * place
+        return displacements + moved.flatten(2)
+
+
+def displacement_loss(outputs: Tensor, labels: Tensor, alignment: Alignment) -> Tensor:
+    """Laplace likelihood of the means, each term weighted by the root of its own scale, and Gaussian likelihood of the
+    standard deviations about those means.
+
+    Slip makes heavy tails, for which a Laplace density is closer than a Gaussian. The weight (Seitzer et al. 2022,
+    beta-NLL with beta 0.5) keeps the likelihood from giving up on what is hard, gamma above all.
+
+    Args:
+        outputs: (networks, n, 18).
+        labels: (networks, n, 6).
+        alignment: of the standard deviations.
+    """
+    mean, log_inverse_scale, log_precision = outputs[..., :6], outputs[..., 6:12], outputs[..., 12:]
+    residual = labels - mean
+    off = residual.abs()
+    laplace = (off * log_inverse_scale.exp() - log_inverse_scale) * (-0.5 * log_inverse_scale.detach()).exp()
+    gaussian = 0.5 * (alignment(residual.detach(), mean) * log_precision.exp()).square() - log_precision
+    loss: Tensor = (laplace.sum(-1) + 0.2 * gaussian.sum(-1)).mean()
+    return loss

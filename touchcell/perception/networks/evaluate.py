@@ -1,0 +1,149 @@
+"""How good a model is on a split of a data set: errors, likelihood, calibration and time per frame."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from touchcell.drivers.core.clock import Clock, MonotonicClock
+from touchcell.drivers.replay.dataset import read_split
+from touchcell.perception.networks.dataset import Progress
+from touchcell.perception.networks.scores import Scores
+from touchcell.perception.runtime.estimators import load_estimator
+from touchcell.perception.runtime.inference import Prediction
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_COVERAGE = {"68": 0.68, "95": 0.95}
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What a model achieved on a split.
+
+    Attributes:
+        n: images.
+        mae: mean absolute error of each component of the contact, mm or degrees.
+        nll: mean negative log-likelihood of xi under the predicted Gaussian, summed over its components, in nats per
+            image with xi in mm and degrees.
+        latency_ms: ``median`` and ``p99`` of the time from a decoded image to its prediction, on one thread.
+        coverage: for ``68`` and ``95`` percent, the fraction of labels of each component of xi that lie in the central
+            interval of the predicted Gaussian; the components of xi are the contact's, seen from the surface's side.
+    """
+
+    n: int
+    mae: dict[str, float]
+    nll: float
+    latency_ms: dict[str, float]
+    coverage: dict[str, dict[str, float]]
+
+    def to_json(self) -> str:
+        """One JSON object with the attributes as keys."""
+        return json.dumps(asdict(self), indent=2) + "\n"
+
+    def write(self, path: Path) -> None:
+        """``to_json`` into a file, whole or not at all."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+            unfinished = Path(scratch) / path.name
+            unfinished.write_text(self.to_json(), encoding="utf-8")
+            os.replace(unfinished, path)
+
+
+def evaluate(
+    data: Path,
+    split: str,
+    model: Path,
+    *,
+    calibration: Path | None = None,
+    deeper_than_mm: float | None = None,
+    clock: Clock | None = None,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Predict every image of a split, one by one as a cell would, and compare with the labels.
+
+    Args:
+        data: data set, see ``dataset``.
+        split: train, val or test.
+        model: model file.
+        calibration: of the camera, as ``load_estimator`` takes it.
+        deeper_than_mm: leave out shallower contacts.
+        clock: measures the latency; None for the machine's.
+        progress: told (images done, images in all).
+
+    Raises:
+        DataError: the data set is damaged.
+        ModelError: the model file is damaged.
+        ImageError: the model was made for other images.
+    """
+    clock = clock or MonotonicClock()
+    labelled = read_split(data, split)
+    if deeper_than_mm is not None:
+        labelled = labelled.deeper_than(deeper_than_mm)
+    contact_model = load_estimator(model, calibration)
+    n = len(labelled.images)
+    predictions: list[Prediction] = []
+    latencies_ns = np.empty(n)
+    with one_opencv_thread():
+        for i, image in enumerate(labelled.read()):
+            if i == 0:
+                contact_model.predict(image)  # The first run also plans the memory.
+            start_ns = clock.now_ns()
+            predictions.append(contact_model.predict(image))
+            latencies_ns[i] = clock.now_ns() - start_ns
+            if progress is not None:
+                progress(i + 1, n)
+    scores = Scores.of(labelled.contact_mm_deg, predictions)
+    return Evaluation(
+        n=n,
+        mae=scores.mae(),
+        nll=float(scores.nll.mean()),
+        latency_ms={
+            "median": float(np.median(latencies_ns)) * 1e-6,
+            "p99": float(np.percentile(latencies_ns, 99)) * 1e-6,
+        },
+        coverage={percent: scores.coverage(share) for percent, share in _COVERAGE.items()},
+    )
+
+
+def print_table(evaluation: Evaluation, console: Console | None = None) -> None:
+    """Show an evaluation to a person."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"{evaluation.n} images")
+    table.add_column("")
+    for name in evaluation.mae:
+        table.add_column(name, justify="right")
+    table.add_row("MAE", *(f"{error:.3f}" for error in evaluation.mae.values()))
+    for percent, fractions in evaluation.coverage.items():
+        table.add_row(f"within {percent} %", *(f"{100.0 * fractions[name]:.1f} %" for name in evaluation.mae))
+    console = console or Console()
+    console.print(table)
+    latency = evaluation.latency_ms
+    console.print(
+        f"NLL {evaluation.nll:.3f} nats per image (mm, deg); "
+        f"{latency['median']:.2f} ms per image (median), {latency['p99']:.2f} ms (99 %)",
+        soft_wrap=True,
+    )
+
+
+@contextmanager
+def one_opencv_thread() -> Iterator[None]:
+    """Within it OpenCV uses one thread, as a running cell does."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

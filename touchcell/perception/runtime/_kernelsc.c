@@ -1,0 +1,424 @@
+/* Python's door to the compiled kernels: takes buffers, checks them, runs a kernel, writes into buffers.
+ *
+ * What is not of the right type, shape or order in memory, not finite, or too large, raises ArrayError. The shapes are in
+ * touchcell/perception/runtime/kernels.py, which is what other modules call.
+ */
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+#include <stdarg.h>
+
+#include "_image_kernels.h"
+#include "_matching_kernels.h"
+
+enum { MOST_ARGUMENTS = 8, ANY = -1 };
+
+static const double LARGEST = 1e9;
+static const Py_ssize_t MOST = 1 << 24;
+
+static PyObject *array_error;
+
+/* The buffers of one call, given back together. */
+typedef struct {
+    const char *function;
+    Py_buffer views[MOST_ARGUMENTS];
+    int count;
+} Call;
+
+static PyObject *finish(Call *call, PyObject *result)
+{
+    while (call->count)
+        PyBuffer_Release(&call->views[--call->count]);
+    return result;
+}
+
+static void refuse(const Call *call, const char *argument, const char *reason)
+{
+    PyObject *error = PyObject_CallFunction(array_error, "sss", call->function, argument, reason);
+    if (error)
+        PyErr_SetObject(array_error, error);
+    Py_XDECREF(error);
+}
+
+static int is_of(const Py_buffer *view, char type)
+{
+    const char *format = view->format ? view->format : "B";
+    if (format[0] == '\0' || format[1] != '\0')
+        return 0;
+    return format[0] == type || (type == 'q' && format[0] == 'l' && view->itemsize == 8);
+}
+
+/* A buffer of a type and shape; ANY is any length. NULL with an exception. */
+static Py_buffer *take(Call *call, const char *argument, PyObject *value, char type, int flags, int ndim, ...)
+{
+    Py_buffer *view = &call->views[call->count];
+    if (PyObject_GetBuffer(value, view, flags | PyBUF_FORMAT) < 0) {
+        PyErr_Clear();
+        refuse(call, argument, "is no array of the right order in memory");
+        return NULL;
+    }
+    call->count++;
+    if (!is_of(view, type)) {
+        refuse(call, argument, "is of another type");
+        return NULL;
+    }
+    int fits = view->ndim == ndim;
+    va_list lengths;
+    va_start(lengths, ndim);
+    for (int i = 0; i < ndim && fits; i++) {
+        Py_ssize_t length = va_arg(lengths, Py_ssize_t);
+        fits = length == ANY ? view->shape[i] <= MOST : view->shape[i] == length;
+    }
+    va_end(lengths);
+    if (!fits) {
+        refuse(call, argument, "has another shape");
+        return NULL;
+    }
+    if (type == 'd' && !(flags & PyBUF_WRITABLE)) {
+        const double *numbers = view->buf;
+        for (Py_ssize_t i = 0; i < view->len / 8; i++)
+            if (!(fabs(numbers[i]) <= LARGEST)) {
+                refuse(call, argument, "is not finite, or larger than 1e9");
+                return NULL;
+            }
+    }
+    return view;
+}
+
+static int takes(const Call *call, Py_ssize_t count, Py_ssize_t wanted)
+{
+    if (count == wanted)
+        return 1;
+    PyErr_Format(PyExc_TypeError, "%s takes %zd arguments", call->function, wanted);
+    return 0;
+}
+
+/* A finite number between bounds. */
+static int number(const Call *call, const char *argument, PyObject *value, double least, double most, double *to)
+{
+    *to = PyFloat_AsDouble(value);
+    if (PyErr_Occurred())
+        return 0;
+    if (*to >= least && *to <= most)
+        return 1;
+    refuse(call, argument, "is out of range");
+    return 0;
+}
+
+/* Rows of an image may lie apart, its pixels may not. */
+static Py_buffer *take_image(Call *call, PyObject *value)
+{
+    Py_buffer *image = take(call, "image", value, 'B', PyBUF_STRIDES, 2, (Py_ssize_t)ANY, (Py_ssize_t)ANY);
+    if (!image)
+        return NULL;
+    if (image->shape[0] < 1 || image->shape[1] < 1) {
+        refuse(call, "image", "is empty");
+        return NULL;
+    }
+    if (image->shape[1] > 1 && image->strides[1] != 1) {
+        refuse(call, "image", "has pixels that do not lie side by side");
+        return NULL;
+    }
+    return image;
+}
+
+static PyObject *ended(Call *call, int done)
+{
+    if (!done)
+        return finish(call, PyErr_NoMemory());
+    return finish(call, Py_NewRef(Py_None));
+}
+
+static PyObject *py_median_5(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "median_5"};
+    Py_buffer *image, *to;
+    if (!takes(&call, count, 2) || !(image = take_image(&call, arguments[0])) ||
+        !(to = take(&call, "to", arguments[1], 'B', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, image->shape[0],
+                    image->shape[1])))
+        return finish(&call, NULL);
+    int done;
+    Py_BEGIN_ALLOW_THREADS;
+    done = median_5(image->buf, image->strides[0], image->shape[0], image->shape[1], to->buf);
+    Py_END_ALLOW_THREADS;
+    return ended(&call, done);
+}
+
+static PyObject *py_threshold(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "threshold"};
+    Py_buffer *image, *to;
+    double with_median, block_px, offset;
+    if (!takes(&call, count, 5) || !(image = take_image(&call, arguments[0])) ||
+        !number(&call, "with_median", arguments[1], 0.0, 1.0, &with_median) ||
+        !number(&call, "block_px", arguments[2], 3.0, 255.0, &block_px) ||
+        !number(&call, "offset", arguments[3], -256.0, 256.0, &offset) ||
+        !(to = take(&call, "to", arguments[4], 'B', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, image->shape[0],
+                    image->shape[1])))
+        return finish(&call, NULL);
+    if ((int)block_px % 2 == 0) {
+        refuse(&call, "block_px", "is even");
+        return finish(&call, NULL);
+    }
+    int done;
+    Py_BEGIN_ALLOW_THREADS;
+    done = threshold(image->buf, image->strides[0], image->shape[0], image->shape[1], with_median != 0.0,
+                     (ptrdiff_t)block_px, (int32_t)offset, to->buf);
+    Py_END_ALLOW_THREADS;
+    return ended(&call, done);
+}
+
+static PyObject *py_shrink(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "shrink"};
+    Py_buffer *image, *to;
+    double factor;
+    if (!takes(&call, count, 3) || !(image = take_image(&call, arguments[0])) ||
+        !number(&call, "factor", arguments[1], 1.0, 64.0, &factor) ||
+        !(to = take(&call, "to", arguments[2], 'B', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2,
+                    image->shape[0] / (Py_ssize_t)factor, image->shape[1] / (Py_ssize_t)factor)))
+        return finish(&call, NULL);
+    if ((int)factor & ((int)factor - 1)) {
+        refuse(&call, "factor", "is no power of two");
+        return finish(&call, NULL);
+    }
+    return ended(&call, shrink(image->buf, image->strides[0], image->shape[0], image->shape[1], (ptrdiff_t)factor, to->buf));
+}
+
+static PyObject *py_area_means(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "area_means"};
+    Py_buffer *image, *to;
+    if (!takes(&call, count, 2) || !(image = take_image(&call, arguments[0])) ||
+        !(to = take(&call, "to", arguments[1], 'B', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, (Py_ssize_t)ANY,
+                    (Py_ssize_t)ANY)))
+        return finish(&call, NULL);
+    if (to->shape[0] < 1 || to->shape[1] < 1 || to->shape[0] > image->shape[0] || to->shape[1] > image->shape[1]) {
+        refuse(&call, "to", "is empty or larger than the image");
+        return finish(&call, NULL);
+    }
+    int done;
+    Py_BEGIN_ALLOW_THREADS;
+    done = area_means(image->buf, image->strides[0], image->shape[0], image->shape[1], to->shape[0], to->shape[1],
+                      to->buf);
+    Py_END_ALLOW_THREADS;
+    return ended(&call, done);
+}
+
+static PyObject *py_discs(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "discs"};
+    Py_buffer *image;
+    double smallest, largest, longest;
+    if (!takes(&call, count, 4) || !(image = take_image(&call, arguments[0])) ||
+        !number(&call, "smallest_px", arguments[1], 0.0, INT32_MAX, &smallest) ||
+        !number(&call, "largest_px", arguments[2], 0.0, INT32_MAX, &largest) ||
+        !number(&call, "longest_side_px", arguments[3], 0.0, INT32_MAX, &longest))
+        return finish(&call, NULL);
+    if ((int64_t)image->shape[0] * image->shape[1] > INT32_MAX) {
+        refuse(&call, "image", "is too large");
+        return finish(&call, NULL);
+    }
+    Component *components;
+    int32_t found;
+    Py_BEGIN_ALLOW_THREADS;
+    found = find_components(image->buf, image->strides[0], (int32_t)image->shape[0], (int32_t)image->shape[1],
+                            &components);
+    Py_END_ALLOW_THREADS;
+    if (found < 0)
+        return ended(&call, 0);
+    found = keep_discs(components, found, (DiscSize){(int32_t)smallest, (int32_t)largest, (int32_t)longest});
+    PyObject *result = PyByteArray_FromStringAndSize(NULL, (Py_ssize_t)found * 3 * (Py_ssize_t)sizeof(double));
+    if (result) {
+        double *to = (double *)PyByteArray_AS_STRING(result);
+        for (int32_t i = 0; i < found; i++) {
+            to[2 * i] = (double)components[i].sum_u / components[i].area;
+            to[2 * i + 1] = (double)components[i].sum_v / components[i].area;
+            to[2 * found + i] = components[i].area;
+        }
+    }
+    free(components);
+    return finish(&call, result);
+}
+
+static Py_buffer *take_points(Call *call, const char *argument, PyObject *value)
+{
+    Py_buffer *points = take(call, argument, value, 'd', PyBUF_C_CONTIGUOUS, 2, (Py_ssize_t)ANY, (Py_ssize_t)2);
+    if (points && points->shape[0] < 1) {
+        refuse(call, argument, "is empty");
+        return NULL;
+    }
+    return points;
+}
+
+static PyObject *py_pair(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "pair"};
+    Py_buffer *places, *points, *partner, *square, *owns;
+    if (!takes(&call, count, 5) || !(places = take_points(&call, "places", arguments[0])) ||
+        !(points = take_points(&call, "points", arguments[1])) ||
+        !(partner = take(&call, "partner", arguments[2], 'q', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1, places->shape[0])) ||
+        !(square = take(&call, "square", arguments[3], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1, places->shape[0])) ||
+        !(owns = take(&call, "owns", arguments[4], '?', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1, places->shape[0])))
+        return finish(&call, NULL);
+    Buckets buckets;
+    int32_t *owner = malloc((size_t)points->shape[0] * sizeof *owner);
+    int done = owner && fill_buckets(&buckets, points->buf, points->shape[0]);
+    if (done) {
+        const double *place = places->buf;
+        for (Py_ssize_t i = 0; i < places->shape[0]; i++)
+            ((int64_t *)partner->buf)[i] = nearest_point(&buckets, place + 2 * i, (double *)square->buf + i);
+        find_owners(partner->buf, square->buf, places->shape[0], owner, points->shape[0], owns->buf);
+        free_buckets(&buckets);
+    }
+    free(owner);
+    return ended(&call, done);
+}
+
+/* The basis as (2 markers, stride), of which the first columns are the modes. */
+static int take_modes(Call *call, PyObject *value, Py_ssize_t modes, Modes *to)
+{
+    Py_buffer *basis = take(call, "basis", value, 'd', PyBUF_C_CONTIGUOUS, 2, (Py_ssize_t)ANY, (Py_ssize_t)ANY);
+    if (!basis)
+        return 0;
+    Py_ssize_t stride = basis->shape[1];
+    if (basis->shape[0] < 2 || basis->shape[0] % 2 || stride < 1 || stride > 1024 || stride % TILE_COLUMNS ||
+        modes < 1 || modes > stride) {
+        refuse(call, "basis", "has another shape");
+        return 0;
+    }
+    *to = (Modes){basis->buf, basis->shape[0] / 2, modes, stride};
+    return 1;
+}
+
+static PyObject *py_fit(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "fit"};
+    Modes modes;
+    Py_buffer *weight, *off, *from_start, *ridge, *change;
+    if (!takes(&call, count, 6) ||
+        !(ridge = take(&call, "ridge", arguments[4], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)ANY)) ||
+        !take_modes(&call, arguments[0], ridge->shape[0], &modes) ||
+        !(weight = take(&call, "weight", arguments[1], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)modes.markers)) ||
+        !(off = take(&call, "off", arguments[2], 'd', PyBUF_C_CONTIGUOUS, 2, (Py_ssize_t)modes.markers, (Py_ssize_t)2)) ||
+        !(from_start = take(&call, "from_start", arguments[3], 'd', PyBUF_C_CONTIGUOUS, 1, ridge->shape[0])) ||
+        !(change = take(&call, "change", arguments[5], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1, ridge->shape[0])))
+        return finish(&call, NULL);
+    double *room = malloc((size_t)(modes.stride * (modes.stride + 1)) * sizeof *room);
+    if (!room)
+        return ended(&call, 0);
+    double *found = room + modes.stride * modes.stride;
+    if (!fit_change(&modes, weight->buf, off->buf, from_start->buf, ridge->buf, room, found)) {
+        free(room);
+        refuse(&call, "ridge", "leaves moments that are not positive definite");
+        return finish(&call, NULL);
+    }
+    memcpy(change->buf, found, (size_t)modes.modes * sizeof *found);
+    free(room);
+    return ended(&call, 1);
+}
+
+static PyObject *py_settle(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "settle"};
+    Modes modes;
+    Py_buffer *base, *start, *ridge, *points, *coefficients;
+    Settling settling;
+    double turns;
+    if (!takes(&call, count, 10) ||
+        !(ridge = take(&call, "ridge", arguments[3], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)ANY)) ||
+        !take_modes(&call, arguments[0], ridge->shape[0], &modes) ||
+        !(base = take(&call, "base", arguments[1], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)(2 * modes.markers))) ||
+        !(start = take(&call, "start", arguments[2], 'd', PyBUF_C_CONTIGUOUS, 1, ridge->shape[0])) ||
+        !(points = take_points(&call, "points", arguments[4])) ||
+        !number(&call, "reach_px", arguments[5], 1e-9, LARGEST, &settling.reach_px) ||
+        !number(&call, "least_reach_px", arguments[6], 1e-9, LARGEST, &settling.least_reach_px) ||
+        !number(&call, "settled_px", arguments[7], 0.0, LARGEST, &settling.settled_px) ||
+        !number(&call, "turns", arguments[8], 0.0, 1000.0, &turns) ||
+        !(coefficients = take(&call, "coefficients", arguments[9], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1,
+                              ridge->shape[0])))
+        return finish(&call, NULL);
+    settling.turns = (int)turns;
+    Buckets buckets;
+    int done = fill_buckets(&buckets, points->buf, points->shape[0]);
+    if (done) {
+        done = settle(&modes, base->buf, start->buf, ridge->buf, &buckets, points->shape[0], settling,
+                      coefficients->buf);
+        free_buckets(&buckets);
+    }
+    return ended(&call, done);
+}
+
+static PyObject *py_density(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "density"};
+    Py_buffer *points, *weights, *low, *density;
+    double cell_px;
+    if (!takes(&call, count, 5) ||
+        !(points = take(&call, "centres", arguments[0], 'd', PyBUF_C_CONTIGUOUS, 3, (Py_ssize_t)ANY, (Py_ssize_t)ANY,
+                        (Py_ssize_t)2)) ||
+        !(weights = take(&call, "weights", arguments[1], 'd', PyBUF_C_CONTIGUOUS, 2, points->shape[0],
+                         points->shape[1])) ||
+        !(low = take(&call, "low", arguments[2], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)2)) ||
+        !number(&call, "cell_px", arguments[3], 1e-6, LARGEST, &cell_px) ||
+        !(density = take(&call, "density", arguments[4], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 3, points->shape[0],
+                         (Py_ssize_t)ANY, (Py_ssize_t)ANY)))
+        return finish(&call, NULL);
+    Py_ssize_t grid = density->shape[1], each = points->shape[1];
+    if (density->shape[2] != grid) {
+        refuse(&call, "density", "is not square");
+        return finish(&call, NULL);
+    }
+    for (Py_ssize_t i = 0; i < points->shape[0]; i++)
+        add_density((const double *)points->buf + 2 * each * i, (const double *)weights->buf + each * i, each, low->buf,
+                    cell_px, grid, (double *)density->buf + grid * grid * i);
+    return ended(&call, 1);
+}
+
+static PyObject *py_affine(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "affine"};
+    Py_buffer *weight, *bias, *x, *to;
+    if (!takes(&call, count, 4) ||
+        !(weight = take(&call, "weight", arguments[0], 'f', PyBUF_C_CONTIGUOUS, 2, (Py_ssize_t)ANY, (Py_ssize_t)ANY)) ||
+        !(bias = take(&call, "bias", arguments[1], 'f', PyBUF_C_CONTIGUOUS, 1, weight->shape[1])) ||
+        !(x = take(&call, "x", arguments[2], 'f', PyBUF_C_CONTIGUOUS, 1, weight->shape[0])) ||
+        !(to = take(&call, "to", arguments[3], 'f', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1, weight->shape[1])))
+        return finish(&call, NULL);
+    affine(weight->buf, bias->buf, x->buf, weight->shape[0], weight->shape[1], to->buf);
+    return ended(&call, 1);
+}
+
+static PyObject *py_bytes_apart(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "bytes_apart"};
+    Py_buffer *rows, *one, *apart;
+    if (!takes(&call, count, 3) ||
+        !(rows = take(&call, "rows", arguments[0], 'B', PyBUF_C_CONTIGUOUS, 2, (Py_ssize_t)ANY, (Py_ssize_t)ANY)) ||
+        !(one = take(&call, "one", arguments[1], 'B', PyBUF_C_CONTIGUOUS, 1, rows->shape[1])) ||
+        !(apart = take(&call, "apart", arguments[2], 'i', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1, rows->shape[0])))
+        return finish(&call, NULL);
+    if (rows->shape[1] > 32768) {
+        refuse(&call, "rows", "are longer than 32768");
+        return finish(&call, NULL);
+    }
+    bytes_apart(rows->buf, rows->shape[0], one->buf, rows->shape[1], apart->buf);
+    return ended(&call, 1);
+}
+
+#define FAST(name) {#name, (PyCFunction)(void (*)(void))py_##name, METH_FASTCALL, NULL}
+
+static PyMethodDef METHODS[] = {FAST(median_5), FAST(threshold), FAST(shrink),  FAST(area_means),  FAST(discs),  FAST(pair), FAST(fit),
+                                FAST(settle),   FAST(density),   FAST(bytes_apart), FAST(affine), {NULL, NULL, 0, NULL}};
+
+static struct PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "touchcell.perception.runtime._kernelsc",
+                                    "Compiled kernels of touchcell.perception.runtime.kernels.", -1, METHODS};
+
+PyMODINIT_FUNC PyInit__kernelsc(void)
+{
+    PyObject *errors = PyImport_ImportModule("touchcell.perception.errors");
+    if (!errors)
+        return NULL;
+    array_error = PyObject_GetAttrString(errors, "ArrayError");
+    Py_DECREF(errors);
+    return array_error ? PyModule_Create(&MODULE) : NULL;
+}

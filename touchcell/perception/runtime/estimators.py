@@ -1,0 +1,71 @@
+"""Any trained model by its file alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+from touchcell.geometry.types import ImageArray
+from touchcell.perception.runtime.inference import ContactModel, Prediction
+from touchcell.perception.runtime.model_file import Header, Model, load_model
+
+
+class ContactEstimator(Protocol):
+    """A trained model, ready to predict."""
+
+    @property
+    def header(self) -> Header:
+        """Of the model file."""
+        ...
+
+    @property
+    def reference(self) -> ImageArray | None:
+        """Preprocessed image out of contact, or None when nobody took one."""
+        ...
+
+    def reduce(self, image: ImageArray) -> ImageArray:
+        """The model's preprocessing. Raises ImageError."""
+        ...
+
+    def predict(self, image: ImageArray) -> Prediction:
+        """Contact in one camera image. Raises ImageError."""
+        ...
+
+    def predict_reduced(self, reduced: ImageArray) -> Prediction:
+        """Contact in an image that ``reduce`` made."""
+        ...
+
+
+def load_estimator(path: Path, calibration: Path | None = None) -> ContactEstimator:
+    """Open a model file of any kind.
+
+    Args:
+        path: model file.
+        calibration: of the camera, where it is not the one that taught the model (``touchcell calibrate``).
+
+    Raises:
+        ModelError: as ``model_file.load_model``.
+        ConfigError: the calibration file cannot be used.
+    """
+    model = load_model(path)
+    change = model.header.camera
+    if calibration is not None:
+        from touchcell.perception.runtime.camera_change import load_change
+
+        found = load_change(calibration)
+        change = found if change is None else change.after(found)
+    estimator = estimator_of(model)
+    if change is None:
+        return estimator
+    from touchcell.perception.runtime.calibrated_estimator import CalibratedEstimator
+
+    return CalibratedEstimator(estimator, change)
+
+
+def estimator_of(model: Model) -> ContactEstimator:
+    """The estimator that a model of any kind describes."""
+    if model.header.architecture.kind == "markers":
+        from touchcell.perception.markers.estimator import MarkerEstimator
+
+        return MarkerEstimator(model)
+    return ContactModel(model)

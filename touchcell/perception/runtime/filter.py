@@ -1,0 +1,115 @@
+"""The discriminative Bayesian filter on SE(3) (Lloyd & Lepora 2024, section 3.2, Algorithm 2).
+
+State: a Gaussian over ``T_s_f`` with left perturbations. The surface stands still in the world, so when the sensor
+moves from ``T_b_s`` to ``T_b_s'`` the state moves by ``U = inv(T_b_s') T_b_s``; an observation is fused as the product
+of two Gaussians on the manifold. Training poses are drawn evenly, so dividing by p(state) changes nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from touchcell.geometry import gaussian, se3
+from touchcell.geometry.gaussian import PoseGaussian
+from touchcell.geometry.types import Array
+
+
+@dataclass(frozen=True, slots=True)
+class FilterState:
+    """A belief, the sensor pose and the time that it is for, and how it agreed with the last frame."""
+
+    belief: PoseGaussian
+    T_base_sensor: Array
+    t_ns: int
+    nis: float | None = None
+
+
+class ContactFilter(Protocol):
+    """What a pipeline asks of a filter; ``PoseFilter`` and ``moving_surface.MovingSurfaceFilter`` offer it."""
+
+    def reset(self) -> None:
+        """Forget everything: the next observation starts a new contact."""
+        ...
+
+    def predict(self, T_base_sensor: Array, t_ns: int) -> PoseGaussian:
+        """Belief after the sensor has moved to ``T_base_sensor`` at ``t_ns``; the state itself stays."""
+        ...
+
+    def update(self, observation: PoseGaussian, T_base_sensor: Array, t_ns: int) -> FilterState:
+        """Fuse an observation made at ``t_ns`` with the sensor at ``T_base_sensor``; returns the new state."""
+        ...
+
+
+class PoseFilter:
+    """Filters observations of ``T_s_f`` of a still surface, from a moving sensor.
+
+    Args:
+        noise_density: (6, 6) growth of the covariance per second, [v, w], m^2/s and rad^2/s, sensor frame. It stands
+            for slip, surface curvature and whatever else the still-surface model leaves out.
+        order: 2 or 4, order of the covariance's prediction (NUMERICS: 2 suffices below 0.1 rad of uncertainty).
+
+    Raises:
+        NotPositiveDefinite: the noise density is not finite or not positive semidefinite.
+    """
+
+    def __init__(self, noise_density: Array, *, order: Literal[2, 4] = 2) -> None:
+        require_noise_density(noise_density)
+        self._noise_density = noise_density
+        self._order = order
+        self._state: FilterState | None = None
+
+    @property
+    def state(self) -> FilterState | None:
+        """The present state, None before the first observation."""
+        return self._state
+
+    def reset(self) -> None:
+        """Forget everything: the next observation starts a new contact."""
+        self._state = None
+
+    def predict(self, T_base_sensor: Array, t_ns: int) -> PoseGaussian:
+        """Belief after the sensor has moved to ``T_base_sensor`` at ``t_ns``; the state itself stays.
+
+        Raises:
+            ValueError: no observation yet, or ``t_ns`` lies before the state's time.
+        """
+        state = self._state
+        if state is None:
+            raise ValueError("predict before the first observation")
+        if t_ns < state.t_ns:
+            raise ValueError(f"cannot predict back from {state.t_ns} to {t_ns} ns")
+        U = se3.compose(se3.inverse(T_base_sensor), state.T_base_sensor)
+        noise = self._noise_density * ((t_ns - state.t_ns) * 1e-9)
+        return gaussian.compound(U, state.belief, noise=noise, order=self._order)
+
+    def update(self, observation: PoseGaussian, T_base_sensor: Array, t_ns: int) -> FilterState:
+        """Fuse an observation made at ``t_ns`` with the sensor at ``T_base_sensor``; returns the new state.
+
+        Raises:
+            GeometryError: ``T_base_sensor`` is no pose, or the fusion did not converge; the state stays as it was.
+            ValueError: ``t_ns`` lies before the state's time.
+        """
+        if self._state is None:
+            self._state = FilterState(observation, require_pose(T_base_sensor), t_ns)
+        else:
+            fused, record = gaussian.fuse(self.predict(T_base_sensor, t_ns), observation)
+            self._state = FilterState(fused, T_base_sensor, t_ns, record.nis)
+        return self._state
+
+
+def isotropic_noise(translation_m_per_sqrt_s: float, rotation_rad_per_sqrt_s: float) -> Array:
+    """(6, 6) noise density of independent random walks, equal along all axes."""
+    return np.diag([translation_m_per_sqrt_s**2] * 3 + [rotation_rad_per_sqrt_s**2] * 3)
+
+
+def require_noise_density(noise_density: Array) -> None:
+    """Raise NotPositiveDefinite unless it can be the growth of a covariance: at once, not at the second frame."""
+    gaussian.compound(np.eye(4), PoseGaussian(np.eye(4), np.eye(6)), noise_density)
+
+
+def require_pose(T_base_sensor: Array) -> Array:
+    """The pose itself. Raises GeometryError unless it is one: a first frame is stored before anything is computed."""
+    return PoseGaussian(T_base_sensor, np.eye(6)).mean

@@ -1,0 +1,62 @@
+"""The ONNX graph of a model, built from its header and tensors. Needs neither PyTorch nor the ``onnx`` package."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from touchcell.perception.runtime import onnx_wire
+from touchcell.perception.runtime.architecture import Architecture
+from touchcell.perception.runtime.model_file import Model
+
+IMAGES = "images"
+OUTPUTS = "outputs"
+
+
+def onnx_model(model: Model) -> bytes:
+    """A serialised ONNX model: float32 (n, 1, height, width) in [0, 1] to float32 (n, outputs).
+
+    The same function as ``networks.ContactNetwork`` in evaluation, softbound included.
+
+    Raises:
+        TypeError: the model is no image network.
+    """
+    architecture = model.header.architecture
+    if not isinstance(architecture, Architecture):
+        raise TypeError(f"a model of kind {architecture.kind} has no graph")
+    constants: dict[str, NDArray[np.float32]] = dict(model.tensors)
+    nodes: list[bytes] = []
+    last = IMAGES
+
+    def add(operator: str, *others: str, output: str = "", before: str = "", **attributes: int | Sequence[int]) -> None:
+        nonlocal last
+        result = output or f"value{len(nodes)}"
+        first = (before, last) if before else (last,)
+        nodes.append(onnx_wire.node(operator, [*first, *others], result, attributes))
+        last = result
+
+    for i in range(len(architecture.channels)):
+        add("Conv", f"conv{i}.weight", f"conv{i}.bias", kernel_shape=[3, 3], pads=[1, 1, 1, 1])
+        add("Relu")
+        add("MaxPool", kernel_shape=[2, 2], strides=[2, 2])
+    add("Flatten", axis=1)
+    add("Gemm", "hidden.weight", "hidden.bias", transB=1)
+    add("Relu")
+    add("Gemm", "output.weight", "output.bias", output="" if architecture.bounds else OUTPUTS, transB=1)
+    if architecture.bounds:
+        low, high = (np.array(bound, dtype=np.float32) for bound in architecture.bounds)
+        c = np.exp(low - high)
+        constants |= {"low": low, "high": high, "c": c, "rest": np.float32(1) - c, "one": np.array(1, np.float32)}
+        # exp of what is far below is infinite, and one over that zero: the bounds hold over the whole range of float32.
+        add("Sub", before="low")
+        add("Exp")
+        add("Add", "c")
+        add("Div", before="rest")
+        add("Add", "one")
+        add("Log")
+        add("Add", "low")
+        add("Min", "high", output=OUTPUTS)
+    height, width = architecture.input_size
+    return onnx_wire.model(nodes, constants, {IMAGES: ("n", 1, height, width)}, {OUTPUTS: ("n", architecture.outputs)})

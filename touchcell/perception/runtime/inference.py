@@ -1,0 +1,135 @@
+"""Contact pose and shear from one image, in a running cell: ONNX Runtime on one thread, no PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from touchcell.drivers.core.samples import Frame, Stamped
+from touchcell.geometry.types import Array, ImageArray
+from touchcell.perception.runtime.graph import IMAGES, OUTPUTS, onnx_model
+from touchcell.perception.runtime.model_file import Header, Model, load_model
+from touchcell.perception.runtime.preprocessing import scale
+
+Runner = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+"""Computes a network: float32 (n, 1, height, width) in [0, 1] to its outputs (n, outputs)."""
+
+RANGE_TOLERANCE = 0.05
+"""How far, in label half-ranges, a prediction may lie outside the taught range and still count as inside."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """A Gaussian over the exponential coordinates of a contact, xi = log(T_s_f) (SPEC part 2).
+
+    Attributes:
+        xi: (6,) mean [v, w], m and rad.
+        covariance: (6, 6) of xi, m and rad.
+        in_range: the mean lies in the range of labels that the model was taught. Outside it, and out of contact, a
+            prediction means little.
+        markers: share of the markers expected in view that were seen, where the model looks for markers.
+    """
+
+    xi: Array
+    covariance: Array
+    in_range: bool
+    markers: float | None = None
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) standard deviation of each component of xi, m and rad."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+
+def onnx_runtime(model: Model) -> Runner:
+    """A model's network in ONNX Runtime, on the thread that calls it and no other."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # On batches of one neither of these is faster: a memory plan for each input shape (1 MB), and a second, packed copy
+    # of the weights (3 MB).
+    options.enable_mem_pattern = False
+    options.add_session_config_entry("session.disable_prepacking", "1")
+    session = onnxruntime.InferenceSession(onnx_model(model), options, providers=["CPUExecutionProvider"])
+    # It keeps the whole model for another provider that it might fall back to: 2 to 6 MB, and there is no other.
+    session._model_bytes = None
+
+    def run(inputs: NDArray[np.float32]) -> NDArray[np.float32]:
+        outputs: NDArray[np.float32] = session.run([OUTPUTS], {IMAGES: inputs})[0]
+        return outputs
+
+    return run
+
+
+class ContactModel:
+    """A trained model, ready to predict.
+
+    Memory does not grow with the number of predictions. Not safe for use from two threads at once.
+
+    Args:
+        model: what was trained.
+        runner: computes its network; None for ``onnx_runtime``.
+    """
+
+    def __init__(self, model: Model, runner: Runner | None = None) -> None:
+        self._run = runner or onnx_runtime(model)
+        self.header: Header = model.header
+        self.reference: ImageArray | None = model.reference
+        self._preprocessing = model.header.preprocessing
+
+    @classmethod
+    def load(cls, path: Path) -> ContactModel:
+        """Open a model file.
+
+        Raises:
+            ModelError: as ``model_file.load_model``.
+        """
+        return cls(load_model(path))
+
+    def predict(self, image: ImageArray) -> Prediction:
+        """Contact in one camera image.
+
+        Raises:
+            ImageError: the image is not what the model's preprocessing was made for.
+        """
+        return self.predict_reduced(self.reduce(image))
+
+    def reduce(self, image: ImageArray) -> ImageArray:
+        """The model's preprocessing, uint8 (height, width): what a contact gate compares. Raises as ``predict``."""
+        return self._preprocessing.reduce(image)
+
+    def predict_reduced(self, reduced: ImageArray) -> Prediction:
+        """Contact in an image that ``reduce`` made, so that a gate and a prediction share the preprocessing."""
+        return self.decode(self.infer(reduced))
+
+    def infer(self, reduced: ImageArray) -> NDArray[np.float32]:
+        """First step of ``predict_reduced``: the network's outputs."""
+        outputs: NDArray[np.float32] = self._run(scale(reduced)[None, None])[0]
+        return outputs
+
+    def predict_batch(self, images: Sequence[ImageArray]) -> list[Prediction]:
+        """``predict`` of several images in one run; faster per image, and the whole batch is held in memory."""
+        if not images:
+            return []
+        return [self.decode(row) for row in self._run(np.stack([self._preprocessing.apply(i) for i in images]))]
+
+    def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:
+        """``predict`` of a camera's sample; the prediction keeps the stamp, number and quality of the frame."""
+        return Stamped(
+            self.predict(sample.value.image), sample.t_ns, sample.seq, sample.t_device_ns, quality=sample.quality
+        )
+
+    def decode(self, output: NDArray[np.float32]) -> Prediction:
+        """Last step of ``predict_reduced``: the outputs of the network as a Gaussian over xi."""
+        mean = output[:6].astype(np.float64)
+        sigma = np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else np.ones(6)
+        xi, covariance = self.header.labels.xi_gaussian(mean, self.header.calibrated(sigma))
+        return Prediction(xi, covariance, in_range=bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE)))

@@ -1,0 +1,224 @@
+"""The inner loops of perception, in C: arrays in, new arrays out.
+
+Each raises ``ArrayError`` where an argument has another shape or type than it says, or is not finite. Without a
+compiler there is no extension: the image filters then are OpenCV's, whose results are the same to the bit, and the
+others raise ``KernelsMissing``.
+"""
+
+from __future__ import annotations
+
+import math
+from types import ModuleType
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from touchcell.geometry.types import Array, ImageArray
+from touchcell.perception.errors import KernelsMissing
+
+_COLUMNS = 8
+_MOST_OFFSET = 256.0
+_FACTORS = (4, 8, 16, 32, 64)
+
+
+def _find() -> ModuleType | None:
+    try:
+        from touchcell.perception.runtime import _kernelsc
+    except ImportError:
+        return None
+    return _kernelsc
+
+
+_FOUND = _find()
+
+
+def _compiled() -> ModuleType:
+    if _FOUND is None:
+        raise KernelsMissing
+    return _FOUND
+
+
+def _in_rows(image: ImageArray) -> ImageArray:
+    return image if image.strides[-1] == 1 else np.ascontiguousarray(image)
+
+
+def median_5(image: ImageArray) -> ImageArray:
+    """Median of 5x5 pixels of a grey image, its border repeated outwards; half the time of OpenCV's."""
+    if _FOUND is None:
+        return np.asarray(cv2.medianBlur(np.ascontiguousarray(image), 5), np.uint8)
+    medians = np.empty(image.shape, np.uint8)
+    _FOUND.median_5(_in_rows(image), medians)
+    return medians
+
+
+def threshold(image: ImageArray, block_px: int, offset: float, *, of_median_5: bool) -> ImageArray:
+    """255 where a grey pixel exceeds the mean of its neighbourhood less ``offset``, 0 elsewhere.
+
+    Args:
+        image: uint8 (height, width).
+        block_px: side of the square neighbourhood, odd, 3 to 255; the image's border is repeated outwards.
+        offset: grey levels.
+        of_median_5: take the medians of 5x5 pixels first, which then are never held all at once.
+    """
+    if _FOUND is None:
+        image = median_5(image) if of_median_5 else np.ascontiguousarray(image)
+        mean, binary = cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY
+        return np.asarray(cv2.adaptiveThreshold(image, 255, mean, binary, block_px, offset), np.uint8)
+    white = np.empty(image.shape, np.uint8)
+    whole = max(-_MOST_OFFSET, min(math.ceil(offset), _MOST_OFFSET))
+    _FOUND.threshold(_in_rows(image), of_median_5, block_px, whole, white)
+    return white
+
+
+def area_means(image: ImageArray, size: tuple[int, int]) -> ImageArray:
+    """A grey image as means over the area of each new pixel, rounded.
+
+    Args:
+        image: uint8 (height, width).
+        size: (height, width) of the result.
+    """
+    (height, width), (rows, columns) = image.shape, size
+    factor = height // rows
+    whole = height % rows == 0 and width % columns == 0
+    other = whole and not (factor in _FACTORS and width == factor * columns)
+    if _FOUND is None or other or rows > height or columns > width:
+        return np.asarray(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA), np.uint8)
+    means = np.empty(size, np.uint8)
+    if whole:
+        _FOUND.shrink(_in_rows(image), factor, means)
+    else:
+        _FOUND.area_means(_in_rows(image), means)
+    return means
+
+
+def discs(image: ImageArray, smallest_px: int, largest_px: int, longest_side_px: int) -> tuple[Array, Array]:
+    """Connected components (8 neighbours) of what is not zero, in the order of their first pixels.
+
+    Args:
+        image: uint8 (height, width).
+        smallest_px, largest_px: bounds on the area.
+        longest_side_px: bound on width and height.
+
+    Returns:
+        (n, 2) centroids (u, v), px, and (n,) areas.
+    """
+    found = np.frombuffer(_compiled().discs(_in_rows(image), smallest_px, largest_px, longest_side_px))
+    n = len(found) // 3
+    return found[: 2 * n].reshape(n, 2), found[2 * n :]
+
+
+def pair(places: Array, points: Array) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
+    """The point nearest to each place, the squared distance, and whether no other place is nearer to that point.
+
+    Args:
+        places: (m, 2), one or more.
+        points: (n, 2), one or more.
+
+    Returns:
+        (m,) each; of equals the first counts.
+    """
+    m = len(places)
+    partner, square, owns = np.empty(m, np.int64), np.empty(m), np.empty(m, np.bool_)
+    _compiled().pair(np.ascontiguousarray(places), np.ascontiguousarray(points), partner, square, owns)
+    return partner, square, owns
+
+
+class Modes:
+    """Ways in which markers move together, laid out for ``settle`` and ``fit``.
+
+    Args:
+        base: (2 m,) px, markers (u, v, u, v, ...) with all coefficients zero.
+        basis: (k, 2 m), a row for each way.
+    """
+
+    def __init__(self, base: Array, basis: Array) -> None:
+        modes, coordinates = basis.shape
+        self._base = np.ascontiguousarray(base)
+        self._modes = modes
+        self._basis = np.zeros((coordinates, -(-modes // _COLUMNS) * _COLUMNS))
+        self._basis[:, :modes] = basis.T
+
+    def fit(self, weight: Array, off: Array, from_start: Array, ridge: Array) -> Array:
+        """(k,) change d of the coefficients that solves (B' W B + R) d = B' W off + R from_start.
+
+        Args:
+            weight: (m,) of the markers.
+            off: (m, 2) px, where each marker should move.
+            from_start: (k,) px, what leads back to the coefficients to stay near to.
+            ridge: (k,) diagonal of R.
+        """
+        change = np.empty(self._modes)
+        _compiled().fit(self._basis, weight, off, from_start, ridge, change)
+        return change
+
+    def settle(
+        self,
+        coefficients: Array,
+        start: Array,
+        ridge: Array,
+        points: Array,
+        *,
+        reach_px: float,
+        least_reach_px: float,
+        settled_px: float,
+        turns: int,
+    ) -> Array:
+        """(k,) coefficients after markers were paired with points and fitted by turns, until none moves.
+
+        Args:
+            coefficients: (k,) px, where to begin.
+            start: (k,) px, what to stay near to.
+            ridge: (k,) how strongly.
+            points: (n, 2) px.
+            reach_px: pairs further apart are not used at first.
+            least_reach_px: nor those in the end.
+            settled_px: shifts below this end it.
+            turns: of pairing and fitting, at most.
+        """
+        settled = np.array(coefficients, dtype=np.float64)
+        _compiled().settle(
+            self._basis,
+            self._base,
+            np.ascontiguousarray(start),
+            ridge,
+            np.ascontiguousarray(points),
+            reach_px,
+            least_reach_px,
+            settled_px,
+            turns,
+            settled,
+        )
+        return settled
+
+
+def density(centres: Array, weights: Array, low: Array, cell_px: float, grid: int) -> Array:
+    """How much lies in each cell of a grid, each point shared bilinearly among the four cells around it.
+
+    Args:
+        centres: (b, n, 2) px.
+        weights: (b, n).
+        low: (2,) px, where the grid begins.
+        cell_px: side of a cell.
+        grid: cells along each side.
+
+    Returns:
+        (b, grid, grid), rows along v.
+    """
+    result = np.zeros((len(centres), grid, grid))
+    _compiled().density(np.ascontiguousarray(centres), np.ascontiguousarray(weights), low, cell_px, result)
+    return result
+
+
+def bytes_apart(rows: NDArray[np.uint8], one: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """(b,) squared distances of rows (b, n) from one more (n,), n at most 32768."""
+    apart = np.empty(len(rows), np.int32)
+    _compiled().bytes_apart(rows, one, apart)
+    return apart
+
+
+def affine(weight: NDArray[np.float32], bias: NDArray[np.float32], x: NDArray[np.float32]) -> NDArray[np.float32]:
+    """x W + b on the thread that calls it: (outputs,) of a weight (inputs, outputs)."""
+    result = np.empty(len(bias), np.float32)
+    _compiled().affine(weight, bias, x, result)
+    return result

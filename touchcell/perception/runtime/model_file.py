@@ -1,0 +1,299 @@
+"""A trained model as one file, ``NAME.safetensors``: tensors, and in the header all that is needed to use them."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from touchcell.geometry.types import Array, ImageArray
+from touchcell.perception.errors import ModelError
+from touchcell.perception.markers.architecture import MarkerArchitecture
+from touchcell.perception.runtime.architecture import Architecture
+from touchcell.perception.runtime.camera_change import CameraChange
+from touchcell.perception.runtime.labels import CONTACT_NAMES, contact_from_xi, shear_direction, xi_gaussian
+from touchcell.perception.runtime.preprocessing import Preprocessing
+
+FORMAT_VERSION = 1
+_METADATA_KEY = "touchcell"
+_REFERENCE = "reference_image"
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
+SixPositive = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
+
+
+class Labels(BaseModel):
+    """What the outputs mean, and the range that was taught.
+
+    A network's mean o stands for ``centre + o * half_range``: contacts in mm and degrees (``of_contacts``), or
+    exponential coordinates log(T_s_f) in m and rad. Slip blurs x, y and gamma. In the coordinates of a contact it stays
+    there, in exponential coordinates it also blurs depth and tilt.
+
+    The standard deviations that go with a contact are those of its shear along and across the shear's own direction,
+    then of z, alpha, beta and gamma, as slip errs along the shear (``xi_gaussian``).
+
+    Attributes:
+        names: of the six components.
+        units: of the six components.
+        low: smallest label of the training set.
+        high: largest label of the training set.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    names: tuple[str, ...] = ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z")
+    units: tuple[str, ...] = ("m", "m", "m", "rad", "rad", "rad")
+    low: Six
+    high: Six
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Labels:
+        if any(high <= low for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError("every high must exceed its low")
+        return self
+
+    @classmethod
+    def of_contacts(cls, low: Six, high: Six) -> Labels:
+        """Contacts between ``low`` and ``high``, mm and degrees, in the order of ``labels.CONTACT_NAMES``."""
+        return cls(names=CONTACT_NAMES, units=("mm", "mm", "mm", "deg", "deg", "deg"), low=low, high=high)
+
+    @property
+    def are_contacts(self) -> bool:
+        """Whether they are contacts rather than exponential coordinates."""
+        return self.names == CONTACT_NAMES
+
+    @property
+    def centre(self) -> Array:
+        """(6,) middle of the range."""
+        return _ranges(self.low, self.high)[0]
+
+    @property
+    def half_range(self) -> Array:
+        """(6,) half of the range."""
+        return _ranges(self.low, self.high)[1]
+
+    @property
+    def sigma_unit(self) -> Array:
+        """(6,) what a standard deviation of one stands for: the half range, one for both directions of shear."""
+        return _ranges(self.low, self.high)[2 if self.are_contacts else 1]
+
+    def targets(self, xi: Array) -> Array:
+        """(n, 6) what a network should answer for contacts with exponential coordinates (n, 6), m and rad."""
+        values = contact_from_xi(xi) if self.are_contacts else xi
+        return np.divide(values - self.centre, self.half_range)
+
+    def contacts(self, mean: Array) -> Array:
+        """(..., 6) contacts, mm and degrees, that outputs (..., 6) stand for."""
+        values = self.centre + self.half_range * mean
+        contacts: Array = values if self.are_contacts else contact_from_xi(values)
+        return contacts
+
+    def aligned(self, residual: Array, mean: Array) -> Array:
+        """Residuals (..., 6) of outputs about ``mean`` (..., 6), in the directions and units of the sigmas."""
+        if not self.are_contacts:
+            return residual
+        along = shear_direction(self.centre + self.half_range * mean)
+        values = residual * self.half_range / self.sigma_unit
+        x, y = values[..., 0], values[..., 1]
+        shear = np.stack([along[..., 0] * x + along[..., 1] * y, along[..., 0] * y - along[..., 1] * x], axis=-1)
+        return np.concatenate([shear, values[..., 2:]], axis=-1)
+
+    def xi_gaussian(self, mean: Array, sigma: Array) -> tuple[Array, Array]:
+        """Means (..., 6) and covariances (..., 6, 6) of xi = log(T_s_f), m and rad, that outputs and sigmas say."""
+        values = self.centre + self.half_range * mean
+        variance = (sigma * self.sigma_unit) ** 2
+        covariance = variance[..., None] * np.eye(6)
+        if not self.are_contacts:
+            return values, covariance
+        direction = shear_direction(values)
+        u, v = direction[..., 0], direction[..., 1]
+        along, across = variance[..., 0], variance[..., 1]
+        covariance[..., 0, 0] = u**2 * along + v**2 * across
+        covariance[..., 1, 1] = v**2 * along + u**2 * across
+        covariance[..., 0, 1] = covariance[..., 1, 0] = u * v * (along - across)
+        return xi_gaussian(values, covariance)
+
+
+@lru_cache(maxsize=8)
+def _ranges(low: Six, high: Six) -> tuple[Array, Array, Array]:
+    """Middle, half range, and the half range with one for both directions of shear; read-only, as every frame asks."""
+    half = 0.5 * np.subtract(high, low, dtype=np.float64)
+    shared = half.copy()
+    shared[:2] = half[:2].mean()
+    ranges = 0.5 * np.add(low, high, dtype=np.float64), half, shared
+    for each in ranges:
+        each.setflags(write=False)
+    return ranges
+
+
+class Header(BaseModel):
+    """Everything about a model but its tensors.
+
+    Attributes:
+        format_version: of this header.
+        touchcell_version: that wrote it.
+        architecture: which tensors there are and how they are joined.
+        preprocessing: from camera image to network input.
+        labels: what the outputs mean.
+        sigma_scale: (6,) what a network's standard deviations, raised to ``sigma_power``, are multiplied by to be
+            calibrated; cnn: the standard deviations themselves. In ``labels.sigma_unit``, along ``labels.aligned``.
+            Found on the validation split.
+        sigma_power: (6,) see ``calibration.calibrate``.
+        camera: from the pixels of this model's sensor to those of the one that taught its networks, where it was
+            adapted (``touchcell adapt``).
+        label_turn_deg: of its contacts' axes about the sensor's z axis, to those that its networks were taught with.
+        training_data: digest of the training set (``LabelledImages.digest``).
+        training: settings and outcome of the training, for people.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format_version: Literal[1] = 1
+    touchcell_version: str
+    architecture: Annotated[Architecture | MarkerArchitecture, Field(discriminator="kind")]
+    preprocessing: Preprocessing
+    labels: Labels
+    sigma_scale: SixPositive
+    sigma_power: SixPositive = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    camera: CameraChange | None = None
+    label_turn_deg: Finite = 0.0
+    training_data: str
+    training: dict[str, str | int | float | list[float] | None] = {}
+
+    def calibrated(self, sigma: Array) -> Array:
+        """(..., 6) standard deviations of the network (..., 6) after calibration."""
+        calibrated: Array = np.array(self.sigma_scale) * sigma ** np.array(self.sigma_power)
+        return calibrated
+
+    @model_validator(mode="after")
+    def _preprocessing_feeds_network(self) -> Header:
+        if self.preprocessing.output_size != self.architecture.input_size:
+            raise ValueError("the preprocessing's output_size is not the architecture's input_size")
+        return self
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained network.
+
+    Attributes:
+        header: what it is.
+        tensors: float32, as ``header.architecture.tensor_shapes`` names them.
+        reference: the preprocessed image (height, width) of the sensor out of contact, or None when nobody took one.
+    """
+
+    header: Header
+    tensors: dict[str, NDArray[np.float32]]
+    reference: ImageArray | None = None
+
+
+def touchcell_version() -> str:
+    """Version of the installed touchcell."""
+    return version("touchcell")
+
+
+def save_model(model: Model, path: Path) -> None:
+    """Write a model file, whole or not at all.
+
+    Raises:
+        ModelError: a tensor is missing, of the wrong shape or not finite.
+    """
+    from safetensors.numpy import save
+
+    _check_tensors(model, path)
+    tensors: dict[str, NDArray[np.generic]] = dict(model.tensors)
+    if model.reference is not None:
+        tensors[_REFERENCE] = model.reference
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+        unfinished = Path(scratch) / path.name
+        unfinished.write_bytes(save(tensors, metadata={_METADATA_KEY: model.header.model_dump_json()}))
+        os.replace(unfinished, path)
+
+
+def load_model(path: Path) -> Model:
+    """Read a model file.
+
+    Raises:
+        ModelError: the file is missing, truncated, not a touchcell model, of a newer format, or its tensors are not
+            those that its header announces.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise ModelError(path, "no such file", hint="train one with `touchcell train DATA --out NAME.safetensors`")
+    try:
+        with safe_open(path, framework="np") as stored:
+            metadata = stored.metadata() or {}
+            header = _parse_header(metadata.get(_METADATA_KEY), path)
+            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError) as error:
+        if isinstance(error, ModelError):
+            raise
+        raise ModelError(path, f"damaged or no safetensors file: {error}", hint="copy or train it again") from error
+    model = Model(header, tensors, reference=tensors.pop(_REFERENCE, None))
+    _check_tensors(model, path)
+    return model
+
+
+def _parse_header(text: str | None, path: Path) -> Header:
+    if text is None:
+        raise ModelError(path, "a safetensors file, but no touchcell model", key=_METADATA_KEY)
+    try:
+        fields = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ModelError(path, f"header is no JSON: {error}", key=_METADATA_KEY) from error
+    found = fields.get("format_version") if isinstance(fields, dict) else None
+    if found != FORMAT_VERSION:
+        newer = isinstance(found, int) and found > FORMAT_VERSION
+        raise ModelError(
+            path,
+            f"format {found}, this touchcell reads {FORMAT_VERSION}",
+            key="format_version",
+            hint="install a newer touchcell" if newer else "train it again",
+        )
+    try:
+        return Header.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ModelError(path, first["msg"], key=_key(first["type"], first["loc"]), hint="train it again") from error
+
+
+def _key(error: str, location: tuple[int | str, ...]) -> str:
+    """The header's field that an error of pydantic speaks of; it names the architecture's kind among the fields."""
+    parts = [str(part) for part in location]
+    if error.startswith("union_tag"):
+        parts.append("kind")
+    elif parts[:1] == ["architecture"]:
+        parts[1:2] = []
+    return ".".join(parts)
+
+
+def _check_tensors(model: Model, path: Path) -> None:
+    shapes = model.header.architecture.tensor_shapes()
+    for name in shapes.keys() | model.tensors.keys():
+        if name not in model.tensors:
+            raise ModelError(path, "missing tensor", key=name)
+        if name not in shapes:
+            raise ModelError(path, "tensor that the architecture does not have", key=name)
+        tensor = model.tensors[name]
+        if tensor.shape != shapes[name] or tensor.dtype != np.float32:
+            raise ModelError(path, f"{tensor.dtype} {tensor.shape}, expected float32 {shapes[name]}", key=name)
+        if not np.isfinite(tensor).all():
+            raise ModelError(path, "holds values that are not finite", key=name)
+    reference = model.reference
+    if reference is not None and (
+        reference.dtype != np.uint8 or reference.shape != model.header.preprocessing.output_size
+    ):
+        raise ModelError(path, "is not an image as the preprocessing leaves it", key=_REFERENCE)

@@ -1,0 +1,193 @@
+"""From camera frames to stamped contact estimates, doing no more than the scene needs.
+
+A frame that nobody asks for is never decoded, an image without contact is not put through the network, and without a
+filter configured none runs. Each stage's duration is kept for the latency budget.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from touchcell.drivers.core.errors import EndOfStream
+from touchcell.drivers.core.protocols import FrameSource
+from touchcell.drivers.core.samples import Frame, Stamped
+from touchcell.geometry import gaussian
+from touchcell.geometry.gaussian import PoseGaussian
+from touchcell.geometry.types import Array
+from touchcell.perception.runtime.contact_gate import ContactGate
+from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.perception.runtime.estimators import ContactEstimator
+from touchcell.perception.runtime.filter import ContactFilter
+from touchcell.perception.runtime.motion import PoseHistory
+from touchcell.perception.runtime.preprocessing import Preprocessing
+
+Timer = Callable[[], int]
+
+
+class ContactSource(Protocol):
+    """Anything that tells the contact of one tactile sensor."""
+
+    @property
+    def ended(self) -> bool:
+        """Whether no further estimate will come (a recording has been played)."""
+        ...
+
+    def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
+        """Tell where the sensor was; called before ``update``."""
+        ...
+
+    def update(self, now_ns: int) -> ContactEstimate | None:
+        """Newest estimate, for the time ``now_ns``; None before the first frame."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class StageTimes:
+    """Nanoseconds that the stages of one new frame took; zero for a stage that was skipped."""
+
+    read_ns: int = 0
+    preprocess_ns: int = 0
+    infer_ns: int = 0
+    filter_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """What one frame said by itself: the network's Gaussian before the filter, None without contact."""
+
+    seq: int
+    t_ns: int
+    belief: PoseGaussian | None
+
+
+class ContactPipeline:
+    """Camera, network, contact gate and filter of one sensor.
+
+    What an estimator says of an image outside the range that it was taught is told as such, and not fused: its sigma
+    means nothing there, and the filter carries the contact on by the sensor's own motion.
+
+    Args:
+        camera: an opened frame source.
+        model: any estimator, with its preprocessing.
+        contact_gate: decides about contact without the network; None puts every frame through the network.
+        pose_filter: None takes each frame by itself.
+        timer: nanosecond counter for stage durations; it never influences an estimate.
+    """
+
+    def __init__(
+        self,
+        camera: FrameSource,
+        model: ContactEstimator,
+        *,
+        contact_gate: ContactGate | None = None,
+        pose_filter: ContactFilter | None = None,
+        timer: Timer = time.perf_counter_ns,
+    ) -> None:
+        self._camera = camera
+        self._model = model
+        self._contact_gate = contact_gate
+        self._filter = pose_filter
+        self._timer = timer
+        self._poses = PoseHistory()
+        self._newest: ContactEstimate | None = None
+        self._ended = False
+        self._filtering = False
+        self.measurement: Measurement | None = None
+        self.frame: Stamped[Frame] | None = None
+        self.times = StageTimes()
+
+    @property
+    def ended(self) -> bool:
+        """Whether the camera has come to its end."""
+        return self._ended
+
+    @property
+    def preprocessing(self) -> Preprocessing:
+        """Of the model, from camera images."""
+        return self._model.header.preprocessing
+
+    def await_frame(self) -> None:
+        """Wait for the camera's first frame, which is processed by the next update. Raises DeviceError."""
+        with suppress(EndOfStream):
+            self._camera.latest()
+
+    def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
+        """Tell where the sensor was at ``t_ns``."""
+        self._poses.record(t_ns, T_base_sensor)
+
+    def update(self, now_ns: int) -> ContactEstimate | None:
+        """Process the newest frame if there is a new one, then replay the sensor's motion up to ``now_ns``.
+
+        Raises:
+            DeviceError: from the camera, except EndOfStream, which sets ``ended``.
+            ImageError: the camera's images are not what the model was made for.
+        """
+        self.times = StageTimes()
+        self.measurement = None
+        start = self._timer()
+        try:
+            frame = self._camera.latest()
+        except EndOfStream:
+            self._ended = True
+            return self._newest
+        read_ns = self._timer() - start
+        # A frame that is older than the newest tells nothing, and there is no way back in a filter.
+        if self._newest is None or frame.t_ns > self._newest.t_frame_ns:
+            self.frame = frame
+            self._newest = self._process(frame, read_ns)
+        return self._replayed(self._newest, now_ns)
+
+    def _process(self, frame: Stamped[Frame], read_ns: int) -> ContactEstimate:
+        start = self._timer()
+        reduced = self._model.reduce(frame.value.image)
+        in_contact = self._contact_gate is None or self._contact_gate.update(reduced)
+        preprocess_ns = self._timer() - start
+        if not in_contact:
+            self.times = StageTimes(read_ns, preprocess_ns)
+            self.measurement = Measurement(frame.seq, frame.t_ns, None)
+            if self._filter is not None:
+                self._filter.reset()
+                self._filtering = False
+            return ContactEstimate(False, None, frame.t_ns, frame.seq, frame.t_ns)
+        start = self._timer()
+        prediction = self._model.predict_reduced(reduced)
+        infer_ns = self._timer() - start
+        start = self._timer()
+        observed = gaussian.from_exponential(prediction.xi, prediction.covariance)
+        self.measurement = Measurement(frame.seq, frame.t_ns, observed)
+        belief, nis = observed, None
+        if self._filter is not None:
+            T_base_sensor = self._sensor_pose(frame.t_ns)
+            if prediction.in_range:
+                state = self._filter.update(observed, T_base_sensor, frame.t_ns)
+                self._filtering = True
+                belief, nis = state.belief, state.nis
+            elif self._filtering:
+                belief = self._filter.predict(T_base_sensor, frame.t_ns)
+        self.times = StageTimes(read_ns, preprocess_ns, infer_ns, self._timer() - start)
+        return ContactEstimate(
+            True,
+            belief,
+            frame.t_ns,
+            frame.seq,
+            frame.t_ns,
+            in_range=prediction.in_range,
+            nis=nis,
+            markers=prediction.markers,
+        )
+
+    def _replayed(self, estimate: ContactEstimate, now_ns: int) -> ContactEstimate:
+        """The estimate carried from its frame to now by the sensor's own motion since."""
+        if self._filter is None or not self._filtering or estimate.belief is None or now_ns <= estimate.t_frame_ns:
+            return estimate
+        belief = self._filter.predict(self._sensor_pose(now_ns), now_ns)
+        return replace(estimate, belief=belief, t_ns=now_ns)
+
+    def _sensor_pose(self, t_ns: int) -> Array:
+        return self._poses.at(t_ns) if len(self._poses) else np.eye(4)

@@ -1,0 +1,265 @@
+"""Contact of a soft hemispherical tip with a rigid surface: depth, tilt, shear that sticks, and slip.
+
+Frames are SPEC part 2's. {s} has its origin at the centre of the tip's sphere and z out of the tip. {f} has z along the
+inward normal and its origin one tip radius outside the surface, so that {f} = {s} at a normal contact of zero depth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+from touchcell.simulation.surfaces import Surface
+from touchcell.simulation.timeline import Restore
+
+_IDENTITY = np.eye(4)
+
+
+@dataclass(frozen=True, slots=True)
+class ContactState:
+    """What the tip feels: the only thing that the simulated image depends on, and the ground truth for it.
+
+    Attributes:
+        T_f_s: (4, 4) effective pose of the sensor in the surface frame, after slip; out of contact its z is minus the
+            gap and it carries no shear.
+        T_world_f: (4, 4) pose of the surface frame.
+        in_contact: whether the tip touches.
+        slipping: whether the contact slid in the last step.
+        normal_force_n: force on the tip along the surface normal.
+        shear_force_n: force on the tip along the x and y axes of {f}; zero where the physics does not tell it.
+    """
+
+    T_f_s: Array
+    T_world_f: Array
+    in_contact: bool
+    slipping: bool
+    normal_force_n: float
+    shear_force_n: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def T_s_f(self) -> Array:  # noqa: N802  the field's own name
+        """(4, 4) pose of the surface frame in the sensor frame: what the network predicts."""
+        return se3.inverse(self.T_f_s)
+
+    @property
+    def depth_m(self) -> float:
+        """Indentation, negative out of contact."""
+        return float(self.T_f_s[2, 3])
+
+    @property
+    def force_world_n(self) -> Array:
+        """(3,) force on the tip along the world's axes."""
+        force: Array = self.T_world_f[:3, :3] @ np.array([*self.shear_force_n, -self.normal_force_n])
+        return force
+
+
+@dataclass(frozen=True, slots=True)
+class ContactLaw:
+    """How a TacTip gives and slips.
+
+    Attributes:
+        tip_radius_m: radius of the hemisphere.
+        stiffness_n_m: normal force per depth.
+        friction: tangential force per normal force with which the skin slips.
+        slip_at_1mm_m: shear that survives at 1 mm depth, measured on public images (SIMULATION part 5).
+        slip_exponent: growth of that shear with depth, measured on the same.
+        torsion_grip: share of the shear that sticks by which the patch may turn before it slips. The same images fit
+            best with 0.08; 0.15 lets 5 deg stick from 4.5 mm on.
+    """
+
+    tip_radius_m: float = 0.020
+    stiffness_n_m: float = 1500.0
+    friction: float = 0.9
+    slip_at_1mm_m: float = 0.34e-3
+    slip_exponent: float = 1.83
+    torsion_grip: float = 0.15
+
+    def max_shear_m(self, depth_m: float) -> float:
+        """Largest tangential displacement that sticks."""
+        return self.slip_at_1mm_m * (1e3 * depth_m) ** self.slip_exponent if depth_m > 0.0 else 0.0
+
+    def shear_stiffness_n_m(self, depth_m: float) -> float:
+        """Tangential force per shear at a positive depth: what sticks is used up when friction is."""
+        return self.friction * self.stiffness_n_m * depth_m / self.max_shear_m(depth_m)
+
+    def max_torsion_rad(self, depth_m: float) -> float:
+        """Largest rotation about the normal that sticks.
+
+        A uniformly pressed disc of radius a turns against its friction with the mean lever 2a/3; a is the radius of the
+        sphere's cap at that depth. Skin there lets go after ``torsion_grip`` of the displacement that it holds in pure
+        shear. Gives 0.7 deg at 1 mm and 5.4 deg at 4.5 mm. The form is ours.
+        """
+        if depth_m <= 0.0:
+            return 0.0
+        disc_radius_m = math.sqrt(depth_m * max(2.0 * self.tip_radius_m - depth_m, self.tip_radius_m))
+        return self.torsion_grip * self.max_shear_m(depth_m) / (2.0 / 3.0 * disc_radius_m)
+
+
+@dataclass(slots=True)
+class _Anchor:
+    """Where the skin holds on to the surface, in the surface's own frame, so that a moving surface drags it.
+
+    Attributes:
+        surface: what it holds on to.
+        point: (3,) m, on the surface.
+        R: (3, 3) axes of {f} at ``point``.
+    """
+
+    surface: Surface
+    point: Array
+    R: Array
+
+
+@dataclass(slots=True)
+class ContactModel:
+    """One tip's contact over time.
+
+    The shear is not integrated: while the skin sticks it is the way from the anchor to the present nearest point, so
+    nothing drifts. When it exceeds what the depth can hold, the anchor is dragged along the surface, its axes turned
+    with the normal by the smallest rotation (parallel transport). Shear and torsion are limited separately.
+    """
+
+    law: ContactLaw = field(default_factory=ContactLaw)
+    _anchor: _Anchor | None = None
+
+    def held_point(self, surface: Surface) -> Array | None:
+        """(3,) m, where the skin holds on to ``surface``, in its own frame; None where it does not."""
+        anchor = self._anchor
+        return anchor.point if anchor is not None and anchor.surface is surface else None
+
+    def step(self, T_world_s: Array, surface: Surface, t_s: float) -> ContactState:
+        """Bring the contact to time ``t_s`` with the sensor at ``T_world_s`` (4, 4)."""
+        return self.advance(T_world_s, surface, t_s)()
+
+    def advance(self, T_world_s: Array, surface: Surface, t_s: float) -> Callable[[], ContactState]:
+        """The same, with its state worked out only when it is asked for."""
+        T_world_b = surface.motion.pose(t_s)
+        R_world_b = T_world_b[:3, :3]
+        R_b_s = R_world_b.T @ T_world_s[:3, :3]
+        centre = R_world_b.T @ (T_world_s[:3, 3] - T_world_b[:3, 3])
+        nearest = surface.shape.nearest(centre)
+        depth = self.law.tip_radius_m - nearest.distance_m
+        R_tilt = tilt_of(-nearest.normal @ R_b_s)
+
+        if depth <= 0.0:
+            self._anchor = None
+            R_b_f = R_b_s @ R_tilt.T
+            return lambda: self._state(T_world_s, R_world_b @ R_b_f, R_tilt, (0.0, 0.0, depth), slipping=False)
+
+        anchor = self._anchor
+        if anchor is None or anchor.surface is not surface:
+            anchor = self._anchor = _Anchor(surface, nearest.point, R_b_s @ R_tilt.T)
+        R_b_f = _transport(anchor.R, -nearest.normal)
+        slipping = False
+
+        shear = R_b_f[:, :2].T @ (nearest.point - anchor.point)
+        length, longest = math.hypot(shear[0], shear[1]), self.law.max_shear_m(depth)
+        if length > longest:
+            slipping = True
+            shear *= longest / length
+            dragged = nearest.point + (anchor.point - nearest.point) * (longest / length)
+            held = surface.shape.nearest(dragged)
+            anchor.point = held.point
+            anchor.R = _transport(anchor.R, -held.normal)
+            R_b_f = _transport(anchor.R, -nearest.normal)
+
+        R_gamma = R_b_f.T @ R_b_s @ R_tilt.T
+        torsion = math.atan2(R_gamma[1, 0], R_gamma[0, 0])
+        largest = self.law.max_torsion_rad(depth)
+        if abs(torsion) > largest:
+            slipping = True
+            held_torsion = math.copysign(largest, torsion)
+            anchor.R = anchor.R @ about_z(torsion - held_torsion)
+            R_b_f = R_b_f @ about_z(torsion - held_torsion)
+            torsion = held_torsion
+        position = shear[0], shear[1], depth
+        return lambda: self._state(T_world_s, R_world_b @ R_b_f, about_z(torsion) @ R_tilt, position, slipping=slipping)
+
+    def snapshot(self) -> Restore:
+        """What brings the contact back as it is now."""
+        held = self._anchor and replace(self._anchor)
+
+        def restore() -> None:
+            self._anchor = held and replace(held)
+
+        return restore
+
+    def _state(
+        self, T_world_s: Array, R_world_f: Array, R_f_s: Array, position: tuple[float, float, float], *, slipping: bool
+    ) -> ContactState:
+        T_f_s = _IDENTITY.copy()
+        T_f_s[:3, :3] = R_f_s
+        T_f_s[:3, 3] = position
+        T_world_f = _IDENTITY.copy()
+        T_world_f[:3, :3] = R_world_f
+        T_world_f[:3, 3] = T_world_s[:3, 3] - R_world_f @ T_f_s[:3, 3]
+        depth = position[2]
+        force = self.law.stiffness_n_m * max(depth, 0.0)
+        return ContactState(T_f_s, T_world_f, in_contact=depth > 0.0, slipping=slipping, normal_force_n=force)
+
+
+def contact_at(T_f_s: Array, law: ContactLaw) -> ContactState:
+    """The contact that a tip pressed and then sheared to ``T_f_s`` (4, 4) ends in: {f} at the world's origin, shear and
+    torsion cut to what its depth holds. What data collection (Algorithm 1 of the paper) does, without the way there."""
+    depth = float(T_f_s[2, 3])
+    R_tilt = tilt_of(T_f_s[2, :3])
+    R_gamma = T_f_s[:3, :3] @ R_tilt.T
+    asked_torsion, asked_shear = math.atan2(R_gamma[1, 0], R_gamma[0, 0]), math.hypot(T_f_s[0, 3], T_f_s[1, 3])
+    largest, longest = law.max_torsion_rad(depth), law.max_shear_m(depth)
+    torsion = min(max(asked_torsion, -largest), largest)
+    T = np.eye(4)
+    T[:3, :3] = about_z(torsion) @ R_tilt
+    T[:2, 3] = T_f_s[:2, 3] * min(1.0, longest / max(asked_shear, 1e-12))
+    T[2, 3] = depth
+    slipping = asked_shear > longest or abs(asked_torsion) > largest
+    return ContactState(T, np.eye(4), depth > 0.0, slipping, law.stiffness_n_m * max(depth, 0.0))
+
+
+def tilt_of(inward_in_s: Array) -> Array:
+    """Tilt (3, 3) of a sensor: the Ry(beta) Rx(alpha) that takes ``inward_in_s`` (3,), the inward normal in {s}, to the
+    z axis of {f}."""
+    x, y, z = inward_in_s.tolist()
+    # The inverse rotation takes z to (-sin beta, sin alpha cos beta, cos alpha cos beta).
+    cos_beta = math.hypot(y, z)
+    # With the normal along the sensor's x axis alpha is free.
+    sin_alpha, cos_alpha = (y / cos_beta, z / cos_beta) if cos_beta > 1e-12 else (0.0, 1.0)
+    sin_beta = -x
+    return np.array(
+        [
+            [cos_beta, sin_beta * sin_alpha, sin_beta * cos_alpha],
+            [0.0, cos_alpha, -sin_alpha],
+            [-sin_beta, cos_beta * sin_alpha, cos_beta * cos_alpha],
+        ]
+    )
+
+
+def about_z(angle: float) -> Array:
+    """Rotation (3, 3) about the z axis."""
+    sin, cos = math.sin(angle), math.cos(angle)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _transport(R: Array, z: Array) -> Array:
+    """Axes ``R`` (3, 3) turned by the smallest rotation that brings their z axis to the unit vector ``z`` (3,)."""
+    (x0, _, a0), (x1, _, a1), (x2, _, a2) = R.tolist()
+    b0, b1, b2 = z.tolist()
+    # x + v x x + v x (v x x) / (1 + a.b) with v = a x b; x is normal to a, so it is x - (a + b) (b.x) / (1 + a.b).
+    scale = (b0 * x0 + b1 * x1 + b2 * x2) / (1.0 + a0 * b0 + a1 * b1 + a2 * b2)
+    x0, x1, x2 = x0 - (a0 + b0) * scale, x1 - (a1 + b1) * scale, x2 - (a2 + b2) * scale
+    # Rounding would add up over thousands of steps of sliding.
+    along = x0 * b0 + x1 * b1 + x2 * b2
+    x0, x1, x2 = x0 - b0 * along, x1 - b1 * along, x2 - b2 * along
+    length = math.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
+    x0, x1, x2 = x0 / length, x1 / length, x2 / length
+    return np.array(
+        [
+            [x0, b1 * x2 - b2 * x1, b0],
+            [x1, b2 * x0 - b0 * x2, b1],
+            [x2, b0 * x1 - b1 * x0, b2],
+        ]
+    )

@@ -1,0 +1,208 @@
+"""A simulated arm: a tool centre point that moves by twists, as ideally as its acceleration limits allow.
+
+It has no joints, no singularities and no tracking error beyond those limits; it is for tasks, not for arm dynamics.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from touchcell.drivers.core.arm import Arm, LimitsConfig
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.device import Lifecycle, OperatorToken
+from touchcell.drivers.core.errors import StaleData
+from touchcell.drivers.core.protocols import StopCategory
+from touchcell.drivers.core.samples import Stamped, TcpState
+from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+from touchcell.simulation.faults import ArmFaults
+from touchcell.simulation.kinematics import TwistFollower
+from touchcell.simulation.scene import Scene
+from touchcell.simulation.timeline import DEFAULT_STEP_S, Phase, Timeline
+
+CAPABILITIES = Capabilities(
+    kind="arm",
+    abilities=frozenset({"TcpSource", "TwistSink", "Stoppable", "HealthSource"}),
+    state_rate_hz=1.0 / DEFAULT_STEP_S,
+    stop_categories=frozenset({1, 2}),
+    has_brakes=True,
+    virtual_time=True,
+)
+
+_READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE, Lifecycle.FAULTED)
+
+
+class SimArmConfig(DriverConfig):
+    """Where the arm stands, how fast it may be, and how late it obeys: twists only, stops reach it at once."""
+
+    start_pose_mm_deg: tuple[float, float, float, float, float, float]
+    base_pose_mm_deg: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    limits: LimitsConfig = LimitsConfig()
+    latency_ms: float = Field(default=0.0, ge=0.0, le=500.0)
+    max_ttl_s: float = Field(default=1.0, gt=0.0, le=10.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Late:
+    """A twist that has not reached the arm yet."""
+
+    due_ns: int
+    twist_base: Array
+    expires_ns: int
+
+    def postponed(self, by_ns: int) -> _Late:
+        return replace(self, due_ns=self.due_ns + by_ns, expires_ns=self.expires_ns + by_ns)
+
+
+class SimArm(Arm):
+    """One simulated arm.
+
+    Args:
+        name: the device's name in the cell.
+        config: checked configuration.
+        clock: injected time.
+        timeline: of the scene that it moves in; its own if there is none.
+
+    ``faults`` may be set at any time.
+    """
+
+    def __init__(self, name: str, config: SimArmConfig, clock: Clock, timeline: Timeline | None = None) -> None:
+        super().__init__(
+            name,
+            clock,
+            config.limits.build(),
+            stop_categories=CAPABILITIES.stop_categories,
+            max_ttl_s=config.max_ttl_s,
+        )
+        self.faults = ArmFaults()
+        self.T_world_base = se3.from_euler_mm_deg(config.base_pose_mm_deg)
+        self._timeline = timeline or Timeline(clock)
+        self._body = TwistFollower(se3.from_euler_mm_deg(config.start_pose_mm_deg), self.limits, self._timeline.step_ns)
+        self._latency_ns = round(config.latency_ms * 1e6)
+        self._on_the_way: deque[_Late] = deque()
+        self._powered = False
+        self._told: Stamped[TcpState] | None = None
+        self._timeline.add(Phase.MOTION, self._step)
+        self._timeline.keep(self._snapshot)
+
+    def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
+        """State at the last step of the simulation. Raises StaleData if it is older than ``max_age_s``."""
+        self._require("tell its pose", *_READABLE)
+        t_ns = self._timeline.advance()
+        state = TcpState(self._body.T_base_tcp.copy(), self._velocity())
+        if self.faults.nan_state:
+            state = TcpState(np.full((4, 4), np.nan), np.full(6, np.nan))
+        sample = Stamped(state, t_ns, t_ns // self._timeline.step_ns)
+        if self.faults.stale and self._told is not None:
+            sample = self._told
+        self._told = sample
+        age_s = sample.age_s(self._clock.now_ns())
+        if max_age_s is not None and age_s > max_age_s:
+            raise StaleData(self.name, age_s, max_age_s, sample.seq)
+        return sample
+
+    def at_rest(self) -> bool:
+        """Whether it stands still and is not about to move."""
+        self._timeline.advance()
+        return self._body.at_rest() and not (self._on_the_way or self._velocity().any())
+
+    def health(self) -> dict[str, float | int | str | bool]:
+        """Speeds of the tool centre point and who commands it."""
+        self._timeline.advance()
+        velocity = self._body.velocity
+        return {
+            "speed_m_s": float(np.linalg.norm(velocity[:3])),
+            "rot_speed_rad_s": float(np.linalg.norm(velocity[3:])),
+            "owner": self.owner or "",
+        }
+
+    def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
+        """(4, 4) at the simulation's present step, in any lifecycle state and without advancing time: for scenes."""
+        return self.T_world_base @ self._body.T_base_tcp
+
+    def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
+        self._timeline.advance()
+        expires_ns = now_ns + round(ttl_s * 1e9)
+        if self._latency_ns:
+            self._on_the_way.append(_Late(now_ns + self._latency_ns, twist_base.copy(), expires_ns + self._latency_ns))
+        else:
+            self._body.follow(twist_base, expires_ns)
+
+    def _begin_stop(self, category: StopCategory) -> None:
+        self._timeline.advance()
+        if self.faults.deaf:
+            return
+        self._on_the_way.clear()
+        self._powered = category is StopCategory.STOP_AND_HOLD
+        if not (self.faults.runs_on and self._powered):
+            self._body.halt()
+
+    def _step(self, t_ns: int) -> None:
+        while self._on_the_way and self._on_the_way[0].due_ns <= t_ns - self._timeline.step_ns:
+            late = self._on_the_way.popleft()
+            self._body.follow(late.twist_base, late.expires_ns)
+        if self.faults.runs_on and self._powered:
+            self._body.prolong(t_ns)
+        self._body.step(t_ns)
+        drift_m_s = self._drift_m_s()
+        if drift_m_s:
+            T = self._body.T_base_tcp.copy()
+            T[2, 3] -= drift_m_s * self._timeline.step_ns * 1e-9
+            self._body.T_base_tcp = T
+
+    def _snapshot(self) -> Callable[[int], None]:
+        """The body alone: who may command it is no matter of the simulation."""
+        powered, body, on_the_way = self._powered, self._body.snapshot(), tuple(self._on_the_way)
+
+        def restore(later_ns: int) -> None:
+            self._powered = powered
+            self._on_the_way = deque(late.postponed(later_ns) for late in on_the_way)
+            body(later_ns)
+
+        return restore
+
+    def _velocity(self) -> Array:
+        velocity = self._body.velocity.copy()
+        velocity[2] -= self._drift_m_s()
+        return velocity
+
+    def _drift_m_s(self) -> float:
+        return self.faults.drift_m_s if self._powered else 0.0
+
+    def _activate(self) -> None:
+        self._powered = True
+
+    def _open(self) -> None:
+        self._timeline.advance()
+
+    def _close(self) -> None:
+        self._timeline.advance()
+        self._forget()
+
+    def _recover(self, token: OperatorToken) -> None:
+        self._forget()
+
+    def _forget(self) -> None:
+        self._on_the_way.clear()
+        self._body.freeze()
+
+
+def _build(name: str, config: Any, context: DriverContext) -> SimArm:
+    scene = context.scene
+    return SimArm(name, config, context.clock, scene.timeline if isinstance(scene, Scene) else None)
+
+
+SPEC = DriverSpec(
+    name="sim_arm",
+    summary="simulated arm with ideal kinematics",
+    config=SimArmConfig,
+    capabilities=CAPABILITIES,
+    build=_build,
+)

@@ -1,0 +1,162 @@
+"""Rigs of the devices that live in this process, on virtual time: what they have in place of an emulator."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+import numpy as np
+
+from touchcell.drivers.core.clock import Clock, VirtualClock
+from touchcell.drivers.core.device import Device
+from touchcell.drivers.core.spec import DriverConfig, DriverContext, DriverSpec
+from touchcell.drivers.replay import camera as replay_camera
+from touchcell.simulation.devices import arm as sim_arm
+from touchcell.simulation.devices import joint_arm as sim_joint_arm
+from touchcell.simulation.devices import tactip as sim_tactip
+from touchcell.simulation.devices.arm import SimArm
+from touchcell.simulation.devices.joint_arm import SimJointArm
+from touchcell.simulation.faults import FrameFaults
+from touchcell.simulation.scene import SceneConfig
+from touchcell.testing.emulation.rig import Rig
+
+_START = (400.0, 0.0, 300.0, 180.0, 0.0, 30.0)
+_IMAGES = 90
+
+
+class StandIn:
+    """Plays the emulator for a device in this process: its truth is asked of the device itself.
+
+    Args:
+        truth: tells it.
+        faults: what to do when a fault begins (with its value) and ends (with None).
+        end: called when the emulator is to vanish.
+    """
+
+    def __init__(
+        self,
+        truth: Callable[[], dict[str, Any]] = dict,
+        faults: dict[str, Callable[[Any], None]] | None = None,
+        end: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._truth = truth
+        self._faults = faults or {}
+        self._end = end
+
+    def state(self) -> dict[str, Any]:
+        return self._truth()
+
+    def fault(self, name: str, value: Any = True) -> dict[str, Any]:
+        self._faults[name](value)
+        return self.state()
+
+    def clear(self, name: str) -> dict[str, Any]:
+        self._faults[name](None)
+        return self.state()
+
+    def freeze(self) -> None:
+        """It cannot hang while its client lives."""
+
+    def thaw(self) -> None:
+        """It never hangs."""
+
+    def kill(self) -> None:
+        self._end()
+
+    def stop(self) -> None:
+        self._end()
+
+
+def sim_arm_rig(folder: Path, address: int) -> Rig:
+    """A simulated arm with no scene around it."""
+    return _arm_rig(sim_arm.SPEC, sim_arm.SimArmConfig(start_pose_mm_deg=_START))
+
+
+def sim_joint_arm_rig(folder: Path, address: int) -> Rig:
+    """A simulated Panda with no scene around it."""
+    return _arm_rig(sim_joint_arm.SPEC, sim_joint_arm.SimJointArmConfig(model="panda", start_pose_mm_deg=_START))
+
+
+def _arm_rig(spec: DriverSpec, config: DriverConfig) -> Rig:
+    arms: list[SimArm | SimJointArm] = []
+
+    def build(clock: Clock) -> Device:
+        arm = cast(SimArm | SimJointArm, spec.build("arm", config, DriverContext(clock)))
+        arms.append(arm)
+        return arm
+
+    def truth() -> dict[str, Any]:
+        # Simulated time advances when somebody asks; in the scene that is the camera.
+        arms[-1].health()
+        T = arms[-1].T_world_tcp()
+        return {"T_base_tcp": T.tolist(), "position_m": T[:3, 3].tolist()}
+
+    return Rig(
+        spec=spec,
+        start=lambda: StandIn(truth),
+        build=build,
+        energising=None,
+        pose="T_base_tcp",
+        clock=VirtualClock,
+        process=False,
+    )
+
+
+def sim_tactip_rig(folder: Path, address: int) -> Rig:
+    """A simulated sensor on a simulated arm above a plane."""
+    cameras: list[sim_tactip.SimTactip] = []
+    clocks: list[Clock] = []
+
+    def build(clock: Clock) -> Device:
+        scene = SceneConfig.model_validate({"surfaces": {"table": {"kind": "plane"}}}).build(clock)
+        context = DriverContext(clock, scene=scene)
+        arm = sim_arm.SPEC.build("arm", sim_arm.SimArmConfig(start_pose_mm_deg=_START), context)
+        config = sim_tactip.SimTactipConfig(mounted_on="arm")
+        context = DriverContext(clock, {"arm": arm}, scene)
+        cameras.append(cast(sim_tactip.SimTactip, sim_tactip.SPEC.build("tip", config, context)))
+        clocks.append(clock)
+        return cameras[-1]
+
+    def pause(value: Any) -> None:
+        last = cameras[-1].latest().seq if value is not None else None
+        cameras[-1].faults = FrameFaults(last_seq=last)
+
+    def delay(value: Any) -> None:
+        cameras[-1].faults = FrameFaults(extra_latency_s=value or 0.0)
+
+    return Rig(
+        spec=sim_tactip.SPEC,
+        start=lambda: StandIn(faults={"pause": pause, "delay": delay}),
+        build=build,
+        energising=None,
+        position=None,
+        faults={"pause": (True, "stale"), "delay": (0.5, "stale")},
+        clock=VirtualClock,
+        process=False,
+    )
+
+
+def replay_camera_rig(folder: Path, address: int) -> Rig:
+    """A folder of small images, as a camera."""
+    images = folder / "images"
+
+    def start() -> StandIn:
+        images.mkdir()
+        for number in range(_IMAGES):
+            image = np.full((48, 64), 2 * number, np.uint8)
+            cv2.imwrite(str(images / f"image_{number}.png"), image)
+        return StandIn(end=lambda: shutil.rmtree(images))
+
+    config = replay_camera.ReplayCameraConfig(data=images, rate_hz=30.0)
+    return Rig(
+        spec=replay_camera.SPEC,
+        start=start,
+        build=lambda clock: replay_camera.SPEC.build("replay", config, DriverContext(clock)),
+        energising=None,
+        position=None,
+        clock=VirtualClock,
+        process=False,
+    )

@@ -1,0 +1,216 @@
+"""A simulated TacTip: camera frames of the markers of a tip that an arm carries through the scene."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.device import Device, Lifecycle
+from touchcell.drivers.core.errors import ConfigError, StaleData, TransportTimeout
+from touchcell.drivers.core.protocols import TcpSource
+from touchcell.drivers.core.samples import Frame, Stamped
+from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
+from touchcell.geometry import se3
+from touchcell.simulation.faults import FrameFaults
+from touchcell.simulation.render import FrameRenderer, Lighting
+from touchcell.simulation.scene import Carrier, LoadBearer, MeasuredCarrier, Scene
+from touchcell.simulation.tip import Tip
+from touchcell.simulation.tip_file import load_tip
+
+CAPABILITIES = Capabilities(
+    kind="camera",
+    abilities=frozenset({"FrameSource", "HealthSource"}),
+    state_rate_hz=30.0,
+    virtual_time=True,
+)
+
+_READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
+
+
+class SimTactipConfig(DriverConfig):
+    """Where the sensor is mounted and how its camera behaves.
+
+    ``exposure`` is a factor on grey levels, ``blur_px`` the standard deviation of a Gaussian, ``dropped`` the share of
+    frames that never come, ``tip`` a tip file (``touchcell calibrate-sim``) or the name of one that ships. Exposure,
+    blur and noise are of ``output: raw``; processed images are black and white.
+    """
+
+    mounted_on: str
+    tcp_to_sensor_mm_deg: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    rate_hz: float = Field(default=30.0, ge=1.0, le=500.0)
+    latency_ms: float = Field(default=10.0, ge=0.0, le=1000.0)
+    noise: float = Field(default=2.0, ge=0.0, le=40.0)
+    exposure: float = Field(default=1.0, gt=0.0, le=10.0)
+    blur_px: float = Field(default=0.0, ge=0.0, le=20.0)
+    dropped: float = Field(default=0.0, ge=0.0, le=0.9)
+    tip: str | None = None
+    output: Literal["raw", "processed"] = "raw"
+
+
+class SimTactip(Device):
+    """One simulated sensor.
+
+    Frames are exposed at whole multiples of the period on the clock, whether or not anybody reads them, and carry that
+    time; frame k has ``seq`` k. They become available ``latency_ms`` later and are drawn when they are read. ``faults``
+    may be set at any time.
+
+    Args:
+        name: the device's name in the cell and in the scene.
+        config: checked configuration.
+        clock: injected time.
+        scene: what there is to touch.
+        mount: what carries it.
+        seed: of the noise; the same seed and frame give the same image.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        config: SimTactipConfig,
+        clock: Clock,
+        scene: Scene,
+        mount: Carrier,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(name, clock)
+        self.faults = FrameFaults()
+        self._scene = scene
+        self._processed = config.output == "processed"
+        self._period_ns = round(1e9 / config.rate_hz)
+        self._latency_ns = round(config.latency_ms * 1e6)
+        self._first = 0
+        self._tip = Tip() if config.tip is None else Tip(load_tip(config.tip).tip)
+        self._dropped = config.dropped
+        self._seed = (seed, zlib.crc32(name.encode()))
+        self._renderer = FrameRenderer(
+            self._tip.parameters.disc_radius_px,
+            Lighting(noise=config.noise, exposure=config.exposure, blur_px=config.blur_px),
+            seed=self._seed,
+        )
+        self._newest: Stamped[Frame] | None = None
+        self._drawn = 0
+        self._mount = mount
+        self._T_tcp_s = se3.from_euler_mm_deg(config.tcp_to_sensor_mm_deg)
+        scene.timeline.keep(lambda: self._forget)
+        if not isinstance(mount, MeasuredCarrier):
+            self._touch()
+
+    def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
+        """Newest frame; waits for the very first. Raises StaleData if it is older than ``max_age_s``."""
+        self._require("deliver frames", *_READABLE)
+        self._clock.sleep_until_ns(self._available_ns(self._from(self._first)))
+        now_ns = self._clock.now_ns()
+        seq = self._newest_seq(now_ns)
+        age_s = (now_ns - seq * self._period_ns) * 1e-9
+        if max_age_s is not None and age_s > max_age_s:
+            raise StaleData(self.name, age_s, max_age_s, seq)
+        return self._draw(seq)
+
+    def next(self, after_seq: int, timeout_s: float) -> Stamped[Frame]:
+        """Newest frame if its ``seq > after_seq``, else the first that is. Raises TransportTimeout."""
+        self._require("deliver frames", *_READABLE)
+        now_ns = self._clock.now_ns()
+        seq = self._from(max(self._newest_seq(now_ns), after_seq + 1, self._first))
+        deadline_ns = now_ns + round(timeout_s * 1e9)
+        if self._available_ns(seq) > deadline_ns or self._never_comes(seq):
+            self._clock.sleep_until_ns(deadline_ns)
+            raise TransportTimeout(self.name, f"frame after {after_seq}", timeout_s)
+        self._clock.sleep_until_ns(self._available_ns(seq))
+        return self._draw(seq)
+
+    def health(self) -> dict[str, float | int | str | bool]:
+        """How many frames were drawn."""
+        return {"frames_drawn": self._drawn, "rate_hz": 1e9 / self._period_ns}
+
+    def _available_ns(self, seq: int) -> int:
+        return seq * self._period_ns + self._delay_ns()
+
+    def _delay_ns(self) -> int:
+        return self._latency_ns + round(self.faults.extra_latency_s * 1e9)
+
+    def _newest_seq(self, now_ns: int) -> int:
+        seq = (now_ns - self._delay_ns()) // self._period_ns
+        if self.faults.last_seq is not None:
+            seq = min(seq, self.faults.last_seq)
+        while seq > self._first and not self._comes(seq):
+            seq -= 1
+        return seq
+
+    def _from(self, seq: int) -> int:
+        """The first frame that comes, from ``seq`` on."""
+        while not self._comes(seq):
+            seq += 1
+        return seq
+
+    def _comes(self, seq: int) -> bool:
+        """Whether frame ``seq`` is not dropped: the same for the same seed."""
+        return not self._dropped or np.random.default_rng((*self._seed, max(seq, 0), 1)).random() >= self._dropped
+
+    def _never_comes(self, seq: int) -> bool:
+        return self.faults.last_seq is not None and seq > self.faults.last_seq
+
+    def _draw(self, seq: int) -> Stamped[Frame]:
+        if self._newest is None or self._newest.seq != seq:
+            t_ns = seq * self._period_ns
+            frame = self._newest.value if self._newest and self.faults.frozen else self._expose(seq, t_ns)
+            self._newest = Stamped(frame, t_ns, seq)
+        return self._newest
+
+    def _expose(self, seq: int, t_ns: int) -> Frame:
+        pixels = self._tip.pixels(self._scene.contact(self.name, t_ns).value.T_f_s)
+        image = self._renderer.processed(pixels) if self._processed else self._renderer.raw(pixels, seq)
+        if self.faults.gain != 1.0:
+            image = np.clip(image * self.faults.gain, 0.0, 255.0).astype(np.uint8)
+        image.flags.writeable = False
+        self._drawn += 1
+        return Frame(image)
+
+    def _forget(self, later_ns: int) -> None:
+        """The newest picture may show what a restored scene has taken back."""
+        self._newest = None
+
+    def _open(self) -> None:
+        self._scene.timeline.advance()
+        if not self._scene.has(self.name):
+            self._touch()
+
+    def _touch(self) -> None:
+        mount, T_tcp_s = self._mount, self._T_tcp_s
+        bear = mount.bear if isinstance(mount, LoadBearer) else None
+        self._scene.mount(self.name, lambda: mount.T_world_tcp() @ T_tcp_s, bear)
+        self._first = math.ceil(self._scene.timeline.t_ns / self._period_ns)
+
+    def _close(self) -> None:
+        self._newest = None
+
+
+def _build(name: str, config: Any, context: DriverContext) -> SimTactip:
+    scene: object = context.scene
+    arm: object = context.devices.get(config.mounted_on)
+    mount: object = arm
+    if not isinstance(arm, Carrier) and isinstance(arm, TcpSource):
+        mount = MeasuredCarrier(arm, context.bases.get(config.mounted_on, np.eye(4)))
+    if not isinstance(scene, Scene):
+        raise ConfigError("a simulated sensor needs a scene", key=name, hint="add a scene: section to the cell file")
+    if not isinstance(mount, Carrier):
+        raise ConfigError(
+            f"{config.mounted_on!r} is no arm of this cell",
+            key=f"{name}.mounted_on",
+            value=config.mounted_on,
+            hint=f"devices so far: {', '.join(context.devices) or 'none'}",
+        )
+    return SimTactip(name, config, context.clock, scene, mount, context.seed)
+
+
+SPEC = DriverSpec(
+    name="sim_tactip",
+    summary="simulated TacTip on an arm, in a simulated scene",
+    config=SimTactipConfig,
+    capabilities=CAPABILITIES,
+    build=_build,
+)

@@ -1,0 +1,360 @@
+"""Full dynamics of free objects and soft tips, by MuJoCo: pushing, slipping, toppling, holding.
+
+Between a sensor and what it touches are springs and a rigid sphere (``dynamics_model.TipMechanics``). The springs'
+other end, the carriage, goes from pose to pose at an even speed, whatever pulls. It keeps its z axis along the surface
+normal: tilting about the tip's centre shears nothing, as in SPEC part 2, and the springs' deflection is the contact's
+shear and torsion. MuJoCo is told the carriage's speed for all physics steps of a step of the scene, and the tip's
+coordinates, along the axes that the carriage had at its start, are told anew along those at its end.
+
+Surfaces that move as they were told are given to each tip as the patch that is tangent before it.
+
+Free objects touch the table, tips and each other, no prescribed surfaces.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+
+from touchcell.drivers.core.errors import ConfigError
+from touchcell.geometry.errors import TouchcellError
+from touchcell.geometry.types import Array
+from touchcell.simulation.contact import ContactState, about_z, tilt_of
+from touchcell.simulation.dynamics_model import TipMechanics, build_model, cross, quaternion, rotation
+from touchcell.simulation.objects import FreeObject
+from touchcell.simulation.solids import shape_of
+from touchcell.simulation.surfaces import Surface, SurfacePoint
+from touchcell.simulation.timeline import Restore
+from touchcell.simulation.world import Feeling
+
+# A carriage that would turn faster than this in one step has come to another face: it is set there, not swung.
+_SWING_RAD = 0.1
+# Friction is regularised: what slides carries a little less than the cone allows.
+_SLIDING_SHARE = 0.97
+_IDENTITY = np.eye(4)
+_UP = np.array([0.0, 0.0, 1.0])
+_STILL = np.zeros(3)
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+@dataclass(slots=True)
+class _Mounted:
+    """One sensor's carriage after the last step.
+
+    Attributes:
+        T_world_s: (4, 4) pose of the sensor.
+        R_world_c: (3, 3) axes of the carriage.
+        R_start: (3, 3) the same before that step.
+        speed: (6,) [v, w] in that step along ``R_start``, where the tip was on it.
+        normal: (3,) outward, of what was nearest.
+    """
+
+    T_world_s: Array
+    R_world_c: Array
+    R_start: Array
+    speed: Array
+    normal: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _Coordinates:
+    """A tip's part of MuJoCo's state, to be read and written in place.
+
+    Attributes:
+        q, rate: (6,) how far the springs have given way along and about the carriage's axes, and how fast they do.
+        applied: (6,) forces along the same.
+        ctrl, act: (4,) speed of the springs' other ends along x, y, z and about z, and how far they have come.
+        position, turn: (3,), (4,) of the carriage in the world.
+    """
+
+    q: Array
+    rate: Array
+    applied: Array
+    ctrl: Array
+    act: Array
+    position: Array
+    turn: Array
+
+
+class PhysicsError(TouchcellError, ArithmeticError):
+    """The physics was given, or came to, numbers that are not finite.
+
+    Attributes:
+        what: where they are.
+        t_s: time of the scene.
+    """
+
+    def __init__(self, what: str, t_s: float) -> None:
+        super().__init__(
+            f"{what} is not finite at {t_s:.3f} s of the scene",
+            hint="a smaller physics_step_ms helps where motions are very fast or tips very stiff",
+        )
+        self.what = what
+        self.t_s = t_s
+
+
+class DynamicWorld:
+    """A world that MuJoCo moves.
+
+    Args:
+        surfaces: that move as they were told, by name.
+        objects: free ones, by name.
+        table_height_m: of the level plane under them.
+        tip: what every tip is made of.
+        step_s: time step of the physics; steps of the scene must be multiples of it.
+
+    Raises:
+        ConfigError: there is nothing to touch.
+    """
+
+    def __init__(
+        self,
+        surfaces: Mapping[str, Surface],
+        objects: Mapping[str, FreeObject],
+        table_height_m: float,
+        tip: TipMechanics,
+        step_s: float,
+    ) -> None:
+        if not (surfaces or objects):
+            raise ConfigError("the scene has nothing to touch", key="scene")
+        self.tip = tip
+        self._surfaces = list(surfaces.values())
+        self._things = dict(objects)
+        self._shapes = {name: shape_of(thing.solid) for name, thing in objects.items()}
+        self._table_height_m = table_height_m if objects else None
+        self._step_s = step_s
+        across = tip.shear_damping_n_s_m
+        self._damping = np.array([across, across, tip.damping_n_s_m, 0.0, 0.0, tip.torsion_damping_n_m_s])
+        self._mounted: dict[str, _Mounted] = {}
+        self._t_s = 0.0
+        self._build({})
+
+    def mount(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
+        """Let ``sensor`` feel; returns what it feels at ``T_world_s`` (4, 4) at ``t_s``. All tips begin undeformed
+        and all objects at rest."""
+        normal = self._nearest(T_world_s[:3, 3], t_s).normal
+        R_world_c = _upright(T_world_s, normal)
+        self._mounted[sensor] = _Mounted(T_world_s, R_world_c, R_world_c, np.zeros(6), normal)
+        self._t_s = t_s
+        self._build(self.objects())
+        return self._feel(sensor, T_world_s, t_s)()
+
+    def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, Feeling]:
+        """Go on to ``t_s``. Raises PhysicsError."""
+        span_s = t_s - self._t_s
+        for sensor, pose in T_world_s.items():
+            self._carry(sensor, pose, span_s)
+        mujoco.mj_step(self._at.model, self._data, round(span_s / self._step_s))
+        for sensor in T_world_s:
+            self._settle(sensor)
+        if not math.isfinite(float(self._qpos.sum())):
+            raise PhysicsError("the state", t_s)
+        self._t_s = t_s
+        self._look()
+        return {sensor: self._feel(sensor, pose, t_s) for sensor, pose in T_world_s.items()}
+
+    def objects(self) -> Mapping[str, Array]:
+        """T_world_object (4, 4) of every free object now."""
+        return self._T_world_object
+
+    def snapshot(self) -> Restore:
+        """What puts objects, tips and carriages back."""
+        model, data = self._at.model, self._data
+        state = np.empty(mujoco.mj_stateSize(model, _STATE))
+        mujoco.mj_getState(model, data, state, _STATE)
+        t_s, mounted = self._t_s, {sensor: replace(each) for sensor, each in self._mounted.items()}
+
+        def restore() -> None:
+            mujoco.mj_setState(model, data, state, _STATE)
+            self._t_s, self._mounted = t_s, {sensor: replace(each) for sensor, each in mounted.items()}
+            self._look()
+
+        return restore
+
+    def _look(self) -> None:
+        """See where objects are: anew each time, for what has been told stays as it was."""
+        self._T_world_object = {name: self._pose(name) for name in self._things}
+
+    def _build(self, T_world_object: Mapping[str, Array]) -> None:
+        """Compile the model anew, with objects at ``T_world_object`` (4, 4) or else where they stand at first."""
+        self._at = build_model(
+            self._things,
+            self._table_height_m,
+            list(self._mounted),
+            self.tip,
+            self._step_s,
+            patches=bool(self._surfaces),
+        )
+        self._data = mujoco.MjData(self._at.model)
+        model, data = self._at.model, self._data
+        self._qpos, self._qvel = data.qpos, data.qvel
+        self._tips = {
+            sensor: _Coordinates(
+                data.qpos[at.qpos : at.qpos + 6],
+                data.qvel[at.qvel : at.qvel + 6],
+                data.qfrc_applied[at.qvel : at.qvel + 6],
+                data.ctrl[at.servo : at.servo + 4],
+                data.act[at.servo : at.servo + 4],
+                model.body_pos[at.body],
+                model.body_quat[at.body],
+            )
+            for sensor, at in self._at.tips.items()
+        }
+        for name, pose in T_world_object.items():
+            self._place(self._at.objects[name].qpos, pose[:3, 3], pose[:3, :3])
+        self._look()
+
+    def _carry(self, sensor: str, T_world_s: Array, span_s: float) -> None:
+        """Send the carriage from where it is to ``T_world_s``, and put the surface before its tip.
+
+        The normal that keeps it upright is the last step's: what moves is not known yet where it will be.
+        """
+        if not math.isfinite(float(T_world_s.sum())):
+            raise PhysicsError(f"the pose of {sensor!r}", self._t_s)
+        mounted, tip = self._mounted[sensor], self._tips[sensor]
+        position = mounted.T_world_s[:3, 3]
+        R_start, R_end = mounted.R_world_c, _upright(T_world_s, mounted.normal)
+        swing = _swing(R_start, R_end)
+        if swing is None:
+            R_start, swing = R_end, _STILL
+        v = (T_world_s[:3, 3] - position) @ R_start / span_s
+        w = swing @ R_start / span_s
+        tip.position[:], tip.turn[:] = position, quaternion(R_start)
+        tip.ctrl[:3], tip.ctrl[3] = v, w[2]
+        # Of the carriage where the tip is on it: springs are damped against that, and carrying a tip takes no force.
+        speed = np.concatenate([v + cross(w, tip.q[:3]), w])
+        tip.rate[:] += speed
+        tip.applied[:] = self._damping * speed
+        if self._surfaces:
+            self._place_patch(sensor, position + R_start @ tip.q[:3])
+        mounted.T_world_s, mounted.R_world_c = T_world_s, R_end
+        mounted.R_start, mounted.speed = R_start, speed
+
+    def _settle(self, sensor: str) -> None:
+        """Tell the tip's coordinates, and how they change, along its carriage as it is now."""
+        mounted, tip = self._mounted[sensor], self._tips[sensor]
+        turned = mounted.R_world_c.T @ mounted.R_start
+        tip.q[:3] = turned @ (tip.q[:3] - tip.act[:3])
+        tip.q[3:5] = 0.0
+        tip.q[5] -= tip.act[3]
+        tip.act[:] = 0.0
+        tip.rate[:] -= mounted.speed
+        tip.rate[:3] = turned @ tip.rate[:3]
+        tip.rate[3:5] = 0.0
+
+    def _place_patch(self, sensor: str, tip_centre: Array) -> None:
+        """Put the tangent of the surface that is nearest to the tip where it is now, moving as the surface does."""
+        surface, found = self._nearest_surface(tip_centre, self._t_s)
+        at = self._at.patches[sensor]
+        R = _facing(found.normal)
+        self._place(at.qpos, found.point, R)
+        twist = surface.motion.twist(self._t_s)
+        if twist.any():
+            arm = found.point - surface.motion.pose(self._t_s)[:3, 3]
+            self._qvel[at.qvel : at.qvel + 3] = twist[:3] + cross(twist[3:], arm)
+            self._qvel[at.qvel + 3 : at.qvel + 6] = R.T @ twist[3:]
+        else:
+            self._qvel[at.qvel : at.qvel + 6] = 0.0
+
+    def _feel(self, sensor: str, T_world_s: Array, t_s: float) -> Feeling:
+        nearest, tip = self._nearest(T_world_s[:3, 3], t_s), self._tips[sensor]
+        self._mounted[sensor].normal = nearest.normal
+        dx, dy, dz, _, _, turned = tip.q.tolist()
+        rate = float(tip.rate[2])
+        return lambda: _contact(self.tip, T_world_s, nearest, (dx, dy, dz), turned, rate)
+
+    def _nearest(self, point: Array, t_s: float) -> SurfacePoint:
+        """What is nearest to ``point`` (3,): a surface, the table, or an object where it is now."""
+        found: SurfacePoint | None = None
+        if self._surfaces:
+            found = self._nearest_surface(point, t_s)[1]
+        for name, shape in self._shapes.items():
+            T = self._T_world_object[name]
+            R, origin = T[:3, :3], T[:3, 3]
+            local = shape.nearest((point - origin) @ R)
+            if found is None or local.distance_m < found.distance_m:
+                found = SurfacePoint(local.distance_m, R @ local.normal, R @ local.point + origin)
+        if self._table_height_m is not None and (found is None or point[2] - self._table_height_m < found.distance_m):
+            x, y, z = point.tolist()
+            found = SurfacePoint(z - self._table_height_m, _UP, np.array([x, y, self._table_height_m]))
+        assert found is not None
+        return found
+
+    def _nearest_surface(self, point: Array, t_s: float) -> tuple[Surface, SurfacePoint]:
+        found = ((surface, surface.nearest(point, t_s)) for surface in self._surfaces)
+        return min(found, key=lambda each: each[1].distance_m)
+
+    def _pose(self, name: str) -> Array:
+        at = self._at.objects[name].qpos
+        T = _IDENTITY.copy()
+        T[:3, :3] = rotation(self._qpos[at + 3 : at + 7])
+        T[:3, 3] = self._qpos[at : at + 3]
+        return T
+
+    def _place(self, at: int, position: Array, R: Array) -> None:
+        self._qpos[at : at + 3] = position
+        self._qpos[at + 3 : at + 7] = quaternion(R)
+
+
+def _contact(
+    tip: TipMechanics,
+    T_world_s: Array,
+    nearest: SurfacePoint,
+    deflection: tuple[float, float, float],
+    turned: float,
+    rate: float,
+) -> ContactState:
+    """What a tip feels whose springs have given way by ``deflection`` and ``turned``, at ``rate`` along the normal."""
+    R_f_s, depth = tilt_of(-nearest.normal @ T_world_s[:3, :3]), tip.radius_m - nearest.distance_m
+    shear = pull = (0.0, 0.0)
+    force, slipping = 0.0, False
+    if depth > 0.0:
+        dx, dy, dz = deflection
+        # The sphere stays behind with the surface, so its deflection is the sensor's own displacement reversed.
+        sin, cos = math.sin(turned), math.cos(turned)
+        shear = (-cos * dx - sin * dy, sin * dx - cos * dy)
+        pull = (-tip.shear_stiffness_n_m * shear[0], -tip.shear_stiffness_n_m * shear[1])
+        pressing = -tip.stiffness_n_m * dz
+        held = math.hypot(
+            tip.shear_stiffness_n_m * math.hypot(dx, dy) / tip.friction,
+            tip.torsion_stiffness_n_m_rad * turned / tip.torsion_friction_m,
+        )
+        force = max(pressing - tip.damping_n_s_m * rate, 0.0)
+        slipping = held >= _SLIDING_SHARE * pressing
+        R_f_s = about_z(-turned) @ R_f_s
+    T_f_s = _IDENTITY.copy()
+    T_f_s[:3, :3] = R_f_s
+    T_f_s[:3, 3] = (*shear, depth)
+    T_world_f = _IDENTITY.copy()
+    T_world_f[:3, :3] = T_world_s[:3, :3] @ R_f_s.T
+    T_world_f[:3, 3] = T_world_s[:3, 3] - T_world_f[:3, :3] @ T_f_s[:3, 3]
+    return ContactState(T_f_s, T_world_f, depth > 0.0, slipping, force, pull)
+
+
+def _swing(R_start: Array, R_end: Array) -> Array | None:
+    """Rotation vector (3,) along world axes from one to the other; None if it is no small one."""
+    (a, b, c), (d, e, f), (g, h, i) = (R_end @ R_start.T).tolist()
+    if a + e + i <= 1.0 + 2.0 * math.cos(_SWING_RAD):
+        return None
+    return np.array([0.5 * (h - f), 0.5 * (c - g), 0.5 * (d - b)])
+
+
+def _upright(T_world_s: Array, normal: Array) -> Array:
+    """Axes of {s} without its tilt: z along the inward normal, turned about it as the sensor is."""
+    R = T_world_s[:3, :3]
+    upright: Array = R @ tilt_of(-normal @ R).T
+    return upright
+
+
+def _facing(normal: Array) -> Array:
+    """Axes (3, 3) with z along the unit vector ``normal``."""
+    x, y, z = normal.tolist()
+    # A rotation about an axis normal to both takes the world's z axis, or its opposite, there.
+    sign = math.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return np.array([[1.0 + sign * x * x * a, b, x], [sign * b, sign + y * y * a, y], [-sign * x, -y, z]])

@@ -1,0 +1,97 @@
+"""A tool centre point that follows twists with limited acceleration and comes to rest when they expire."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from touchcell.drivers.core.gate import TwistLimits
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+
+_THREE_HALVES = 1.5 * np.eye(3)
+
+
+class TwistFollower:
+    """Ideal kinematics: no joints, no dynamics but the acceleration limits.
+
+    Args:
+        T_base_tcp: start pose (4, 4).
+        limits: of which it uses the accelerations.
+        step_ns: length of a step.
+    """
+
+    def __init__(self, T_base_tcp: Array, limits: TwistLimits, step_ns: int) -> None:
+        self.T_base_tcp = T_base_tcp
+        self.velocity = np.zeros(6)
+        self._limits = limits
+        self._step_ns = step_ns
+        self._target = np.zeros(6)
+        self._expires_ns = 0
+
+    def follow(self, twist: Array, expires_ns: int) -> None:
+        """Head for ``twist`` (6,), along base axes, until ``expires_ns``."""
+        self._target = twist.copy()
+        self._expires_ns = expires_ns
+
+    def prolong(self, t_ns: int) -> None:
+        """Let what it follows hold at least until ``t_ns``."""
+        self._expires_ns = max(self._expires_ns, t_ns)
+
+    def halt(self) -> None:
+        """Slow down to rest."""
+        self._target = np.zeros(6)
+
+    def freeze(self) -> None:
+        """Rest at once."""
+        self.halt()
+        self.velocity = np.zeros(6)
+
+    def at_rest(self) -> bool:
+        """Whether it neither moves nor is about to."""
+        return not (self.velocity.any() or self._target.any())
+
+    def snapshot(self) -> Callable[[int], None]:
+        """What brings pose, velocity and command back, given how many nanoseconds later it is then."""
+        kept = self.T_base_tcp, self.velocity, self._target
+        expires_ns = self._expires_ns
+
+        def restore(later_ns: int) -> None:
+            self.T_base_tcp, self.velocity, self._target = kept
+            self._expires_ns = expires_ns + later_ns
+
+        return restore
+
+    def step(self, t_ns: int) -> None:
+        """Move over the step that ends at ``t_ns``."""
+        if t_ns - self._step_ns >= self._expires_ns:
+            self.halt()
+        if self.at_rest():
+            return
+        dt_s = self._step_ns * 1e-9
+        before, goal = self.velocity.tolist(), self._target.tolist()
+        if before != goal:
+            linear = _towards(before[:3], goal[:3], self._limits.accel_m_s2 * dt_s)
+            goal = linear + _towards(before[3:], goal[3:], self._limits.rot_accel_rad_s2 * dt_s)
+            self.velocity = np.array(goal)
+        x, y, z, a, b, c = [0.5 * (old + new) * dt_s for old, new in zip(before, goal, strict=True)]
+        T = self.T_base_tcp.copy()
+        T[:3, 3] += (x, y, z)
+        if a or b or c:
+            R = se3.exp(np.array([0.0, 0.0, 0.0, a, b, c]))[:3, :3] @ T[:3, :3]
+            # One Newton-Schulz step takes off this step's rounding, so that none adds up; se3.project iterates more.
+            T[:3, :3] = R @ (_THREE_HALVES - 0.5 * (R.T @ R))
+        self.T_base_tcp = T
+
+
+def _towards(start: list[float], goal: list[float], longest: float) -> list[float]:
+    """As far from ``start`` to ``goal`` as ``longest`` allows."""
+    (x0, y0, z0), (x1, y1, z1) = start, goal
+    x, y, z = x1 - x0, y1 - y0, z1 - z0
+    length = math.sqrt(x * x + y * y + z * z)
+    if length <= longest:
+        return goal
+    share = longest / length
+    return [x0 + x * share, y0 + y * share, z0 + z * share]

@@ -1,0 +1,172 @@
+"""Free rigid objects on a table: what they are shaped like, what they weigh, how they slide."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+
+PoseMmDeg = tuple[float, float, float, float, float, float]
+
+TABLES: dict[str, float] = {"mdf": 0.3, "foam": 0.6}
+"""Coefficients of sliding friction of the paper's two tables (SIMULATION part 3 proposes them)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prism:
+    """A convex outline drawn up along z; the origin is in the middle of its bottom.
+
+    Attributes:
+        outline_m: (n, 2) corners, anticlockwise.
+        height_m: along z.
+    """
+
+    outline_m: Array
+    height_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Turned:
+    """A solid of revolution about z, made of cylinders upon each other; the origin is in the middle of its bottom.
+
+    Attributes:
+        sections_m: (height, radius) of each, from the bottom up. One section is a plain cylinder.
+    """
+
+    sections_m: tuple[tuple[float, float], ...]
+
+    @property
+    def height_m(self) -> float:
+        """Along z."""
+        return sum(height for height, _ in self.sections_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Ball:
+    """A ball about its origin."""
+
+    radius_m: float
+
+    @property
+    def height_m(self) -> float:
+        """Its diameter."""
+        return 2.0 * self.radius_m
+
+
+Solid = Prism | Turned | Ball
+
+
+@dataclass(frozen=True, slots=True)
+class FreeObject:
+    """A rigid object that goes where it is pushed.
+
+    Attributes:
+        solid: its shape, of even density.
+        mass_kg: its mass.
+        friction: coefficient of sliding friction against the table.
+        T_world_object: (4, 4) where it stands at first; see the solid for where its frame is.
+    """
+
+    solid: Solid
+    mass_kg: float
+    friction: float
+    T_world_object: Array
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class BoxShape(_Part):
+    """A block, its sides along the object's axes."""
+
+    kind: Literal["box"]
+    size_mm: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+
+    def build(self) -> Solid:
+        """The solid."""
+        x, y, z = (0.5e-3 * size for size in self.size_mm)
+        return Prism(np.array([[-x, -y], [x, -y], [x, y], [-x, y]]), 2.0 * z)
+
+
+class HexagonShape(_Part):
+    """A hexagonal prism, two of its faces across the object's x axis."""
+
+    kind: Literal["hexagon"]
+    width_mm: PositiveFloat = Field(description="across flats")
+    height_mm: PositiveFloat
+
+    def build(self) -> Solid:
+        """The solid."""
+        corner_m = 1e-3 * self.width_mm / math.sqrt(3.0)
+        angles = np.radians(30.0 + 60.0 * np.arange(6))
+        return Prism(corner_m * np.column_stack([np.cos(angles), np.sin(angles)]), 1e-3 * self.height_mm)
+
+
+class CylinderShape(_Part):
+    """An upright cylinder."""
+
+    kind: Literal["cylinder"]
+    diameter_mm: PositiveFloat
+    height_mm: PositiveFloat
+
+    def build(self) -> Solid:
+        """The solid."""
+        return Turned(((1e-3 * self.height_mm, 0.5e-3 * self.diameter_mm),))
+
+
+class BottleShape(_Part):
+    """Cylinders upon each other: [height, diameter] of each, from the bottom up."""
+
+    kind: Literal["bottle"]
+    sections_mm: tuple[tuple[PositiveFloat, PositiveFloat], ...] = Field(min_length=1)
+
+    def build(self) -> Solid:
+        """The solid."""
+        return Turned(tuple((1e-3 * height, 0.5e-3 * diameter) for height, diameter in self.sections_mm))
+
+
+class BallShape(_Part):
+    """A ball; its frame is in its middle."""
+
+    kind: Literal["ball"]
+    diameter_mm: PositiveFloat
+
+    def build(self) -> Solid:
+        """The solid."""
+        return Ball(0.5e-3 * self.diameter_mm)
+
+
+class ObjectConfig(_Part):
+    """One free object of the ``scene:`` section. ``pose_mm_deg`` is in the world frame, its z above the table's top."""
+
+    shape: Annotated[
+        BoxShape | HexagonShape | CylinderShape | BottleShape | BallShape,
+        Field(discriminator="kind"),
+    ]
+    mass_g: PositiveFloat
+    pose_mm_deg: PoseMmDeg = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def build(self, table: TableConfig) -> FreeObject:
+        """The object, standing on ``table``."""
+        T_world_object = se3.from_euler_mm_deg(np.array(self.pose_mm_deg))
+        T_world_object[2, 3] += 1e-3 * table.height_mm
+        return FreeObject(self.shape.build(), 1e-3 * self.mass_g, table.coefficient, T_world_object)
+
+
+class TableConfig(_Part):
+    """What objects stand on: a level plane."""
+
+    height_mm: float = 0.0
+    friction: Literal["mdf", "foam"] | Annotated[float, Field(gt=0.0, le=2.0)] = "mdf"
+
+    @property
+    def coefficient(self) -> float:
+        """Of sliding friction."""
+        return TABLES[self.friction] if isinstance(self.friction, str) else self.friction

@@ -1,0 +1,170 @@
+"""Random contacts as random simulated sensors see them, over the ranges of the public data (SPEC part 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+from touchcell.simulation.contact import ContactLaw, contact_at
+from touchcell.simulation.mount import Rig
+from touchcell.simulation.tip import Tip, TipParameters
+
+PUBLIC_DEPTH_MM = (0.5, 6.0)
+_IMAGES_PER_TIP = 16
+_ADDITIVE = {"centre_px", "image_rotation_rad", "layout_phase_rad", "camera_tilt_rad"}
+
+
+@dataclass(frozen=True, slots=True)
+class Variation:
+    """How much simulated sensors and images differ, so that a model does not learn one of them by heart.
+
+    Attributes:
+        parameters: relative standard deviation of the tip's parameters.
+        turn_rad: standard deviation of the image's and the layout's rotation.
+        shift_px: standard deviation of the image centre, in the frame.
+        marker_px: standard deviation of each marker's place, in the frame.
+        disc_radius: relative standard deviation of the discs' radius from image to image.
+        missing: share of markers that are not seen.
+        field: what no parameter can say: standard deviation of a smooth displacement of the whole field, as a share of
+            the markers' mean displacement.
+        slip: relative standard deviation of what a rig lets slip, from one batch of contacts to the next.
+    """
+
+    parameters: float = 0.03
+    turn_rad: float = 0.005
+    shift_px: float = 0.7
+    marker_px: float = 0.3
+    disc_radius: float = 0.08
+    missing: float = 0.003
+    field: float = 0.0
+    slip: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class SampledContact:
+    """One random contact as one random sensor sees it.
+
+    Attributes:
+        T_f_s: (4, 4) label: after slip, or with a rig the command.
+        pixels: (markers, 2) px of the markers that are seen, in the 640x480 frame.
+        disc_radius_px: of the markers.
+    """
+
+    T_f_s: Array
+    pixels: Array
+    disc_radius_px: float
+
+
+def contacts(
+    n: int,
+    seed: int,
+    *,
+    depth_mm: tuple[float, float] = PUBLIC_DEPTH_MM,
+    parameters: TipParameters | None = None,
+    law: ContactLaw | None = None,
+    rig: Rig | None = None,
+    variation: Variation | None = None,
+) -> Iterator[SampledContact]:
+    """Yield ``n`` random contacts, the same for the same seed.
+
+    Depth is even in ``depth_mm``, tilt in a 25 deg disc, shear in a 5 mm disc, torsion in +-5 deg; what the depth
+    cannot hold slips, and the label is the pose that is left. With a ``rig`` the label is the command, as in collected
+    data, and the rig says what is left of it.
+
+    Args:
+        n: how many.
+        seed: of everything random.
+        depth_mm: least and greatest depth.
+        parameters: of the sensor around which the others scatter.
+        law: how the tips slip.
+        rig: how they are mounted and slip, in place of ``law``.
+        variation: how far they scatter.
+    """
+    rng = np.random.default_rng(seed)
+    middle, law, variation = parameters or TipParameters(), law or ContactLaw(), variation or Variation()
+    for start in range(0, n, _IMAGES_PER_TIP):
+        count = min(_IMAGES_PER_TIP, n - start)
+        tip = Tip(_scattered(middle, variation, rng))
+        poses = random_poses(count, rng, depth_mm)
+        if rig is None:
+            T_f_s = np.stack([contact_at(pose, law).T_f_s for pose in poses])
+            pixels = tip.pixels(T_f_s)
+        else:
+            T_f_s = poses
+            pixels = tip.pixels(_slipping(rig, variation, rng).contact(poses))
+        if variation.field:
+            pixels += _smooth_fields(tip.project(tip.rest_positions), pixels, variation.field, rng)
+        pixels += rng.normal(0.0, variation.marker_px, pixels.shape)
+        seen = rng.random(pixels.shape[:2]) >= variation.missing
+        radius = tip.parameters.disc_radius_px * (1.0 + rng.normal(0.0, variation.disc_radius, count))
+        for i in range(count):
+            yield SampledContact(T_f_s[i], pixels[i][seen[i]], float(radius[i]))
+
+
+def random_poses(
+    n: int,
+    rng: np.random.Generator,
+    depth_mm: tuple[float, float] = PUBLIC_DEPTH_MM,
+    *,
+    tilt_deg: float = 25.0,
+    shear_mm: float = 5.0,
+    torsion_deg: float = 5.0,
+) -> Array:
+    """(n, 4, 4) contacts T_f_s over the ranges of the public data, before any slip."""
+    tilt, shear = _disc(n, tilt_deg, rng), _disc(n, shear_mm, rng)
+    depth, gamma = rng.uniform(*depth_mm, n), rng.uniform(-torsion_deg, torsion_deg, n)
+    return se3.from_euler_mm_deg(np.column_stack([shear, depth, tilt, gamma]))
+
+
+def _disc(n: int, radius: float, rng: np.random.Generator) -> Array:
+    """(n, 2) points spread evenly over a disc."""
+    length, angle = radius * np.sqrt(rng.random(n)), rng.uniform(0.0, 2.0 * np.pi, n)
+    return np.column_stack([length * np.cos(angle), length * np.sin(angle)])
+
+
+def _slipping(rig: Rig, variation: Variation, rng: np.random.Generator) -> Rig:
+    longer, steeper, looser = 1.0 + variation.slip * rng.normal(0.0, 1.0, 3)
+    return replace(
+        rig,
+        slip_at_1mm_m=rig.slip_at_1mm_m * max(longer, 0.2),
+        uphill=rig.uphill * steeper,
+        torsion_release=rig.torsion_release * max(looser, 0.2),
+    )
+
+
+def _smooth_fields(rest: Array, pixels: Array, share: float, rng: np.random.Generator) -> Array:
+    """(n, markers, 2) px: random polynomials of third degree over the lattice, growing with the displacements."""
+    u, v = ((rest - rest.mean(axis=0)) / np.abs(rest - rest.mean(axis=0)).max()).T
+    terms = np.stack([np.ones_like(u), u, v, u * v, u * u, v * v, u**3, v**3])
+    size = share * np.linalg.norm(pixels - rest, axis=2).mean(axis=1)
+    weights = rng.normal(0.0, 1.0, (len(pixels), 2, len(terms))) * size[:, None, None]
+    fields: Array = np.einsum("nck,km->nmc", weights, terms)
+    return fields
+
+
+def _scattered(middle: TipParameters, variation: Variation, rng: np.random.Generator) -> TipParameters:
+    changed = {
+        each.name: getattr(middle, each.name) * (1.0 + rng.normal(0.0, variation.parameters))
+        for each in fields(middle)
+        if each.name not in _ADDITIVE | {"rings", "camera_distance_m", "focal_px", "ring_step_rad"}
+        and getattr(middle, each.name)
+    }
+    u, v = middle.centre_px + rng.normal(0.0, variation.shift_px, 2)
+    # Focal length and camera distance together set the scale: scattered alone they would change it by too much.
+    zoom = 1.0 + rng.normal(0.0, 0.3 * variation.parameters)
+    nearer = 1.0 + rng.normal(0.0, variation.parameters)
+    distance = middle.camera_distance_m * nearer
+    to_apex = (distance + middle.marker_radius_m) / (middle.camera_distance_m + middle.marker_radius_m)
+    return replace(
+        middle,
+        **changed,
+        centre_px=(float(u), float(v)),
+        image_rotation_rad=middle.image_rotation_rad + rng.normal(0.0, variation.turn_rad),
+        layout_phase_rad=middle.layout_phase_rad + rng.normal(0.0, variation.turn_rad),
+        camera_distance_m=distance,
+        focal_px=middle.focal_px * zoom * to_apex,
+    )

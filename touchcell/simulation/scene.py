@@ -1,0 +1,385 @@
+"""A simulated scene: what there is to touch, and the contacts of the sensors that arms carry through it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Annotated, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.errors import ConfigError, DeviceError
+from touchcell.drivers.core.protocols import TcpSource
+from touchcell.drivers.core.samples import Stamped
+from touchcell.geometry import se3
+from touchcell.geometry.errors import TouchcellError
+from touchcell.geometry.types import Array
+from touchcell.simulation.contact import ContactLaw, ContactState
+from touchcell.simulation.motions import Glide, Motion, Periodic, Still
+from touchcell.simulation.objects import ObjectConfig, PoseMmDeg, TableConfig
+from touchcell.simulation.quasi_static import QuasiStaticWorld
+from touchcell.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
+from touchcell.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeline
+from touchcell.simulation.world import Feeling, KinematicWorld, World, known
+
+HISTORY_S = 5.0
+
+
+class ContactNotKept(TouchcellError, LookupError):
+    """Asked for a contact of a time that the scene does not remember.
+
+    Attributes:
+        t_ns: the time that was asked for.
+        oldest_ns, newest_ns: the times that are remembered.
+    """
+
+    def __init__(self, t_ns: int, oldest_ns: int, newest_ns: int) -> None:
+        super().__init__(f"no contact of {t_ns} ns is kept, only of {oldest_ns} to {newest_ns} ns")
+        self.t_ns = t_ns
+        self.oldest_ns = oldest_ns
+        self.newest_ns = newest_ns
+
+
+@runtime_checkable
+class Carrier(Protocol):
+    """A simulated arm, as the sensors see it that it carries."""
+
+    def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
+        """(4, 4) at the present step of the simulation; must not advance time."""
+        ...
+
+
+@runtime_checkable
+class LoadBearer(Protocol):
+    """A simulated arm that gives way to what its sensors touch."""
+
+    def bear(self, force_world: Array, point_world: Array) -> None:
+        """From now on feel ``force_world`` (3,) N at ``point_world`` (3,) m."""
+        ...
+
+
+class MeasuredCarrier:
+    """Any other arm, as what it tells: so that a simulated sensor sits on a real or an emulated arm.
+
+    Where the arm tells nothing, because it is gone or has not begun, it is where it was last.
+
+    Args:
+        arm: tells its pose.
+        T_world_base: (4, 4) where its base stands.
+    """
+
+    def __init__(self, arm: TcpSource, T_world_base: Array) -> None:
+        self._arm = arm
+        self._T_world_base = T_world_base
+        self._T_base_tcp: Array | None = None
+
+    def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
+        """(4, 4) newest measured pose. Raises DeviceError if there has never been one."""
+        try:
+            T_base_tcp = self._arm.tcp().value.T_base_tcp
+        except DeviceError:
+            if self._T_base_tcp is None:
+                raise
+        else:
+            # What is not finite is for the supervisor to see, not for the physics.
+            if self._T_base_tcp is None or np.isfinite(T_base_tcp).all():
+                self._T_base_tcp = T_base_tcp
+        assert self._T_base_tcp is not None
+        return self._T_world_base @ self._T_base_tcp
+
+
+class SceneTruth(Protocol):
+    """What can be asked of a scene, also of one in another process."""
+
+    def contact(self, sensor: str, t_ns: int | None = None) -> Stamped[ContactState]:
+        """What ``sensor`` feels."""
+        ...
+
+    def objects(self) -> Stamped[Mapping[str, Array]]:
+        """T_world_object (4, 4) of every free object."""
+        ...
+
+
+class Scene:
+    """A world and the sensors that touch it. One thread only.
+
+    The world is stepped on the timeline's fixed grid to the clock's now whenever somebody reads a contact or an arm is
+    asked.
+
+    Args:
+        world: what decides what is felt; its time counts from when the scene was made.
+        clock: injected time.
+        step_s: grid of the simulation.
+    """
+
+    def __init__(self, world: World, clock: Clock, step_s: float = DEFAULT_STEP_S) -> None:
+        self.world = world
+        self.timeline = Timeline(clock, step_s)
+        self._start_ns = self.timeline.t_ns
+        self._poses: dict[str, Callable[[], Array]] = {}
+        self._bearers: dict[str, Callable[[Array, Array], None]] = {}
+        # The last one is of the timeline's present step, the one before it of the step before.
+        self._felt: dict[str, deque[Feeling]] = {}
+        self._kept = round(HISTORY_S * 1e9 / self.timeline.step_ns)
+        self.timeline.add(Phase.CONTACT, self._step)
+        self.timeline.keep(self._snapshot)
+
+    def mount(self, sensor: str, pose: Callable[[], Array], bear: Callable[[Array, Array], None] | None = None) -> None:
+        """Let ``sensor`` feel.
+
+        Args:
+            sensor: its name.
+            pose: gives T_world_s (4, 4) at the present step and must not advance time.
+            bear: told after every step with which force (3,) N what is touched pushes the sensor, and at which point
+                (3,) m, both in the world frame.
+        """
+        if sensor in self._poses:
+            raise ConfigError(f"sensor {sensor!r} is mounted already", key="scene", value=sensor)
+        t_ns = self.timeline.t_ns
+        state = self.world.mount(sensor, pose(), self.seconds(t_ns))
+        self._poses[sensor] = pose
+        if bear is not None:
+            self._bearers[sensor] = bear
+        self._felt[sensor] = deque([known(state)], maxlen=self._kept)
+
+    def has(self, sensor: str) -> bool:
+        """Whether ``sensor`` is mounted."""
+        return sensor in self._poses
+
+    def contact(self, sensor: str, t_ns: int | None = None) -> Stamped[ContactState]:
+        """What ``sensor`` feels now, or felt at ``t_ns`` (the step before it), at most HISTORY_S ago.
+
+        Raises:
+            ConfigError: no such sensor.
+            ContactNotKept: ``t_ns`` lies in the future or too far back.
+        """
+        if sensor not in self._felt:
+            raise ConfigError(f"no sensor {sensor!r} is mounted", key="scene", value=sensor)
+        now_ns = self.timeline.advance()
+        felt, step_ns = self._felt[sensor], self.timeline.step_ns
+        newest = now_ns // step_ns
+        seq = newest if t_ns is None else t_ns // step_ns
+        if not 0 <= newest - seq < len(felt):
+            raise ContactNotKept(seq * step_ns, (newest - len(felt) + 1) * step_ns, now_ns)
+        at = seq - newest - 1
+        state = felt[at]()
+        felt[at] = known(state)
+        return Stamped(state, seq * step_ns, seq)
+
+    def objects(self) -> Stamped[Mapping[str, Array]]:
+        """T_world_object (4, 4) of every free object now."""
+        t_ns = self.timeline.advance()
+        return Stamped(self.world.objects(), t_ns, t_ns // self.timeline.step_ns)
+
+    def snapshot(self) -> Restore:
+        """What puts the world, its contacts and the arms in it back as they are now, at whatever time it is called.
+
+        The clock goes on: a surface that moves as it was told goes on from where it was. Lifecycles and leases of
+        devices are not touched.
+
+        Raises (when called):
+            ConfigError: a sensor was mounted since.
+        """
+        return self.timeline.snapshot()
+
+    def seconds(self, t_ns: int) -> float:
+        """Time of the world at ``t_ns``."""
+        return (t_ns - self._start_ns) * 1e-9
+
+    def _step(self, t_ns: int) -> None:
+        poses = {sensor: pose() for sensor, pose in self._poses.items()}
+        for sensor, felt in self.world.step(poses, self.seconds(t_ns)).items():
+            self._felt[sensor].append(felt)
+            if sensor in self._bearers:
+                self._bearers[sensor](felt().force_world_n, poses[sensor][:3, 3])
+
+    def _snapshot(self) -> Callable[[int], None]:
+        start_ns, world = self._start_ns, self.world.snapshot()
+        felt = {sensor: kept.copy() for sensor, kept in self._felt.items()}
+
+        def restore(later_ns: int) -> None:
+            if felt.keys() != self._felt.keys():
+                raise ConfigError("a sensor was mounted after the snapshot was taken", key="scene")
+            self._start_ns = start_ns + later_ns
+            self._felt = {sensor: kept.copy() for sensor, kept in felt.items()}
+            world()
+
+        return restore
+
+
+@contextmanager
+def physics_engine(key: str, value: str) -> Iterator[None]:
+    """Around imports that need MuJoCo. Raises ConfigError, with what to install, where it is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"needs {error.name}, which is not installed",
+            key=key,
+            value=value,
+            hint="pip install 'touchcell[physics]'",
+        ) from None
+
+
+_HERE: PoseMmDeg = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+_SI = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class GlideConfig(_Part):
+    """One smooth move: translations along and at most one rotation about the start frame's axes."""
+
+    kind: Literal["glide"]
+    displacement_mm_deg: PoseMmDeg
+    start_s: float = Field(ge=0.0)
+    duration_s: float = Field(gt=0.0)
+
+    @model_validator(mode="after")
+    def _one_rotation(self) -> GlideConfig:
+        if sum(angle != 0.0 for angle in self.displacement_mm_deg[3:]) > 1:
+            raise ValueError("displacement_mm_deg may turn about one axis only; use kind: periodic for more")
+        return self
+
+    def build(self, T_start: Array) -> Motion:
+        return Glide(T_start, np.array(self.displacement_mm_deg) * _SI, self.start_s, self.duration_s)
+
+
+class PeriodicConfig(_Part):
+    """Sines in all pose components of the start frame, begun gently; see ``motions.Periodic``."""
+
+    kind: Literal["periodic"]
+    amplitude_mm_deg: PoseMmDeg
+    shift_deg: PoseMmDeg = (0.0, 90.0, 0.0, 0.0, 90.0, 45.0)
+    period_s: float = Field(gt=0.0)
+    ramp_s: float = Field(default=1.0, gt=0.0)
+
+    def build(self, T_start: Array) -> Motion:
+        return Periodic(
+            T_start,
+            np.array(self.amplitude_mm_deg) * _SI,
+            np.radians(self.shift_deg),
+            self.period_s,
+            self.ramp_s,
+        )
+
+
+class _SurfaceConfig(_Part):
+    pose_mm_deg: PoseMmDeg = _HERE
+    motion: Annotated[GlideConfig | PeriodicConfig, Field(discriminator="kind")] | None = None
+
+    def shape(self) -> Shape:
+        raise NotImplementedError
+
+    def build(self) -> Surface:
+        T_world_body = se3.from_euler_mm_deg(self.pose_mm_deg)
+        return Surface(self.shape(), self.motion.build(T_world_body) if self.motion else Still(T_world_body))
+
+
+class PlaneConfig(_SurfaceConfig):
+    """A flat plate: the plane z = 0 of its pose, outside towards +z."""
+
+    kind: Literal["plane"]
+
+    def shape(self) -> Shape:
+        return Plane()
+
+
+class RampConfig(_SurfaceConfig):
+    """Flat, then bent over an arc to an incline along the pose's +x; see ``surfaces.Ramp``."""
+
+    kind: Literal["ramp"]
+    bend_radius_mm: float = Field(gt=0.0)
+    incline_deg: float = Field(gt=-90.0, lt=90.0)
+
+    def shape(self) -> Shape:
+        return Ramp(self.bend_radius_mm * 1e-3, float(np.radians(self.incline_deg)))
+
+
+class DomeConfig(_SurfaceConfig):
+    """A hemisphere on a plane, its centre at the pose's origin, rising towards +z."""
+
+    kind: Literal["dome"]
+    radius_mm: float = Field(gt=0.0)
+
+    def shape(self) -> Shape:
+        return Dome(self.radius_mm * 1e-3)
+
+
+class SphereConfig(_SurfaceConfig):
+    """A ball about the pose's origin."""
+
+    kind: Literal["sphere"]
+    radius_mm: float = Field(gt=0.0)
+
+    def shape(self) -> Shape:
+        return Sphere(self.radius_mm * 1e-3)
+
+
+class TipLawConfig(_Part):
+    """What every simulated tip of the scene is made of; see ``contact.ContactLaw``."""
+
+    radius_mm: float = Field(default=20.0, gt=0.0)
+    stiffness_n_mm: float = Field(default=1.5, gt=0.0)
+    friction: float = Field(default=0.9, gt=0.0, le=3.0, description="of the skin, where objects are free")
+
+    def build(self) -> ContactLaw:
+        return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3, self.friction)
+
+
+class SceneConfig(_Part):
+    """The ``scene:`` section of a cell file. Poses are in the world frame.
+
+    ``physics`` says how true it is (docs/simulation.md). ``kinematic``: surfaces move as they were told, whatever
+    touches them. ``quasi_static``: besides, objects slide on the table where tips push them, without inertia and always
+    upright. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms`` within ``step_ms``,
+    the grid on which arms move and contacts are kept.
+    """
+
+    physics: Literal["kinematic", "quasi_static", "dynamic"] = "kinematic"
+    surfaces: dict[
+        str,
+        Annotated[PlaneConfig | RampConfig | DomeConfig | SphereConfig, Field(discriminator="kind")],
+    ] = {}
+    objects: dict[str, ObjectConfig] = {}
+    table: TableConfig = TableConfig()
+    tip: TipLawConfig = TipLawConfig()
+    step_ms: float = Field(default=2.0, ge=0.1, le=10.0)
+    physics_step_ms: float = Field(default=1.0, ge=0.05, le=5.0)
+
+    @model_validator(mode="after")
+    def _something_to_touch(self) -> SceneConfig:
+        if not (self.surfaces or self.objects):
+            raise ValueError("the scene has neither surfaces nor objects to touch")
+        if self.physics == "kinematic" and self.objects:
+            raise ValueError("free objects need another physics than kinematic")
+        steps = self.step_ms / self.physics_step_ms
+        if self.physics == "dynamic" and abs(steps - max(round(steps), 1)) > 1e-6:
+            raise ValueError(f"step_ms {self.step_ms:g} is no multiple of physics_step_ms {self.physics_step_ms:g}")
+        return self
+
+    def build(self, clock: Clock) -> Scene:
+        """The scene, with its motions starting now."""
+        return Scene(self._world(), clock, self.step_ms * 1e-3)
+
+    def _world(self) -> World:
+        surfaces = {name: config.build() for name, config in self.surfaces.items()}
+        if self.physics == "kinematic":
+            return KinematicWorld(surfaces, self.tip.build())
+        if self.physics == "quasi_static":
+            objects = {name: config.build(self.table) for name, config in self.objects.items()}
+            return QuasiStaticWorld(surfaces, objects, self.tip.build())
+        return self._dynamic_world(surfaces)
+
+    def _dynamic_world(self, surfaces: Mapping[str, Surface]) -> World:
+        with physics_engine("scene.physics", "dynamic"):
+            from touchcell.simulation.dynamics import DynamicWorld
+            from touchcell.simulation.dynamics_model import TipMechanics
+        tip = TipMechanics(1e-3 * self.tip.radius_mm, 1e3 * self.tip.stiffness_n_mm, self.tip.friction)
+        objects = {name: config.build(self.table) for name, config in self.objects.items()}
+        return DynamicWorld(surfaces, objects, 1e-3 * self.table.height_mm, tip, 1e-3 * self.physics_step_ms)

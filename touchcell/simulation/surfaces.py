@@ -1,0 +1,129 @@
+"""Rigid surfaces in closed form: where is the nearest point, and which way is out.
+
+A ``Shape`` stands still in its own frame; a ``Surface`` is a shape that moves through the world.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from touchcell.drivers.core.errors import ConfigError
+from touchcell.geometry.types import Array
+from touchcell.simulation.motions import Motion, Still
+
+
+@dataclass(frozen=True, slots=True)
+class SurfacePoint:
+    """The point of a surface that is nearest to a query point.
+
+    Attributes:
+        distance_m: from the surface to the query point, negative below the surface.
+        normal: (3,) outward unit normal there.
+        point: (3,) m.
+    """
+
+    distance_m: float
+    normal: Array
+    point: Array
+
+
+class Shape(Protocol):
+    """A rigid body's outside, in the body's own frame."""
+
+    def nearest(self, p: Array) -> SurfacePoint:
+        """Nearest surface point to ``p`` (3,) m."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Plane:
+    """The plane z = 0 with its outside towards +z."""
+
+    def nearest(self, p: Array) -> SurfacePoint:
+        """Nearest surface point to ``p`` (3,) m."""
+        return SurfacePoint(float(p[2]), np.array([0.0, 0.0, 1.0]), np.array([p[0], p[1], 0.0]))
+
+
+@dataclass(frozen=True, slots=True)
+class Sphere:
+    """A ball about the origin."""
+
+    radius_m: float
+
+    def nearest(self, p: Array) -> SurfacePoint:
+        """Nearest surface point to ``p`` (3,) m; for the centre itself, the top."""
+        length = math.sqrt(float(p @ p))
+        normal = p / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
+        return SurfacePoint(length - self.radius_m, normal, self.radius_m * normal)
+
+
+@dataclass(frozen=True, slots=True)
+class Dome:
+    """A hemisphere about the origin that rises from the plane z = 0."""
+
+    radius_m: float
+
+    def nearest(self, p: Array) -> SurfacePoint:
+        """Nearest surface point to ``p`` (3,) m; exact outside the body, which is where a tip's centre is."""
+        on_cap = Sphere(self.radius_m).nearest(p)
+        return on_cap if on_cap.distance_m < p[2] else Plane().nearest(p)
+
+
+@dataclass(frozen=True, slots=True)
+class Ramp:
+    """A flat that bends into an incline along +x over a circular arc; the same for every y.
+
+    The profile is z = 0 for x <= 0, then an arc of ``bend_radius_m``, then a straight incline at ``incline_rad``:
+    rising (a hollow bend) if positive, falling (a rounded edge) if negative. Its slope is continuous.
+    """
+
+    bend_radius_m: float
+    incline_rad: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < abs(self.incline_rad) < math.pi / 2:
+            raise ConfigError("must lie between 0 and 90 deg", key="incline_rad", value=self.incline_rad)
+
+    def nearest(self, p: Array) -> SurfacePoint:
+        """Nearest surface point to ``p`` (3,) m; exact within ``bend_radius_m`` above the surface."""
+        x, y, z = p.tolist()
+        if x <= 0.0:
+            return Plane().nearest(p)
+        R, angle = self.bend_radius_m, self.incline_rad
+        sign = math.copysign(1.0, angle)
+        sin, cos = math.sin(angle), math.cos(angle)
+        end_x, end_z = R * abs(sin), sign * R * (1.0 - cos)
+        along = (x - end_x) * cos + (z - end_z) * sin
+        if along >= 0.0:
+            distance = (z - end_z) * cos - (x - end_x) * sin
+            point = np.array([end_x + along * cos, y, end_z + along * sin])
+            return SurfacePoint(distance, np.array([-sin, 0.0, cos]), point)
+        # The arc's centre lies above a hollow bend and below a rounded edge; outwards is towards it or away from it.
+        from_centre = math.hypot(x, z - sign * R)
+        normal = np.array([-sign * x / from_centre, 0.0, -sign * (z - sign * R) / from_centre])
+        distance = sign * (R - from_centre)
+        return SurfacePoint(distance, normal, np.array([x, y, z]) - distance * normal)
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """A shape on its way through the world.
+
+    Attributes:
+        shape: what it is.
+        motion: where it is when; a ``Still`` one unless told otherwise.
+    """
+
+    shape: Shape
+    motion: Motion = field(default_factory=Still)
+
+    def nearest(self, p_world: Array, t_s: float) -> SurfacePoint:
+        """Nearest point at time ``t_s`` to ``p_world`` (3,) m, in the world frame."""
+        T = self.motion.pose(t_s)
+        R, origin = T[:3, :3], T[:3, 3]
+        found = self.shape.nearest((p_world - origin) @ R)
+        return SurfacePoint(found.distance_m, R @ found.normal, R @ found.point + origin)

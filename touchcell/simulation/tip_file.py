@@ -1,0 +1,95 @@
+"""A calibrated sensor as a file: what ``touchcell calibrate-sim`` found out about one tip, its camera and its mount."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from touchcell.drivers.core.errors import ConfigError, suggest
+from touchcell.simulation.mount import Rig
+from touchcell.simulation.tip import TipParameters
+
+SHIPPED = Path(__file__).parent / "tips"
+
+
+class TipFile(BaseModel):
+    """One sensor. Units are in the names of the parameters.
+
+    Attributes:
+        tip: layout, camera and skin.
+        rig: mount and slip.
+        measured: how it was fitted, and how far its markers are off in images that it was not fitted to, for people.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    schema_: Literal[1] = Field(default=1, alias="schema")
+    tip: TipParameters
+    rig: Rig = Rig()
+    measured: dict[str, str | int | float | dict[str, float]] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known(cls, data: Any) -> Any:
+        for section, kind in (("tip", TipParameters), ("rig", Rig)):
+            given = data.get(section) if isinstance(data, dict) else None
+            names = [each.name for each in fields(kind)]
+            for name in given if isinstance(given, dict) else ():
+                if name not in names:
+                    hint = suggest(name, names)
+                    raise ValueError(f"{section}.{name} is unknown{'; ' + hint if hint else ''}")
+        return data
+
+
+def load_tip(name: str) -> TipFile:
+    """Read the file of that path, or the sensor of that name that ships with touchcell.
+
+    Raises:
+        ConfigError: there is no such file, or it makes no sense.
+    """
+    shipped = SHIPPED / f"{name}.yaml"
+    path = shipped if shipped.is_file() else Path(name)
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return TipFile.model_validate(data)
+    except OSError as error:
+        known = ", ".join(sorted(each.stem for each in SHIPPED.glob("*.yaml")))
+        raise ConfigError(
+            f"cannot be read: {error.strerror}",
+            file=str(path),
+            hint=f"make one with `touchcell calibrate-sim`; these ship: {known}",
+        ) from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"is no YAML: {error}", file=str(path)) from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise ConfigError(first["msg"], file=str(path), key=key) from None
+
+
+def save_tip(tip: TipFile, path: Path) -> None:
+    """Write a tip file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = {
+        "schema": 1,
+        "tip": _plain(asdict(tip.tip)),
+        "rig": _plain(asdict(tip.rig)),
+        "measured": dict(tip.measured),
+    }
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    """Numbers with six digits: more than any of them is known to."""
+    return {
+        name: [float(f"{each:.6g}") for each in value]
+        if isinstance(value, tuple)
+        else value
+        if isinstance(value, int)
+        else float(f"{value:.6g}")
+        for name, value in values.items()
+    }

@@ -1,0 +1,225 @@
+"""One arm with the tactile sensor that it carries: what it feels, and how it is moved to hold a contact."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Protocol
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from touchcell.control.pid import PidGains
+from touchcell.control.servo import TactileServo
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.tasks.interface import Observation, TaskConfig, TaskContext
+
+
+class RunPhase(Protocol):
+    """What a hand does besides holding its contact, once that has settled."""
+
+    @property
+    def feedforward(self) -> Array:
+        """Twist (6,) in the desired sensor frame."""
+        ...
+
+    @property
+    def timeout_s(self) -> float:
+        """Longest time that it may take."""
+        ...
+
+    def advance(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
+        """Take in one cycle and tell whether the work is done.
+
+        Args:
+            dt_s: how long the cycle was.
+            before: T_base_sensor (4, 4) a cycle ago.
+            now: T_base_sensor (4, 4).
+            T_s_f: valid contact pose (4, 4), or None.
+        """
+        ...
+
+    def telemetry(self) -> Mapping[str, float]:
+        """Named numbers for recording and plots, units in the names."""
+        ...
+
+
+Six = tuple[float, float, float, float, float, float]
+"""One number for each of x, y, z, alpha, beta, gamma."""
+
+SixGains = Annotated[Six, Field(description="x, y, z, alpha, beta, gamma of the sensor's twist; zeros: not controlled")]
+
+
+class HandConfig(TaskConfig):
+    """Parameters of one hand's servo.
+
+    Attributes:
+        kp_per_s: proportional gain of each axis.
+        ki_per_s2: integral gain of each axis.
+        kd: derivative gain of each axis.
+        max_integral_speed_mm_s: largest speed that integral action may ask for.
+        max_integral_turn_deg_s: largest turning rate that integral action may ask for.
+        integral_zone_mm: larger errors are not integrated, so that pressing in does not overshoot ...
+        integral_zone_deg: ... nor does turning.
+        max_speed_mm_s: largest speed of the sensor along each axis.
+        max_turn_deg_s: largest turning rate of the sensor about each axis.
+        settle_tolerance_mm: the contact is steady when the controlled errors are below these ...
+        settle_tolerance_deg: ... two.
+        max_frame_age_ms: the arm stops when the newest frame is older.
+        max_state_age_ms: the arm stops when its newest state is older.
+    """
+
+    kp_per_s: SixGains
+    ki_per_s2: SixGains
+    kd: SixGains = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    max_integral_speed_mm_s: NonNegativeFloat = 40.0
+    max_integral_turn_deg_s: NonNegativeFloat = 20.0
+    integral_zone_mm: PositiveFloat = 1.5
+    integral_zone_deg: PositiveFloat = 5.0
+    max_speed_mm_s: PositiveFloat = 60.0
+    max_turn_deg_s: PositiveFloat = 20.0
+    settle_tolerance_mm: PositiveFloat = 0.3
+    settle_tolerance_deg: PositiveFloat = 2.0
+    max_frame_age_ms: PositiveFloat = 150.0
+    max_state_age_ms: PositiveFloat = 50.0
+
+    def gains(self) -> PidGains:
+        """Gains and clips in SI units."""
+        return PidGains(
+            np.array(self.kp_per_s),
+            np.array(self.ki_per_s2),
+            np.array(self.kd),
+            _six(self.max_integral_speed_mm_s, self.max_integral_turn_deg_s),
+            _six(self.integral_zone_mm, self.integral_zone_deg),
+            _six(self.max_speed_mm_s, self.max_turn_deg_s),
+        )
+
+
+def _six(linear_mm: float, angular_deg: float) -> Array:
+    return np.repeat([1e-3 * linear_mm, np.radians(angular_deg)], 3)
+
+
+class Hand:
+    """An arm and its sensor under servo control.
+
+    Args:
+        arm: role of the arm.
+        sensor: role of its tactile sensor.
+        config: parameters.
+        reference_mm_deg: contact to hold, (6,) Euler components of ``T_f_s``.
+        run: what it does once settled.
+        context: of the cell.
+
+    Attributes:
+        T_base_sensor: (4, 4) where the sensor is; None where that is not known or too old.
+        contact: newest estimate; None where there is none or its frame is too old.
+
+    Raises:
+        KeyError: the context has no such sensor.
+    """
+
+    def __init__(
+        self,
+        arm: str,
+        sensor: str,
+        config: HandConfig,
+        reference_mm_deg: Six,
+        run: RunPhase,
+        context: TaskContext,
+    ) -> None:
+        self.arm = arm
+        self.sensor = sensor
+        self.run = run
+        self._config = config
+        self._T_tcp_sensor = context.T_tcp_sensor[sensor]
+        self._Ad_tcp_sensor = se3.adjoint(self._T_tcp_sensor)
+        T_f_sref = se3.from_euler_mm_deg(np.array(reference_mm_deg))
+        self.servo = TactileServo(se3.inverse(T_f_sref), self._T_tcp_sensor, config.gains(), 1.0 / context.rate_hz)
+        self.T_base_sensor: Array | None = None
+        self.contact: ContactEstimate | None = None
+        self._before: Array | None = None
+        self._start: Array | None = None
+
+    @property
+    def sees(self) -> bool:
+        """Whether there are a fresh frame and a fresh arm state."""
+        return self.T_base_sensor is not None and self.contact is not None
+
+    @property
+    def touches(self) -> bool:
+        """Whether the newest frame is of a contact."""
+        return self.contact is not None and self.contact.in_contact
+
+    @property
+    def T_s_f(self) -> Array | None:  # noqa: N802  the field's own name
+        """Valid contact pose (4, 4), or None."""
+        if self.contact is None or not (self.contact.in_contact and self.contact.in_range):
+            return None
+        return None if self.contact.belief is None else self.contact.belief.mean
+
+    def look(self, observation: Observation) -> None:
+        """Take what can be relied on from a cycle's observation."""
+        now_ns, limits = observation.now_ns, self._config
+        arm = observation.arms.get(self.arm)
+        self._before, self.T_base_sensor = self.T_base_sensor, None
+        if arm is not None and 0.0 <= arm.age_s(now_ns) <= 1e-3 * limits.max_state_age_ms:
+            self.T_base_sensor = se3.compose(arm.value.T_base_tcp, self._T_tcp_sensor)
+        self.contact = observation.contacts.get(self.sensor)
+        if self.contact is not None and not 0.0 <= now_ns - self.contact.t_frame_ns <= 1e6 * limits.max_frame_age_ms:
+            self.contact = None
+
+    def start_way(self) -> None:
+        """Measure the way from here."""
+        self._start = self.T_base_sensor
+
+    def way_m(self) -> float:
+        """Way of the sensor since ``start_way``; 0 while it cannot be told."""
+        if self.T_base_sensor is None:
+            return 0.0
+        if self._start is None:
+            self._start = self.T_base_sensor
+        return float(np.linalg.norm(self.T_base_sensor[:3, 3] - self._start[:3, 3]))
+
+    def steady(self) -> bool:
+        """Whether the errors of the latest servo step are small and it was not held back."""
+        if self.T_s_f is None or not self.servo.active:
+            return False
+        e = self.servo.latest_error
+        small = np.linalg.norm(e[:3]) <= 1e-3 * self._config.settle_tolerance_mm
+        return bool(small and np.linalg.norm(e[3:]) <= np.radians(self._config.settle_tolerance_deg))
+
+    def advance(self, dt_s: float) -> bool:
+        """Let ``run`` take in a cycle of which the motion is known; returns whether its work is done."""
+        if self.T_base_sensor is None or self._before is None:
+            return False
+        return self.run.advance(dt_s, self._before, self.T_base_sensor, self.T_s_f)
+
+    def along_z(self, speed_m_s: float) -> Array:
+        """Twist (6,) of the tool that moves the sensor along its axis."""
+        V_tcp: Array = self._Ad_tcp_sensor @ np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0])
+        return V_tcp
+
+    def servo_step(self, V_ff: Array) -> Array | None:
+        """Twist (6,) of the tool that holds the contact; None while there is no valid one."""
+        V_tcp = self.servo.step(self.T_s_f, 0 if self.contact is None else self.contact.t_ns, V_ff)
+        return None if self.T_s_f is None else V_tcp
+
+    def telemetry(self, observation: Observation, *, servoing: bool) -> Mapping[str, float]:
+        """Age of the newest frame, and while ``servoing`` errors, references and what ``run`` has to tell."""
+        told: dict[str, float] = {}
+        contact = observation.contacts.get(self.sensor)
+        if contact is not None:
+            told["frame_age_ms"] = 1e-6 * (observation.now_ns - contact.t_frame_ns)
+        if not (servoing and self.servo.active):
+            return told
+        errors, references = (_UNITS * self.servo.latest_error).tolist(), self.servo.reference_mm_deg.tolist()
+        for name, error, reference in zip(_COMPONENTS, errors, references, strict=True):
+            if math.isfinite(reference):
+                told[f"error_{name}"], told[f"reference_{name}"] = error, reference
+        return {**told, **self.run.telemetry()}
+
+
+_COMPONENTS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
+_UNITS = np.repeat([1e3, np.degrees(1.0)], 3)

@@ -1,0 +1,317 @@
+"""Collect labelled images: touch a known surface again and again, each time in another way (paper, Algorithm 1).
+
+For each sample the sensor tilts out of contact, is pressed in along the surface's normal, sheared along it, and stands
+still while a frame is taken. Label and frame go to the cell, which keeps them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+
+from touchcell.control.reach import Reach, is_there
+from touchcell.drivers.core.commands import TwistCommand, TwistFrame
+from touchcell.geometry import se3
+from touchcell.geometry.errors import TouchcellError
+from touchcell.geometry.types import Array
+from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.simulation.samples import PUBLIC_DEPTH_MM, random_poses
+from touchcell.tasks.interface import Action, Observation, TaskConfig, TaskContext, TaskSpec, TransitionRecord
+from touchcell.tasks.servoing import ARM, SENSOR
+from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef
+from touchcell.tasks.state_machine_task import MachineTask
+
+_GAIN_PER_S = 10.0
+_WITHIN_M, _WITHIN_RAD = 2e-5, 5e-4
+
+
+class DataCollectionConfig(TaskConfig):
+    """Parameters of data collection. The ranges are those of the public data.
+
+    Attributes:
+        samples: how many to collect, counting those that earlier runs have left.
+        seed: of the contacts; sample k is the same whenever it is taken.
+        depth_mm: least and greatest indentation.
+        tilt_deg: radius of the disc of tilts.
+        shear_mm: radius of the disc of shears.
+        torsion_deg: largest turn about the surface's normal.
+        clearance_mm: gap between tip and surface while the sensor tilts.
+        speed_mm_s: speed out of contact.
+        press_speed_mm_s: speed in contact.
+        turn_deg_s: turning rate.
+        settle_ms: how long the sensor has stood still when a frame counts.
+        move_timeout_s: longest time of each motion.
+        max_frame_age_ms: the arm stops when the newest frame is older.
+        max_state_age_ms: the arm stops when its newest state is older.
+        stale_timeout_s: the task trips when the arm has been stopped for lack of either for this long.
+    """
+
+    samples: PositiveInt = 1000
+    seed: NonNegativeInt = 0
+    depth_mm: tuple[PositiveFloat, PositiveFloat] = PUBLIC_DEPTH_MM
+    tilt_deg: Annotated[float, Field(ge=0.0, le=45.0)] = 25.0
+    shear_mm: NonNegativeFloat = 5.0
+    torsion_deg: NonNegativeFloat = 5.0
+    clearance_mm: PositiveFloat = 3.0
+    speed_mm_s: PositiveFloat = 40.0
+    press_speed_mm_s: PositiveFloat = 15.0
+    turn_deg_s: PositiveFloat = 60.0
+    settle_ms: NonNegativeFloat = 50.0
+    move_timeout_s: PositiveFloat = 10.0
+    max_frame_age_ms: PositiveFloat = 250.0
+    max_state_age_ms: PositiveFloat = 50.0
+    stale_timeout_s: PositiveFloat = 0.5
+
+
+class CollectState(Enum):
+    """States of data collection."""
+
+    PREPARE = auto()
+    LIFT = auto()
+    TILT = auto()
+    PRESS = auto()
+    SHEAR = auto()
+    GRAB = auto()
+    RETRACT = auto()
+    DONE = auto()
+    STOPPED = auto()
+    FAILED = auto()
+    TRIPPED = auto()
+    FAULTED = auto()
+
+
+_MOVING = (CollectState.LIFT, CollectState.TILT, CollectState.PRESS, CollectState.SHEAR, CollectState.RETRACT)
+
+
+def collect_table(config: DataCollectionConfig) -> Table:
+    """States and transitions of data collection."""
+    s = CollectState
+    longest_s = config.move_timeout_s
+    return Table(
+        "data_collection",
+        (
+            StateDef(s.PREPARE, longest_s, "timeout"),
+            StateDef(s.LIFT, longest_s, "timeout", on_enter="withdraw"),
+            StateDef(s.TILT, longest_s, "timeout", on_enter="aim_tilt"),
+            StateDef(s.PRESS, longest_s, "timeout", on_enter="aim_press"),
+            StateDef(s.SHEAR, longest_s, "timeout", on_enter="aim_shear"),
+            StateDef(s.GRAB, longest_s, "timeout", on_enter="start_grab"),
+            StateDef(s.RETRACT, longest_s, "timeout", on_enter="withdraw"),
+            StateDef(s.DONE, terminal=True),
+            StateDef(s.STOPPED, terminal=True),
+            StateDef(s.FAILED, terminal=True),
+            StateDef(s.TRIPPED, terminal=True),
+            StateDef(s.FAULTED, terminal=True),
+        ),
+        (
+            TransitionDef("ready", s.PREPARE, s.LIFT),
+            TransitionDef("timeout", s.PREPARE, s.FAILED),
+            TransitionDef(STOP, s.PREPARE, s.STOPPED),
+            TransitionDef("arrived", s.LIFT, s.TILT, guard="more_to_take"),
+            TransitionDef("arrived", s.LIFT, s.RETRACT),
+            TransitionDef("arrived", s.TILT, s.PRESS),
+            TransitionDef("arrived", s.PRESS, s.SHEAR),
+            TransitionDef("arrived", s.SHEAR, s.GRAB),
+            TransitionDef("taken", s.GRAB, s.LIFT),
+            TransitionDef("arrived", s.RETRACT, s.STOPPED, guard="was_stopped"),
+            TransitionDef("arrived", s.RETRACT, s.FAILED, guard="more_to_take"),
+            TransitionDef("arrived", s.RETRACT, s.DONE),
+            TransitionDef("timeout", s.RETRACT, s.FAILED),
+            TransitionDef("timeout", None, s.RETRACT),
+            TransitionDef(STOP, None, s.RETRACT),
+            TransitionDef(TRIP, None, s.TRIPPED),
+            TransitionDef(FAULT, None, s.FAULTED),
+        ),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Sight:
+    """What can be relied on in one cycle: None where it is missing or too old."""
+
+    now_ns: int
+    T_base_s: Array | None
+    contact: ContactEstimate | None
+
+    @property
+    def T_s_f(self) -> Array | None:  # noqa: N802  the field's own name
+        """Where the surface is, (4, 4)."""
+        return None if self.contact is None or self.contact.belief is None else self.contact.belief.mean
+
+
+class DataCollection(MachineTask):
+    """The task in execution; see ``touchcell.tasks.interface.Task`` for what its members mean.
+
+    Its estimator has to know where the surface is, also out of contact (``kind: known_surface``).
+
+    Args:
+        config: its parameters.
+        context: of the cell.
+
+    Raises:
+        KeyError: the context has no sensor in the role "sensor".
+    """
+
+    def __init__(self, config: DataCollectionConfig, context: TaskContext) -> None:
+        self._config = config
+        self._T_tcp_sensor = context.T_tcp_sensor[SENSOR]
+        self._Ad_tcp_sensor = se3.adjoint(self._T_tcp_sensor)
+        self._ttl_s = 3.0 / context.rate_hz
+        turn_rad_s = float(np.radians(config.turn_deg_s))
+        self._in_air = Reach(_GAIN_PER_S, 1e-3 * config.speed_mm_s, turn_rad_s)
+        self._in_contact = Reach(_GAIN_PER_S, 1e-3 * config.press_speed_mm_s, turn_rad_s)
+        self._machine = TaskMachine(collect_table(config), self)
+        self._sight = _Sight(0, None, None)
+        self._T_base_f: Array | None = None
+        self._goal: Array | None = None
+        self._taken = context.kept
+        self._arrived_ns = 0
+        self._blind_since_ns: int | None = None
+        self._stop_seen = False
+
+    def tick(self, observation: Observation) -> Action:
+        """Advance by one cycle."""
+        if self.finished:
+            return Action()
+        try:
+            self._sight = self._look(observation)
+            labels = self._watch(observation)
+            self._machine.tick(observation.now_ns)
+            V_s = self._twist()
+        except TouchcellError as error:
+            self._machine.fire(FAULT, str(error), now_ns=observation.now_ns)
+            return Action()
+        telemetry = {"sample": float(self._taken), "samples": float(self._config.samples)}
+        if V_s is None:
+            return Action({}, telemetry, labels)
+        command = TwistCommand(self._Ad_tcp_sensor @ V_s, TwistFrame.TCP, t_ns=observation.now_ns, ttl_s=self._ttl_s)
+        return Action({ARM: command}, telemetry, labels)
+
+    def more_to_take(self) -> bool:
+        """Guard: samples are missing."""
+        return self._taken < self._config.samples
+
+    def was_stopped(self) -> bool:
+        """Guard: a person asked for the end."""
+        return self._stop_seen
+
+    def withdraw(self, record: TransitionRecord) -> None:
+        """On entry: straight back from wherever the sensor is, turned as it is."""
+        self._goal = None
+
+    def aim_tilt(self, record: TransitionRecord) -> None:
+        """On entry: the next sample's tilt, above where it will touch."""
+        _, _, _, alpha, beta, _ = self._sample()
+        self._aim([0.0, 0.0, -self._config.clearance_mm, alpha, beta, 0.0])
+
+    def aim_press(self, record: TransitionRecord) -> None:
+        """On entry: down to its depth."""
+        _, _, depth, alpha, beta, _ = self._sample()
+        self._aim([0.0, 0.0, depth, alpha, beta, 0.0])
+
+    def aim_shear(self, record: TransitionRecord) -> None:
+        """On entry: along the surface."""
+        self._aim(self._sample())
+
+    def start_grab(self, record: TransitionRecord) -> None:
+        """On entry: stay, and count the time."""
+        self._arrived_ns = record.t_ns
+
+    def _sample(self) -> list[float]:
+        """Contact T_f_s of the sample in hand, mm and degrees."""
+        config = self._config
+        T_f_s = random_poses(
+            1,
+            np.random.default_rng((config.seed, self._taken)),
+            config.depth_mm,
+            tilt_deg=config.tilt_deg,
+            shear_mm=config.shear_mm,
+            torsion_deg=config.torsion_deg,
+        )[0]
+        sample: list[float] = se3.to_euler_mm_deg(T_f_s).tolist()
+        return sample
+
+    def _aim(self, T_f_s_mm_deg: Sequence[float]) -> None:
+        assert self._T_base_f is not None
+        self._goal = se3.compose(self._T_base_f, se3.from_euler_mm_deg(np.array(T_f_s_mm_deg)))
+
+    def _look(self, observation: Observation) -> _Sight:
+        now_ns, config = observation.now_ns, self._config
+        arm, contact = observation.arms.get(ARM), observation.contacts.get(SENSOR)
+        T_base_s = None
+        if arm is not None and 0.0 <= arm.age_s(now_ns) <= 1e-3 * config.max_state_age_ms:
+            T_base_s = se3.compose(arm.value.T_base_tcp, self._T_tcp_sensor)
+        if contact is not None and not 0.0 <= now_ns - contact.t_frame_ns <= 1e6 * config.max_frame_age_ms:
+            contact = None
+        return _Sight(now_ns, T_base_s, contact)
+
+    def _watch(self, observation: Observation) -> Mapping[str, Array]:
+        """Post what this cycle means for the present state; returns the label of a frame that is to be kept."""
+        if observation.operator_stop and not self._stop_seen:
+            self._stop_seen = True
+            self._post(STOP, "operator")
+        sight, state = self._sight, self._machine.state
+        withdrawing = state is CollectState.RETRACT
+        self._watch_sight(blind=sight.T_base_s is None or (sight.T_s_f is None and not withdrawing))
+        if sight.T_base_s is None:
+            return {}
+        match state:
+            case CollectState.PREPARE:
+                if sight.T_s_f is not None:
+                    self._T_base_f = se3.compose(sight.T_base_s, sight.T_s_f)
+                    self._post("ready")
+            case CollectState.GRAB:
+                settled_ns = self._arrived_ns + round(1e6 * self._config.settle_ms)
+                if sight.contact is not None and sight.T_s_f is not None and sight.contact.t_frame_ns >= settled_ns:
+                    self._taken += 1
+                    self._post("taken")
+                    return {SENSOR: se3.inverse(sight.T_s_f)}
+            case _:
+                if self._goal is not None and is_there(sight.T_base_s, self._goal, _WITHIN_M, _WITHIN_RAD):
+                    self._post("arrived")
+        return {}
+
+    def _watch_sight(self, *, blind: bool) -> None:
+        now_ns = self._sight.now_ns
+        if not blind or self._machine.state is CollectState.PREPARE:
+            self._blind_since_ns = None
+            return
+        if self._blind_since_ns is None:
+            self._blind_since_ns = now_ns
+        blind_s = (now_ns - self._blind_since_ns) * 1e-9
+        if blind_s > self._config.stale_timeout_s:
+            self._post(TRIP, f"no fresh frame or arm state for {blind_s:.3f} s")
+
+    def _post(self, event: str, reason: str = "") -> None:
+        self._machine.post(event, reason, epoch=self._machine.epoch)
+
+    def _twist(self) -> Array | None:
+        """Twist (6,) of the sensor in the present state; None where it has to stand still."""
+        T_base_s, state = self._sight.T_base_s, self._machine.state
+        if T_base_s is None or self._T_base_f is None or state not in _MOVING:
+            return None
+        # Away from the surface it may go without seeing.
+        if self._sight.contact is None and state is not CollectState.RETRACT:
+            return None
+        if self._goal is None:
+            pose = se3.to_euler_mm_deg(se3.compose(se3.inverse(self._T_base_f), T_base_s))
+            pose[2] = min(float(pose[2]), -self._config.clearance_mm)
+            self._aim(pose.tolist())
+        assert self._goal is not None
+        return (self._in_air if state is CollectState.TILT else self._in_contact).twist(T_base_s, self._goal)
+
+
+SPEC = TaskSpec(
+    name="data_collection",
+    summary="touch a known surface in many ways and label what the sensor sees",
+    config=DataCollectionConfig,
+    arms={ARM: frozenset({"TcpSource", "TwistSink", "Stoppable"})},
+    sensors=frozenset({SENSOR}),
+    build=DataCollection,
+    labels_frames=True,
+)

@@ -1,0 +1,48 @@
+"""State diagrams of the tasks in ``docs/tasks.md``: ``python -m touchcell.tasks.diagrams [FILE]`` writes them anew."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from touchcell.tasks.data_collection import DataCollectionConfig, collect_table
+from touchcell.tasks.observe import ObserveConfig, observe_table
+from touchcell.tasks.servoing import servo_table
+from touchcell.tasks.state_machine import Table, mermaid
+from touchcell.tasks.surface_following import SurfaceFollowingConfig
+
+PAGE: Final = Path(__file__).parents[2] / "docs" / "tasks.md"
+
+_BLOCK: Final = re.compile(r"(<!-- diagram: (\w+) -->\n).*?(<!-- end of diagram -->)", re.DOTALL)
+
+
+def tables() -> Mapping[str, Table]:
+    """The tables that are drawn, by the word in their markers."""
+    return {
+        "servoing": servo_table("servoing", SurfaceFollowingConfig(), run_timeout_s=1.0),
+        "data_collection": collect_table(DataCollectionConfig()),
+        "observe": observe_table(ObserveConfig()),
+    }
+
+
+def redrawn(page: str) -> str:
+    """``page`` with every diagram between its markers drawn from the code. Raises KeyError for an unknown one."""
+    known = tables()
+
+    def draw(block: re.Match[str]) -> str:
+        return f"{block[1]}```mermaid\n{mermaid(known[block[2]])}\n```\n{block[3]}"
+
+    return _BLOCK.sub(draw, page)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Redraw the diagrams of the page named, or of ``docs/tasks.md``."""
+    page = Path(arguments[0]) if arguments else PAGE
+    page.write_text(redrawn(page.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,21 @@
+"""What can go wrong in tasks, as types with attributes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from touchcell.geometry.errors import TouchcellError
+
+
+class TaskDefinitionError(TouchcellError, ValueError):
+    """A task's table is wrong; found when the task is built, before anything moves.
+
+    Attributes:
+        task: name of the task.
+        problems: everything that is wrong, one sentence each.
+    """
+
+    def __init__(self, task: str, problems: Sequence[str]) -> None:
+        super().__init__(f"task {task!r}:" + "".join(f"\n  - {problem}" for problem in problems))
+        self.task = task
+        self.problems = tuple(problems)

@@ -1,0 +1,73 @@
+"""Track an object: keep the contact as it is while the object moves (paper 5, object tracking)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from pydantic import PositiveFloat
+
+from touchcell.geometry.types import Array
+from touchcell.tasks.contact_servo import Hand, SixGains
+from touchcell.tasks.interface import TaskContext, TaskSpec
+from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
+
+
+class ObjectTrackingConfig(ServoConfig):
+    """Parameters of object tracking. All six components are controlled.
+
+    Attributes:
+        depth_mm: indentation to hold, normal to the surface and without shear.
+        duration_s: how long to track.
+    """
+
+    depth_mm: PositiveFloat = 6.0
+    settle_tolerance_mm: PositiveFloat = 1.0
+    settle_tolerance_deg: PositiveFloat = 3.0
+    kp_per_s: SixGains = (10.0, 10.0, 10.0, 8.0, 8.0, 8.0)
+    ki_per_s2: SixGains = (25.0, 25.0, 25.0, 16.0, 16.0, 16.0)
+    duration_s: PositiveFloat = 30.0
+
+
+class Track:
+    """The run of object tracking: no feedforward, until the time is over."""
+
+    def __init__(self, config: ObjectTrackingConfig) -> None:
+        self._left_s = config.duration_s
+        self._timeout_s = config.duration_s + 1.0
+
+    @property
+    def feedforward(self) -> Array:
+        """No twist (6,): the object leads."""
+        return np.zeros(6)
+
+    @property
+    def timeout_s(self) -> float:
+        """A second more than the run takes."""
+        return self._timeout_s
+
+    def advance(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
+        """Count the time."""
+        self._left_s -= dt_s
+        return self._left_s <= 0.0
+
+    def telemetry(self) -> Mapping[str, float]:
+        """Nothing more."""
+        return {}
+
+
+def build(config: ObjectTrackingConfig, context: TaskContext) -> ServoTask:
+    """The task in a cell that has ``arm`` and ``sensor``."""
+    reference = (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0)
+    hand = Hand(ARM, SENSOR, config, reference, Track(config), context)
+    return ServoTask("object_tracking", config, context, hand)
+
+
+SPEC = TaskSpec(
+    name="object_tracking",
+    summary="keep contact with an object and follow its motion in all six components",
+    config=ObjectTrackingConfig,
+    arms={ARM: frozenset({"TcpSource", "TwistSink", "Stoppable"})},
+    sensors=frozenset({SENSOR}),
+    build=build,
+)

@@ -1,0 +1,187 @@
+"""Where to push an object: the shortest smooth way to a place and heading, around obstacles.
+
+A stably pushed object is steered like a car. Pushed at a point ``a`` behind its middle it turns, per way, by
+``a tan(phi) / c^2`` when the force leans by ``phi`` from the contact normal, with ``c`` the friction radius of its
+bottom (the ellipsoidal limit surface, Goyal, Ruina & Papadopoulos 1991). The force cannot lean further than the
+friction cone, so no turn is narrower than ``c^2 / (a mu)``; ways are made of straight pieces and arcs no narrower
+(Dubins 1957).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from touchcell.control.path import Point
+from touchcell.geometry.errors import TouchcellError
+
+Pose = tuple[float, float, float]
+"""x and y, m, and heading, rad."""
+
+STEP_M = 0.005
+# Kinds of way, and for those of three arcs, on which side of the other two the middle one lies.
+_KINDS = (("LSL", 0), ("RSR", 0), ("LSR", 0), ("RSL", 0), ("LRL", 1), ("LRL", -1), ("RLR", 1), ("RLR", -1))
+_VIA_DIRECTIONS = 24
+
+
+class NoWay(TouchcellError, ValueError):
+    """There is no way that is smooth enough and clear of the obstacles.
+
+    Attributes:
+        start, goal: poses.
+    """
+
+    def __init__(self, start: Pose, goal: Pose) -> None:
+        super().__init__(
+            f"no way from {_told(start)} to {_told(goal)} clear of the obstacles; smaller turns or clearances may help"
+        )
+        self.start = start
+        self.goal = goal
+
+
+def _told(pose: Pose) -> str:
+    return f"({1e3 * pose[0]:.0f}, {1e3 * pose[1]:.0f}) mm, {math.degrees(pose[2]):.0f} deg"
+
+
+@dataclass(frozen=True, slots=True)
+class Obstacle:
+    """A disc that the object's middle keeps out of: the obstacle and half of the object. Metres."""
+
+    x_m: float
+    y_m: float
+    radius_m: float
+
+    def hits(self, points: Sequence[Point]) -> bool:
+        """Whether a point lies inside."""
+        limit = self.radius_m - 1e-6
+        return any(math.hypot(x - self.x_m, y - self.y_m) < limit for x, y in points)
+
+
+def narrowest_turn_m(contact_m: float, friction_radius_m: float, friction: float) -> float:
+    """Least radius of a stable push's turn.
+
+    Args:
+        contact_m: from the object's middle to where it is pushed.
+        friction_radius_m: of its bottom; see ``touchcell.simulation.solids.friction_radius_m``.
+        friction: of the skin on the object.
+    """
+    return friction_radius_m**2 / (contact_m * friction)
+
+
+def plan(start: Pose, goal: Pose, turn_m: float, obstacles: Sequence[Obstacle] = ()) -> list[Point]:
+    """Points every few millimetres on the shortest way found, without the start, the goal the last one.
+
+    Without obstacles it is the shortest there is. With them, ways past one pose beside an obstacle are tried too.
+
+    Args:
+        start: of the object's middle.
+        goal: likewise.
+        turn_m: radius of its turns.
+        obstacles: what its middle keeps out of.
+
+    Raises:
+        NoWay: none is clear.
+    """
+    best: list[Point] | None = None
+    length = math.inf
+    for way, way_m in _ways(start, goal, turn_m, obstacles):
+        if way_m < length and not any(obstacle.hits(way) for obstacle in obstacles):
+            best, length = way, way_m
+    if best is None:
+        raise NoWay(start, goal)
+    return best
+
+
+def length_m(points: Sequence[Point]) -> float:
+    """Of the pieces between points."""
+    return sum(math.hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(points))
+
+
+def _ways(start: Pose, goal: Pose, turn_m: float, obstacles: Sequence[Obstacle]) -> Iterator[tuple[list[Point], float]]:
+    for kind in _KINDS:
+        if found := _dubins(start, goal, turn_m, *kind):
+            yield found
+    for obstacle in obstacles:
+        around_m = max(obstacle.radius_m, 1e-3) + 1e-5
+        for i in range(_VIA_DIRECTIONS):
+            angle = 2.0 * math.pi * i / _VIA_DIRECTIONS
+            at = obstacle.x_m + around_m * math.cos(angle), obstacle.y_m + around_m * math.sin(angle)
+            for side in (0.5 * math.pi, -0.5 * math.pi):
+                via = (*at, angle + side)
+                there = _shortest(start, via, turn_m, obstacles)
+                onwards = _shortest(via, goal, turn_m, obstacles)
+                if there is not None and onwards is not None:
+                    yield there[0] + onwards[0], there[1] + onwards[1]
+
+
+def _shortest(
+    start: Pose, goal: Pose, turn_m: float, obstacles: Sequence[Obstacle]
+) -> tuple[list[Point], float] | None:
+    found = [way for kind in _KINDS if (way := _dubins(start, goal, turn_m, *kind)) is not None]
+    clear = [way for way in found if not any(obstacle.hits(way[0]) for obstacle in obstacles)]
+    return min(clear, key=lambda way: way[1], default=None)
+
+
+def _dubins(start: Pose, goal: Pose, turn_m: float, word: str, side: int) -> tuple[list[Point], float] | None:
+    """The way of one kind, as points and length: turns to the left and right and straight pieces, as in ``word``."""
+    first, last = _turning(word[0]), _turning(word[2])
+    ax, ay = _centre(start, first, turn_m)
+    bx, by = _centre(goal, last, turn_m)
+    apart, towards = math.hypot(bx - ax, by - ay), math.atan2(by - ay, bx - ax)
+    if word[1] == "S":
+        if first == last:
+            straight, heading = apart, towards
+        else:
+            square = apart * apart - 4.0 * turn_m * turn_m
+            if square < 0.0:
+                return None
+            straight = math.sqrt(square)
+            heading = towards + first * math.atan2(2.0 * turn_m, straight)
+        turns = (_arc(start[2], heading, first), straight / turn_m, _arc(heading, goal[2], last))
+    else:
+        if apart > 4.0 * turn_m or apart < 1e-9:
+            return None
+        # Three circles of one size touch: the middle one's centre stands over the middle of the others'.
+        lean = math.acos(apart / (4.0 * turn_m))
+        to_middle = towards + side * lean
+        mx, my = ax + 2.0 * turn_m * math.cos(to_middle), ay + 2.0 * turn_m * math.sin(to_middle)
+        leave = to_middle + first * 0.5 * math.pi
+        meet = math.atan2(by - my, bx - mx) - first * 0.5 * math.pi
+        turns = (_arc(start[2], leave, first), _arc(leave, meet, -first), _arc(meet, goal[2], last))
+    points, pose = [], start
+    for kind, amount in zip(word, turns, strict=True):
+        count = max(math.ceil(amount * turn_m / STEP_M), 1) if amount > 1e-9 else 0
+        for _ in range(count):
+            pose = _go(pose, _turning(kind), amount / count, turn_m)
+            points.append(pose[:2])
+    if not points or math.hypot(pose[0] - goal[0], pose[1] - goal[1]) > 1e-6:
+        return None
+    points[-1] = goal[:2]
+    return points, sum(turns) * turn_m
+
+
+def _turning(kind: str) -> float:
+    return {"L": 1.0, "S": 0.0, "R": -1.0}[kind]
+
+
+def _centre(pose: Pose, turning: float, turn_m: float) -> Point:
+    x, y, heading = pose
+    return x - turning * turn_m * math.sin(heading), y + turning * turn_m * math.cos(heading)
+
+
+def _arc(heading: float, to: float, turning: float) -> float:
+    """Angle to turn by, from 0 up to a whole turn."""
+    angle = (turning * (to - heading)) % (2.0 * math.pi)
+    return 0.0 if 2.0 * math.pi - angle < 1e-9 else angle
+
+
+def _go(pose: Pose, turning: float, amount: float, turn_m: float) -> Pose:
+    """On by ``amount`` turning radii."""
+    x, y, heading = pose
+    if turning == 0.0:
+        return x + amount * turn_m * math.cos(heading), y + amount * turn_m * math.sin(heading), heading
+    cx, cy = _centre(pose, turning, turn_m)
+    turned = heading + turning * amount
+    return cx + turning * turn_m * math.sin(turned), cy - turning * turn_m * math.cos(turned), turned

@@ -1,0 +1,281 @@
+"""The machine of every task that holds contacts: find the surface, settle, do the work, withdraw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import Enum, auto
+from typing import Final
+
+import numpy as np
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
+
+from touchcell.drivers.core.commands import TwistCommand, TwistFrame
+from touchcell.geometry.errors import TouchcellError
+from touchcell.geometry.types import Array
+from touchcell.tasks.contact_servo import Hand, HandConfig
+from touchcell.tasks.interface import Action, Observation, TaskContext, TransitionRecord
+from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
+from touchcell.tasks.state_machine_task import MachineTask
+
+ARM: Final = "arm"
+"""Role of the arm in tasks with one arm."""
+SENSOR: Final = "sensor"
+"""Role of the tactile sensor that it carries."""
+
+
+class ServoConfig(HandConfig):
+    """Parameters of every task that holds contacts; what is said of one hand holds for the one that leads.
+
+    Attributes:
+        approach_speed_mm_s: speed towards the surface, along the sensor's z axis.
+        approach_distance_mm: give up when no contact was made within it.
+        settle_time_s: the contact has settled when errors were below the tolerances for this long.
+        settle_timeout_s: give up when it has not settled by then.
+        retract_mm: distance to withdraw at the end.
+        retract_speed_mm_s: speed of that.
+        max_reapproach: how often a lost contact is searched for again.
+        stale_timeout_s: the task trips when the arm has been stopped for lack of a valid estimate for this long.
+        prepare_timeout_s: give up when there is no first frame and arm state by then.
+    """
+
+    approach_speed_mm_s: PositiveFloat = 10.0
+    approach_distance_mm: PositiveFloat = 50.0
+    settle_time_s: NonNegativeFloat = 0.3
+    settle_timeout_s: PositiveFloat = 10.0
+    retract_mm: PositiveFloat = 20.0
+    retract_speed_mm_s: PositiveFloat = 20.0
+    max_reapproach: NonNegativeInt = 2
+    stale_timeout_s: PositiveFloat = 0.5
+    prepare_timeout_s: PositiveFloat = 5.0
+
+
+class ServoState(Enum):
+    """States of a servoing task."""
+
+    PREPARE = auto()
+    APPROACH = auto()
+    SETTLE = auto()
+    RUN = auto()
+    RETRACT = auto()
+    DONE = auto()
+    STOPPED = auto()
+    FAILED = auto()
+    TRIPPED = auto()
+    FAULTED = auto()
+
+
+def servo_table(task: str, config: ServoConfig, run_timeout_s: float) -> Table:
+    """States and transitions of a servoing task; travel times are given twice over before they time out."""
+    s = ServoState
+    approach_s = 2.0 * config.approach_distance_mm / config.approach_speed_mm_s + 1.0
+    retract_s = 2.0 * config.retract_mm / config.retract_speed_mm_s + 1.0
+    return Table(
+        task,
+        (
+            StateDef(s.PREPARE, config.prepare_timeout_s, "timeout"),
+            StateDef(s.APPROACH, approach_s, "timeout", on_enter="start_approach"),
+            StateDef(s.SETTLE, config.settle_timeout_s, "timeout", on_enter="start_settle"),
+            StateDef(s.RUN, run_timeout_s, "timeout", on_enter="start_run"),
+            StateDef(s.RETRACT, retract_s, "timeout", on_enter="start_retract"),
+            StateDef(s.DONE, terminal=True),
+            StateDef(s.STOPPED, terminal=True),
+            StateDef(s.FAILED, terminal=True),
+            StateDef(s.TRIPPED, terminal=True),
+            StateDef(s.FAULTED, terminal=True),
+        ),
+        (
+            TransitionDef("ready", s.PREPARE, s.APPROACH),
+            TransitionDef("timeout", s.PREPARE, s.FAILED),
+            TransitionDef(STOP, s.PREPARE, s.STOPPED),
+            TransitionDef("contact", s.APPROACH, s.SETTLE),
+            TransitionDef("no_contact", s.APPROACH, s.RETRACT),
+            TransitionDef("settled", s.SETTLE, s.RUN),
+            TransitionDef("lost", s.SETTLE, s.APPROACH, guard="may_reapproach"),
+            TransitionDef("lost", s.SETTLE, s.RETRACT),
+            TransitionDef("finished", s.RUN, s.RETRACT),
+            TransitionDef("lost", s.RUN, s.APPROACH, guard="may_reapproach"),
+            TransitionDef("lost", s.RUN, s.RETRACT),
+            TransitionDef("retracted", s.RETRACT, s.STOPPED, guard="was_stopped"),
+            TransitionDef("retracted", s.RETRACT, s.DONE, guard="has_finished"),
+            TransitionDef("retracted", s.RETRACT, s.FAILED),
+            TransitionDef("timeout", s.RETRACT, s.FAILED),
+            TransitionDef("timeout", None, s.RETRACT),
+            TransitionDef(STOP, None, s.RETRACT),
+            TransitionDef(TRIP, None, s.TRIPPED),
+            TransitionDef(FAULT, None, s.FAULTED),
+        ),
+    )
+
+
+class ServoTask(MachineTask):
+    """A task in execution; see ``touchcell.tasks.interface.Task`` for what its members mean.
+
+    While hands look for the surface or hold it, they move only on fresh frames, fresh arm states and valid beliefs, all
+    of them or none. When they withdraw, which is away from the surface, a fresh arm state is enough. A hand that has
+    made its contact holds it until the others have made theirs.
+
+    Args:
+        name: the task's name.
+        config: parameters of its machine.
+        context: of the cell.
+        hands: what holds the contacts. A task with several tells the sensor's role in the names of its telemetry.
+
+    Raises:
+        TaskDefinitionError: the table is wrong.
+    """
+
+    def __init__(self, name: str, config: ServoConfig, context: TaskContext, *hands: Hand) -> None:
+        self._config = config
+        self._period_s = 1.0 / context.rate_hz
+        self._hands = hands
+        self._machine = TaskMachine(servo_table(name, config, min(hand.run.timeout_s for hand in hands)), self)
+        self._now_ns = 0
+        self._steady_s = 0.0
+        self._blind_s = 0.0
+        self._reapproaches = 0
+        self._stop_seen = False
+        self._finished_run = False
+
+    def tick(self, observation: Observation) -> Action:
+        """Advance by one cycle."""
+        if self.finished:
+            return Action()
+        dt_s = (observation.now_ns - self._now_ns) * 1e-9
+        self._now_ns = observation.now_ns
+        try:
+            for hand in self._hands:
+                hand.look(observation)
+            self._watch(observation, dt_s)
+            self._machine.tick(observation.now_ns)
+            twists = self._twists()
+        except TouchcellError as error:
+            self._machine.fire(FAULT, str(error), now_ns=observation.now_ns)
+            return Action()
+        return Action({hand.arm: self._command(hand, V) for hand, V in twists}, self._telemetry(observation))
+
+    def may_reapproach(self) -> bool:
+        """Guard: a lost contact may be searched for again."""
+        return self._reapproaches < self._config.max_reapproach
+
+    def was_stopped(self) -> bool:
+        """Guard: a person asked for the end."""
+        return self._stop_seen
+
+    def has_finished(self) -> bool:
+        """Guard: the work was done."""
+        return self._finished_run
+
+    def start_approach(self, record: TransitionRecord) -> None:
+        """On entry: measure the way from here."""
+        self._reapproaches += record.event == "lost"
+        for hand in self._hands:
+            hand.start_way()
+        self._blind_s = 0.0
+
+    def start_settle(self, record: TransitionRecord) -> None:
+        """On entry: begin to servo, without a past."""
+        for hand in self._hands:
+            hand.servo.reset()
+        self._steady_s = 0.0
+        self._blind_s = 0.0
+
+    def start_run(self, record: TransitionRecord) -> None:
+        """On entry: keep servoing, now with the feedforward."""
+        self._blind_s = 0.0
+
+    def start_retract(self, record: TransitionRecord) -> None:
+        """On entry: measure the way from here, or go on measuring if a stop only confirms it."""
+        if record.source != state_name(ServoState.RETRACT):
+            for hand in self._hands:
+                hand.start_way()
+        self._finished_run = self._finished_run or record.event == "finished"
+
+    def _watch(self, observation: Observation, dt_s: float) -> None:
+        """Post what this cycle's observation means for the present state."""
+        if observation.operator_stop and not self._stop_seen:
+            self._stop_seen = True
+            self._machine.post(STOP, "operator")
+        hands = self._hands
+        match self._machine.state:
+            case ServoState.PREPARE:
+                if all(hand.sees for hand in hands):
+                    self._post("ready")
+            case ServoState.APPROACH:
+                self._watch_sight(dt_s, blind=not all(hand.sees for hand in hands))
+                searching = [hand for hand in hands if not hand.touches]
+                if not searching:
+                    self._post("contact")
+                elif max(hand.way_m() for hand in searching) >= 1e-3 * self._config.approach_distance_mm:
+                    self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
+            case ServoState.SETTLE:
+                self._watch_contact(dt_s)
+                steady = all(hand.steady() for hand in hands)
+                self._steady_s = self._steady_s + dt_s if steady else 0.0
+                if steady and self._steady_s >= self._config.settle_time_s:
+                    self._post("settled")
+            case ServoState.RUN:
+                self._watch_contact(dt_s)
+                # Every hand takes the cycle in, whether another one has finished already or not.
+                finished = [hand.advance(dt_s) for hand in hands]
+                if any(finished):
+                    self._post("finished")
+            case ServoState.RETRACT:
+                if all(hand.way_m() >= 1e-3 * self._config.retract_mm for hand in hands):
+                    self._post("retracted")
+
+    def _watch_contact(self, dt_s: float) -> None:
+        for hand in self._hands:
+            if hand.contact is not None and not hand.contact.in_contact:
+                self._post("lost", f"{hand.sensor}, frame {hand.contact.seq}")
+                break
+        self._watch_sight(dt_s, blind=any(hand.T_base_sensor is None or hand.T_s_f is None for hand in self._hands))
+
+    def _watch_sight(self, dt_s: float, *, blind: bool) -> None:
+        self._blind_s = self._blind_s + dt_s if blind else 0.0
+        if self._blind_s > self._config.stale_timeout_s:
+            self._post(TRIP, f"no valid contact estimate or arm state for {self._blind_s:.3f} s")
+
+    def _post(self, event: str, reason: str = "") -> None:
+        self._machine.post(event, reason, epoch=self._machine.epoch)
+
+    def _twists(self) -> list[tuple[Hand, Array]]:
+        """Twist (6,) of each tool that moves in the present state."""
+        state = self._machine.state
+        if state is ServoState.RETRACT:
+            speed_m_s = -1e-3 * self._config.retract_speed_mm_s
+            return [(hand, hand.along_z(speed_m_s)) for hand in self._hands if hand.T_base_sensor is not None]
+        if state not in (ServoState.APPROACH, ServoState.SETTLE, ServoState.RUN):
+            return []
+        searching = state is ServoState.APPROACH
+        if not all(hand.sees and (searching or hand.T_s_f is not None) for hand in self._hands):
+            for hand in self._hands:
+                hand.servo.reset()
+            return []
+        twists = []
+        for hand in self._hands:
+            V_tcp: Array | None
+            if searching and not hand.touches:
+                V_tcp = hand.along_z(1e-3 * self._config.approach_speed_mm_s)
+            else:
+                V_tcp = hand.servo_step(hand.run.feedforward if state is ServoState.RUN else np.zeros(6))
+            if V_tcp is not None:
+                twists.append((hand, V_tcp))
+        return twists
+
+    def _command(self, hand: Hand, V_tcp: Array) -> TwistCommand:
+        return TwistCommand(
+            V_tcp,
+            TwistFrame.TCP,
+            t_ns=self._now_ns,
+            ttl_s=3.0 * self._period_s,
+            t_cause_ns=None if hand.contact is None else hand.contact.t_frame_ns,
+        )
+
+    def _telemetry(self, observation: Observation) -> Mapping[str, float]:
+        servoing = self._machine.state in (ServoState.SETTLE, ServoState.RUN)
+        telemetry: dict[str, float] = {}
+        for hand in self._hands:
+            prefix = f"{hand.sensor}_" if len(self._hands) > 1 else ""
+            told = hand.telemetry(observation, servoing=servoing)
+            telemetry |= {f"{prefix}{name}": value for name, value in told.items()}
+        return telemetry

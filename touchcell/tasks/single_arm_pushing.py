@@ -1,0 +1,169 @@
+"""Push an object to a target with one arm: press, steer by moving the contact sideways, stop there (paper 3.3.3)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Self
+
+import numpy as np
+from pydantic import NonNegativeFloat, PositiveFloat, model_validator
+
+from touchcell.control.alignment import Aim, AlignmentGains, TargetAlignment
+from touchcell.control.path import Point
+from touchcell.geometry.types import Array
+from touchcell.tasks.contact_servo import Hand, HandConfig, Six, SixGains
+from touchcell.tasks.interface import TaskContext, TaskSpec
+from touchcell.tasks.push_path import Obstacle, plan
+from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
+
+Mm = tuple[float, float]
+
+
+class PushConfig(HandConfig):
+    """Parameters of whoever pushes. The servo keeps the sensor normal to the object; how deep it is pressed is left to
+    the object's friction, and where it touches, to target alignment.
+
+    Attributes:
+        reference_mm_deg: contact to hold; only the components with gains count.
+        target_mm: x and y of the target in the arm's base frame, whose z axis is upright.
+        path_mm: points to push it past on the way there, where no way is planned.
+        goal_heading_deg: how it shall head there, as the contact normal from the base's x axis; then, or with
+            obstacles, the way is planned (``touchcell.tasks.push_path``).
+        obstacles_mm: x, y and radius of discs on the table.
+        clearance_mm: how far the object's middle keeps from obstacles.
+        turning_radius_mm: of planned ways; no less than a stable push can turn.
+        push_speed_mm_s: speed along the sensor's axis.
+        middle_mm: the object's middle, ahead of the middle of the tip: the tip's radius and half of the object. It is
+            what is brought to the target, and about which the object turns.
+        look_ahead_mm: how far ahead on the way the middle is aimed.
+        align_kp_mm_s_per_deg: sideways speed per degree of the bearing of the point that is aimed at.
+        align_ki_deg_per_mm_s: how fast it is headed aside per distance from the way.
+        align_kd_mm_per_deg: derivative gain on the bearing.
+        align_max_mm_s: largest sideways speed.
+        push_timeout_s: give up when it has not arrived by then.
+    """
+
+    reference_mm_deg: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    kp_per_s: SixGains = (0.0, 0.0, 0.0, 8.0, 0.0, 0.0)
+    ki_per_s2: SixGains = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    target_mm: Mm
+    path_mm: tuple[Mm, ...] = ()
+    goal_heading_deg: float | None = None
+    obstacles_mm: tuple[tuple[float, float, PositiveFloat], ...] = ()
+    clearance_mm: PositiveFloat = 60.0
+    turning_radius_mm: PositiveFloat = 120.0
+    push_speed_mm_s: PositiveFloat = 20.0
+    middle_mm: PositiveFloat = 60.0
+    look_ahead_mm: PositiveFloat = 60.0
+    align_kp_mm_s_per_deg: PositiveFloat = 5.0
+    align_ki_deg_per_mm_s: NonNegativeFloat = 0.2
+    align_kd_mm_per_deg: NonNegativeFloat = 0.0
+    align_max_mm_s: PositiveFloat = 10.0
+    push_timeout_s: PositiveFloat = 120.0
+
+    def alignment(self) -> TargetAlignment:
+        """The controller that steers, in SI units."""
+        per_rad = 1e-3 * np.degrees(1.0)
+        gains = AlignmentGains(
+            kp=self.align_kp_mm_s_per_deg * per_rad,
+            ki=1e3 * np.radians(self.align_ki_deg_per_mm_s),
+            kd=self.align_kd_mm_per_deg * per_rad,
+            limit_m_s=1e-3 * self.align_max_mm_s,
+            look_ahead_m=1e-3 * self.look_ahead_mm,
+            lead_m=1e-3 * self.middle_mm,
+        )
+        return TargetAlignment(self.route, gains)
+
+    def route(self, middle: Point, heading_rad: float) -> Sequence[Point]:
+        """Points of the way, m, from where the object's middle is and heads. Raises NoWay."""
+        target = 1e-3 * self.target_mm[0], 1e-3 * self.target_mm[1]
+        if self.goal_heading_deg is None and not self.obstacles_mm:
+            return [*((1e-3 * x, 1e-3 * y) for x, y in self.path_mm), target]
+        goal_rad = math.atan2(target[1] - middle[1], target[0] - middle[0])
+        if self.goal_heading_deg is not None:
+            goal_rad = math.radians(self.goal_heading_deg)
+        obstacles = [Obstacle(1e-3 * x, 1e-3 * y, 1e-3 * (r + self.clearance_mm)) for x, y, r in self.obstacles_mm]
+        return plan((*middle, heading_rad), (*target, goal_rad), 1e-3 * self.turning_radius_mm, obstacles)
+
+    @model_validator(mode="after")
+    def _one_kind_of_way(self) -> Self:
+        if self.path_mm and (self.goal_heading_deg is not None or self.obstacles_mm):
+            raise ValueError("path_mm is a way already: leave out goal_heading_deg and obstacles_mm")
+        return self
+
+
+class SingleArmPushingConfig(PushConfig, ServoConfig):
+    """Parameters of single-arm pushing."""
+
+
+class Push:
+    """The run of pushing: forward along the contact normal, sideways by target alignment, until the target is near."""
+
+    def __init__(self, config: PushConfig) -> None:
+        self._speed_m_s = 1e-3 * config.push_speed_mm_s
+        self._timeout_s = config.push_timeout_s
+        self._alignment = config.alignment()
+        self._goal_heading_deg = config.goal_heading_deg
+        self._aim: Aim | None = None
+        self._left_m_s = 0.0
+        self._y_is_left = 1.0
+
+    @property
+    def left_m_s(self) -> float:
+        """How fast alignment moves the contact to the left of the contact normal."""
+        return self._left_m_s
+
+    @property
+    def feedforward(self) -> Array:
+        """Twist (6,) in the desired sensor frame."""
+        return np.array([0.0, self._y_is_left * self._left_m_s, self._speed_m_s, 0.0, 0.0, 0.0])
+
+    @property
+    def timeout_s(self) -> float:
+        """As the parameters say."""
+        return self._timeout_s
+
+    def advance(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
+        """Look where the object stands to its target."""
+        if T_s_f is None:
+            self._alignment.pause()
+            self._left_m_s = 0.0
+            return False
+        self._y_is_left = -float(np.sign(now[2, 0]))
+        self._aim = self._alignment.aim(now, T_s_f)
+        self._left_m_s = self._alignment.step(self._aim, dt_s)
+        return self._aim.rest_m <= 0.0
+
+    def telemetry(self) -> Mapping[str, float]:
+        """Way that is left, distance of the target from the contact normal, and how the object is steered."""
+        if self._aim is None:
+            return {}
+        heading_deg = float(np.degrees(self._aim.heading_rad))
+        goal_deg = self._goal_heading_deg
+        off = {} if goal_deg is None else {"heading_error_deg": math.remainder(heading_deg - goal_deg, 360.0)}
+        return {
+            "rest_mm": 1e3 * self._aim.rest_m,
+            "target_aside_mm": 1e3 * self._aim.target_aside_m,
+            "aside_mm": 1e3 * self._aim.aside_m,
+            "bearing_deg": float(np.degrees(self._aim.theta_rad)),
+            "heading_deg": heading_deg,
+            "align_mm_s": 1e3 * self._left_m_s,
+            **off,
+        }
+
+
+def build(config: SingleArmPushingConfig, context: TaskContext) -> ServoTask:
+    """The task in a cell that has ``arm`` and ``sensor``."""
+    hand = Hand(ARM, SENSOR, config, config.reference_mm_deg, Push(config), context)
+    return ServoTask("single_arm_pushing", config, context, hand)
+
+
+SPEC = TaskSpec(
+    name="single_arm_pushing",
+    summary="push an object over a table to a target, steering it by touch",
+    config=SingleArmPushingConfig,
+    arms={ARM: frozenset({"TcpSource", "TwistSink", "Stoppable"})},
+    sensors=frozenset({SENSOR}),
+    build=build,
+)

@@ -1,0 +1,78 @@
+"""Follow a surface: glide over it at constant depth, normal to it, in one direction (paper 5, surface following)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from pydantic import PositiveFloat
+
+from touchcell.geometry.types import Array
+from touchcell.tasks.contact_servo import Hand, SixGains
+from touchcell.tasks.interface import TaskContext, TaskSpec
+from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
+
+
+class SurfaceFollowingConfig(ServoConfig):
+    """Parameters of surface following. Shear is left alone: its gains are zero.
+
+    Attributes:
+        depth_mm: indentation to hold, normal to the surface.
+        speed_mm_s: tangential speed of the sensor.
+        direction_deg: direction of travel, from the sensor's x axis towards its y axis.
+        distance_mm: way of the sensor until the task is done.
+    """
+
+    depth_mm: PositiveFloat = 3.0
+    kp_per_s: SixGains = (0.0, 0.0, 8.0, 8.0, 8.0, 0.0)
+    ki_per_s2: SixGains = (0.0, 0.0, 16.0, 16.0, 16.0, 0.0)
+    speed_mm_s: PositiveFloat = 20.0
+    direction_deg: float = 0.0
+    distance_mm: PositiveFloat = 100.0
+
+
+class Follow:
+    """The run of surface following: a tangential feedforward until the way along it is done."""
+
+    def __init__(self, config: SurfaceFollowingConfig) -> None:
+        angle = np.radians(config.direction_deg)
+        self._direction = np.array([np.cos(angle), np.sin(angle), 0.0])
+        self._feedforward = np.concatenate([1e-3 * config.speed_mm_s * self._direction, np.zeros(3)])
+        self._left_m = 1e-3 * config.distance_mm
+        self._timeout_s = 2.0 * config.distance_mm / config.speed_mm_s + 1.0
+
+    @property
+    def feedforward(self) -> Array:
+        """Twist (6,) in the desired sensor frame."""
+        return self._feedforward
+
+    @property
+    def timeout_s(self) -> float:
+        """Twice the time that the way takes, and a second."""
+        return self._timeout_s
+
+    def advance(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
+        """Count the way along the direction of travel, so that noise and corrections do not add to it."""
+        self._left_m -= float(self._direction @ now[:3, :3].T @ (now[:3, 3] - before[:3, 3]))
+        return self._left_m <= 0.0
+
+    def telemetry(self) -> Mapping[str, float]:
+        """Nothing more."""
+        return {}
+
+
+def build(config: SurfaceFollowingConfig, context: TaskContext) -> ServoTask:
+    """The task in a cell that has ``arm`` and ``sensor``."""
+    reference = (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0)
+    hand = Hand(ARM, SENSOR, config, reference, Follow(config), context)
+    return ServoTask("surface_following", config, context, hand)
+
+
+SPEC = TaskSpec(
+    name="surface_following",
+    summary="glide over an unknown surface at constant depth and normal to it",
+    config=SurfaceFollowingConfig,
+    arms={ARM: frozenset({"TcpSource", "TwistSink", "Stoppable"})},
+    sensors=frozenset({SENSOR}),
+    build=build,
+)

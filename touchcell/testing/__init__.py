@@ -1,0 +1,1 @@
+"""Tools for testing drivers and cells: emulators, the conformance suite and pytest plugins."""

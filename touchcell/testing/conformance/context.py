@@ -1,0 +1,416 @@
+"""What a check works with: the device, its emulator's truth, and the clock that both live on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from touchcell.drivers.core.arm import Arm
+from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
+from touchcell.drivers.core.device import Device, Lifecycle, OperatorToken
+from touchcell.drivers.core.errors import DeviceError, StaleData
+from touchcell.drivers.core.lease import Lease
+from touchcell.drivers.core.protocols import FrameSource, HealthSource
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+from touchcell.testing.emulation.rig import Emulated, Rig, RigFunction
+
+CREEP_M_S = 0.005
+CREEP_RAD_S = 0.02
+OWNER = "conformance"
+_PERIOD_NS = 20_000_000
+_TTL_S = 0.25
+_STILL_M = 1e-4
+_STILL_RAD = 1e-3
+_STILL_NS = 60_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Where the tool truly was.
+
+    Attributes:
+        t_ns: (n,) times on the check's clock.
+        poses: (n, 4, 4) in the base frame.
+        t_true_s: (n,) the same times by the emulator's own clock, which counts for speeds.
+    """
+
+    t_ns: Array
+    poses: Array
+    t_true_s: Array
+
+    @property
+    def late_s(self) -> float:
+        """How long nobody looked, or by how much the emulator lagged behind, at worst: what a busy machine adds."""
+        if len(self.t_ns) < 2:
+            return 0.0
+        lag_s = self.t_ns * 1e-9 - self.t_true_s
+        return float(np.diff(self.t_ns).max() * 1e-9 + np.ptp(lag_s))
+
+    def position_at(self, t_ns: float) -> Array:
+        """Position (3,) at ``t_ns``, between samples by straight lines."""
+        return np.array([np.interp(t_ns, self.t_ns, self.poses[:, axis, 3]) for axis in range(3)])
+
+    def since(self, t_ns: float) -> Track:
+        """The part from ``t_ns`` on."""
+        late = self.t_ns >= t_ns
+        return Track(self.t_ns[late], self.poses[late], self.t_true_s[late])
+
+    def mean_twist(self, frame: TwistFrame) -> Array:
+        """Mean twist (6,) of the tool centre point from the first sample to the last, along base or first tool axes."""
+        first, last = self.poses[0], self.poses[-1]
+        turn = np.eye(4)
+        turn[:3, :3] = last[:3, :3] @ first[:3, :3].T
+        moved = np.concatenate([last[:3, 3] - first[:3, 3], se3.log(turn)[3:]])
+        if frame is TwistFrame.TCP:
+            R = first[:3, :3].T
+            moved = np.concatenate([R @ moved[:3], R @ moved[3:]])
+        return cast(Array, moved / (self.t_true_s[-1] - self.t_true_s[0]))
+
+
+class _Recorder:
+    """Makes a track."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        self.times: list[int] = []
+        self.poses: list[Array] = []
+        self._true: list[float] = []
+        self.truth: dict[str, Any] = {}
+
+    def note(self) -> None:
+        """Take a sample."""
+        bench = self._bench
+        before_ns = bench.clock.now_ns()
+        self.truth = {} if bench.is_real else bench.truth()
+        self.poses.append(bench.pose(self.truth))
+        t_ns = (before_ns + bench.clock.now_ns()) // 2
+        self.times.append(t_ns)
+        self._true.append(t_ns * 1e-9 if bench.rig.time is None or bench.is_real else self.truth[bench.rig.time])
+
+    def track(self, count: int | None = None) -> Track:
+        """The first ``count`` samples, or all."""
+        t_ns, poses, true = self.times[:count], self.poses[:count], self._true[:count]
+        return Track(np.array(t_ns, dtype=np.float64), np.array(poses), np.array(true))
+
+
+class Seat:
+    """One rig and its emulator, which the checks of one driver share until one of them spoils it."""
+
+    def __init__(self, function: RigFunction, folder: Path, address: int) -> None:
+        self.function = function
+        self.folder = folder
+        self.address = address
+        self.rig: Rig = function(folder, address)
+        self._emulator: Emulated | None = None
+
+    def emulator(self) -> Emulated:
+        """The running emulator."""
+        if self._emulator is None:
+            assert self.rig.start is not None
+            self._emulator = self.rig.start()
+        return self._emulator
+
+    def clear(self) -> None:
+        """End the emulator; the next check gets a fresh one."""
+        emulator, self._emulator = self._emulator, None
+        if emulator is not None:
+            with suppress(DeviceError):
+                emulator.thaw()
+            emulator.stop()
+
+    def vanish(self) -> None:
+        """The device disappears without a word."""
+        emulator, self._emulator = self._emulator, None
+        assert emulator is not None
+        emulator.kill()
+
+
+class Bench:
+    """One check's view of a seat; makes devices and takes them away again.
+
+    Attributes:
+        seat: the rig and its emulator.
+        rig: short for the seat's.
+        clock: what everything runs on; a virtual one passes only when somebody sleeps.
+        device: the device under test, DISCONNECTED at first.
+        late_s: by how much the host overslept at worst while the last ``stream`` was sent.
+        changed: set it if the emulator has to be put back to how it started.
+        spoiled: set it if the emulator cannot serve another check.
+    """
+
+    def __init__(self, seat: Seat) -> None:
+        self.seat = seat
+        self.rig = seat.rig
+        self.clock = self.rig.clock()
+        self.late_s = 0.0
+        self._devices: list[Device] = []
+        self._began: set[str] = set()
+        if self.rig.start is not None:
+            seat.emulator()
+        self.device = self.another()
+        # An arm that falls when it is let go begins each check where it began the first.
+        self.changed = self.rig.spec.capabilities.falls_on_power_loss or not self.rig.process
+        self.spoiled = False
+
+    @property
+    def arm(self) -> Arm:
+        """The device, as an arm."""
+        return cast(Arm, self.device)
+
+    @property
+    def camera(self) -> FrameSource:
+        """The device, as a camera."""
+        return cast(FrameSource, self.device)
+
+    @property
+    def emulator(self) -> Emulated:
+        """The emulator."""
+        return self.seat.emulator()
+
+    @property
+    def is_real(self) -> bool:
+        """Whether the device is one that can hurt people."""
+        return self.rig.start is None
+
+    @property
+    def token(self) -> OperatorToken:
+        """An operator's."""
+        return OperatorToken("conformance suite", self.clock.now_ns())
+
+    def is_in(self, state: Lifecycle) -> bool:
+        """Whether the device is in ``state`` now."""
+        return self.device.state is state
+
+    def another(self) -> Device:
+        """One more DISCONNECTED device object for the same device."""
+        device = self.rig.build(self.clock)
+        self._devices.append(device)
+        return device
+
+    def close(self) -> None:
+        """Put everything back for the next check."""
+        try:
+            if not self.is_real and self.rig.process:
+                self.emulator.thaw()
+                for fault in self._began:
+                    self.emulator.clear(fault)
+        except (DeviceError, OSError):
+            self.spoiled = True
+        for device in self._devices:
+            device.disconnect()
+        if self.spoiled and not self.is_real:
+            self.seat.clear()
+        elif self.changed and not self.is_real:
+            self.restore()
+
+    def restore(self) -> None:
+        """Put the emulator back to how it started, or start another."""
+        if self.rig.reset is not None:
+            self.emulator.fault(self.rig.reset)
+            return
+        self.seat.clear()
+        self.seat.emulator()
+
+    def begin(self, fault: str, value: Any) -> None:
+        """Begin a fault in the emulator; it ends with the check at the latest."""
+        self._began.add(fault)
+        self.emulator.fault(fault, value)
+
+    def end(self, fault: str) -> None:
+        """End a fault."""
+        self._began.discard(fault)
+        self.emulator.clear(fault)
+
+    def ready(self) -> Device:
+        """Bring the device to READY."""
+        self.device.connect()
+        self.device.configure()
+        return self.device
+
+    def active(self) -> Device:
+        """Bring the device to ACTIVE."""
+        self.ready().activate()
+        return self.device
+
+    def leased(self) -> Lease:
+        """Bring the arm to ACTIVE and take its lease."""
+        self.active()
+        return self.arm.acquire(OWNER)
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+        self.clock.sleep_until_ns(self.clock.now_ns() + round(seconds * 1e9))
+
+    def until(self, condition: Callable[[], bool], within_s: float, what: str) -> float:
+        """Wait for ``condition``; returns how long it took in s, and fails the check if it took too long."""
+        start_ns = self.clock.now_ns()
+        while not condition():
+            if (self.clock.now_ns() - start_ns) * 1e-9 > within_s:
+                pytest.fail(f"{what}: not within {within_s:g} s", pytrace=False)
+            self.sleep(0.005)
+        return (self.clock.now_ns() - start_ns) * 1e-9
+
+    def truth(self) -> dict[str, Any]:
+        """What is true inside the emulator."""
+        return self.emulator.state()
+
+    def energised(self) -> int:
+        """How many messages that change power, mode or zero have reached the emulator."""
+        return int(self.truth()[self.rig.energising]) if self.rig.energising else 0
+
+    def pose(self, truth: dict[str, Any] | None = None) -> Array:
+        """True pose (4, 4) of the tool centre point in the base frame; on a real bench what the arm says."""
+        if self.is_real:
+            return self.arm.tcp().value.T_base_tcp
+        truth = truth or self.truth()
+        if self.rig.pose is not None:
+            return np.array(truth[self.rig.pose])
+        T = self.arm.tcp().value.T_base_tcp.copy()
+        T[:3, 3] = truth[cast(str, self.rig.position)]
+        return T
+
+    def position(self) -> Array:
+        """True position (3,) of the tool centre point; on a real bench what the arm says."""
+        if self.is_real or self.rig.position is None:
+            return self.pose()[:3, 3]
+        return np.array(self.truth()[self.rig.position])
+
+    def speed(self, fraction: float = 0.3) -> float:
+        """Linear speed for tests in m/s: a fraction of the limit, and creeping on a real bench."""
+        return min(CREEP_M_S if self.is_real else 0.05, fraction * self.arm.limits.speed_m_s)
+
+    def rot_speed(self, fraction: float = 0.3) -> float:
+        """The same for turning, in rad/s."""
+        return min(CREEP_RAD_S if self.is_real else 0.15, fraction * self.arm.limits.rot_speed_rad_s)
+
+    def axis(self) -> int:
+        """An axis that the arm can follow."""
+        return self.rig.spec.capabilities.twist_axes.index(True)
+
+    def twist(self, axis: int, *, speed: float | None = None) -> Array:
+        """(6,) along one axis at test speed."""
+        twist = np.zeros(6)
+        twist[axis] = speed if speed is not None else self.speed() if axis < 3 else self.rot_speed()
+        return twist
+
+    def command(
+        self, twist: Array, frame: TwistFrame = TwistFrame.BASE, ttl_s: float = _TTL_S, *, age_s: float = 0.0
+    ) -> TwistCommand:
+        """A command computed ``age_s`` ago."""
+        return TwistCommand(twist, frame, self.clock.now_ns() - round(age_s * 1e9), ttl_s)
+
+    def stream(
+        self,
+        lease: Lease,
+        twist: Array,
+        seconds: float,
+        *,
+        frame: TwistFrame = TwistFrame.BASE,
+        ttl_s: float = _TTL_S,
+    ) -> tuple[Track, Sent[TwistCommand]]:
+        """Send ``twist`` at 50 Hz for a while; returns where the tool truly went, and the last command as sent."""
+        recorder = _Recorder(self)
+        self.late_s = 0.0
+        due_ns = self.clock.now_ns()
+        end_ns = due_ns + round(seconds * 1e9)
+        while True:
+            now_ns = self.clock.now_ns()
+            self.late_s = max(self.late_s, (now_ns - due_ns) * 1e-9)
+            try:
+                sent = self.arm.send_twist(self.command(twist, frame, ttl_s), lease)
+            except StaleData as error:
+                recorder.note()
+                # Not the driver's doing where the emulator was not let run; the caller tries again.
+                if recorder.track().late_s < error.limit_s or now_ns >= end_ns:
+                    pytest.fail(f"{error}; fault: {self.device.fault}", pytrace=False)
+                self.late_s = max(self.late_s, error.age_s)
+                due_ns = self.clock.now_ns()
+                continue
+            except DeviceError as error:
+                pytest.fail(f"{error}; fault: {self.device.fault}", pytrace=False)
+            recorder.note()
+            if now_ns >= end_ns:
+                return recorder.track(), sent
+            due_ns = now_ns + _PERIOD_NS
+            self.clock.sleep_until_ns(due_ns)
+
+    def track_to_rest(self, within_s: float, ended: Callable[[dict[str, Any]], bool] | None = None) -> Track:
+        """Watch the true pose until it rests (or ``ended`` says so of the truth); fails the check if it does not.
+
+        The track ends where the rest began.
+        """
+        recorder = _Recorder(self)
+        times, poses = recorder.times, recorder.poses
+        deadline_ns = self.clock.now_ns() + round(within_s * 1e9) + _STILL_NS
+        while True:
+            recorder.note()
+            if ended is not None and ended(recorder.truth):
+                return recorder.track()
+            calm = next((i for i, t_ns in enumerate(times) if t_ns >= times[-1] - _STILL_NS), 0)
+            if times[-1] - times[0] >= _STILL_NS and _spread(poses[calm:]):
+                return recorder.track(calm + 1)
+            if times[-1] > deadline_ns:
+                pytest.fail(f"the tool still moves after {within_s:g} s", pytrace=False)
+            self.sleep(0.003)
+
+    def settle(self, within_s: float = 2.0) -> None:
+        """Wait until the tool truly rests."""
+        self.track_to_rest(within_s)
+
+    def read(self, max_age_s: float | None = None) -> Any:
+        """Newest sample of the device, whatever it delivers."""
+        if self.rig.spec.capabilities.kind == "camera":
+            return self.camera.latest(max_age_s)
+        return self.arm.tcp(max_age_s)
+
+    def counters(self) -> dict[str, int]:
+        """Whole numbers in the device's health."""
+        if not isinstance(self.device, HealthSource):
+            return {}
+        health = self.device.health()
+        return {key: value for key, value in health.items() if isinstance(value, int) and not isinstance(value, bool)}
+
+    def reach_faulted(self, within_s: float, lease: Lease | None = None) -> float:
+        """Use the device as a task would until it is FAULTED; returns how long it took in s."""
+
+        def use() -> bool:
+            with suppress(DeviceError):
+                if lease is not None:
+                    self.arm.send_twist(self.command(self.twist(self.axis(), speed=0.002)), lease)
+                self.read()
+            return self.device.state is Lifecycle.FAULTED
+
+        return self.until(use, within_s, "FAULTED")
+
+    def reconnect(self, within_s: float = 5.0) -> None:
+        """Disconnect, and bring the device to ACTIVE again as soon as it can be reached."""
+        self.device.disconnect()
+        assert self.device.state is Lifecycle.DISCONNECTED
+        refused: list[DeviceError] = []
+
+        def again() -> bool:
+            try:
+                self.active()
+            except DeviceError as error:
+                refused.append(error)
+                self.device.disconnect()
+            return self.device.state is Lifecycle.ACTIVE
+
+        try:
+            self.until(again, within_s, "ACTIVE again")
+        except pytest.fail.Exception:
+            pytest.fail(f"not ACTIVE again within {within_s:g} s: {refused[-1]}", pytrace=False)
+
+
+def _spread(poses: Sequence[Array]) -> bool:
+    stack = np.array(poses)
+    return bool(
+        np.ptp(stack[:, :3, 3], axis=0).max() < _STILL_M and np.ptp(stack[:, :3, :3], axis=0).max() < _STILL_RAD
+    )

@@ -1,0 +1,85 @@
+"""Checks of cameras beyond stamps and numbers: waiting, losing, and not working for nobody."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from touchcell.drivers.core.errors import DeviceError, TransportTimeout
+from touchcell.testing.conformance.context import Bench
+from touchcell.testing.conformance.suite import check
+
+_UNREAD_PERIODS = 8
+
+
+@check("FrameSource", on_bench=True)
+def next_waits_and_gives_up(bench: Bench) -> None:
+    """``next`` gives a frame beyond the number that is known, and TransportTimeout when none comes in time."""
+    bench.active()
+    first = bench.camera.next(-1, 2.0)
+    assert bench.camera.next(first.seq, 2.0).seq > first.seq
+    ahead = round(bench.rig.state_rate_hz or bench.rig.spec.capabilities.state_rate_hz)
+    start_ns = bench.clock.now_ns()
+    with pytest.raises(TransportTimeout) as caught:
+        bench.camera.next(first.seq + ahead, 0.1)
+    assert caught.value.timeout_s == pytest.approx(0.1)
+    assert (bench.clock.now_ns() - start_ns) * 1e-9 >= 0.099
+
+
+@check("FrameSource", on_bench=True)
+def latest_never_goes_back(bench: Bench) -> None:
+    """``latest`` repeats the newest frame until a newer one is there, and skips those that nobody read."""
+    rate_hz = bench.rig.state_rate_hz or bench.rig.spec.capabilities.state_rate_hz
+    bench.active()
+    first = bench.camera.next(-1, 2.0)
+    bench.sleep(_UNREAD_PERIODS / rate_hz)
+    newest = bench.camera.latest()
+    assert newest.seq >= first.seq + _UNREAD_PERIODS // 2
+    assert bench.camera.latest().seq >= newest.seq
+
+
+@check("FrameSource")
+def frames_that_nobody_reads_are_not_decoded(bench: Bench) -> None:
+    """While frames pass unread OpenCV decodes none of them; reading decodes one."""
+    import cv2
+
+    decoded = 0
+    original = cv2.imdecode
+
+    def counting(*arguments: Any) -> Any:
+        nonlocal decoded
+        decoded += 1
+        return original(*arguments)
+
+    rate_hz = bench.rig.state_rate_hz or bench.rig.spec.capabilities.state_rate_hz
+    bench.active()
+    first = bench.camera.next(-1, 2.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cv2, "imdecode", counting)
+        bench.sleep(_UNREAD_PERIODS / rate_hz)
+        assert decoded == 0
+        assert bench.camera.latest().seq > first.seq
+        bench.camera.latest()
+    if decoded == 0:
+        pytest.skip("decodes nothing with OpenCV: not to be seen from outside")
+    assert decoded <= 2
+
+
+@check("FrameSource", "truth")
+def lost_frames_leave_a_gap(bench: Bench) -> None:
+    """Frames that are lost on the way are missing in the numbers."""
+    if "drop" not in bench.rig.faults:
+        pytest.skip("its emulator drops no frames")
+    bench.active()
+    seq = bench.camera.next(-1, 2.0).seq
+    bench.begin("drop", 3)
+    widest = 0
+    for _ in range(12):
+        try:
+            frame = bench.camera.next(seq, 1.0)
+        except DeviceError:
+            continue
+        widest = max(widest, frame.seq - seq)
+        seq = frame.seq
+    assert widest >= 3

@@ -1,0 +1,226 @@
+"""A CAN bus without a kernel module: a UNIX SEQPACKET hub, and the python-can interface ``touchcell_hub`` to it.
+
+Every packet is one frame in SocketCAN's layout (``struct can_frame``, 16 bytes, or ``struct canfd_frame``, 72 bytes),
+so order and frame boundaries are the kernel's. The hub closing its end is an unplugged adapter. Any python-can program
+can use it: ``can.Bus(interface="touchcell_hub", channel="/path/of/the/hub")``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import math
+import select
+import socket
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import can
+
+from touchcell.drivers.core import can_errors
+
+_CLASSIC = struct.Struct("=IB3x8s")
+_FD = struct.Struct("=IBB2x64s")
+_EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
+_BIT_RATE_SWITCH, _FD_FRAME = 0x01, 0x04
+
+
+def pack(message: can.Message) -> bytes:
+    """A message in SocketCAN's layout."""
+    number = message.arbitration_id
+    number |= _EXTENDED if message.is_extended_id else 0
+    number |= _REMOTE if message.is_remote_frame else 0
+    number |= _ERROR if message.is_error_frame else 0
+    data = bytes(message.data)
+    if message.is_fd:
+        flags = _FD_FRAME | (_BIT_RATE_SWITCH if message.bitrate_switch else 0)
+        return _FD.pack(number, len(data), flags, data)
+    return _CLASSIC.pack(number, message.dlc, data)
+
+
+def unpack(packet: bytes, timestamp_s: float = 0.0) -> can.Message:
+    """The inverse of ``pack``. Raises ValueError for a packet of another size or with an impossible length."""
+    if len(packet) == _CLASSIC.size:
+        (number, length, data), flags, longest = _CLASSIC.unpack(packet), 0, 8
+    elif len(packet) == _FD.size:
+        number, length, flags, data = _FD.unpack(packet)
+        longest = 64
+    else:
+        raise ValueError(f"a packet of {len(packet)} bytes is no CAN frame")
+    if length > longest:
+        raise ValueError(f"a frame cannot carry {length} bytes")
+    is_remote = bool(number & _REMOTE)
+    return can.Message(
+        timestamp=timestamp_s,
+        arbitration_id=number & 0x1FFFFFFF,
+        is_extended_id=bool(number & _EXTENDED),
+        is_remote_frame=is_remote,
+        is_error_frame=bool(number & _ERROR),
+        is_fd=len(packet) == _FD.size,
+        bitrate_switch=bool(flags & _BIT_RATE_SWITCH),
+        dlc=length,
+        data=None if is_remote else data[:length],
+        check=True,
+    )
+
+
+class HubBus(can.BusABC):  # type: ignore[misc]
+    """python-can interface to a ``Hub``.
+
+    Args:
+        channel: path of the hub's socket.
+        fd: whether CAN FD frames may be sent.
+        can_filters: as in python-can.
+        options: ``bitrate`` and the like, which a wire of no length has no use for.
+    """
+
+    def __init__(self, channel: str, fd: bool = False, can_filters: Any = None, **options: Any) -> None:
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            self._socket.connect(str(channel))
+        except OSError as error:
+            self._socket.close()
+            raise can.CanInitializationError(f"no hub at {channel}: {error}", error.errno) from error
+        self.channel_info = f"touchcell_hub {channel}"
+        self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
+        self._bus_state = can.BusState.ACTIVE
+        super().__init__(channel=channel, can_filters=can_filters)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Put a frame on the bus. Raises CanOperationError when the adapter is gone or its queue is full."""
+        try:
+            self._socket.settimeout(timeout or 0.0)
+            self._socket.send(pack(msg))
+        except BlockingIOError as error:
+            raise can.CanOperationError("transmit queue is full", errno.ENOBUFS) from error
+        except OSError as error:
+            raise can.CanOperationError(f"adapter is gone: {error}", error.errno) from error
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        # Not select(), which knows no file beyond number 1023.
+        poller = select.poll()
+        poller.register(self._socket, select.POLLIN)
+        if not poller.poll(None if timeout is None else math.ceil(1e3 * timeout)):
+            return None, False
+        try:
+            packet = self._socket.recv(128)
+        except OSError as error:
+            raise can.CanOperationError(f"adapter is gone: {error}", error.errno) from error
+        if not packet:
+            raise can.CanOperationError("adapter is gone", errno.ENODEV)
+        message = unpack(packet, time.time())
+        if message.is_error_frame:
+            self._note_error(message)
+        return message, False
+
+    def _note_error(self, message: can.Message) -> None:
+        if message.arbitration_id & can_errors.BUS_OFF:
+            self._bus_state = can.BusState.ERROR
+        elif can_errors.is_error_passive(message.arbitration_id, bytes(message.data)):
+            self._bus_state = can.BusState.PASSIVE
+        elif message.arbitration_id & can_errors.RESTARTED:
+            self._bus_state = can.BusState.ACTIVE
+
+    @property
+    def state(self) -> can.BusState:
+        """Controller state as far as error frames have told."""
+        return self._bus_state
+
+    def fileno(self) -> int:
+        """For select, and for python-can's asyncio notifier."""
+        return self._socket.fileno()
+
+    def shutdown(self) -> None:
+        """Leave the bus."""
+        super().shutdown()
+        self._socket.close()
+
+
+class Hub:
+    """The bus itself: passes every frame to all other clients and to the emulated nodes.
+
+    Args:
+        path: of its socket.
+        on_frame: called with every frame from a client.
+    """
+
+    def __init__(self, path: Path, on_frame: Callable[[can.Message], None]) -> None:
+        self._path = path
+        self._on_frame = on_frame
+        self._listener: socket.socket | None = None
+        self._clients: list[socket.socket] = []
+
+    @property
+    def client_count(self) -> int:
+        """How many programs are on the bus."""
+        return len(self._clients)
+
+    def open(self) -> None:
+        """Listen; must run in the event loop's thread."""
+        self._path.unlink(missing_ok=True)
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._listener.setblocking(False)
+        self._listener.bind(str(self._path))
+        self._listener.listen()
+        asyncio.get_running_loop().add_reader(self._listener, self._accept)
+
+    def close(self) -> None:
+        """Unplug every client and stop listening."""
+        if self._listener is not None:
+            asyncio.get_running_loop().remove_reader(self._listener)
+            self._listener.close()
+            self._listener = None
+        for client in list(self._clients):
+            self._leave(client)
+        self._path.unlink(missing_ok=True)
+
+    def send(self, message: can.Message, *, but: socket.socket | None = None) -> None:
+        """Give a frame to every client; one whose queue is full loses it, as on a real adapter."""
+        packet = pack(message)
+        for client in list(self._clients):
+            if client is but:
+                continue
+            try:
+                client.send(packet)
+            except BlockingIOError:
+                continue
+            except OSError:
+                self._leave(client)
+
+    def drain(self) -> None:
+        """Read what clients have sent already, before time is told to have passed."""
+        for client in list(self._clients):
+            self._read(client)
+
+    def _accept(self) -> None:
+        assert self._listener is not None
+        client, _ = self._listener.accept()
+        client.setblocking(False)
+        self._clients.append(client)
+        asyncio.get_running_loop().add_reader(client, self._read, client)
+
+    def _read(self, client: socket.socket) -> None:
+        while client in self._clients:
+            try:
+                packet = client.recv(128)
+            except BlockingIOError:
+                return
+            except OSError:
+                packet = b""
+            if not packet:
+                self._leave(client)
+                return
+            with contextlib.suppress(ValueError):
+                message = unpack(packet)
+                self.send(message, but=client)
+                self._on_frame(message)
+
+    def _leave(self, client: socket.socket) -> None:
+        if client in self._clients:
+            self._clients.remove(client)
+            asyncio.get_running_loop().remove_reader(client)
+            client.close()

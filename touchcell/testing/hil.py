@@ -1,0 +1,121 @@
+"""pytest plugin: the conformance suite on a real bench, ``pytest -m hil --cell bench.yaml``.
+
+Every device of the cell file is tested at no more than 5 mm/s. A person is asked before each arm; ``--hil-yes`` answers
+for them. Installed as an entry point of ``pytest11``; without ``--cell`` it does nothing but deselect ``hil`` tests.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from touchcell.cell.config.schema import CellPlan, DevicePlan
+    from touchcell.testing.emulation.rig import Rig, RigFunction
+
+_CONFIRMED = pytest.StashKey[set[str]]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--cell`` and ``--hil-yes``."""
+    group = parser.getgroup("touchcell")
+    group.addoption("--cell", type=Path, help="cell file of the bench on which `hil` tests run")
+    group.addoption("--hil-yes", action="store_true", help="run `hil` tests without asking the operator")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Take the cell file as one more test file."""
+    config.addinivalue_line("markers", "hil: moves a real device; needs --cell")
+    config.stash[_CONFIRMED] = set()
+    if cell := config.getoption("--cell"):
+        config.args.append(str(cell.resolve()))
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Without a bench there are no tests on it."""
+    if config.getoption("--cell"):
+        return
+    on_bench = [item for item in items if item.get_closest_marker("hil")]
+    if on_bench:
+        config.hook.pytest_deselected(items=on_bench)
+        items[:] = [item for item in items if not item.get_closest_marker("hil")]
+
+
+def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+    """The cell file becomes a module of suites."""
+    cell = parent.config.getoption("--cell")
+    if cell is None or file_path != cell.resolve():
+        return None
+    return BenchModule.from_parent(parent, path=file_path)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Ask the operator once for each device."""
+    device = getattr(getattr(item, "cls", None), "driver", None)
+    confirmed = item.config.stash[_CONFIRMED]
+    if device is None or device in confirmed or not item.get_closest_marker("hil"):
+        return
+    if not item.config.getoption("--hil-yes"):
+        _ask(item.config, device)
+    confirmed.add(device)
+
+
+class BenchModule(pytest.Module):
+    """A cell file, with one suite for each of its devices."""
+
+    def _getobj(self) -> ModuleType:
+        from touchcell.cell.config.schema import plan_cell
+        from touchcell.testing.conformance.suite import suite
+
+        plan = plan_cell(self.path)
+        module = ModuleType(self.path.stem)
+        for name, device in plan.devices.items():
+            tests: Any = suite(_rig_of(plan, device))
+            tests.driver = name
+            tests.pytestmark = [pytest.mark.hil]
+            setattr(module, f"Test_{name}", tests)
+        return module
+
+
+def _rig_of(plan: CellPlan, device: DevicePlan) -> RigFunction:
+    """A rig that knows nothing but the device itself."""
+    from touchcell.cell.runtime.compose import build_devices
+    from touchcell.drivers.core.clock import MonotonicClock, VirtualClock
+    from touchcell.testing.emulation.rig import Rig
+
+    def rig(folder: Path, address: int) -> Rig:
+        return Rig(
+            spec=device.spec,
+            start=None,
+            build=lambda clock: build_devices(plan, plan.devices, clock)[device.name],
+            energising=None,
+            position=None,
+            state_rate_hz=getattr(device.config, "rate_hz", None) or _scene_rate_hz(plan, device),
+            clock=VirtualClock if plan.cell.time == "simulated" else MonotonicClock,
+            process=False,
+        )
+
+    return rig
+
+
+def _scene_rate_hz(plan: CellPlan, device: DevicePlan) -> float | None:
+    """Of an arm that is sampled in the steps of the cell's scene."""
+    able = device.spec.capabilities
+    if plan.cell.scene is None or able.kind != "arm" or not able.virtual_time:
+        return None
+    from touchcell.simulation.scene import SceneConfig
+
+    return 1e3 / SceneConfig.model_validate(plan.cell.scene).step_ms
+
+
+def _ask(config: pytest.Config, device: str) -> None:
+    capture = config.pluginmanager.getplugin("capturemanager")
+    with capture.global_and_fixture_disabled():
+        print(f"\n{device} will be powered and, if it is an arm, move about 10 mm along and 2 deg about every axis.")
+        print("Is the space around it free, are people away, and is a hand on the emergency stop? Type yes: ", end="")
+        answer = input()
+    if answer.strip().lower() != "yes":
+        pytest.exit(f"the operator did not agree to test {device}", returncode=pytest.ExitCode.INTERRUPTED)
