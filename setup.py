@@ -16,11 +16,11 @@ setup(
             optional=True,
         ),
         Extension(
-            "touchcell.perception.runtime._kernelsc",
-            sources=["touchcell/perception/runtime/_kernelsc.c"],
+            "touchcell.perception._kernelsc",
+            sources=["touchcell/perception/_kernelsc.c"],
             depends=[
-                "touchcell/perception/runtime/_image_kernels.h",
-                "touchcell/perception/runtime/_matching_kernels.h",
+                "touchcell/perception/_image_kernels.h",
+                "touchcell/perception/_matching_kernels.h",
             ],
             extra_compile_args=["-O3", "-ffp-contract=off"],
             # Without a compiler image networks serve, and marker estimators say what is missing.

@@ -31,11 +31,11 @@ from touchcell.perception.calibration.adaptation import (
     tune,
 )
 from touchcell.perception.calibration.marked_data import evenly
-from touchcell.perception.markers.architecture import MarkerArchitecture
-from touchcell.perception.markers.detection import Discs, MarkerSize, detect_markers
+from touchcell.perception.markers.detection import Discs, detect_markers
 from touchcell.perception.markers.estimator import matcher_of
-from touchcell.perception.runtime.labels import contact_from_xi, xi_from_contact
-from touchcell.perception.runtime.model_file import Model, load_model
+from touchcell.perception.models.labels import contact_from_xi, xi_from_contact
+from touchcell.perception.models.marker_architecture import MarkerArchitecture, MarkerSize
+from touchcell.perception.models.model_file import Model, load_model
 from touchcell.simulation.mount import Rig
 from touchcell.simulation.samples import Variation, contacts
 from touchcell.simulation.tip import TipParameters

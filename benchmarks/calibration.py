@@ -19,10 +19,11 @@ from touchcell.drivers.replay.dataset import read_image, read_split
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.calibration.zero_frame import find_change
 from touchcell.perception.errors import TrainingError
+from touchcell.perception.models.labels import contact_from_xi
+from touchcell.perception.models.model_file import load_model
+from touchcell.perception.models.prediction import ContactEstimator
 from touchcell.perception.runtime.calibrated_estimator import CalibratedEstimator
-from touchcell.perception.runtime.estimators import ContactEstimator, load_estimator
-from touchcell.perception.runtime.labels import contact_from_xi
-from touchcell.perception.runtime.model_file import load_model
+from touchcell.perception.runtime.estimators import load_estimator
 
 _CHANGES = {
     "none": (1.0, 0.0, 0.0),

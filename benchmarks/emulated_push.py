@@ -24,17 +24,17 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
-from touchcell.cell.analysis.report import tip_points
+from touchcell.cell.analysis.run_data import tip_points
 from touchcell.cell.analysis.run_folder import RunFolder, object_poses, scene_time, sensor_poses, true_contacts
 from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.cli.main import find_cell
 from touchcell.cell.config.schema import plan_cell
-from touchcell.cell.experiments.pushing import off_normal_mm, target_mm
+from touchcell.cell.experiments.push_measures import off_normal_mm, target_mm
 from touchcell.cell.recording.mcap import RECORDING, Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import Outcome, RunLoop
 from touchcell.drivers.core.errors import DeviceError
-from touchcell.drivers.v4l2.emulator.shim import environment
+from touchcell.drivers.v4l2.shim import environment
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.testing.emulation.process import EmulatorProcess

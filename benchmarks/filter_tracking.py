@@ -12,7 +12,8 @@ import numpy as np
 import yaml
 from pydantic import TypeAdapter
 
-from touchcell.cell.analysis.report import load_run, summarise
+from touchcell.cell.analysis.report import summarise
+from touchcell.cell.analysis.run_data import load_run
 from touchcell.cell.cli.main import find_cell
 from touchcell.cell.config.schema import FilterSection, plan_cell
 from touchcell.cell.recording.mcap import Recorder
@@ -21,9 +22,9 @@ from touchcell.cell.runtime.loop import RunLoop
 from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.types import Array
+from touchcell.perception.models.labels import XI_UNITS
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.perception.runtime.filter import ContactFilter
-from touchcell.perception.runtime.labels import XI_UNITS
 from touchcell.perception.runtime.motion import PoseHistory
 from touchcell.perception.runtime.pipeline import ContactSource
 

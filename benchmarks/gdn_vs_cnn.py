@@ -19,11 +19,11 @@ import numpy as np
 from touchcell.cell.bench.provenance import provenance
 from touchcell.drivers.replay.dataset import read_split
 from touchcell.geometry.types import Array
+from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.labels import xi_from_contact
+from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.dataset import LabelledImages, default_cache, load_reduced
 from touchcell.perception.networks.scores import SCORE_NAMES, Scores
-from touchcell.perception.runtime.architecture import Architecture
-from touchcell.perception.runtime.labels import xi_from_contact
-from touchcell.perception.runtime.preprocessing import Preprocessing
 
 KINDS: tuple[Literal["gdn", "cnn"], ...] = ("gdn", "cnn")
 
@@ -117,8 +117,8 @@ def _train(
 
 
 def _scores(model: Path, validation: LabelledImages) -> dict[str, float]:
+    from touchcell.perception.models.labels import contact_from_xi
     from touchcell.perception.runtime.inference import ContactModel
-    from touchcell.perception.runtime.labels import contact_from_xi
 
     network = ContactModel.load(model)
     predictions = [network.predict_reduced(image) for image in validation.images]

@@ -6,7 +6,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
-from touchcell.drivers.core.errors import ConfigError, suggest
+from touchcell.errors import ConfigError, suggest
 
 S = TypeVar("S")
 

@@ -12,11 +12,12 @@ from benchmarks import filter_rivals, filter_tracking
 from benchmarks.filter_sequences import filtered, single_frames, summary, synthetic
 from tests.helpers.tactile_samples import write_split
 from tests.perception.runtime.test_inference import constant_model
-from touchcell.cell.cli.main import EXIT_OK, main
+from touchcell.cell.cli.exit_codes import EXIT_OK
+from touchcell.cell.cli.main import main
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.gaussian import PoseGaussian
+from touchcell.perception.models.model_file import save_model
 from touchcell.perception.runtime.filter import PoseFilter
-from touchcell.perception.runtime.model_file import save_model
 
 
 def test_matched_noise_is_consistent_and_best() -> None:

@@ -12,8 +12,8 @@ from tests.helpers.tactile_samples import write_split
 pytest.importorskip("torch")
 
 from benchmarks.gdn_vs_cnn import KINDS, run, summary
+from touchcell.perception.models.model_file import load_model
 from touchcell.perception.networks.scores import SCORE_NAMES
-from touchcell.perception.runtime.model_file import load_model
 
 
 def test_both_kinds_are_trained_alike_and_once(

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from touchcell.control.errors import SafetyTrip
-from touchcell.control.interlocks.config import Depth, TcpSpeed
+from touchcell.control.interlocks.basic import Depth, TcpSpeed
+from touchcell.control.interlocks.errors import SafetyTrip
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.control.latch import Latch, LatchState, Refusal, ResetDone, ResetRefused
@@ -18,7 +18,7 @@ from touchcell.control.supervisor import Supervisor
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.device import OperatorToken
 from touchcell.drivers.core.samples import Stamped, TcpState
-from touchcell.geometry.errors import TouchcellError
+from touchcell.errors import TouchcellError
 
 DEPTH = Depth("depth", Severity.TRIP, 0.006)
 SPEED = TcpSpeed("speed", Severity.TRIP, 0.1, 1.0)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from touchcell.drivers import discovery
-from touchcell.drivers.v4l2.emulator.shim import ShimCalls
+from touchcell.cell.cli import discovery
+from touchcell.drivers.v4l2.shim import ShimCalls
 from touchcell.testing.emulation.process import EmulatorProcess
 
 

@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 import yaml
 
+from touchcell.cell.cli import discovery
 from touchcell.cell.cli.devices import print_devices, probe_cell
-from touchcell.cell.cli.main import EXIT_OK, EXIT_TASK_FAILED, main
-from touchcell.drivers import discovery
+from touchcell.cell.cli.discovery import Found
+from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED
+from touchcell.cell.cli.main import main
 from touchcell.drivers.damiao import rig as damiao_can
-from touchcell.drivers.discovery import Found
 from touchcell.drivers.ur import rig as ur
 from touchcell.paths import CONFIGS
 

@@ -19,7 +19,6 @@ from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
     CommandRejected,
-    ConfigError,
     ConnectError,
     DeviceFault,
     DeviceGone,
@@ -33,6 +32,7 @@ from touchcell.drivers.core.errors import (
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.damiao.driver import DamiaoCanArm
 from touchcell.drivers.damiao.rig import config, rig
+from touchcell.errors import ConfigError
 from touchcell.testing.emulation.process import EmulatorProcess
 
 CLOCK = MonotonicClock()

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 import yaml
 
-from touchcell.cell.analysis.report import load_run
+from touchcell.cell.analysis.run_data import load_run
 from touchcell.cell.cli.emulate_cell import CellEmulator
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.recording.mcap import RECORDING
-from touchcell.drivers.core.errors import ConfigError
-from touchcell.drivers.v4l2.emulator.shim import environment
+from touchcell.drivers.v4l2.shim import environment
+from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
 from touchcell.testing.emulation.process import EmulatorProcess
 

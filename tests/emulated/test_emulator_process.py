@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from touchcell.drivers.core.errors import ConfigError, ConnectError
+from touchcell.drivers.core.errors import ConnectError
+from touchcell.errors import ConfigError
 from touchcell.testing.emulation.base import read_fault_script
 from touchcell.testing.emulation.process import EmulatorProcess
 

@@ -20,7 +20,6 @@ from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
     CommandRejected,
-    ConfigError,
     ConnectError,
     DeviceFault,
     DeviceGone,
@@ -35,6 +34,7 @@ from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.samples import Quality
 from touchcell.drivers.feetech.driver import FeetechSerialArm
 from touchcell.drivers.feetech.rig import DIRECTION, PARK_DEG, ZERO_TICKS, config, emulator, rig
+from touchcell.errors import ConfigError
 from touchcell.testing.emulation.process import EmulatorProcess
 
 CLOCK = MonotonicClock()

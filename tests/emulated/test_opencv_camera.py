@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from touchcell.drivers.core.spec import spec
-from touchcell.drivers.v4l2.emulator.shim import environment
+from touchcell.drivers.v4l2.shim import environment
 from touchcell.testing.emulation.process import EmulatorProcess
 
 PRELUDE = """

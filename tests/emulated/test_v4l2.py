@@ -18,7 +18,6 @@ from touchcell.drivers.core.camera import SettingRefused
 from touchcell.drivers.core.clock import MonotonicClock, VirtualClock
 from touchcell.drivers.core.device import Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
-    ConfigError,
     ConnectError,
     CorruptMessage,
     DeviceGone,
@@ -32,8 +31,9 @@ from touchcell.drivers.core.spec import spec
 from touchcell.drivers.v4l2.codec import Arrival
 from touchcell.drivers.v4l2.driver import SPEC, V4l2Camera, V4l2Config
 from touchcell.drivers.v4l2.emulator import picture
-from touchcell.drivers.v4l2.emulator.shim import ShimCalls
 from touchcell.drivers.v4l2.rig import rig
+from touchcell.drivers.v4l2.shim import ShimCalls
+from touchcell.errors import ConfigError
 from touchcell.testing.emulation.process import EmulatorProcess
 
 TOKEN = OperatorToken("test", 0)
@@ -512,7 +512,7 @@ CLIENT = """
 import sys
 from pathlib import Path
 from touchcell.drivers.core.clock import MonotonicClock
-from touchcell.drivers.v4l2.emulator.shim import ShimCalls
+from touchcell.drivers.v4l2.shim import ShimCalls
 from touchcell.drivers.v4l2.driver import V4l2Camera, V4l2Config
 camera = V4l2Camera("tip", MonotonicClock(), V4l2Config(device=sys.argv[2]), ShimCalls(Path(sys.argv[1])))
 camera.connect()

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from touchcell.drivers.core.errors import ConnectError
-from touchcell.drivers.v4l2.emulator.shim import environment
+from touchcell.drivers.v4l2.shim import environment
 from touchcell.testing.emulation.process import EmulatorProcess
 
 NODE = "/dev/video0"

@@ -28,7 +28,7 @@ from touchcell.drivers.core.clock import MonotonicClock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.spec import DriverContext
-from touchcell.geometry.errors import TouchcellError
+from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
 from touchcell.tasks import registry as tasks_registry
 from touchcell.tasks.interface import TaskContext

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from tests.fault_injection.two_arms import pushing_plan, two_arm_plan
-from touchcell.cell.recording.black_box import BlackBox
 from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.cell.runtime.compose import Cell, compose
 from touchcell.cell.runtime.loop import Progress, RunLoop, StopRequest
 from touchcell.cell.runtime.process_watchdog import ProcessWatch

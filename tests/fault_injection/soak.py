@@ -23,11 +23,11 @@ import yaml
 from tests.fault_injection.fault_matrix import FAULTS, Fault, on_true_contact, plan_anew
 from tests.fault_injection.sent_commands import SentCommands
 from touchcell.cell.bench.provenance import provenance
-from touchcell.cell.recording.black_box import BlackBox
 from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.cell.runtime.compose import Cell, compose
 from touchcell.cell.runtime.loop import Outcome, RunLoop, RunResult, StopRequest
-from touchcell.geometry.errors import TouchcellError
+from touchcell.errors import TouchcellError
 from touchcell.paths import CONFIGS
 from touchcell.simulation.devices.arm import SimArm
 

@@ -19,7 +19,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from tests.fault_injection.fault_matrix import cells, on_true_contact
 from touchcell.cell.config.schema import plan_cell
-from touchcell.cell.recording.black_box import BlackBox
+from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import Outcome, RunLoop, StopRequest
 from touchcell.drivers.core.device import Lifecycle

@@ -7,7 +7,8 @@ import os
 from pathlib import Path
 
 from tests.fault_injection.soak import Held, Lap, held, judged
-from touchcell.cell.cli.main import EXIT_OK, main
+from touchcell.cell.cli.exit_codes import EXIT_OK
+from touchcell.cell.cli.main import main
 
 
 def test_what_leaks_is_counted(tmp_path: Path) -> None:

@@ -10,10 +10,10 @@ import numpy as np
 
 from touchcell.drivers.replay.dataset import IMAGE_COLUMN, LABEL_COLUMNS
 from touchcell.geometry.types import Array, ImageArray
+from touchcell.perception.models.labels import xi_from_contact
+from touchcell.perception.models.model_file import load_model
+from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.dataset import LabelledImages
-from touchcell.perception.runtime.labels import xi_from_contact
-from touchcell.perception.runtime.model_file import load_model
-from touchcell.perception.runtime.preprocessing import Preprocessing
 
 SIZE = (44, 48)
 HALF_RANGES = np.array([5.0, 5.0, 2.75, 20.0, 20.0, 5.0])

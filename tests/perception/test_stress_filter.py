@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from tests.helpers.filter_stress import BLOCK, DRIFT_PER_STEP, SIGMA, STEP_NS, ExactFilter, LongRun, long_run
+from touchcell.errors import TouchcellError
 from touchcell.geometry import _plain_gaussian, gaussian, se3
-from touchcell.geometry.errors import GeometryError, TouchcellError
+from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.gaussian import (
     NotConverged,
     NotPositiveDefinite,

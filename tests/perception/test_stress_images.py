@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from tests.helpers.tactile_samples import SIZE, contacts, draw
+from tests.perception.models.test_model_file import make_model
 from tests.perception.runtime.test_inference import constant_model
-from tests.perception.runtime.test_model_file import make_model
 from touchcell.drivers.core.samples import Frame, Stamped
+from touchcell.errors import TouchcellError
 from touchcell.geometry import gaussian
-from touchcell.geometry.errors import TouchcellError
 from touchcell.geometry.types import ImageArray
 from touchcell.perception.errors import ImageError
+from touchcell.perception.models.preprocessing import AdaptiveThreshold, Crop, Preprocessing
 from touchcell.perception.runtime.contact_gate import ContactGate
 from touchcell.perception.runtime.filter import PoseFilter, isotropic_noise
 from touchcell.perception.runtime.inference import ContactModel
 from touchcell.perception.runtime.moving_surface import MovingSurfaceFilter
 from touchcell.perception.runtime.pipeline import ContactPipeline
-from touchcell.perception.runtime.preprocessing import AdaptiveThreshold, Crop, Preprocessing
 
 RAW_SIZE = (480, 640)
 CHAIN = Preprocessing(

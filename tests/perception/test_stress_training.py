@@ -14,12 +14,12 @@ pytest.importorskip("torch")
 from tests.helpers.tactile_samples import labelled, preprocessing
 from touchcell.geometry.types import Array
 from touchcell.perception.errors import TrainingError
+from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.labels import contact_from_xi, xi_from_contact
+from touchcell.perception.models.model_file import load_model
 from touchcell.perception.networks.dataset import LabelledImages
 from touchcell.perception.networks.training import Settings, train_on_arrays
-from touchcell.perception.runtime.architecture import Architecture
 from touchcell.perception.runtime.inference import ContactModel
-from touchcell.perception.runtime.labels import contact_from_xi, xi_from_contact
-from touchcell.perception.runtime.model_file import load_model
 
 ARCHITECTURE = Architecture(input_size=(32, 32), channels=(4, 8), hidden=16)
 Sets = tuple[LabelledImages, LabelledImages]

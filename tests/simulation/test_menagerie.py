@@ -11,9 +11,9 @@ import pytest
 from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
-from touchcell.drivers.core.errors import ConfigError
 from touchcell.drivers.core.spec import DriverContext
 from touchcell.drivers.kinematics.chain import ChainDescription
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.simulation.devices.joint_arm import SimJointArm
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from touchcell.drivers.core.clock import VirtualClock
-from touchcell.drivers.core.errors import ConfigError
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 from touchcell.simulation.contact import ContactLaw, ContactState
 from touchcell.simulation.objects import ObjectConfig, TableConfig

@@ -3,7 +3,7 @@ import pytest
 from pydantic import ValidationError
 
 from touchcell.drivers.core.clock import VirtualClock
-from touchcell.drivers.core.errors import ConfigError
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.simulation.contact import ContactLaw
 from touchcell.simulation.motions import Glide

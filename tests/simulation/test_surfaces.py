@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from touchcell.drivers.core.errors import ConfigError
+from touchcell.errors import ConfigError
 from touchcell.simulation.motions import Glide, Motion, Periodic, Still
 from touchcell.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
 

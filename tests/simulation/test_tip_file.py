@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from touchcell.drivers.core.errors import ConfigError
+from touchcell.errors import ConfigError
 from touchcell.simulation.mount import Rig
 from touchcell.simulation.tip import Tip, TipParameters
 from touchcell.simulation.tip_file import SHIPPED, TipFile, load_tip, save_tip

@@ -18,8 +18,8 @@ from touchcell.cell.recording.dataset_writer import Collection
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
 from touchcell.control.reach import Reach, is_there
-from touchcell.drivers.core.errors import ConfigError
 from touchcell.drivers.replay.dataset import read_rest, read_split
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.paths import CONFIGS

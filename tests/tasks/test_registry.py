@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from touchcell.drivers.core import protocols as abilities
-from touchcell.drivers.core.errors import ConfigError
+from touchcell.errors import ConfigError
 from touchcell.tasks import diagrams, registry
 from touchcell.tasks.interface import TaskContext, TaskSpec
 

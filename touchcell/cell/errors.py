@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from touchcell.geometry.errors import TouchcellError
+from touchcell.errors import TouchcellError
 
 
 class RecordingError(TouchcellError):

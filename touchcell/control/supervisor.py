@@ -8,8 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from touchcell.control.errors import SafetyTrip
-from touchcell.control.interlocks.config import Finite, Interlock
+from touchcell.control.interlocks.basic import Finite
+from touchcell.control.interlocks.errors import SafetyTrip
+from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.snapshot import CellView
 from touchcell.control.interlocks.timers import Past, TimedInterlock
 from touchcell.control.interlocks.violation import Severity, Violation

@@ -1,25 +1,8 @@
-"""The root of touchcell's one error tree, and the geometric branch of it."""
+"""What can go wrong in geometry, as a type with attributes."""
 
 from __future__ import annotations
 
-
-class TouchcellError(Exception):
-    """Anything touchcell raises on purpose.
-
-    Subclasses carry their facts as attributes, so that callers never match on text.
-
-    Args:
-        message: one sentence that says what is wrong.
-        hint: one sentence that says what to do about it; may be empty.
-    """
-
-    def __init__(self, message: str, *, hint: str = "") -> None:
-        super().__init__(message)
-        self.message = message
-        self.hint = hint
-
-    def __str__(self) -> str:
-        return f"{self.message} ({self.hint})" if self.hint else self.message
+from touchcell.errors import TouchcellError
 
 
 class GeometryError(TouchcellError, ValueError):

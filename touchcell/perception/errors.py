@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from touchcell.geometry.errors import TouchcellError
+from touchcell.errors import TouchcellError
 
 
 class ImageError(TouchcellError, ValueError):

@@ -20,8 +20,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from touchcell.drivers.core.errors import ConfigError
-from touchcell.geometry.errors import TouchcellError
+from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry.types import Array
 from touchcell.simulation.contact import ContactState, about_z, tilt_of
 from touchcell.simulation.dynamics_model import TipMechanics, build_model, cross, quaternion, rotation

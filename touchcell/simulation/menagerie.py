@@ -12,8 +12,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from touchcell.drivers.core.errors import ConfigError
 from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.simulation.dynamics_model import quaternion

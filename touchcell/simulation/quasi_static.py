@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from touchcell.drivers.core.errors import ConfigError
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 from touchcell.simulation.contact import ContactLaw, ContactModel, ContactState
 from touchcell.simulation.objects import Ball, FreeObject

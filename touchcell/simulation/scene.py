@@ -11,11 +11,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from touchcell.drivers.core.clock import Clock
-from touchcell.drivers.core.errors import ConfigError, DeviceError
+from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import TcpSource
 from touchcell.drivers.core.samples import Stamped
+from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry import se3
-from touchcell.geometry.errors import TouchcellError
 from touchcell.geometry.types import Array
 from touchcell.simulation.contact import ContactLaw, ContactState
 from touchcell.simulation.motions import Glide, Motion, Periodic, Still

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from touchcell.drivers.core.errors import ConfigError
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 from touchcell.simulation.motions import Motion, Still
 

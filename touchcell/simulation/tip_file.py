@@ -9,7 +9,7 @@ from typing import Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from touchcell.drivers.core.errors import ConfigError, suggest
+from touchcell.errors import ConfigError, suggest
 from touchcell.simulation.mount import Rig
 from touchcell.simulation.tip import TipParameters
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from touchcell.drivers.core.errors import ConfigError
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 from touchcell.simulation.contact import ContactLaw, ContactModel, ContactState
 from touchcell.simulation.surfaces import Surface

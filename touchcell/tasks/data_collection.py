@@ -16,8 +16,8 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 
 from touchcell.control.reach import Reach, is_there
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
+from touchcell.errors import TouchcellError
 from touchcell.geometry import se3
-from touchcell.geometry.errors import TouchcellError
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.simulation.samples import PUBLIC_DEPTH_MM, random_poses

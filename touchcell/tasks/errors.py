@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from touchcell.geometry.errors import TouchcellError
+from touchcell.errors import TouchcellError
 
 
 class TaskDefinitionError(TouchcellError, ValueError):

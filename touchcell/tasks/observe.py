@@ -8,8 +8,8 @@ from enum import Enum, auto
 import numpy as np
 from pydantic import PositiveFloat
 
+from touchcell.errors import TouchcellError
 from touchcell.geometry import se3
-from touchcell.geometry.errors import TouchcellError
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.tasks.interface import Action, Observation, TaskConfig, TaskContext, TaskSpec
 from touchcell.tasks.servoing import SENSOR

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from touchcell.control.path import Point
-from touchcell.geometry.errors import TouchcellError
+from touchcell.errors import TouchcellError
 
 Pose = tuple[float, float, float]
 """x and y, m, and heading, rad."""

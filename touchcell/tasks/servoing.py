@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
-from touchcell.geometry.errors import TouchcellError
+from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import Hand, HandConfig
 from touchcell.tasks.interface import Action, Observation, TaskContext, TransitionRecord

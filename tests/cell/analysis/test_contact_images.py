@@ -14,7 +14,8 @@ import yaml
 
 from touchcell.cell.analysis.contact_images import contact_pictures
 from touchcell.cell.analysis.web_viewer import Page, play
-from touchcell.cell.cli.main import EXIT_BAD_INPUT, main
+from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT
+from touchcell.cell.cli.main import main
 from touchcell.cell.recording.mcap import RECORDING, Recorder, follow, read
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.geometry import se3

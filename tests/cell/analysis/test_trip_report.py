@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 import yaml
 
-from touchcell.cell.cli.main import EXIT_BAD_INPUT, EXIT_OK, EXIT_TRIPPED, main
-from touchcell.cell.recording.black_box import BlackBox
+from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_TRIPPED
+from touchcell.cell.cli.main import main
 from touchcell.cell.recording.mcap import read
+from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.paths import CONFIGS
 from touchcell.simulation.devices.arm import SimArm
 from touchcell.simulation.faults import ArmFaults

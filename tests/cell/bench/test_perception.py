@@ -10,17 +10,18 @@ import numpy as np
 import pytest
 
 from tests.helpers.tactile_samples import contacts, draw, write_split
+from tests.perception.models.test_model_file import make_model
 from tests.perception.runtime.test_inference import constant_model
-from tests.perception.runtime.test_model_file import make_model
 from touchcell.cell.bench.perception import camera_frame, table, write_simulated
 from touchcell.cell.bench.perception_runtimes import RUNTIMES, installed
 from touchcell.cell.bench.perception_serving import FRAME_SIZE, from_camera
-from touchcell.cell.cli.main import EXIT_OK, main
+from touchcell.cell.cli.exit_codes import EXIT_OK
+from touchcell.cell.cli.main import main
 from touchcell.drivers.replay.dataset import read_split
+from touchcell.perception.models.model_file import save_model
+from touchcell.perception.models.preprocessing import Crop, Preprocessing
 from touchcell.perception.networks.evaluate import evaluate
 from touchcell.perception.runtime.inference import ContactModel
-from touchcell.perception.runtime.model_file import save_model
-from touchcell.perception.runtime.preprocessing import Crop, Preprocessing
 from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.samples import contacts as simulated_contacts
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from touchcell.cell.bench.sensors import measure
-from touchcell.cell.cli.main import EXIT_OK, main
+from touchcell.cell.cli.exit_codes import EXIT_OK
+from touchcell.cell.cli.main import main
 
 
 def test_every_sensor_is_heard(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

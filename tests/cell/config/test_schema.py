@@ -10,7 +10,7 @@ import pytest
 
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
-from touchcell.drivers.core.errors import ConfigError
+from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
 
 SHIPPED = CONFIGS / "surface_follow_sim.yaml"

@@ -15,7 +15,7 @@ from touchcell.cell.experiments.runner import ExperimentSpec, Scale, installed, 
 from touchcell.cell.experiments.table import Column, Row, table, to_json
 from touchcell.cell.experiments.trials import Finished, Perform, Trial, perform_all
 from touchcell.cell.recording.mcap import read
-from touchcell.drivers.core.errors import ConfigError
+from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
 
 SHORT = {

@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from touchcell.cell.cli.main import EXIT_BAD_INPUT, main
+from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT
+from touchcell.cell.cli.main import main
 from touchcell.cell.runtime.operator_input import (
     FolderInUse,
     NoSuchRun,

@@ -20,7 +20,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from tests.fault_injection.fault_matrix import cells
-from touchcell.cell.cli.main import EXIT_BAD_INPUT, EXIT_OK, EXIT_TASK_FAILED, main
+from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_TASK_FAILED
+from touchcell.cell.cli.main import main
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
 from touchcell.cell.runtime.compose import Cell, compose

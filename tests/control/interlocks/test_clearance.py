@@ -25,9 +25,9 @@ from touchcell.control.interlocks.violation import Severity
 from touchcell.control.latch import Latch
 from touchcell.control.supervisor import LIMIT_FOR_NS, REDUCED, Supervisor
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
-from touchcell.drivers.core.errors import ConfigError
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 
 NOW = 1_000_000_000

@@ -10,13 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from touchcell.control.interlocks.config import INTERLOCKS, Finite, build_interlocks, parse_interlocks
+from touchcell.control.interlocks.basic import Finite
+from touchcell.control.interlocks.config import INTERLOCKS, build_interlocks, parse_interlocks
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
 from touchcell.control.interlocks.timers import TimedInterlock
 from touchcell.control.interlocks.violation import Severity
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
-from touchcell.drivers.core.errors import ConfigError
 from touchcell.drivers.core.samples import Stamped, TcpState
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 
 NOW = 1_000_000_000

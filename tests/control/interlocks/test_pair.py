@@ -14,8 +14,8 @@ from touchcell.control.interlocks.planning_scene import Surroundings
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
 from touchcell.control.interlocks.timers import Past, TimedInterlock
 from touchcell.control.interlocks.violation import Severity, Violation
-from touchcell.drivers.core.errors import ConfigError
 from touchcell.drivers.core.samples import Stamped, TcpState
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 

@@ -16,8 +16,9 @@ from touchcell.control.interlocks.timers import TimedInterlock
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.control.latch import Latch
 from touchcell.control.supervisor import LIMIT_FOR_NS, REDUCED, Supervisor
-from touchcell.drivers.core.commands import Adjustment, Sent, TwistCommand, TwistFrame
+from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
 from touchcell.drivers.core.samples import Stamped, TcpState
+from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.geometry import se3
 
 CYCLE_NS = 10_000_000

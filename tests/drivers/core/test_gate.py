@@ -9,13 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from touchcell.drivers.core.arm import JointLimitsConfig
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.gate import TwistGate, TwistLimits
 from touchcell.drivers.core.lease import LeaseDesk
 from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain
-from touchcell.drivers.kinematics.joint_limits import IkSettings, JointLimitsConfig
+from touchcell.drivers.kinematics.joint_limits import IkSettings
 from touchcell.geometry.types import Array
 
 LIMITS = TwistLimits(0.1, 0.5, 0.5, 2.5, 20.0, 100.0)

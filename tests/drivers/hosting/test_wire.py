@@ -11,10 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from touchcell.drivers.core.commands import Adjustment
 from touchcell.drivers.core.errors import (
     CommandRejected,
-    ConfigError,
     ConnectError,
     DeviceError,
     DeviceFault,
@@ -29,7 +27,8 @@ from touchcell.drivers.core.errors import (
 from touchcell.drivers.hosting import wire
 from touchcell.drivers.hosting.layouts import ANSWER, ARM, RecordReader, RecordWriter, close_fd, new_block
 from touchcell.drivers.hosting.memory import BlockMismatch
-from touchcell.geometry.errors import TouchcellError
+from touchcell.drivers.kinematics.adjustment import Adjustment
+from touchcell.errors import ConfigError, TouchcellError
 
 ERRORS = [
     CommandRejected("left", Rejection.EXPIRED, "too old", value=0.2, limit=0.03, hint="hurry"),

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.errors import DeviceFault, FaultClass
 from touchcell.drivers.franka.emulator import arm as franka_arm
-from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain, Tool, require_same_arm
+from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain, Tool
 from touchcell.drivers.ur.emulator import kinematics as ur_model
 from touchcell.geometry import se3
 

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from touchcell.drivers.core.errors import ConfigError
 from touchcell.drivers.kinematics.chain import (
     GRAVITY_M_S2,
     ChainDescription,
@@ -17,6 +16,7 @@ from touchcell.drivers.kinematics.chain import (
     SerialChain,
     Tool,
 )
+from touchcell.errors import ConfigError
 from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.types import Array
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.perception.runtime.test_model_file import make_model
+from tests.perception.models.test_model_file import make_model
 
 pytest.importorskip("torch")
 
@@ -26,17 +26,17 @@ from touchcell.perception.calibration.adaptation import (
     outputs_of,
     tune,
 )
-from touchcell.perception.calibration.marker_learning import train_guess
 from touchcell.perception.errors import ModelError, TrainingError
-from touchcell.perception.markers.architecture import MarkerArchitecture
-from touchcell.perception.markers.detection import Discs, MarkerSize
+from touchcell.perception.markers.detection import Discs
 from touchcell.perception.markers.estimator import matcher_of
 from touchcell.perception.markers.matching import DisplacementModel
+from touchcell.perception.models.marker_architecture import MarkerArchitecture, MarkerSize
+from touchcell.perception.models.model_file import Header, Labels, Model, save_model
+from touchcell.perception.models.prediction import Prediction
+from touchcell.perception.models.preprocessing import Preprocessing
+from touchcell.perception.networks.marker_learning import train_guess
 from touchcell.perception.runtime.calibrated_estimator import turned
 from touchcell.perception.runtime.estimators import load_estimator
-from touchcell.perception.runtime.inference import Prediction
-from touchcell.perception.runtime.model_file import Header, Labels, Model, save_model
-from touchcell.perception.runtime.preprocessing import Preprocessing
 from touchcell.simulation.mount import Rig
 from touchcell.simulation.render import PUBLIC_CROP
 from touchcell.simulation.tip import Tip, TipParameters

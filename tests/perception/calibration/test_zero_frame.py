@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 
 from tests.helpers.marker_samples import REST, SIZE
-from tests.perception.runtime.test_model_file import make_model
+from tests.perception.models.test_model_file import make_model
 from touchcell.cell.cli.calibrate import calibrate
 from touchcell.cell.runtime.compose import MODELS
-from touchcell.drivers.core.errors import ConfigError, DataError
+from touchcell.errors import ConfigError, DataError
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.calibration.zero_frame import find_change, lattice_turns, similarity
 from touchcell.perception.errors import TrainingError
+from touchcell.perception.models.camera_change import CameraChange, load_change
+from touchcell.perception.models.model_file import Model
+from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.runtime.calibrated_estimator import CalibratedEstimator
-from touchcell.perception.runtime.camera_change import CameraChange, load_change
 from touchcell.perception.runtime.estimators import load_estimator
 from touchcell.perception.runtime.inference import ContactModel
-from touchcell.perception.runtime.model_file import Model
-from touchcell.perception.runtime.preprocessing import Preprocessing
 from touchcell.simulation.render import FrameRenderer
 
 CORNER = np.array([105.0, 20.0])

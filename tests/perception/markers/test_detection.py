@@ -5,18 +5,12 @@ import numpy as np
 import pytest
 
 from tests.helpers.marker_samples import CORNER, REST, SIZE, simulated
-from touchcell.perception.calibration.marker_learning import fit_lattice
 from touchcell.perception.errors import ImageError
-from touchcell.perception.markers.detection import (
-    Discs,
-    MarkerSize,
-    detect_markers,
-    lattice,
-    ring_numbers,
-    typical_size,
-)
+from touchcell.perception.markers.detection import Discs, detect_markers, lattice, ring_numbers, typical_size
 from touchcell.perception.markers.figures import density_change
-from touchcell.perception.runtime.preprocessing import AdaptiveThreshold, Crop, Preprocessing
+from touchcell.perception.models.marker_architecture import MarkerSize
+from touchcell.perception.models.preprocessing import AdaptiveThreshold, Crop, Preprocessing
+from touchcell.perception.networks.marker_learning import fit_lattice
 from touchcell.simulation.render import FrameRenderer
 
 MARKERS = MarkerSize.of_disc(np.pi * 6.2**2)

@@ -10,7 +10,7 @@ import pytest
 
 from tests.helpers.marker_samples import SIZE, simulated, write_split
 from tests.helpers.tactile_samples import taught
-from tests.perception.runtime.test_model_file import make_model
+from tests.perception.models.test_model_file import make_model
 from tests.perception.runtime.test_pipeline import StubCamera
 
 torch = pytest.importorskip("torch")
@@ -20,6 +20,7 @@ from touchcell.geometry import se3  # noqa: E402
 from touchcell.perception.errors import ImageError, ModelError, TrainingError  # noqa: E402
 from touchcell.perception.markers.estimator import MarkerEstimator, mixed  # noqa: E402
 from touchcell.perception.markers.matching import DisplacementModel, MarkerField  # noqa: E402
+from touchcell.perception.models.model_file import Labels, Model, load_model, save_model  # noqa: E402
 from touchcell.perception.networks.checkpoint import EpochRecord, checkpoint_path  # noqa: E402
 from touchcell.perception.networks.contact_network import Alignment  # noqa: E402
 from touchcell.perception.networks.displacement_network import DisplacementNetwork, displacement_loss  # noqa: E402
@@ -27,7 +28,6 @@ from touchcell.perception.networks.evaluate import evaluate  # noqa: E402
 from touchcell.perception.networks.marker_training import MarkerSettings, preprocessing_for, train_markers  # noqa: E402
 from touchcell.perception.runtime.estimators import load_estimator  # noqa: E402
 from touchcell.perception.runtime.inference import ContactModel  # noqa: E402
-from touchcell.perception.runtime.model_file import Labels, Model, load_model, save_model  # noqa: E402
 from touchcell.perception.runtime.pipeline import ContactPipeline  # noqa: E402
 
 QUICK = MarkerSettings(epochs=8, networks=2, hidden=(96, 48), modes=16, guess_steps=30, batch_size=16, memory=0.95)

@@ -10,10 +10,10 @@ from tests.perception.markers.test_detection import MARKERS, inside
 
 pytest.importorskip("torch")
 
-from touchcell.perception.calibration.marker_learning import Learned, fit_lattice, learn_markers
 from touchcell.perception.errors import TrainingError
 from touchcell.perception.markers.detection import Discs, detect_markers
 from touchcell.perception.markers.matching import DisplacementModel, MarkerField, MarkerMatcher
+from touchcell.perception.networks.marker_learning import Learned, fit_lattice, learn_markers
 
 
 @pytest.fixture(scope="module")

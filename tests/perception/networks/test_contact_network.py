@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 torch = pytest.importorskip("torch")
 
+from touchcell.perception.models.architecture import LOG_PRECISION_BOUNDS, MEAN_BOUNDS, Architecture  # noqa: E402
+from touchcell.perception.models.model_file import Labels  # noqa: E402
 from touchcell.perception.networks.contact_network import (  # noqa: E402
     Alignment,
     ContactNetwork,
@@ -17,8 +19,6 @@ from touchcell.perception.networks.contact_network import (  # noqa: E402
     weighted_absolute_loss,
     weighted_square_loss,
 )
-from touchcell.perception.runtime.architecture import LOG_PRECISION_BOUNDS, MEAN_BOUNDS, Architecture  # noqa: E402
-from touchcell.perception.runtime.model_file import Labels  # noqa: E402
 
 BOUNDS = [MEAN_BOUNDS, LOG_PRECISION_BOUNDS, (0.0, 1.0), (1e-6, 1e6**0.25), (-20.0, 20.0), (5.0, 5.5)]
 SMALL = Architecture(input_size=(32, 32), channels=(4, 8), hidden=16)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from tests.helpers.tactile_samples import SIZE, contacts, draw, labelled, preprocessing, write_split
-from touchcell.drivers.core.errors import DataError
 from touchcell.drivers.replay.dataset import read_image, read_split
+from touchcell.errors import DataError
 from touchcell.perception.errors import ImageError
+from touchcell.perception.models.labels import contact_from_xi, xi_from_contact
 from touchcell.perception.networks import dataset
 from touchcell.perception.networks.dataset import LabelledImages, load_reduced
-from touchcell.perception.runtime.labels import contact_from_xi, xi_from_contact
 
 
 @pytest.fixture

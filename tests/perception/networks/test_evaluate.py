@@ -13,11 +13,11 @@ from rich.console import Console
 from tests.helpers.tactile_samples import CENTRE, contacts, draw, write_split
 from tests.perception.runtime.test_inference import constant_model
 from touchcell.drivers.core.clock import VirtualClock
-from touchcell.drivers.core.errors import DataError
+from touchcell.errors import DataError
 from touchcell.perception.errors import ImageError, ModelError
+from touchcell.perception.models.labels import XI_UNITS, xi_from_contact
+from touchcell.perception.models.model_file import Labels, save_model
 from touchcell.perception.networks.evaluate import evaluate, print_table
-from touchcell.perception.runtime.labels import XI_UNITS, xi_from_contact
-from touchcell.perception.runtime.model_file import Labels, save_model
 
 N = 25
 HALF = np.array([5e-3, 5e-3, 3e-3, 0.4, 0.4, 0.1])

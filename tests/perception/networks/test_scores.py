@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from touchcell.perception.models.labels import CONTACT_NAMES, XI_UNITS, xi_from_contact
+from touchcell.perception.models.prediction import Prediction
 from touchcell.perception.networks.scores import SCORE_NAMES, Scores
-from touchcell.perception.runtime.inference import Prediction
-from touchcell.perception.runtime.labels import CONTACT_NAMES, XI_UNITS, xi_from_contact
 
 CONTACT = np.array([1.0, -0.5, 3.0, 5.0, -8.0, 1.0])
 """x, y, z mm, alpha, beta, gamma deg."""

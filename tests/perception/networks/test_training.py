@@ -13,16 +13,16 @@ from rich.console import Console
 torch = pytest.importorskip("torch")
 
 from tests.helpers.tactile_samples import CENTRE, draw, labelled, preprocessing, taught, write_split  # noqa: E402
-from touchcell.drivers.core.errors import DataError  # noqa: E402
 from touchcell.drivers.replay.dataset import REST_IMAGE  # noqa: E402
+from touchcell.errors import DataError  # noqa: E402
 from touchcell.perception.errors import ModelError, TrainingError  # noqa: E402
+from touchcell.perception.models.architecture import Architecture  # noqa: E402
+from touchcell.perception.models.labels import contact_from_xi, xi_from_contact  # noqa: E402
+from touchcell.perception.models.model_file import Model, load_model  # noqa: E402
 from touchcell.perception.networks.checkpoint import EpochRecord, checkpoint_path  # noqa: E402
 from touchcell.perception.networks.dataset import LabelledImages  # noqa: E402
 from touchcell.perception.networks.progress import Display  # noqa: E402
 from touchcell.perception.networks.training import Settings, learning_rate, preprocessing_for, train, train_on_arrays  # noqa: E402
-from touchcell.perception.runtime.architecture import Architecture  # noqa: E402
-from touchcell.perception.runtime.labels import contact_from_xi, xi_from_contact  # noqa: E402
-from touchcell.perception.runtime.model_file import Model, load_model  # noqa: E402
 
 ARCHITECTURE = Architecture(input_size=(32, 32), channels=(8, 16), hidden=32)
 QUICK = Settings(epochs=4, batch_size=16, learning_rate=3e-3)

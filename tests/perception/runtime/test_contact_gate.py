@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from tests.helpers.tactile_samples import CENTRE, contacts, draw, preprocessing
-from tests.perception.runtime.test_model_file import make_model
+from tests.perception.models.test_model_file import make_model
 from touchcell.perception.errors import ImageError
+from touchcell.perception.models.model_file import Model
 from touchcell.perception.runtime.contact_gate import ContactGate
-from touchcell.perception.runtime.model_file import Model
 
 REST = CENTRE - [0.0, 0.0, 2.75, 0.0, 0.0, 0.0]
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.helpers.tactile_samples import SIZE, contacts, draw, preprocessing
-from tests.perception.runtime.test_model_file import make_model
+from tests.perception.models.test_model_file import make_model
 from touchcell.drivers.core.samples import Frame, Quality, Stamped
 from touchcell.perception.errors import ImageError
-from touchcell.perception.runtime.architecture import Architecture
+from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.model_file import Header, Labels, Model, save_model
 from touchcell.perception.runtime.inference import ContactModel
-from touchcell.perception.runtime.model_file import Header, Labels, Model, save_model
 
 IMAGES = [draw(contact) for contact in contacts(8, seed=5)]
 

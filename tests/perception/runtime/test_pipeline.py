@@ -13,10 +13,10 @@ from touchcell.drivers.core.errors import EndOfStream
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array, ImageArray
+from touchcell.perception.models.prediction import Prediction
 from touchcell.perception.runtime.contact_gate import ContactGate
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.perception.runtime.filter import PoseFilter, isotropic_noise
-from touchcell.perception.runtime.inference import Prediction
 from touchcell.perception.runtime.pipeline import ContactPipeline
 
 XI = se3.log(se3.inverse(se3.from_euler_mm_deg([0.5, 0.0, 3.0, 2.0, -4.0, 1.0])))

@@ -11,11 +11,12 @@ from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop
 from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
-from touchcell.drivers.core.errors import ConfigError, LifecycleError
+from touchcell.drivers.core.errors import LifecycleError
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.spec import DriverContext
 from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain
 from touchcell.drivers.kinematics.inverse import joints_for_pose
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.simulation.devices.joint_arm import TOOLS, SimJointArm
 from touchcell.simulation.devices.tactip import SimTactip, SimTactipConfig

@@ -5,10 +5,11 @@ from pydantic import ValidationError
 from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
-from touchcell.drivers.core.errors import ConfigError, DeviceGone, LifecycleError, StaleData, TransportTimeout
+from touchcell.drivers.core.errors import DeviceGone, LifecycleError, StaleData, TransportTimeout
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.drivers.core.spec import DriverContext
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.simulation.devices.arm import SimArm
 from touchcell.simulation.devices.tactip import SimTactip, SimTactipConfig

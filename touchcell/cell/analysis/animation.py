@@ -28,7 +28,7 @@ from touchcell.cell.analysis.run_folder import (
     true_contacts,
 )
 from touchcell.cell.recording.mcap import read
-from touchcell.drivers.core.errors import ConfigError
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.simulation.render import FrameRenderer

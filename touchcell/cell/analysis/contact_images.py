@@ -17,10 +17,10 @@ from touchcell.geometry.types import ImageArray
 from touchcell.perception.errors import ImageError
 from touchcell.perception.markers.figures import draw_contact, write_markers
 from touchcell.perception.markers.tracking import MarkerTracker, TrackedMarkers
-from touchcell.perception.runtime.preprocessing import Preprocessing
+from touchcell.perception.models.preprocessing import Preprocessing
 
 if TYPE_CHECKING:
-    from touchcell.cell.analysis.report import Run
+    from touchcell.cell.analysis.run_data import Run
 
 _PICTURES = 5
 

@@ -11,7 +11,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from touchcell.cell.analysis.report import Run, tip_points
+from touchcell.cell.analysis.run_data import Run, tip_points
 from touchcell.cell.recording.messages import COMPONENTS
 from touchcell.geometry.types import Array
 

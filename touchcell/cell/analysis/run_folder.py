@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from touchcell.cell.analysis.report import Run, Series, load_run, tip_points
+from touchcell.cell.analysis.run_data import Run, Series, load_run, tip_points
 from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.geometry.types import Array
 from touchcell.simulation.scene import SceneConfig

@@ -10,7 +10,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from touchcell.cell.analysis.report import Run
+from touchcell.cell.analysis.run_data import Run
 
 _BEFORE_S, _AFTER_S = 1.0, 0.5
 

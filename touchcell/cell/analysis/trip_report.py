@@ -8,9 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from touchcell.cell.analysis.report import Run, Series, load_run
+from touchcell.cell.analysis.run_data import Run, Series, load_run
 from touchcell.cell.errors import RecordingError
-from touchcell.cell.recording.black_box import ABOUT, MESSAGES
+from touchcell.cell.runtime.black_box import ABOUT, MESSAGES
 from touchcell.cell.runtime.watchdog import NOTES
 from touchcell.geometry.types import Array
 

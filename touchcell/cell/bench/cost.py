@@ -97,7 +97,7 @@ def ready():
 from pathlib import Path
 if what == "run":
     from touchcell.cell.cli.run import give_back_memory
-    from touchcell.cell.recording.black_box import BlackBox
+    from touchcell.cell.runtime.black_box import BlackBox
     from touchcell.cell.runtime.compose import compose
     from touchcell.cell.config.schema import plan_cell
     from touchcell.cell.runtime.loop import RunLoop

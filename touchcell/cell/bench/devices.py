@@ -103,7 +103,7 @@ def _vendor(seat: Seat) -> dict[str, Any]:
 def _client(who: str, seat: Seat, name: str) -> dict[str, Any]:
     environment = dict(os.environ)
     if name == "v4l2":
-        from touchcell.drivers.v4l2.emulator.shim import environment as shim
+        from touchcell.drivers.v4l2.shim import environment as shim
 
         environment |= shim(seat.folder)
     try:

@@ -32,10 +32,10 @@ from touchcell.drivers.replay.dataset import IMAGE_COLUMN, IMAGE_FOLDER, LABEL_C
 from touchcell.geometry import se3
 from touchcell.geometry.types import ImageArray
 from touchcell.paths import MODELS
+from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.model_file import Header, load_model
 from touchcell.perception.networks.figures import write_predictions
 from touchcell.perception.networks.scores import SCORE_NAMES, Scores
-from touchcell.perception.runtime.architecture import Architecture
-from touchcell.perception.runtime.model_file import Header, load_model
 from touchcell.simulation.render import FrameRenderer, Lighting
 from touchcell.simulation.samples import Variation, contacts
 

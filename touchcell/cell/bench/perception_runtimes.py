@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.cell.bench.quantiles import median_and_p99
-from touchcell.perception.runtime.architecture import Architecture
-from touchcell.perception.runtime.graph import onnx_model
+from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.graph import onnx_model
+from touchcell.perception.models.model_file import Model
 from touchcell.perception.runtime.inference import Runner, onnx_runtime
-from touchcell.perception.runtime.model_file import Model
 
 
 def openvino(model: Model) -> Runner:

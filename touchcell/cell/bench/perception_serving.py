@@ -20,10 +20,11 @@ import numpy as np
 from touchcell.cell.bench.quantiles import median_and_p99
 from touchcell.geometry.types import ImageArray
 from touchcell.perception.markers.estimator import MarkerEstimator
-from touchcell.perception.runtime.estimators import ContactEstimator, estimator_of
-from touchcell.perception.runtime.inference import ContactModel, Prediction
-from touchcell.perception.runtime.model_file import Model, load_model
-from touchcell.perception.runtime.preprocessing import AdaptiveThreshold, Crop, Preprocessing
+from touchcell.perception.models.model_file import Model, load_model
+from touchcell.perception.models.prediction import ContactEstimator, Prediction
+from touchcell.perception.models.preprocessing import AdaptiveThreshold, Crop, Preprocessing
+from touchcell.perception.runtime.estimators import estimator_of
+from touchcell.perception.runtime.inference import ContactModel
 
 T = TypeVar("T")
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.compose import build_devices
-from touchcell.drivers.core.errors import ConfigError, DataError
 from touchcell.drivers.core.protocols import FrameSource
 from touchcell.drivers.replay.dataset import natural_order, read_image
+from touchcell.errors import ConfigError, DataError
 from touchcell.geometry.types import ImageArray
 from touchcell.perception.calibration.zero_frame import find_change
-from touchcell.perception.runtime.camera_change import CameraChange
-from touchcell.perception.runtime.model_file import load_model
+from touchcell.perception.models.camera_change import CameraChange
+from touchcell.perception.models.model_file import load_model
 
 _FRAME_TIMEOUT_S = 5.0
 

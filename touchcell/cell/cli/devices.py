@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from touchcell.cell.cli import discovery
+from touchcell.cell.cli.discovery import Found
 from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.cell.runtime.compose import build_devices
-from touchcell.drivers import discovery
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.errors import DeviceError, LifecycleError
 from touchcell.drivers.core.protocols import FrameSource, HealthSource, JointSource, TcpSource
-from touchcell.drivers.discovery import Found
 from touchcell.geometry import se3
 
 

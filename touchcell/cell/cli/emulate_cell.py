@@ -25,11 +25,12 @@ import numpy as np
 from touchcell.cell.cli.main import find_cell
 from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.drivers.core.clock import MonotonicClock
-from touchcell.drivers.core.errors import ConfigError, DeviceError
+from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.franka.emulator import arm as franka_arm
 from touchcell.drivers.ur.emulator import kinematics as ur_model
 from touchcell.drivers.v4l2.emulator.server import V4l2Emulator
-from touchcell.drivers.v4l2.emulator.shim import environment
+from touchcell.drivers.v4l2.shim import environment
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.simulation.render import FrameRenderer

@@ -6,6 +6,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 from touchcell import registry as entry_points
+from touchcell.cell.bench.catalog import benchmarks
 from touchcell.control.interlocks.config import INTERLOCKS
 from touchcell.drivers.core import spec as drivers_registry
 from touchcell.paths import CONFIGS
@@ -22,7 +23,7 @@ def listing() -> dict[str, list[tuple[str, str]]]:
         "experiments": [
             (name, _summary(point)) for name, point in sorted(entry_points.installed("touchcell.experiments").items())
         ],
-        "benchmarks": [(name, "") for name in sorted(entry_points.installed("touchcell.benchmarks"))],
+        "benchmarks": [(name, "") for name in sorted(benchmarks())],
         "cells that ship": [(f"configs/{path.name}", _first_comment(path)) for path in _shipped()],
     }
 

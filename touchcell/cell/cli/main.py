@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import argparse
 import os
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from touchcell.geometry.errors import TouchcellError
-from touchcell.paths import CHECKOUT, CONFIGS
-
-EXIT_OK = 0
-EXIT_TASK_FAILED = 1
-EXIT_BAD_INPUT = 2
-EXIT_TRIPPED = 3
+from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_TASK_FAILED
+from touchcell.errors import TouchcellError
+from touchcell.paths import CONFIGS
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -399,18 +394,14 @@ def _ask(options: argparse.Namespace) -> int:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from touchcell import registry as entry_points
+    from touchcell.cell.bench.catalog import benchmarks
 
-    known = entry_points.installed("touchcell.benchmarks")
-    arguments = [*options.rest, *options.passed_on]
-    if options.name not in known and options.name and (CHECKOUT / "benchmarks" / "__main__.py").is_file():
-        command = [sys.executable, "-m", "benchmarks", "--out", str(options.out), options.name, *arguments]
-        return subprocess.run(command, env={**os.environ, "PYTHONPATH": str(CHECKOUT)}, check=False).returncode
+    known = benchmarks()
     if options.name not in known:
         print(f"benchmarks: {', '.join(sorted(known))}", file=sys.stderr)
         return EXIT_BAD_INPUT
     options.out.mkdir(parents=True, exist_ok=True)
-    known[options.name].load()(arguments, options.out)
+    known[options.name].load()([*options.rest, *options.passed_on], options.out)
     return EXIT_OK
 
 

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from touchcell.cell.analysis.report import write_report
-from touchcell.cell.cli.main import EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
+from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
 from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.cell.errors import RecordingError
-from touchcell.cell.recording.black_box import BlackBox, cause_record, keep_earlier, stop_record
 from touchcell.cell.recording.mcap import RECORDING, Recorder
+from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, stop_record
 from touchcell.cell.runtime.compose import Cell, compose
 from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
 from touchcell.cell.runtime.operator_channel import OperatorDesk

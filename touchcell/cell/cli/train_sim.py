@@ -17,12 +17,13 @@ import numpy as np
 
 from touchcell.geometry import se3
 from touchcell.geometry.types import ImageArray
-from touchcell.perception.markers.detection import Discs, MarkerSize
+from touchcell.perception.markers.detection import Discs
+from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.marker_architecture import MarkerSize
+from touchcell.perception.models.preprocessing import AdaptiveThreshold, Crop, Preprocessing
 from touchcell.perception.networks.dataset import LabelledImages
 from touchcell.perception.networks.progress import Display, Observer
 from touchcell.perception.networks.training import Settings, train_on_arrays
-from touchcell.perception.runtime.architecture import Architecture
-from touchcell.perception.runtime.preprocessing import AdaptiveThreshold, Crop, Preprocessing
 from touchcell.simulation.render import FRAME_SIZE, PUBLIC_CROP, FrameRenderer
 from touchcell.simulation.samples import SampledContact, Variation, contacts
 from touchcell.simulation.tip import Tip, TipParameters

@@ -17,19 +17,14 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat,
 
 from touchcell.cell.config.stopping_distance import Overshoot, overshoot, together
 from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile, load
+from touchcell.control.interlocks.basic import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
-from touchcell.control.interlocks.config import (
-    INTERLOCKS,
-    REQUIRED_TO_MOVE,
-    REQUIRED_TO_TOUCH,
-    InterlocksConfig,
-    WorkspaceConfig,
-)
+from touchcell.control.interlocks.config import INTERLOCKS, REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
 from touchcell.drivers.core import spec as driver_registry
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.device import DeactivatePolicy
-from touchcell.drivers.core.errors import ConfigError, suggest
 from touchcell.drivers.core.spec import DriverConfig, DriverSpec
+from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.tasks import registry as task_registry

@@ -10,7 +10,7 @@ from typing import Any, TypeVar, get_args
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from touchcell.drivers.core.errors import ConfigError, suggest
+from touchcell.errors import ConfigError, suggest
 
 KeyPath = tuple[str | int, ...]
 M = TypeVar("M", bound=BaseModel)

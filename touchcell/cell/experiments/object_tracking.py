@@ -10,15 +10,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from touchcell.cell.analysis.run_folder import Poses, RunFolder, rms, scene_time, sensor_poses, surface, true_contacts
+from touchcell.cell.analysis.run_folder import RunFolder, rms
 from touchcell.cell.experiments.runner import ExperimentSpec, Scale
 from touchcell.cell.experiments.table import Column
+from touchcell.cell.experiments.tracking_error import tracking
 from touchcell.cell.experiments.trials import Finished, Trial
 from touchcell.cell.recording.messages import COMPONENTS
-from touchcell.geometry import se3
-from touchcell.geometry.types import Array
 
 SENSOR = "sensor"
 CELL = "object_track_sim.yaml"
@@ -78,30 +75,6 @@ def measure(trial: RunFolder) -> Mapping[str, float]:
     """RMS of each component of the sensor's pose against a sensor that sticks where it first touched."""
     _, _, error = tracking(trial)
     return {f"{name}_rms": rms(error[:, i]) for i, name in enumerate(COMPONENTS)}
-
-
-def tracking(trial: RunFolder) -> tuple[Poses, Array, Array]:
-    """The sensor's poses, the plate's at the same times, and the errors (n, 6) in mm and degrees.
-
-    The surface frame is that of the first touch, carried along by the plate; the error is the sensor's pose in it
-    against the reference. NaN while the task does not track.
-    """
-    plate = surface(trial)
-    poses = sensor_poses(trial, SENSOR)
-    T_world_plate = np.stack([plate.motion.pose(float(t)) for t in poses.t_s])
-    T_plate_s = se3.inverse(T_world_plate) @ poses.T_world
-    series, contacts = true_contacts(trial, SENSOR)
-    touched = np.flatnonzero([bool(row.get("in_contact")) for row in series.rows])
-    error = np.full((len(poses.t_s), 6), np.nan)
-    task = trial.recording.series("/task")
-    if len(touched) and task is not None:
-        t_touch = scene_time(trial, series)[touched[0]]
-        at_touch = Poses(poses.t_s, T_plate_s).at(np.array([t_touch]))[0]
-        T_f_plate = se3.from_euler_mm_deg(contacts[touched[0]]) @ se3.inverse(at_touch)
-        error = np.asarray(se3.to_euler_mm_deg(T_f_plate @ T_plate_s))
-        error[:, 2] -= np.nanmedian(task.column("reference_z_mm"))
-        error[~trial.recording.during(poses.t_s - 1e-9 * trial.recording.start_ns, "run")] = np.nan
-    return poses, T_world_plate, error
 
 
 def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:

@@ -6,7 +6,6 @@ one density: squares of 80 and 60 mm, a circle of 80 mm and a hexagon of 70 mm a
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from touchcell.cell.analysis.run_folder import Poses, RunFolder, object_poses, scene_time, sensor_poses, true_contacts
+from touchcell.cell.experiments.push_measures import OBJECT, lean_deg, off_normal_mm, pushed_until_s, target_mm
 from touchcell.cell.experiments.runner import ExperimentSpec, Scale
 from touchcell.cell.experiments.table import Column
 from touchcell.cell.experiments.trials import Finished, Trial
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
-OBJECT = "prism"
 SURFACES = ("mdf", "foam")
 PUSH_HEIGHT_MM = 45.0
 _HEIGHT_MM = 80.0
@@ -215,37 +214,9 @@ def push_measures(run: RunFolder) -> dict[str, float]:
     }
 
 
-def target_mm(run: RunFolder) -> Array:
-    """(2,) the target, from above."""
-    return np.array(run.plan.task_config.model_dump()["target_mm"], dtype=np.float64)
-
-
-def pushed_until_s(run: RunFolder) -> float | None:
-    """When the task stopped pushing, in time of the scene; None if it never pushed."""
-    task = run.recording.series("/task")
-    if task is None:
-        return None
-    running = np.flatnonzero([row.get("state") == "run" for row in task.rows])
-    return float(scene_time(run, task)[running[-1]]) if len(running) else None
-
-
-def off_normal_mm(T_world_f: Array, target_mm: Array) -> float:
-    """Distance, from above, of a target (2,) from the line of the contact normal of a surface frame (4, 4)."""
-    x, y = target_mm - 1e3 * T_world_f[:2, 3]
-    along_x, along_y = T_world_f[:2, 2] / math.hypot(*T_world_f[:2, 2])
-    return float(abs(along_x * y - along_y * x))
-
-
 def _surface_pose(run: RunFolder, sensor: str, t_s: float) -> Array:
     """T_world_f (4, 4) of the true contact."""
     T_world_s = sensor_poses(run, sensor).at(np.array([t_s]))[0]
     series, contacts = true_contacts(run, sensor)
     felt = Poses(scene_time(run, series), np.asarray(se3.from_euler_mm_deg(np.nan_to_num(contacts))))
     return se3.compose(T_world_s, se3.inverse(felt.at(np.array([t_s]))[0]))
-
-
-def lean_deg(run: RunFolder) -> Array:
-    """(n,) angle of the object's axis from upright over time."""
-    upright = object_poses(run)[OBJECT].T_world[:, 2, 2]
-    angle: Array = np.degrees(np.arccos(np.clip(upright, -1.0, 1.0)))
-    return angle

@@ -10,7 +10,7 @@ import numpy as np
 
 from touchcell.cell.analysis.run_folder import Poses, RunFolder
 from touchcell.cell.experiments.frames import BLUE, ORANGE, frames_2d, label_2d, path_2d, save
-from touchcell.cell.experiments.object_tracking import tracking
+from touchcell.cell.experiments.tracking_error import tracking
 from touchcell.cell.experiments.trials import Finished
 from touchcell.cell.recording.messages import COMPONENTS
 from touchcell.geometry import se3

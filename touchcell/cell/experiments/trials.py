@@ -25,7 +25,7 @@ from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import Outcome, RunLoop
-from touchcell.drivers.core.errors import ConfigError, suggest
+from touchcell.errors import ConfigError, suggest
 from touchcell.paths import CONFIGS
 
 COLLECTED = "data"

@@ -15,8 +15,8 @@ from typing import Any
 import cv2
 
 from touchcell.cell.errors import RecordingError
-from touchcell.drivers.core.errors import ConfigError
 from touchcell.drivers.replay.dataset import IMAGE_COLUMN, IMAGE_FOLDER, LABEL_COLUMNS, LABEL_FILES, REST_IMAGE
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array, ImageArray
 

@@ -32,10 +32,10 @@ from touchcell.control.supervisor import Supervisor
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.clock import Clock, MonotonicClock, VirtualClock
 from touchcell.drivers.core.device import Device
-from touchcell.drivers.core.errors import ConfigError
 from touchcell.drivers.core.protocols import FrameSource, StopCategory, TcpSource
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.drivers.core.spec import DriverContext
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.paths import MODELS

@@ -38,8 +38,8 @@ from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.protocols import ServoArm, TwistSink
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
+from touchcell.errors import TouchcellError
 from touchcell.geometry import se3
-from touchcell.geometry.errors import TouchcellError
 from touchcell.geometry.finite import all_finite
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
@@ -113,7 +113,7 @@ class StopRequest:
 
 
 class Box(Protocol):
-    """Something that keeps messages and never fails; see ``touchcell.cell.recording.black_box``."""
+    """Something that keeps messages and never fails; see ``touchcell.cell.runtime.black_box``."""
 
     def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
         """Keep one message."""

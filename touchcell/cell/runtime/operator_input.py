@@ -19,7 +19,7 @@ from typing import IO, Final
 
 from touchcell.cell.runtime.loop import StopRequest
 from touchcell.cell.runtime.operator_channel import Ask, OperatorDesk
-from touchcell.geometry.errors import TouchcellError
+from touchcell.errors import TouchcellError
 
 PID_FILE: Final = "pid"
 AT_ONCE_KEYS: Final = b" \x1b"

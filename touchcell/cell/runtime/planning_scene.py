@@ -11,9 +11,9 @@ from touchcell.cell.config.schema import ArmSection, BoxSection, CapsuleSection,
 from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.control.interlocks.collision import BASE, TOOL, Box, Capsule
 from touchcell.control.interlocks.planning_scene import Body, Surroundings
-from touchcell.drivers.core.errors import ConfigError
 from touchcell.drivers.core.protocols import ServoArm, TwistSink
 from touchcell.drivers.kinematics.chain import CapsuleShape, ChainDescription
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 

@@ -13,7 +13,7 @@ from touchcell.control.interlocks.collision import Clearances, Pair
 from touchcell.control.interlocks.planning_scene import Body, PlacedSettings, Surroundings
 from touchcell.control.interlocks.snapshot import CellView
 from touchcell.control.interlocks.violation import Severity, Violation
-from touchcell.drivers.core.errors import ConfigError
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 
 _AHEAD_S = 0.01

@@ -29,8 +29,8 @@ from touchcell.control.interlocks.timers import (
     shared,
 )
 from touchcell.control.interlocks.violation import Severity
-from touchcell.drivers.core.errors import ConfigError
 from touchcell.drivers.core.samples import TcpState
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 
 _REFERENCE_DEPTH_M = 1e-3

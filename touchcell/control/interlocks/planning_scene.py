@@ -17,7 +17,7 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 if TYPE_CHECKING:
-    from touchcell.control.interlocks.config import Interlock
+    from touchcell.control.interlocks.interlock import Interlock
     from touchcell.control.interlocks.timers import TimedInterlock
 
 

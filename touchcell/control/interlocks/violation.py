@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 
-from touchcell.control.errors import SafetyTrip
+from touchcell.control.interlocks.errors import SafetyTrip
 
 
 class Severity(IntEnum):

@@ -10,13 +10,13 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable
 from contextlib import suppress
-from typing import final
+from typing import Self, final
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from touchcell.drivers.core.clock import Clock
-from touchcell.drivers.core.commands import Adjustment, Sent, TwistCommand, TwistFrame
+from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
 from touchcell.drivers.core.device import DeactivatePolicy, Device, Lifecycle
 from touchcell.drivers.core.errors import (
     CommandRejected,
@@ -31,7 +31,9 @@ from touchcell.drivers.core.lease import Lease, LeaseDesk
 from touchcell.drivers.core.protocols import StopCategory
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.drivers.core.spec import DriverConfig
+from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.drivers.kinematics.chain import DifferentialIk, LocalIk
+from touchcell.drivers.kinematics.joint_limits import IkSettings
 from touchcell.geometry.finite import all_finite
 from touchcell.geometry.types import Array
 
@@ -280,3 +282,32 @@ class Arm(Device):
         if not all_finite(T_base_tcp):
             raise CommandRejected(self.name, Rejection.NON_FINITE, "the arm's own pose is not finite", value=T_base_tcp)
         return T_base_tcp
+
+
+class JointLimitsConfig(DriverConfig):
+    """The ``joint_limits:`` of an arm in the cell file; ranges, speeds and accelerations are in its chain file."""
+
+    margin_deg: float = Field(default=5.0, gt=0.0, le=45.0)
+    characteristic_length_mm: float = Field(default=250.0, gt=0.0, le=2000.0)
+    singular_value_mm: float = Field(default=40.0, gt=0.0, le=500.0)
+    singular_floor_mm: float = Field(default=20.0, gt=0.0, le=500.0)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.singular_floor_mm >= self.singular_value_mm:
+            raise ValueError(
+                f"singular_floor_mm {self.singular_floor_mm:g} is not below "
+                f"singular_value_mm {self.singular_value_mm:g}"
+            )
+        return self
+
+    def settings(self, *, own_controller: bool = False) -> IkSettings:
+        """For an arm whose joints we drive, or whose own controller turns twists into joint velocities."""
+        return IkSettings(
+            characteristic_length_m=1e-3 * self.characteristic_length_mm,
+            singular_value_m=1e-3 * self.singular_value_mm,
+            singular_floor_m=1e-3 * self.singular_floor_mm,
+            damping_m=0.0 if own_controller else 1e-3 * self.singular_value_mm,
+            limit_margin_rad=float(np.deg2rad(self.margin_deg)),
+            goes_round=not own_controller,
+        )

@@ -13,12 +13,11 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from touchcell.drivers.core.arm import LimitsConfig
+from touchcell.drivers.core.arm import JointLimitsConfig, LimitsConfig
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import DeactivatePolicy
 from touchcell.drivers.core.errors import (
     CommandRejected,
-    ConfigError,
     ConnectError,
     DeviceError,
     DeviceFault,
@@ -35,7 +34,7 @@ from touchcell.drivers.core.protocols import StopCategory
 from touchcell.drivers.core.samples import JointState, Stamped
 from touchcell.drivers.core.spec import DriverConfig
 from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain, Tool
-from touchcell.drivers.kinematics.joint_limits import JointLimitsConfig
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 
 Positive = Annotated[float, Field(gt=0.0)]

@@ -16,10 +16,11 @@ from pydantic import Field, model_validator
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device, Lifecycle, OperatorToken
-from touchcell.drivers.core.errors import ConfigError, CorruptMessage, DeviceError, StaleData, TransportTimeout
+from touchcell.drivers.core.errors import CorruptMessage, DeviceError, StaleData, TransportTimeout
 from touchcell.drivers.core.frame_monitor import FrameWatch
 from touchcell.drivers.core.samples import Frame, Quality, Stamped
 from touchcell.drivers.core.spec import DriverConfig
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import ImageArray
 
 _FIRST_FRAME_S = 5.0

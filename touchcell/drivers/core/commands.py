@@ -8,6 +8,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.geometry.types import Array
 
 C = TypeVar("C")
@@ -37,15 +38,6 @@ class TwistCommand:
     t_ns: int
     ttl_s: float
     t_cause_ns: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Adjustment:
-    """One reason why what was sent is not what was asked for."""
-
-    limit: str
-    asked: float
-    allowed: float
 
 
 @dataclass(frozen=True, slots=True)

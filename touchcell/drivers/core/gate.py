@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from touchcell.drivers.core.clock import Clock
-from touchcell.drivers.core.commands import Adjustment, Sent, TwistCommand, TwistFrame, in_base_axes
+from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame, in_base_axes
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, Rejection
 from touchcell.drivers.core.lease import Lease, LeaseDesk
+from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.drivers.kinematics.chain import LocalIk
 from touchcell.geometry.finite import all_finite
 from touchcell.geometry.types import Array

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from touchcell.drivers.core.commands import Adjustment
 from touchcell.drivers.core.gate import TwistLimits
+from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.drivers.kinematics.chain import DifferentialIk, SerialChain
 from touchcell.geometry.types import Array
 

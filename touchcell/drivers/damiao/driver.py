@@ -22,7 +22,6 @@ from touchcell.drivers.core.bus_arm import BusArm, BusArmConfig
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
-    ConfigError,
     ConnectError,
     DeviceError,
     DeviceFault,
@@ -39,6 +38,7 @@ from touchcell.drivers.damiao import codec
 from touchcell.drivers.damiao.bus import Address, Answer, MotorBus
 from touchcell.drivers.damiao.codec import MitCommand, Register
 from touchcell.drivers.kinematics.chain import GRAVITY_M_S2, ChainDescription, SerialChain, Vector3
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 
 _MAX_BUS_LOAD = 0.8

@@ -25,10 +25,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from touchcell.drivers.core.bus_arm import BusArm, BusArmConfig
 from touchcell.drivers.core.clock import Clock
-from touchcell.drivers.core.commands import Adjustment
 from touchcell.drivers.core.device import OperatorToken
 from touchcell.drivers.core.errors import (
-    ConfigError,
     ConnectError,
     CorruptMessage,
     DeviceError,
@@ -43,8 +41,10 @@ from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.feetech import codec
 from touchcell.drivers.feetech.bus import Answer, ServoBus
 from touchcell.drivers.feetech.codec import FaultBit, Register, ServoState
+from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain
 from touchcell.drivers.kinematics.twist_projection import followable
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 
 Ticks = Annotated[int, Field(ge=0, lt=codec.TICKS_PER_TURN)]

@@ -22,7 +22,8 @@ from xml.etree import ElementTree
 import numpy as np
 from pydantic import Field
 
-from touchcell.drivers.core.arm import Arm, LimitsConfig
+from touchcell.drivers.core.arm import Arm, JointLimitsConfig, LimitsConfig
+from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
@@ -45,15 +46,7 @@ from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.franka.errors import BY_NAME, ERRORS, MODES, VendorError
 from touchcell.drivers.franka.reader import PERIOD_S, Reading, StateReader
-from touchcell.drivers.kinematics.chain import (
-    ChainDescription,
-    DifferentialIk,
-    LocalIk,
-    SerialChain,
-    Tool,
-    require_same_arm,
-)
-from touchcell.drivers.kinematics.joint_limits import JointLimitsConfig
+from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, LocalIk, SerialChain, Tool
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 

@@ -47,7 +47,7 @@ from touchcell.drivers.hosting.layouts import (
 from touchcell.drivers.hosting.realtime import ask_for_realtime
 from touchcell.drivers.hosting.watchdog import silence_s
 from touchcell.drivers.hosting.wire import encode_adjustments, encode_error, error_note, receive, send
-from touchcell.geometry.errors import TouchcellError
+from touchcell.errors import TouchcellError
 
 if TYPE_CHECKING:
     from touchcell.simulation.scene import Scene

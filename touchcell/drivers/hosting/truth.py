@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from touchcell.drivers.core.errors import ConfigError, StaleData
+from touchcell.drivers.core.errors import StaleData
 from touchcell.drivers.core.samples import Stamped
 from touchcell.drivers.hosting.layouts import MAX_OBJECTS, OBJECTS, TRUTH, RecordReader, RecordWriter
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 from touchcell.simulation.contact import ContactState
 

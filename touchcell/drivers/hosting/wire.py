@@ -12,9 +12,9 @@ from typing import Any, Final
 import numpy as np
 
 from touchcell.drivers.core import errors
-from touchcell.drivers.core.commands import Adjustment
 from touchcell.drivers.core.errors import CorruptMessage, DeviceError, FaultClass, Rejection, Remedy
-from touchcell.geometry.errors import TouchcellError
+from touchcell.drivers.kinematics.adjustment import Adjustment
+from touchcell.errors import TouchcellError
 
 MAX_MESSAGE_BYTES: Final = 1 << 17
 

@@ -8,7 +8,6 @@ only.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -16,8 +15,7 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from touchcell.drivers.core.commands import Adjustment
-from touchcell.drivers.core.errors import ConfigError, DeviceFault, FaultClass, Remedy
+from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.drivers.kinematics.joint_limits import (
     IkSettings,
     off_singularity,
@@ -25,7 +23,7 @@ from touchcell.drivers.kinematics.joint_limits import (
     within_acceleration,
     within_bounds,
 )
-from touchcell.geometry import se3
+from touchcell.errors import ConfigError
 from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.types import Array
 
@@ -117,7 +115,7 @@ class ChainDescription(_Description):
     @classmethod
     def shipped(cls, name: str) -> ChainDescription:
         """One of the descriptions that come with touchcell. Raises ConfigError for an unknown name."""
-        folder = Path(str(files("drivers") / "chains"))
+        folder = Path(__file__).parent / "chains"
         known = sorted(path.stem for path in folder.glob("*.yaml"))
         if name not in known:
             raise ConfigError(f"unknown chain {name!r}", key="chain", value=name, hint=f"known: {', '.join(known)}")
@@ -233,30 +231,6 @@ class SerialChain:
         for i in range(1, len(q)):
             T_base_joint[i] = T_base_joint[i - 1] @ T_base_joint[i]
         return T_base_joint, T_base_joint[-1] @ self._T_joint_tcp
-
-
-def require_same_arm(device: str, chain: SerialChain, q: Array, T_base_tcp: Array) -> None:
-    """Hold a chain against what a controller says of its own arm.
-
-    Args:
-        device: name for the error.
-        chain: how we describe it.
-        q: (n,) rad, told together with ...
-        T_base_tcp: ... this pose (4, 4).
-
-    Raises:
-        DeviceFault: the poses lie further apart than two arms of one model.
-    """
-    apart = se3.compose(se3.inverse(chain.forward(q)), T_base_tcp)
-    away_m, turned_rad = float(np.linalg.norm(apart[:3, 3])), float(np.linalg.norm(se3.log(apart)[3:]))
-    if away_m > _SAME_ARM_M or turned_rad > _SAME_ARM_RAD:
-        raise DeviceFault(
-            device,
-            f"its tool is {1e3 * away_m:.0f} mm and {np.rad2deg(turned_rad):.1f} deg from where the chain puts it",
-            fault_class=FaultClass.CONFIGURATION,
-            needs=Remedy.OPERATOR,
-            hint="name the chain of this arm's model, and the tool that it carries",
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -416,7 +390,5 @@ def _cross(a: Array, b: Array) -> Array:
     return product
 
 
-_SAME_ARM_M = 0.02
-_SAME_ARM_RAD = np.deg2rad(2.0)
 _YZX = np.array([1, 2, 0])
 _ZXY = np.array([2, 0, 1])

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from touchcell.drivers.core.errors import ConfigError
 from touchcell.drivers.kinematics.chain import SerialChain
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 

@@ -8,13 +8,10 @@ joint.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
-from pydantic import Field, model_validator
 
-from touchcell.drivers.core.commands import Adjustment
-from touchcell.drivers.core.spec import DriverConfig
+from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.geometry.types import Array
 
 NEGLIGIBLE = 1e-6
@@ -46,35 +43,6 @@ class IkSettings:
     singular_gain_hz: float = 10.0
     limit_margin_rad: float = np.deg2rad(5.0)
     goes_round: bool = True
-
-
-class JointLimitsConfig(DriverConfig):
-    """The ``joint_limits:`` of an arm in the cell file; ranges, speeds and accelerations are in its chain file."""
-
-    margin_deg: float = Field(default=5.0, gt=0.0, le=45.0)
-    characteristic_length_mm: float = Field(default=250.0, gt=0.0, le=2000.0)
-    singular_value_mm: float = Field(default=40.0, gt=0.0, le=500.0)
-    singular_floor_mm: float = Field(default=20.0, gt=0.0, le=500.0)
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if self.singular_floor_mm >= self.singular_value_mm:
-            raise ValueError(
-                f"singular_floor_mm {self.singular_floor_mm:g} is not below "
-                f"singular_value_mm {self.singular_value_mm:g}"
-            )
-        return self
-
-    def settings(self, *, own_controller: bool = False) -> IkSettings:
-        """For an arm whose joints we drive, or whose own controller turns twists into joint velocities."""
-        return IkSettings(
-            characteristic_length_m=1e-3 * self.characteristic_length_mm,
-            singular_value_m=1e-3 * self.singular_value_mm,
-            singular_floor_m=1e-3 * self.singular_floor_mm,
-            damping_m=0.0 if own_controller else 1e-3 * self.singular_value_mm,
-            limit_margin_rad=float(np.deg2rad(self.margin_deg)),
-            goes_round=not own_controller,
-        )
 
 
 def speed_bounds(q: Array, lower: Array, upper: Array, speed: Array, margin_rad: float) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from touchcell.drivers.core.commands import Adjustment
+from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.geometry.types import Array
 
 _SHORTEST_LEVER_M = 0.01

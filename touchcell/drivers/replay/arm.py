@@ -10,10 +10,11 @@ from pydantic import Field
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device, Lifecycle
-from touchcell.drivers.core.errors import ConnectError, DataError, StaleData
+from touchcell.drivers.core.errors import ConnectError, StaleData
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.replay.dataset import natural_order, read_split
+from touchcell.errors import DataError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 

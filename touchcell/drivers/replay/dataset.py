@@ -19,7 +19,7 @@ from typing import cast
 import cv2
 import numpy as np
 
-from touchcell.drivers.core.errors import DataError
+from touchcell.errors import DataError
 from touchcell.geometry.types import Array, ImageArray
 
 LABEL_FILES = ("targets_images.csv", "targets.csv")

@@ -16,7 +16,8 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from touchcell.drivers.core.arm import Arm, LimitsConfig
+from touchcell.drivers.core.arm import Arm, JointLimitsConfig, LimitsConfig
+from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
@@ -38,15 +39,7 @@ from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.protocols import StopCategory
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
-from touchcell.drivers.kinematics.chain import (
-    ChainDescription,
-    DifferentialIk,
-    LocalIk,
-    SerialChain,
-    Tool,
-    require_same_arm,
-)
-from touchcell.drivers.kinematics.joint_limits import JointLimitsConfig
+from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, LocalIk, SerialChain, Tool
 from touchcell.drivers.ur import codec as ur_codec
 from touchcell.drivers.ur.control import ControlLink
 from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyMode, power_fault, program_fault, safety_fault

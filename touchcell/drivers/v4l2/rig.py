@@ -7,7 +7,7 @@ from pathlib import Path
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.v4l2.driver import SPEC, V4l2Camera, V4l2Config
-from touchcell.drivers.v4l2.emulator.shim import ShimCalls
+from touchcell.drivers.v4l2.shim import ShimCalls
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import Rig
 

@@ -21,19 +21,19 @@ from touchcell.drivers.replay.dataset import read_image, read_split
 from touchcell.geometry.types import Array
 from touchcell.perception.calibration.least_squares import robust_fit
 from touchcell.perception.calibration.marked_data import evenly
-from touchcell.perception.calibration.marker_learning import fit_lattice
 from touchcell.perception.calibration.zero_frame import lattice_turns, similarity
 from touchcell.perception.errors import ModelError, TrainingError
-from touchcell.perception.markers.architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture
-from touchcell.perception.markers.detection import Discs, MarkerSize, detect_markers, typical_size
+from touchcell.perception.markers.detection import Discs, detect_markers, typical_size
 from touchcell.perception.markers.estimator import displacement_model_of, matcher_of, mixed
 from touchcell.perception.markers.matching import DisplacementModel, MarkerMatcher
+from touchcell.perception.models.camera_change import CameraChange
+from touchcell.perception.models.labels import xi_from_contact
+from touchcell.perception.models.marker_architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture, MarkerSize
+from touchcell.perception.models.model_file import Header, Labels, Model, load_model, save_model, touchcell_version
+from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.displacement_network import Jitter, features_of
+from touchcell.perception.networks.marker_learning import fit_lattice
 from touchcell.perception.networks.marker_training import preprocessing_for
-from touchcell.perception.runtime.camera_change import CameraChange
-from touchcell.perception.runtime.labels import xi_from_contact
-from touchcell.perception.runtime.model_file import Header, Labels, Model, load_model, save_model, touchcell_version
-from touchcell.perception.runtime.preprocessing import Preprocessing
 
 _SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 _REFINED_WITH = 60

@@ -11,13 +11,14 @@ import numpy as np
 from touchcell.drivers.replay.dataset import Split, read_image, read_split
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array, ImageArray
-from touchcell.perception.calibration.marker_learning import learn_markers
 from touchcell.perception.calibration.tip_fit import MarkedContacts
 from touchcell.perception.errors import ImageError
-from touchcell.perception.markers.detection import MarkerSize, detect_markers, typical_size
+from touchcell.perception.markers.detection import detect_markers, typical_size
 from touchcell.perception.markers.matching import MarkerField, MarkerMatcher
+from touchcell.perception.models.marker_architecture import MarkerSize
+from touchcell.perception.models.preprocessing import Preprocessing
+from touchcell.perception.networks.marker_learning import learn_markers
 from touchcell.perception.networks.marker_training import preprocessing_for
-from touchcell.perception.runtime.preprocessing import Preprocessing
 from touchcell.simulation.render import FRAME_SIZE, PUBLIC_CROP
 
 _BELIEVED = 0.97

@@ -9,16 +9,16 @@ import numpy as np
 
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.geometry.types import Array, ImageArray
+from touchcell.perception import kernels
 from touchcell.perception.errors import ModelError
-from touchcell.perception.markers.architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture
 from touchcell.perception.markers.detection import Discs, detect_markers
 from touchcell.perception.markers.matching import DisplacementModel, FirstGuess, MarkerField, MarkerMatcher
-from touchcell.perception.runtime import kernels
-from touchcell.perception.runtime.inference import RANGE_TOLERANCE, Prediction
-from touchcell.perception.runtime.model_file import Header, Labels, Model, load_model
+from touchcell.perception.models.marker_architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture
+from touchcell.perception.models.model_file import Header, Labels, Model, load_model
+from touchcell.perception.models.prediction import RANGE_TOLERANCE, Prediction
 
 if TYPE_CHECKING:
-    from touchcell.perception.runtime.camera_change import CameraChange
+    from touchcell.perception.models.camera_change import CameraChange
 
 
 class MarkerEstimator:

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array
+from touchcell.perception import kernels
 from touchcell.perception.markers.detection import Discs
-from touchcell.perception.runtime import kernels
 
 _FIT_SD_PX = 0.7
 _TURNS = 12

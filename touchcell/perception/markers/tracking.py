@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.errors import ImageError
-from touchcell.perception.markers.detection import MarkerSize, detect_markers, typical_size
+from touchcell.perception.markers.detection import detect_markers, typical_size
 from touchcell.perception.markers.matching import pair
+from touchcell.perception.models.marker_architecture import MarkerSize
 
 _REACH_SPACINGS = 0.45
 _LEAST_FOLLOWED = 0.8

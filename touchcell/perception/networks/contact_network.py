@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from touchcell.perception.runtime.architecture import Architecture
-from touchcell.perception.runtime.model_file import Labels
+from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.model_file import Labels
 
 
 def softbound(x: Tensor, low: Tensor | float, high: Tensor | float) -> Tensor:

@@ -16,9 +16,9 @@ import numpy as np
 from touchcell.drivers.replay.dataset import Split
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.errors import TrainingError
-from touchcell.perception.runtime.labels import CONTACT_NAMES, contact_from_xi
-from touchcell.perception.runtime.model_file import Labels
-from touchcell.perception.runtime.preprocessing import Preprocessing
+from touchcell.perception.models.labels import CONTACT_NAMES, contact_from_xi
+from touchcell.perception.models.model_file import Labels
+from touchcell.perception.models.preprocessing import Preprocessing
 
 _SAME_MM_DEG = 1e-6
 

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from touchcell.geometry.types import Array
-from touchcell.perception.markers.architecture import LOG_PRECISION_BOUNDS
 from touchcell.perception.markers.matching import DisplacementModel
+from touchcell.perception.models.marker_architecture import LOG_PRECISION_BOUNDS
 from touchcell.perception.networks.contact_network import Alignment
 
 _DISPLACEMENT_PX = 8.0

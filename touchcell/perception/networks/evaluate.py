@@ -16,10 +16,10 @@ import numpy as np
 
 from touchcell.drivers.core.clock import Clock, MonotonicClock
 from touchcell.drivers.replay.dataset import read_split
+from touchcell.perception.models.prediction import Prediction
 from touchcell.perception.networks.dataset import Progress
 from touchcell.perception.networks.scores import Scores
 from touchcell.perception.runtime.estimators import load_estimator
-from touchcell.perception.runtime.inference import Prediction
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array, ImageArray
-from touchcell.perception.markers.architecture import MarkerArchitecture
+from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.labels import contact_from_xi
+from touchcell.perception.models.marker_architecture import MarkerArchitecture
+from touchcell.perception.models.model_file import Header, Labels, Model, save_model, touchcell_version
+from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.checkpoint import Progress, delete_checkpoint
 from touchcell.perception.networks.figures import write_curves, write_predictions
 from touchcell.perception.networks.sigma_scaling import calibrate
-from touchcell.perception.runtime.architecture import Architecture
-from touchcell.perception.runtime.labels import contact_from_xi
-from touchcell.perception.runtime.model_file import Header, Labels, Model, save_model, touchcell_version
-from touchcell.perception.runtime.preprocessing import Preprocessing
 
 
 def write_trained(

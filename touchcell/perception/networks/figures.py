@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from touchcell.geometry.types import Array
+from touchcell.perception.models.labels import CONTACT_NAMES, XI_UNITS
 from touchcell.perception.networks.checkpoint import EpochRecord
-from touchcell.perception.runtime.labels import CONTACT_NAMES, XI_UNITS
 
 _TITLES = ("x (mm)", "y (mm)", "z (mm)", "α (deg)", "β (deg)", "γ (deg)")
 

@@ -23,20 +23,15 @@ from torch import Tensor
 
 from touchcell.drivers.replay.dataset import Split, read_rest, read_split
 from touchcell.geometry.types import Array, ImageArray
-from touchcell.perception.calibration.marker_learning import (
-    GRID,
-    GUESS_HIDDEN,
-    Learned,
-    learn_markers,
-    match_all,
-    stacked,
-)
 from touchcell.perception.errors import TrainingError
-from touchcell.perception.markers.architecture import MarkerArchitecture
-from touchcell.perception.markers.detection import Discs, MarkerSize, detect_markers, typical_size
+from touchcell.perception.markers.detection import Discs, detect_markers, typical_size
 from touchcell.perception.markers.estimator import mixed
 from touchcell.perception.markers.figures import write_markers
 from touchcell.perception.markers.matching import DisplacementModel
+from touchcell.perception.models.labels import CONTACT_NAMES, contact_from_xi, xi_from_contact
+from touchcell.perception.models.marker_architecture import MarkerArchitecture, MarkerSize
+from touchcell.perception.models.model_file import Labels, Model
+from touchcell.perception.models.preprocessing import AdaptiveThreshold, Preprocessing
 from touchcell.perception.networks.checkpoint import (
     EpochRecord,
     Progress,
@@ -48,10 +43,15 @@ from touchcell.perception.networks.contact_network import Alignment
 from touchcell.perception.networks.dataset import cache_key, default_cache, label_range
 from touchcell.perception.networks.displacement_network import DisplacementNetwork, Jitter, displacement_loss
 from touchcell.perception.networks.export import write_trained
+from touchcell.perception.networks.marker_learning import (
+    GRID,
+    GUESS_HIDDEN,
+    Learned,
+    learn_markers,
+    match_all,
+    stacked,
+)
 from touchcell.perception.networks.progress import Display, Observer
-from touchcell.perception.runtime.labels import CONTACT_NAMES, contact_from_xi, xi_from_contact
-from touchcell.perception.runtime.model_file import Labels, Model
-from touchcell.perception.runtime.preprocessing import AdaptiveThreshold, Preprocessing
 
 _LEAST_SCORE_TAUGHT = 0.9
 _LEAST_BATCHES = 16

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array
-from touchcell.perception.runtime.labels import CONTACT_NAMES, XI_UNITS, contact_from_xi, xi_from_contact
+from touchcell.perception.models.labels import CONTACT_NAMES, XI_UNITS, contact_from_xi, xi_from_contact
 
 if TYPE_CHECKING:
-    from touchcell.perception.runtime.inference import Prediction
+    from touchcell.perception.models.prediction import Prediction
 
 SCORE_NAMES = ("z_mm", "alpha_deg", "beta_deg", "x_mm", "y_mm", "gamma_deg")
 """Components of a contact in the order in which tables show them: pose, then shear."""

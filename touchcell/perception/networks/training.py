@@ -20,6 +20,10 @@ from torch.nn import functional
 from touchcell.drivers.replay.dataset import read_rest, read_split
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.errors import TrainingError
+from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.labels import CONTACT_NAMES, contact_from_xi, xi_from_contact
+from touchcell.perception.models.model_file import Labels, Model
+from touchcell.perception.models.preprocessing import Crop, Preprocessing, scale
 from touchcell.perception.networks.checkpoint import (
     EpochRecord,
     Progress,
@@ -37,10 +41,6 @@ from touchcell.perception.networks.contact_network import (
 from touchcell.perception.networks.dataset import LabelledImages, default_cache, label_range, load_reduced
 from touchcell.perception.networks.export import write_trained
 from touchcell.perception.networks.progress import Display, Observer
-from touchcell.perception.runtime.architecture import Architecture
-from touchcell.perception.runtime.labels import CONTACT_NAMES, contact_from_xi, xi_from_contact
-from touchcell.perception.runtime.model_file import Labels, Model
-from touchcell.perception.runtime.preprocessing import Crop, Preprocessing, scale
 
 _EVALUATION_BATCH = 100
 _SHORT_SIDE_PX = 100

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from touchcell.geometry.types import ImageArray
-from touchcell.perception.runtime.camera_change import CameraChange
-from touchcell.perception.runtime.inference import Prediction
-from touchcell.perception.runtime.model_file import Header
-from touchcell.perception.runtime.preprocessing import Preprocessing
+from touchcell.perception.models.camera_change import CameraChange
+from touchcell.perception.models.model_file import Header
+from touchcell.perception.models.prediction import Prediction
+from touchcell.perception.models.preprocessing import Preprocessing
 
 if TYPE_CHECKING:
-    from touchcell.perception.runtime.estimators import ContactEstimator
+    from touchcell.perception.models.prediction import ContactEstimator
 
 
 class CalibratedEstimator:

@@ -3,37 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
 
-from touchcell.geometry.types import ImageArray
-from touchcell.perception.runtime.inference import ContactModel, Prediction
-from touchcell.perception.runtime.model_file import Header, Model, load_model
-
-
-class ContactEstimator(Protocol):
-    """A trained model, ready to predict."""
-
-    @property
-    def header(self) -> Header:
-        """Of the model file."""
-        ...
-
-    @property
-    def reference(self) -> ImageArray | None:
-        """Preprocessed image out of contact, or None when nobody took one."""
-        ...
-
-    def reduce(self, image: ImageArray) -> ImageArray:
-        """The model's preprocessing. Raises ImageError."""
-        ...
-
-    def predict(self, image: ImageArray) -> Prediction:
-        """Contact in one camera image. Raises ImageError."""
-        ...
-
-    def predict_reduced(self, reduced: ImageArray) -> Prediction:
-        """Contact in an image that ``reduce`` made."""
-        ...
+from touchcell.perception.models.model_file import Model, load_model
+from touchcell.perception.models.prediction import ContactEstimator
+from touchcell.perception.runtime.inference import ContactModel
 
 
 def load_estimator(path: Path, calibration: Path | None = None) -> ContactEstimator:
@@ -50,7 +23,7 @@ def load_estimator(path: Path, calibration: Path | None = None) -> ContactEstima
     model = load_model(path)
     change = model.header.camera
     if calibration is not None:
-        from touchcell.perception.runtime.camera_change import load_change
+        from touchcell.perception.models.camera_change import load_change
 
         found = load_change(calibration)
         change = found if change is None else change.after(found)

@@ -3,46 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.drivers.core.samples import Frame, Stamped
-from touchcell.geometry.types import Array, ImageArray
-from touchcell.perception.runtime.graph import IMAGES, OUTPUTS, onnx_model
-from touchcell.perception.runtime.model_file import Header, Model, load_model
-from touchcell.perception.runtime.preprocessing import scale
+from touchcell.geometry.types import ImageArray
+from touchcell.perception.models.graph import IMAGES, OUTPUTS, onnx_model
+from touchcell.perception.models.model_file import Header, Model, load_model
+from touchcell.perception.models.prediction import RANGE_TOLERANCE, Prediction
+from touchcell.perception.models.preprocessing import scale
 
 Runner = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 """Computes a network: float32 (n, 1, height, width) in [0, 1] to its outputs (n, outputs)."""
-
-RANGE_TOLERANCE = 0.05
-"""How far, in label half-ranges, a prediction may lie outside the taught range and still count as inside."""
-
-
-@dataclass(frozen=True, slots=True)
-class Prediction:
-    """A Gaussian over the exponential coordinates of a contact, xi = log(T_s_f) (SPEC part 2).
-
-    Attributes:
-        xi: (6,) mean [v, w], m and rad.
-        covariance: (6, 6) of xi, m and rad.
-        in_range: the mean lies in the range of labels that the model was taught. Outside it, and out of contact, a
-            prediction means little.
-        markers: share of the markers expected in view that were seen, where the model looks for markers.
-    """
-
-    xi: Array
-    covariance: Array
-    in_range: bool
-    markers: float | None = None
-
-    @property
-    def sigma(self) -> Array:
-        """(6,) standard deviation of each component of xi, m and rad."""
-        return np.sqrt(np.diagonal(self.covariance))
 
 
 def onnx_runtime(model: Model) -> Runner:

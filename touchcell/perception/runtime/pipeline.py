@@ -20,12 +20,12 @@ from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.geometry import gaussian
 from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array
+from touchcell.perception.models.prediction import ContactEstimator
+from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.runtime.contact_gate import ContactGate
 from touchcell.perception.runtime.estimate import ContactEstimate
-from touchcell.perception.runtime.estimators import ContactEstimator
 from touchcell.perception.runtime.filter import ContactFilter
 from touchcell.perception.runtime.motion import PoseHistory
-from touchcell.perception.runtime.preprocessing import Preprocessing
 
 Timer = Callable[[], int]
 

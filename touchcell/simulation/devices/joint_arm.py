@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from touchcell.drivers.core.arm import LimitsConfig
+from touchcell.drivers.core.arm import JointLimitsConfig, LimitsConfig
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle, OperatorToken
-from touchcell.drivers.core.errors import ConfigError
 from touchcell.drivers.core.joint_arm import JointArm
 from touchcell.drivers.core.joint_setpoint import JointSetpoint
 from touchcell.drivers.core.protocols import StopCategory
@@ -25,7 +24,7 @@ from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain, Tool
 from touchcell.drivers.kinematics.inverse import joints_for_pose
-from touchcell.drivers.kinematics.joint_limits import JointLimitsConfig
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.simulation.scene import Scene, physics_engine

@@ -11,10 +11,11 @@ from pydantic import Field
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device, Lifecycle
-from touchcell.drivers.core.errors import ConfigError, StaleData, TransportTimeout
+from touchcell.drivers.core.errors import StaleData, TransportTimeout
 from touchcell.drivers.core.protocols import TcpSource
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.simulation.faults import FrameFaults
 from touchcell.simulation.render import FrameRenderer, Lighting

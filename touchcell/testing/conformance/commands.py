@@ -11,8 +11,8 @@ import pytest
 from touchcell.drivers.core.commands import TwistFrame
 from touchcell.drivers.core.errors import CommandRejected, Rejection
 from touchcell.drivers.core.lease import Lease
+from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import OWNER, Bench
-from touchcell.testing.conformance.suite import check
 
 _FORBIDDEN_TRAVEL_M = 1e-3
 """Much less than any command that got through would make it; a soft arm may still creep to its setpoint."""

@@ -10,8 +10,8 @@ import pytest
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, DeviceError, LifecycleError, StaleData
 from touchcell.drivers.core.lease import Lease
+from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import OWNER, Bench
-from touchcell.testing.conformance.suite import check
 
 _NOTICED_S = 3.0
 _CALM_S = 0.25

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from touchcell.drivers.core.errors import DeviceError, TransportTimeout
+from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import Bench
-from touchcell.testing.conformance.suite import check
 
 _UNREAD_PERIODS = 8
 

@@ -12,8 +12,8 @@ from touchcell.drivers.core import protocols as abilities
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, DeviceError, LifecycleError, Rejection
 from touchcell.drivers.core.protocols import HealthSource, NativeWatchdog, StopCategory
+from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import Bench
-from touchcell.testing.conformance.suite import check
 
 # What combines abilities, as ServoArm does, is none itself.
 _PROTOCOLS = {

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from touchcell.drivers.core.commands import TwistFrame
+from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.client import MovingClient
 from touchcell.testing.conformance.context import Bench
-from touchcell.testing.conformance.suite import check
 
 _STREAM_S = 0.8
 _STEADY_S = 0.3

@@ -11,8 +11,8 @@ import pytest
 
 from touchcell.drivers.core.errors import DeviceError, StaleData
 from touchcell.drivers.core.protocols import JointSource, WrenchSource
+from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import Bench
-from touchcell.testing.conformance.suite import check
 
 _WINDOW_S = 0.5
 _FROZEN_S = 0.3

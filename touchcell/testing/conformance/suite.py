@@ -2,66 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import pytest
 
-from touchcell.testing.emulation.rig import Rig, RigFunction
-
-C = TypeVar("C", bound=Callable[..., None])
-
-
-@dataclass(frozen=True, slots=True)
-class Needs:
-    """What a check needs to make sense.
-
-    Attributes:
-        needs: abilities, "arm", "camera", "truth" (an emulator), "process" (an emulator of its own), "limited axes".
-        on_bench: whether it may be done to a real device.
-        of_faults: chooses among the rig's faults, by name, value and lawful answer, those for each of which it is done;
-            None for a check that has nothing to do with them.
-    """
-
-    needs: tuple[str, ...]
-    on_bench: bool
-    of_faults: Callable[[str, Any, str], bool] | None
-
-    def missing(self, rig: Rig) -> str | None:
-        """Why the check does not apply to ``rig``, or None."""
-        capabilities = rig.spec.capabilities
-        if rig.start is None and not self.on_bench:
-            return "not done to a real device"
-        for need in self.needs:
-            if need in ("arm", "camera"):
-                if capabilities.kind != need:
-                    return f"no {need}"
-            elif need == "truth":
-                if rig.start is None:
-                    return "a real device tells no truth beside its own"
-            elif need == "process":
-                if not rig.process:
-                    return "simulated in the client's own process: it cannot vanish or hang while the client lives"
-            elif need == "limited axes":
-                if all(capabilities.twist_axes):
-                    return "follows all six axes"
-            elif need not in capabilities.abilities:
-                return f"its capability record does not name {need}"
-        return None
-
-
-def check(
-    *needs: str, on_bench: bool = False, of_faults: Callable[[str, Any, str], bool] | None = None
-) -> Callable[[C], C]:
-    """Make a function of a ``Bench`` (and a fault's name) a check of the suite; see ``Needs``."""
-
-    def mark(function: C) -> C:
-        function.conformance = Needs(needs, on_bench, of_faults)  # type: ignore[attr-defined]
-        return function
-
-    return mark
+from touchcell.testing.conformance.check import Needs
+from touchcell.testing.emulation.rig import RigFunction
 
 
 def suite(rig: RigFunction, *, prefix: str = "Test") -> type:

@@ -27,7 +27,7 @@ from typing import Any, ClassVar
 
 import yaml
 
-from touchcell.drivers.core.errors import ConfigError
+from touchcell.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)

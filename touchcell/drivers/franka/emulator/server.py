@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from touchcell.drivers.core.errors import ConfigError, CorruptMessage
+from touchcell.drivers.core.errors import CorruptMessage
 from touchcell.drivers.franka.emulator.arm import EmulatedArm, Reflex, urdf
 from touchcell.drivers.franka.emulator.codec import (
     PORT,
@@ -42,6 +42,7 @@ from touchcell.drivers.franka.emulator.codec import (
     split_requests,
 )
 from touchcell.drivers.franka.errors import BY_NAME, ERRORS
+from touchcell.errors import ConfigError
 from touchcell.testing.emulation.base import CommandOnset, Emulator
 from touchcell.testing.emulation.ticker import Ticker
 

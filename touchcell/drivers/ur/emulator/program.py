@@ -12,16 +12,14 @@ ur-rtde 1.6.5 (MIT); for the built-in functions, Universal Robots, "The URScript
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
+from touchcell.drivers.ur.codec import Value
 from touchcell.drivers.ur.emulator import kinematics as ur_model
-from touchcell.drivers.ur.emulator.motion import Brake, Motion, MoveJ, MoveL, ServoJ, SpeedJ, SpeedL
+from touchcell.drivers.ur.emulator.motion import ArmState, Brake, Motion, MoveJ, MoveL, ServoJ, SpeedJ, SpeedL
 from touchcell.geometry.types import Array
-
-if TYPE_CHECKING:
-    from touchcell.drivers.ur.emulator.controller import Controller
 
 PERIOD_S = 0.002
 READY, DONE = 1, 2
@@ -62,6 +60,32 @@ NAMES = {
 Thread = Generator[None, None, None]
 
 
+class ProgramHost(Protocol):
+    """What a program needs of the controller that runs it."""
+
+    arm: ArmState
+    motion: Motion | None
+    inputs: dict[str, Value]
+    outputs: dict[str, Value]
+    energising: int
+
+    def set_tool(self, T_flange_tcp: Array) -> None:
+        """Set the tool centre point."""
+        ...
+
+    def set_watchdog(self, min_hz: float) -> None:
+        """Demand a rate of input packets."""
+        ...
+
+    def protective_stop(self) -> None:
+        """Stop the arm and latch."""
+        ...
+
+    def log(self, message: str) -> None:
+        """Write to the controller's log."""
+        ...
+
+
 class ProgramError(Exception):
     """A run-time error of the program: the controller stops it."""
 
@@ -74,7 +98,7 @@ class ControlProgram:
         register_offset: 0, or 24 where the client asked for the upper range of registers.
     """
 
-    def __init__(self, controller: Controller, register_offset: int) -> None:
+    def __init__(self, controller: ProgramHost, register_offset: int) -> None:
         self._controller = controller
         self._offset = register_offset
         self._main: Thread = self._main_loop()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from touchcell.drivers.core.errors import ConfigError
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import ImageArray
 
 PICTURES = 64

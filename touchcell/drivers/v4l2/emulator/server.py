@@ -25,7 +25,7 @@ from typing import Any, ClassVar
 from touchcell.drivers.v4l2 import codec
 from touchcell.drivers.v4l2.emulator import picture
 from touchcell.drivers.v4l2.emulator.device import SLOT_BYTES, CameraModel, Handle
-from touchcell.drivers.v4l2.emulator.shim import environment
+from touchcell.drivers.v4l2.shim import environment
 from touchcell.geometry.types import ImageArray
 from touchcell.testing.emulation.base import Emulator
 

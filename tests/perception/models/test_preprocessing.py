@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from touchcell.perception.errors import ImageError
-from touchcell.perception.runtime.preprocessing import AdaptiveThreshold, Crop, Preprocessing, scale
+from touchcell.perception.models.preprocessing import AdaptiveThreshold, Crop, Preprocessing, scale
 
 
 def speckled(height: int, width: int) -> np.ndarray:

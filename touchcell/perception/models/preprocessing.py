@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from touchcell.geometry.types import ImageArray
+from touchcell.perception import kernels
 from touchcell.perception.errors import ImageError
-from touchcell.perception.runtime import kernels
 
 _INTERPOLATIONS = {"linear": cv2.INTER_LINEAR, "nearest": cv2.INTER_NEAREST}
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
-
-from touchcell.perception.markers.detection import MarkerSize
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Count = Annotated[int, Field(gt=0)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -79,3 +78,35 @@ class MarkerArchitecture(BaseModel):
             shapes[f"layer{i}.bias"] = (self.networks, 1, units)
             before = units
         return shapes
+
+
+class MarkerSize(BaseModel):
+    """Which connected components are markers.
+
+    Attributes:
+        smallest_px: least area. Halo speckle is smaller.
+        largest_px: greatest area. Reflections and markers that touch each other are larger.
+        longest_side_px: of the bounding box.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    smallest_px: int = Field(gt=0)
+    largest_px: int = Field(gt=0)
+    longest_side_px: int = Field(gt=0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> MarkerSize:
+        if self.largest_px <= self.smallest_px:
+            raise ValueError("largest_px must exceed smallest_px")
+        return self
+
+    @classmethod
+    def of_disc(cls, area_px: float) -> MarkerSize:
+        """Bounds for discs of about this area: half of it to not quite two."""
+        diameter = 2.0 * np.sqrt(area_px / np.pi)
+        return cls(
+            smallest_px=max(1, int(0.45 * area_px)),
+            largest_px=int(1.8 * area_px) + 1,
+            longest_side_px=int(1.8 * diameter) + 1,
+        )

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from touchcell.perception.runtime import onnx_wire
-from touchcell.perception.runtime.architecture import Architecture
-from touchcell.perception.runtime.model_file import Model
+from touchcell.perception.models import onnx_wire
+from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.model_file import Model
 
 IMAGES = "images"
 OUTPUTS = "outputs"

@@ -17,11 +17,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.errors import ModelError
-from touchcell.perception.markers.architecture import MarkerArchitecture
-from touchcell.perception.runtime.architecture import Architecture
-from touchcell.perception.runtime.camera_change import CameraChange
-from touchcell.perception.runtime.labels import CONTACT_NAMES, contact_from_xi, shear_direction, xi_gaussian
-from touchcell.perception.runtime.preprocessing import Preprocessing
+from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.camera_change import CameraChange
+from touchcell.perception.models.labels import CONTACT_NAMES, contact_from_xi, shear_direction, xi_gaussian
+from touchcell.perception.models.marker_architecture import MarkerArchitecture
+from touchcell.perception.models.preprocessing import Preprocessing
 
 FORMAT_VERSION = 1
 _METADATA_KEY = "touchcell"

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from touchcell.perception.models.labels import XI_UNITS, contact_from_xi, shear_direction, xi_from_contact, xi_gaussian
+from touchcell.perception.models.model_file import Labels
 from touchcell.perception.networks.sigma_scaling import calibrate
-from touchcell.perception.runtime.labels import XI_UNITS, contact_from_xi, shear_direction, xi_from_contact, xi_gaussian
-from touchcell.perception.runtime.model_file import Labels
 
 LABELS = Labels.of_contacts((-5.0, -4.0, 0.5, -25.0, -24.0, -5.0), (5.0, 4.4, 6.0, 25.0, 26.0, 5.0))
 OTHER = Labels(low=(-0.005, -0.005, -0.006, -0.4, -0.4, -0.1), high=(0.005, 0.005, 0.0, 0.4, 0.4, 0.1))

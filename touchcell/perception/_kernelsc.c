@@ -1,7 +1,7 @@
 /* Python's door to the compiled kernels: takes buffers, checks them, runs a kernel, writes into buffers.
  *
  * What is not of the right type, shape or order in memory, not finite, or too large, raises ArrayError. The shapes are in
- * touchcell/perception/runtime/kernels.py, which is what other modules call.
+ * touchcell/perception/kernels.py, which is what other modules call.
  */
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
@@ -410,8 +410,8 @@ static PyObject *py_bytes_apart(PyObject *module, PyObject *const *arguments, Py
 static PyMethodDef METHODS[] = {FAST(median_5), FAST(threshold), FAST(shrink),  FAST(area_means),  FAST(discs),  FAST(pair), FAST(fit),
                                 FAST(settle),   FAST(density),   FAST(bytes_apart), FAST(affine), {NULL, NULL, 0, NULL}};
 
-static struct PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "touchcell.perception.runtime._kernelsc",
-                                    "Compiled kernels of touchcell.perception.runtime.kernels.", -1, METHODS};
+static struct PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "touchcell.perception._kernelsc",
+                                    "Compiled kernels of touchcell.perception.kernels.", -1, METHODS};
 
 PyMODINIT_FUNC PyInit__kernelsc(void)
 {

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from touchcell.geometry.types import Array, ImageArray
+from touchcell.perception import kernels
 from touchcell.perception.errors import ArrayError, KernelsMissing
 from touchcell.perception.markers.matching import disc_density
-from touchcell.perception.runtime import kernels
 
-pytest.importorskip("touchcell.perception.runtime._kernelsc")
-from touchcell.perception.runtime import _kernelsc
+pytest.importorskip("touchcell.perception._kernelsc")
+from touchcell.perception import _kernelsc
 
 GREY = st.one_of(st.integers(0, 255), st.sampled_from([0, 1, 127, 128, 254, 255]))
 

@@ -24,7 +24,7 @@ _FACTORS = (4, 8, 16, 32, 64)
 
 def _find() -> ModuleType | None:
     try:
-        from touchcell.perception.runtime import _kernelsc
+        from touchcell.perception import _kernelsc
     except ImportError:
         return None
     return _kernelsc

@@ -9,8 +9,8 @@ from safetensors.numpy import save_file
 
 from tests.helpers.tactile_samples import preprocessing
 from touchcell.perception.errors import ModelError
-from touchcell.perception.runtime.architecture import Architecture
-from touchcell.perception.runtime.model_file import Header, Labels, Model, load_model, save_model
+from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.model_file import Header, Labels, Model, load_model, save_model
 
 ARCHITECTURE = Architecture(input_size=(32, 32), channels=(3, 5), hidden=7)
 

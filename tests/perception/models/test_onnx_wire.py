@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.perception.runtime.test_model_file import make_model
-from touchcell.perception.runtime import onnx_wire
-from touchcell.perception.runtime.architecture import Architecture
-from touchcell.perception.runtime.graph import onnx_model
-from touchcell.perception.runtime.model_file import Model
+from tests.perception.models.test_model_file import make_model
+from touchcell.perception.models import onnx_wire
+from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.graph import onnx_model
+from touchcell.perception.models.model_file import Model
 
 
 @pytest.mark.parametrize("kind", ["gdn", "cnn"])

@@ -1,7 +1,7 @@
 """ONNX models written byte by byte: the few messages of onnx.proto that a contact network needs.
 
 A serving process that imports the ``onnx`` package for this pays 0.1 s and 7 MB or more. Source: onnx.proto (IR
-version 8) and the protocol-buffer wire format; ``tests/perception/runtime/test_onnx_wire.py`` holds the bytes against
+version 8) and the protocol-buffer wire format; ``tests/perception/models/test_onnx_wire.py`` holds the bytes against
 that package.
 """
 
