@@ -31,6 +31,7 @@ check: .venv/dev
 
 .venv/core: $(SOURCES)
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	rm -rf *.egg-info
 	$(BIN)/python -m pip install --quiet --editable .
 	touch $@
 

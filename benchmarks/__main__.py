@@ -21,6 +21,7 @@ BENCHMARKS = {
     "safety": "tests.fault_injection.safety",
     "se3": "benchmarks.se3",
     "simulation": "benchmarks.simulation",
+    "structure": "benchmarks.structure",
     "soak": "tests.fault_injection.soak",
     "tuning": "benchmarks.tuning",
 }

@@ -27,7 +27,7 @@ import yaml
 from touchcell.cell.analysis.run_data import tip_points
 from touchcell.cell.analysis.run_folder import RunFolder, object_poses, scene_time, sensor_poses, true_contacts
 from touchcell.cell.bench.provenance import provenance
-from touchcell.cell.cli.main import find_cell
+from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.experiments.push_measures import off_normal_mm, target_mm
 from touchcell.cell.recording.mcap import RECORDING, Recorder

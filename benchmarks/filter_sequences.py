@@ -14,11 +14,11 @@ from touchcell.drivers.replay.dataset import natural_order, read_split
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.gaussian import PoseGaussian, mahalanobis_squared
 from touchcell.geometry.types import Array
+from touchcell.perception.contact_poses import random_poses
 from touchcell.perception.models.labels import CONTACT_NAMES, XI_UNITS, contact_from_xi
 from touchcell.perception.models.prediction import Prediction
 from touchcell.perception.runtime.estimators import load_estimator
 from touchcell.perception.runtime.filter import FilterState, PoseFilter
-from touchcell.simulation.samples import random_poses
 
 STEP_NS = 1_000_000_000
 """Between two contacts, so that a noise density per second is one per contact."""

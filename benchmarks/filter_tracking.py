@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 
 from touchcell.cell.analysis.report import summarise
 from touchcell.cell.analysis.run_data import load_run
-from touchcell.cell.cli.main import find_cell
+from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import FilterSection, plan_cell
 from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.compose import build_filter, compose

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from touchcell.drivers.core.clock import VirtualClock
+from touchcell.drivers.core.scene import ContactState
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.simulation.contact import ContactState
 from touchcell.simulation.scene import SceneConfig
 
 GRAVITY_M_S2 = 9.81

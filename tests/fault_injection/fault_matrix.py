@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from tests.fault_injection.sent_commands import SentCommands
-from touchcell.cell.cli.main import find_cell
+from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.cell.runtime.compose import Cell, compose
 from touchcell.cell.runtime.loop import RunLoop, RunResult, StopRequest

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 import yaml
 
-from touchcell.cell.cli.main import find_cell
+from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import CellFile, CellPlan, DevicePlan, plan_cell
 from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame

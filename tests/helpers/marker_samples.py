@@ -9,12 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from touchcell.drivers.replay.dataset import IMAGE_COLUMN, LABEL_COLUMNS
+from touchcell.drivers.replay.dataset import IMAGE_COLUMN, LABEL_COLUMNS, PUBLIC_CROP
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array, ImageArray
+from touchcell.perception.contact_poses import random_poses
 from touchcell.simulation.contact import ContactLaw, contact_at
-from touchcell.simulation.render import PUBLIC_CROP, FrameRenderer
-from touchcell.simulation.samples import random_poses
+from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.tip import Tip
 
 SIZE = (PUBLIC_CROP[3] - PUBLIC_CROP[1], PUBLIC_CROP[2] - PUBLIC_CROP[0])

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from touchcell.drivers.core.clock import VirtualClock
+from touchcell.drivers.core.scene import ContactState
 from touchcell.geometry import se3
 from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
-from touchcell.simulation.contact import ContactState
 from touchcell.simulation.devices.arm import SimArm, SimArmConfig
 from touchcell.simulation.scene import Scene, SceneConfig
 from touchcell.tasks.interface import Observation, Task, TaskContext

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from touchcell.simulation.contact import ContactLaw, ContactModel, ContactState, contact_at
+from touchcell.drivers.core.scene import ContactState
+from touchcell.simulation.contact import ContactLaw, ContactModel, contact_at
 from touchcell.simulation.motions import Glide, Periodic, Still
 from touchcell.simulation.surfaces import Dome, Plane, Ramp, Surface
 

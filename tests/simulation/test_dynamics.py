@@ -6,9 +6,9 @@ from pydantic import ValidationError
 
 from benchmarks.simulation_checks import GRAVITY_M_S2, Hand, uniform_pressure_yaw
 from touchcell.drivers.core.clock import VirtualClock
+from touchcell.drivers.core.scene import ContactState
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
-from touchcell.simulation.contact import ContactState
 from touchcell.simulation.scene import SceneConfig
 
 mujoco = pytest.importorskip("mujoco")

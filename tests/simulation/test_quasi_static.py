@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from touchcell.drivers.core.clock import VirtualClock
+from touchcell.drivers.core.scene import ContactState
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
-from touchcell.simulation.contact import ContactLaw, ContactState
+from touchcell.simulation.contact import ContactLaw
 from touchcell.simulation.objects import ObjectConfig, TableConfig
 from touchcell.simulation.quasi_static import QuasiStaticWorld
 from touchcell.simulation.scene import SceneConfig

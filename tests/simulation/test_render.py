@@ -4,9 +4,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from touchcell.drivers.replay.dataset import PUBLIC_CROP
 from touchcell.geometry import se3
 from touchcell.simulation import _plain_paint
-from touchcell.simulation.render import PUBLIC_CROP, FrameRenderer, Lighting, Stamps
+from touchcell.simulation.render import FrameRenderer, Lighting, Stamps
 from touchcell.simulation.tip import Tip
 
 STAMPS = Stamps(6.2)

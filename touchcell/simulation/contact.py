@@ -12,50 +12,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from touchcell.geometry import se3
+from touchcell.drivers.core.scene import ContactState
 from touchcell.geometry.types import Array
 from touchcell.simulation.surfaces import Surface
 from touchcell.simulation.timeline import Restore
 
 _IDENTITY = np.eye(4)
-
-
-@dataclass(frozen=True, slots=True)
-class ContactState:
-    """What the tip feels: the only thing that the simulated image depends on, and the ground truth for it.
-
-    Attributes:
-        T_f_s: (4, 4) effective pose of the sensor in the surface frame, after slip; out of contact its z is minus the
-            gap and it carries no shear.
-        T_world_f: (4, 4) pose of the surface frame.
-        in_contact: whether the tip touches.
-        slipping: whether the contact slid in the last step.
-        normal_force_n: force on the tip along the surface normal.
-        shear_force_n: force on the tip along the x and y axes of {f}; zero where the physics does not tell it.
-    """
-
-    T_f_s: Array
-    T_world_f: Array
-    in_contact: bool
-    slipping: bool
-    normal_force_n: float
-    shear_force_n: tuple[float, float] = (0.0, 0.0)
-
-    @property
-    def T_s_f(self) -> Array:  # noqa: N802  the field's own name
-        """(4, 4) pose of the surface frame in the sensor frame: what the network predicts."""
-        return se3.inverse(self.T_f_s)
-
-    @property
-    def depth_m(self) -> float:
-        """Indentation, negative out of contact."""
-        return float(self.T_f_s[2, 3])
-
-    @property
-    def force_world_n(self) -> Array:
-        """(3,) force on the tip along the world's axes."""
-        force: Array = self.T_world_f[:3, :3] @ np.array([*self.shear_force_n, -self.normal_force_n])
-        return force
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,9 +20,10 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from touchcell.drivers.core.scene import ContactState
 from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry.types import Array
-from touchcell.simulation.contact import ContactState, about_z, tilt_of
+from touchcell.simulation.contact import about_z, tilt_of
 from touchcell.simulation.dynamics_model import TipMechanics, build_model, cross, quaternion, rotation
 from touchcell.simulation.objects import FreeObject
 from touchcell.simulation.solids import shape_of

@@ -18,9 +18,10 @@ from typing import Final
 
 import numpy as np
 
+from touchcell.drivers.core.scene import ContactState
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
-from touchcell.simulation.contact import ContactLaw, ContactModel, ContactState
+from touchcell.simulation.contact import ContactLaw, ContactModel
 from touchcell.simulation.objects import Ball, FreeObject
 from touchcell.simulation.solids import friction_radius_m, plain_shape_of
 from touchcell.simulation.surfaces import Surface

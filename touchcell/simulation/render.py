@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from touchcell.drivers.replay.dataset import FRAME_SIZE, PUBLIC_CROP
 from touchcell.geometry.types import Array, ImageArray
 
 try:
@@ -18,9 +19,6 @@ except ImportError:
 
 Seed = int | tuple[int, ...]
 
-FRAME_SIZE = (640, 480)
-PUBLIC_CROP = (105, 20, 550, 460)
-"""(left, top, right, bottom) px of the public images within the 640x480 frame."""
 
 _ROWS = 4
 

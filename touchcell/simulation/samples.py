@@ -7,13 +7,12 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.perception.contact_poses import PUBLIC_DEPTH_MM, random_poses
 from touchcell.simulation.contact import ContactLaw, contact_at
 from touchcell.simulation.mount import Rig
 from touchcell.simulation.tip import Tip, TipParameters
 
-PUBLIC_DEPTH_MM = (0.5, 6.0)
 _IMAGES_PER_TIP = 16
 _ADDITIVE = {"centre_px", "image_rotation_rad", "layout_phase_rad", "camera_tilt_rad"}
 
@@ -105,27 +104,6 @@ def contacts(
             yield SampledContact(T_f_s[i], pixels[i][seen[i]], float(radius[i]))
 
 
-def random_poses(
-    n: int,
-    rng: np.random.Generator,
-    depth_mm: tuple[float, float] = PUBLIC_DEPTH_MM,
-    *,
-    tilt_deg: float = 25.0,
-    shear_mm: float = 5.0,
-    torsion_deg: float = 5.0,
-) -> Array:
-    """(n, 4, 4) contacts T_f_s over the ranges of the public data, before any slip."""
-    tilt, shear = _disc(n, tilt_deg, rng), _disc(n, shear_mm, rng)
-    depth, gamma = rng.uniform(*depth_mm, n), rng.uniform(-torsion_deg, torsion_deg, n)
-    return se3.from_euler_mm_deg(np.column_stack([shear, depth, tilt, gamma]))
-
-
-def _disc(n: int, radius: float, rng: np.random.Generator) -> Array:
-    """(n, 2) points spread evenly over a disc."""
-    length, angle = radius * np.sqrt(rng.random(n)), rng.uniform(0.0, 2.0 * np.pi, n)
-    return np.column_stack([length * np.cos(angle), length * np.sin(angle)])
-
-
 def _slipping(rig: Rig, variation: Variation, rng: np.random.Generator) -> Rig:
     longer, steeper, looser = 1.0 + variation.slip * rng.normal(0.0, 1.0, 3)
     return replace(
@@ -168,3 +146,18 @@ def _scattered(middle: TipParameters, variation: Variation, rng: np.random.Gener
         camera_distance_m=distance,
         focal_px=middle.focal_px * zoom * to_apex,
     )
+
+
+def analytic_displacements(reference: Array, rings: int, seed: int, n: int = 2000) -> Array:
+    """(n, m, 2) px displacements of the simulated tip in random contacts, laid onto a sensor's lattice."""
+
+    tip = Tip(TipParameters(rings=rings))
+    poses = random_poses(n, np.random.default_rng(seed), (0.0, 6.5))
+    law = ContactLaw()
+    pixels = tip.pixels(np.stack([contact_at(pose, law).T_f_s for pose in poses]))
+    rest = tip.project(tip.rest_positions)
+    from_tip = (rest - rest.mean(axis=0)) @ np.array([1.0, 1j])
+    to_sensor = (reference - reference.mean(axis=0)) @ np.array([1.0, 1j])
+    turn = np.vdot(from_tip, to_sensor) / np.vdot(from_tip, from_tip)
+    moved = ((pixels - rest) @ np.array([1.0, 1j])) * turn
+    return np.stack([moved.real, moved.imag], axis=-1)

@@ -14,10 +14,11 @@ from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import TcpSource
 from touchcell.drivers.core.samples import Stamped
+from touchcell.drivers.core.scene import ContactState, SceneSection, SceneSpec
 from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.simulation.contact import ContactLaw, ContactState
+from touchcell.simulation.contact import ContactLaw
 from touchcell.simulation.motions import Glide, Motion, Periodic, Still
 from touchcell.simulation.objects import ObjectConfig, PoseMmDeg, TableConfig
 from touchcell.simulation.quasi_static import QuasiStaticWorld
@@ -89,18 +90,6 @@ class MeasuredCarrier:
                 self._T_base_tcp = T_base_tcp
         assert self._T_base_tcp is not None
         return self._T_world_base @ self._T_base_tcp
-
-
-class SceneTruth(Protocol):
-    """What can be asked of a scene, also of one in another process."""
-
-    def contact(self, sensor: str, t_ns: int | None = None) -> Stamped[ContactState]:
-        """What ``sensor`` feels."""
-        ...
-
-    def objects(self) -> Stamped[Mapping[str, Array]]:
-        """T_world_object (4, 4) of every free object."""
-        ...
 
 
 class Scene:
@@ -332,7 +321,7 @@ class TipLawConfig(_Part):
         return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3, self.friction)
 
 
-class SceneConfig(_Part):
+class SceneConfig(_Part, SceneSection):
     """The ``scene:`` section of a cell file. Poses are in the world frame.
 
     ``physics`` says how true it is (docs/simulation.md). ``kinematic``: surfaces move as they were told, whatever
@@ -383,3 +372,6 @@ class SceneConfig(_Part):
         tip = TipMechanics(1e-3 * self.tip.radius_mm, 1e3 * self.tip.stiffness_n_mm, self.tip.friction)
         objects = {name: config.build(self.table) for name, config in self.objects.items()}
         return DynamicWorld(surfaces, objects, 1e-3 * self.table.height_mm, tip, 1e-3 * self.physics_step_ms)
+
+
+SPEC = SceneSpec("simulated", "surfaces and free objects, kinematic, quasi-static or dynamic", SceneConfig)

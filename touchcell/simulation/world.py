@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
+from touchcell.drivers.core.scene import ContactState
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
-from touchcell.simulation.contact import ContactLaw, ContactModel, ContactState
+from touchcell.simulation.contact import ContactLaw, ContactModel
 from touchcell.simulation.surfaces import Surface
 from touchcell.simulation.timeline import Restore
 

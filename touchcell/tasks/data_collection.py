@@ -19,8 +19,8 @@ from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.errors import TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.perception.contact_poses import PUBLIC_DEPTH_MM, random_poses
 from touchcell.perception.runtime.estimate import ContactEstimate
-from touchcell.simulation.samples import PUBLIC_DEPTH_MM, random_poses
 from touchcell.tasks.interface import Action, Observation, TaskConfig, TaskContext, TaskSpec, TransitionRecord
 from touchcell.tasks.servoing import ARM, SENSOR
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef

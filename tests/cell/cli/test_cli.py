@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK
-from touchcell.cell.cli.main import find_cell, main
+from touchcell.cell.cli.main import main
+from touchcell.cell.config.find import find_cell
 
 
 def test_list_names_everything_a_cell_file_may_say(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,8 +1,9 @@
 import numpy as np
 
 from touchcell.geometry import se3
+from touchcell.perception.contact_poses import random_poses
 from touchcell.simulation.contact import ContactLaw
-from touchcell.simulation.samples import Variation, contacts, random_poses
+from touchcell.simulation.samples import Variation, contacts
 from touchcell.simulation.tip import Tip
 
 

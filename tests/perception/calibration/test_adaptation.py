@@ -14,6 +14,7 @@ from benchmarks.adapt import _drawn, _errors, second_sensor
 from tests.helpers.marker_samples import SIZE, write_split
 from touchcell.cell.cli.calibrate_sim import calibrate_sim
 from touchcell.cell.cli.train_sim import Imagined, _discs
+from touchcell.drivers.replay.dataset import PUBLIC_CROP
 from touchcell.geometry import se3
 from touchcell.perception.calibration.adaptation import (
     AdaptSettings,
@@ -38,7 +39,6 @@ from touchcell.perception.networks.marker_learning import train_guess
 from touchcell.perception.runtime.calibrated_estimator import turned
 from touchcell.perception.runtime.estimators import load_estimator
 from touchcell.simulation.mount import Rig
-from touchcell.simulation.render import PUBLIC_CROP
 from touchcell.simulation.tip import Tip, TipParameters
 from touchcell.simulation.tip_file import load_tip
 
@@ -54,7 +54,7 @@ def model() -> Model:
     corner = np.array(PUBLIC_CROP[:2], dtype=np.float64)
     reference = tip.project(tip.rest_positions) - corner
     rng = np.random.default_rng(0)
-    from touchcell.simulation.samples import random_poses
+    from touchcell.perception.contact_poses import random_poses
 
     poses = random_poses(500, rng, (0.2, 6.2))
     displacements = tip.pixels(RIG.contact(poses)) - corner - reference

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from touchcell.cell.analysis.run_data import Run, Series, load_run, tip_points
 from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.geometry.types import Array
-from touchcell.simulation.scene import SceneConfig
-from touchcell.simulation.surfaces import Surface
 
 
 @dataclass(frozen=True)
@@ -91,11 +89,6 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(finite**2))) if len(finite) else float("nan")
 
 
-def surface(run: RunFolder) -> Surface:
-    """The first surface of the run's scene, with its motion."""
-    return next(iter(scene(run).surfaces.values())).build()
-
-
 def object_poses(run: RunFolder) -> Mapping[str, Poses]:
     """Where every free object was, by its name."""
     return {
@@ -103,8 +96,3 @@ def object_poses(run: RunFolder) -> Mapping[str, Poses]:
         for topic, series in run.recording.topics.items()
         if topic.startswith("/objects/")
     }
-
-
-def scene(run: RunFolder) -> SceneConfig:
-    """The scene of a simulated run."""
-    return SceneConfig.model_validate(run.plan.cell.scene)

@@ -20,7 +20,7 @@ import yaml
 
 from touchcell.cell.bench.perception import write_simulated
 from touchcell.cell.bench.provenance import as_installed, provenance
-from touchcell.cell.cli.main import find_cell
+from touchcell.cell.config.find import find_cell
 from touchcell.drivers.replay.dataset import IMAGE_FOLDER
 
 _REPLAYED = 120
@@ -96,14 +96,14 @@ def ready():
 
 from pathlib import Path
 if what == "run":
-    from touchcell.cell.cli.run import give_back_memory
+    from touchcell.cell.cli.run import trim_heap
     from touchcell.cell.runtime.black_box import BlackBox
     from touchcell.cell.runtime.compose import compose
     from touchcell.cell.config.schema import plan_cell
     from touchcell.cell.runtime.loop import RunLoop
     from touchcell.cell.recording.mcap import Recorder
     cell = compose(plan_cell(Path(path)))
-    give_back_memory()
+    trim_heap()
     with Recorder(Path(path).with_name("run.mcap")) as recorder, cell:
         ready()
         times = RunLoop(cell, recorder, box=BlackBox()).run().times.rows

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from touchcell.cell.bench.provenance import provenance
-from touchcell.cell.cli.main import find_cell
+from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.compose import compose

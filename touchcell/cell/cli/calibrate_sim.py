@@ -20,10 +20,10 @@ from rich.table import Table
 
 from touchcell.drivers.replay.dataset import Split, read_image, read_split
 from touchcell.geometry.types import Array
-from touchcell.perception.calibration.marked_data import SensorMarkers, evenly, learn_sensor
-from touchcell.perception.calibration.tip_fit import MarkedContacts, Sensor, fit_tip
+from touchcell.perception.calibration.marked_data import MarkedContacts, SensorMarkers, evenly, learn_sensor
 from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.tip_file import TipFile, save_tip
+from touchcell.simulation.tip_fit import Sensor, fit_tip
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -151,7 +151,7 @@ def _print(console: Console, found: Mapping[str, MarkerErrors]) -> None:
 def _write_picture(
     path: Path, markers: SensorMarkers, split: Split, sensor: Sensor, contacts: MarkedContacts, numbers: Array
 ) -> None:
-    from touchcell.perception.calibration.tip_figures import write_comparison
+    from touchcell.simulation.tip_figures import write_comparison
 
     columns = np.linspace(0, len(numbers) - 1, _SHOWN).round().astype(int)
     real, simulated, measured, predicted, titles = [], [], [], [], []

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from touchcell.cell.cli.main import find_cell
+from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.drivers.core.clock import MonotonicClock
 from touchcell.drivers.core.errors import DeviceError

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_TASK_FAILED
+from touchcell.cell.config.find import find_cell
 from touchcell.errors import TouchcellError
-from touchcell.paths import CONFIGS
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -344,7 +344,7 @@ def _report(options: argparse.Namespace) -> int:
 
     print(write_report(options.folder))
     if options.animate:
-        from touchcell.cell.analysis.animation import animate
+        from touchcell.cell.experiments.animation import animate
 
         print(animate(options.folder))
     return EXIT_OK
@@ -425,12 +425,6 @@ def _experiment(options: argparse.Namespace) -> int:
     if len(tables) > 1:
         (options.out / "summary.txt").write_text("\n\n".join(tables) + "\n")
     return EXIT_OK
-
-
-def find_cell(path: Path) -> Path:
-    """``path`` itself, or the cell file of that name that ships with touchcell."""
-    shipped = CONFIGS / path.name
-    return path if path.exists() or not shipped.exists() else shipped
 
 
 def _overrides(data: Path | None) -> dict[str, Path]:

@@ -19,6 +19,7 @@ from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import RECORDING, Recorder
 from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, stop_record
 from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.heap import trim_heap
 from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
 from touchcell.cell.runtime.operator_channel import OperatorDesk
 from touchcell.cell.runtime.operator_input import reachable, stop_on_keys, stop_on_signals
@@ -57,7 +58,7 @@ def run_cell(
     """
     plan = plan_cell(path, {} if data is None else {"data": data}, model=model)
     cell = compose(plan)
-    give_back_memory()
+    trim_heap()
     folder = out or Path("runs") / f"{plan.cell.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(path, folder / "cell.yaml")
@@ -65,21 +66,12 @@ def run_cell(
     (folder / "result.json").write_text(json.dumps(_result_json(plan, result), indent=1) + "\n")
     print(write_report(folder))
     if moving:
-        from touchcell.cell.analysis.animation import animate
+        from touchcell.cell.experiments.animation import animate
 
         print(f"  {animate(folder).name}")
     if result.outcome in (Outcome.TRIPPED, Outcome.ERROR):
         print(f"`touchcell why {folder}` explains")
     return _EXIT[result.outcome]
-
-
-def give_back_memory() -> None:
-    """Hand what composing a cell has freed back to the system: 5 to 12 MB, which glibc keeps otherwise."""
-    import ctypes
-
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
 
 
 def _run(cell: Cell, folder: Path, live: bool) -> RunResult:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from touchcell.drivers.replay.dataset import FRAME_SIZE, PUBLIC_CROP
 from touchcell.geometry import se3
 from touchcell.geometry.types import ImageArray
 from touchcell.perception.markers.detection import Discs
@@ -24,7 +25,7 @@ from touchcell.perception.models.preprocessing import AdaptiveThreshold, Crop, P
 from touchcell.perception.networks.dataset import LabelledImages
 from touchcell.perception.networks.progress import Display, Observer
 from touchcell.perception.networks.training import Settings, train_on_arrays
-from touchcell.simulation.render import FRAME_SIZE, PUBLIC_CROP, FrameRenderer
+from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.samples import SampledContact, Variation, contacts
 from touchcell.simulation.tip import Tip, TipParameters
 from touchcell.simulation.tip_file import TipFile, load_tip

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -23,6 +22,7 @@ from touchcell.control.interlocks.config import INTERLOCKS, REQUIRED_TO_MOVE, RE
 from touchcell.drivers.core import spec as driver_registry
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.device import DeactivatePolicy
+from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DriverConfig, DriverSpec
 from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
@@ -352,17 +352,11 @@ class _Planner:
             overshoots,
         )
 
-    @cached_property
-    def _scene_model(self) -> type[BaseModel]:
-        from touchcell.simulation.scene import SceneConfig
-
-        return SceneConfig
-
     def _require_scene_fits(self, cell: CellFile) -> None:
         if cell.scene is not None:
-            self._validated(self._scene_model, cell.scene, ("scene",))
+            self._validated(scene_section(), cell.scene, ("scene",))
         if cell.emulated_scene is not None:
-            self._validated(self._scene_model, cell.emulated_scene, ("emulated_scene",))
+            self._validated(scene_section(), cell.emulated_scene, ("emulated_scene",))
 
     def _task(self, cell: CellFile) -> tuple[TaskSpec | None, TaskConfig | None]:
         try:

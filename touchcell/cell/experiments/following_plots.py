@@ -8,10 +8,11 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from touchcell.cell.analysis.outlines import height_mm
-from touchcell.cell.analysis.run_folder import Poses, RunFolder, sensor_poses, surface, tilt_deg, true_contacts
+from touchcell.cell.analysis.run_folder import Poses, RunFolder, sensor_poses, tilt_deg, true_contacts
 from touchcell.cell.experiments.frames import BLUE, GREY, ORANGE, frames_2d, label_2d, path_2d, save
+from touchcell.cell.experiments.scenes import surface
 from touchcell.geometry.types import Array
+from touchcell.simulation.outlines import height_mm
 
 _SIDE, _ABOVE = (0, 2), (0, 1)
 

@@ -8,11 +8,12 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from touchcell.cell.analysis.outlines import ABOVE, SIDE, View, solid_outlines_mm
-from touchcell.cell.analysis.run_folder import Poses, RunFolder, object_poses, scene, sensor_poses
+from touchcell.cell.analysis.run_folder import Poses, RunFolder, object_poses, sensor_poses
 from touchcell.cell.experiments.frames import BLUE, ORANGE, frames_2d, label_2d, path_2d, save
 from touchcell.cell.experiments.push_measures import OBJECT, lean_deg, pushed_until_s, target_mm
+from touchcell.cell.experiments.scenes import scene
 from touchcell.cell.experiments.trials import Finished
+from touchcell.simulation.outlines import ABOVE, SIDE, View, solid_outlines_mm
 
 _RED = "#d62728"
 

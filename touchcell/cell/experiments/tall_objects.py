@@ -111,8 +111,8 @@ def measure(run: RunFolder) -> Mapping[str, float]:
 
 def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
     """The paper's figure 20, the same from the side without follower, and how far each leant; learned estimator."""
-    from touchcell.cell.analysis.outlines import SIDE
     from touchcell.cell.experiments.pushing_plots import plot_leans, plot_pushes
+    from touchcell.simulation.outlines import SIDE
 
     arms = {
         arms: [each for each in finished if each.trial.name.endswith(f"{arms}_learned_1".replace(" ", "_"))]

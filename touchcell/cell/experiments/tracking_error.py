@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from touchcell.cell.analysis.run_folder import Poses, RunFolder, scene_time, sensor_poses, surface, true_contacts
+from touchcell.cell.analysis.run_folder import Poses, RunFolder, scene_time, sensor_poses, true_contacts
+from touchcell.cell.experiments.scenes import surface
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.tasks.servoing import SENSOR

@@ -34,6 +34,7 @@ from touchcell.drivers.core.clock import Clock, MonotonicClock, VirtualClock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.protocols import FrameSource, StopCategory, TcpSource
 from touchcell.drivers.core.samples import Frame, Stamped
+from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DriverContext
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
@@ -43,9 +44,9 @@ from touchcell.perception.runtime.pipeline import ContactPipeline, ContactSource
 from touchcell.tasks.interface import Task, TaskContext
 
 if TYPE_CHECKING:
+    from touchcell.drivers.core.scene import Scene, SceneTruth
     from touchcell.drivers.hosting.chain import Chain
     from touchcell.perception.runtime.filter import ContactFilter
-    from touchcell.simulation.scene import Scene, SceneTruth
 
 BUILTIN = "builtin:"
 
@@ -321,9 +322,7 @@ def _clock(plan: CellPlan) -> Clock:
 def _scene(plan: CellPlan, clock: Clock) -> Scene | None:
     if plan.cell.scene is None:
         return None
-    from touchcell.simulation.scene import SceneConfig
-
-    return SceneConfig.model_validate(plan.cell.scene).build(clock)
+    return scene_section().model_validate(plan.cell.scene).build(clock)
 
 
 def _collection(plan: CellPlan) -> Collection | None:

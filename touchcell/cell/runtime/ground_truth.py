@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from touchcell.drivers.core.scene import SceneTruth
 from touchcell.drivers.replay.arm import ReplayArm
 from touchcell.geometry import se3
 from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
-from touchcell.simulation.scene import SceneTruth
 
 # As good as exact, yet a proper covariance: a micrometre and a microradian.
 _COVARIANCE = np.eye(6) * 1e-12

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict
 from touchcell import registry as entry_points
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
+from touchcell.drivers.core.scene import SceneTruth
 from touchcell.geometry.types import Array
 
 GROUP = "touchcell.drivers"
@@ -71,7 +72,7 @@ class DriverContext:
 
     clock: Clock
     devices: Mapping[str, Device] = field(default_factory=dict)
-    scene: Any = None
+    scene: SceneTruth | None = None
     seed: int = 0
     bases: Mapping[str, Array] = field(default_factory=dict)
 

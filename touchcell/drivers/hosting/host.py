@@ -28,6 +28,7 @@ from touchcell.drivers.core.errors import CommandRejected, DeviceError, Lifecycl
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.protocols import FrameSource, HealthSource, JointSource, StopCategory
 from touchcell.drivers.core.samples import Frame, JointState, Quality, Stamped
+from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DriverContext
 from touchcell.drivers.hosting.layouts import (
     ANSWER,
@@ -50,7 +51,7 @@ from touchcell.drivers.hosting.wire import encode_adjustments, encode_error, err
 from touchcell.errors import TouchcellError
 
 if TYPE_CHECKING:
-    from touchcell.simulation.scene import Scene
+    from touchcell.drivers.core.scene import Scene
 
 LIFECYCLES: Final = tuple(Lifecycle)
 REST_MARGIN_S: Final = 0.1
@@ -435,9 +436,7 @@ class Host:
 def _build(spec: Mapping[str, Any], clock: Clock) -> tuple[dict[str, Device], Scene | None]:
     scene = None
     if spec["scene"] is not None:
-        from touchcell.simulation.scene import SceneConfig
-
-        scene = SceneConfig.model_validate(spec["scene"]).build(clock)
+        scene = scene_section().model_validate(spec["scene"]).build(clock)
     devices: dict[str, Device] = {}
     context = DriverContext(clock, devices, scene, spec["seed"])
     for each in spec["devices"]:

@@ -11,13 +11,13 @@ import numpy as np
 
 from touchcell.drivers.core.errors import StaleData
 from touchcell.drivers.core.samples import Stamped
+from touchcell.drivers.core.scene import ContactState
 from touchcell.drivers.hosting.layouts import MAX_OBJECTS, OBJECTS, TRUTH, RecordReader, RecordWriter
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
-from touchcell.simulation.contact import ContactState
 
 if TYPE_CHECKING:
-    from touchcell.simulation.scene import Scene
+    from touchcell.drivers.core.scene import Scene
 
 
 class TruthSeat:

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from touchcell import errors as base_errors
 from touchcell.drivers.core import errors
 from touchcell.drivers.core.errors import CorruptMessage, DeviceError, FaultClass, Rejection, Remedy
 from touchcell.drivers.kinematics.adjustment import Adjustment
@@ -19,7 +20,9 @@ from touchcell.errors import TouchcellError
 MAX_MESSAGE_BYTES: Final = 1 << 17
 
 _ERRORS: Final[dict[str, type[TouchcellError]]] = {
-    name: found for name, found in vars(errors).items() if isinstance(found, type) and issubclass(found, TouchcellError)
+    name: found
+    for name, found in {**vars(base_errors), **vars(errors)}.items()
+    if isinstance(found, type) and issubclass(found, TouchcellError)
 }
 _ENUMS: Final[dict[str, type[Enum]]] = {each.__name__: each for each in (Rejection, FaultClass, Remedy)}
 

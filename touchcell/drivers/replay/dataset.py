@@ -170,3 +170,10 @@ def _number(text: str | None, table: Path, row: int, column: str) -> float:
     if not math.isfinite(value):
         raise DataError(table, f"{text!r} is no finite number", row=row, column=column)
     return value
+
+
+FRAME_SIZE = (640, 480)
+
+
+PUBLIC_CROP = (105, 20, 550, 460)
+"""(left, top, right, bottom) px of the public images within the 640x480 frame."""

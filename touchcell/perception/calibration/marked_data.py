@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from touchcell.drivers.replay.dataset import Split, read_image, read_split
+from touchcell.drivers.replay.dataset import FRAME_SIZE, PUBLIC_CROP, Split, read_image, read_split
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array, ImageArray
-from touchcell.perception.calibration.tip_fit import MarkedContacts
 from touchcell.perception.errors import ImageError
 from touchcell.perception.markers.detection import detect_markers, typical_size
 from touchcell.perception.markers.matching import MarkerField, MarkerMatcher
@@ -19,7 +20,6 @@ from touchcell.perception.models.marker_architecture import MarkerSize
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.marker_learning import learn_markers
 from touchcell.perception.networks.marker_training import preprocessing_for
-from touchcell.simulation.render import FRAME_SIZE, PUBLIC_CROP
 
 _BELIEVED = 0.97
 
@@ -137,3 +137,25 @@ def evenly(n: int, wanted: int) -> list[int]:
     if wanted >= n:
         return list(range(n))
     return [int(each) for each in np.linspace(0, n - 1, wanted + 2).round()[1:-1]]
+
+
+@dataclass(frozen=True)
+class MarkedContacts:
+    """Contacts that an arm was told to make, and where the markers were then.
+
+    Attributes:
+        T_f_s: (n, 4, 4) commanded.
+        pixels: (n, m, 2) px.
+        seen: (n, m) markers that were found.
+    """
+
+    T_f_s: Array
+    pixels: Array
+    seen: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.T_f_s)
+
+    def chosen(self, which: Any) -> MarkedContacts:
+        """Some of the contacts."""
+        return MarkedContacts(self.T_f_s[which], self.pixels[which], self.seen[which])

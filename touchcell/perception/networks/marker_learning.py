@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from types import FunctionType
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from touchcell import registry
 from touchcell.geometry.types import Array
 from touchcell.perception.errors import TrainingError
 from touchcell.perception.markers.detection import Discs, lattice, ring_numbers
@@ -35,7 +38,6 @@ _LAST_STEPS = 100
 _SURE = 0.96
 _SPREADS = 2
 _ALIKE = 8
-_SWEEP = 2000
 
 Told = Callable[[int, int], None]
 """Told (frames done, frames in all)."""
@@ -122,22 +124,15 @@ def find_reference(frames: Sequence[Discs], rings: int) -> Array:
     return points
 
 
-def analytic_displacements(reference: Array, rings: int, seed: int, n: int = _SWEEP) -> Array:
-    """(n, m, 2) px displacements of the simulated tip in random contacts, laid onto a sensor's lattice."""
-    from touchcell.simulation.contact import ContactLaw, contact_at
-    from touchcell.simulation.samples import random_poses
-    from touchcell.simulation.tip import Tip, TipParameters
+GROUP = "touchcell.displacement_priors"
 
-    tip = Tip(TipParameters(rings=rings))
-    poses = random_poses(n, np.random.default_rng(seed), (0.0, 6.5))
-    law = ContactLaw()
-    pixels = tip.pixels(np.stack([contact_at(pose, law).T_f_s for pose in poses]))
-    rest = tip.project(tip.rest_positions)
-    from_tip = (rest - rest.mean(axis=0)) @ np.array([1.0, 1j])
-    to_sensor = (reference - reference.mean(axis=0)) @ np.array([1.0, 1j])
-    turn = np.vdot(from_tip, to_sensor) / np.vdot(from_tip, from_tip)
-    moved = ((pixels - rest) @ np.array([1.0, 1j])) * turn
-    return np.stack([moved.real, moved.imag], axis=-1)
+DisplacementPrior = Callable[[Array, int, int], Array]
+"""(n, m, 2) px displacements of markers in random contacts, from a lattice (m, 2) px, its rings and a seed."""
+
+
+def displacement_prior() -> DisplacementPrior:
+    """Where learning begins before any image has been matched: a simulated tip, by its entry point."""
+    return cast(DisplacementPrior, registry.load(GROUP, "displacement prior", "simulated", FunctionType))
 
 
 def learn_markers(
@@ -170,7 +165,7 @@ def learn_markers(
     """
     if reference is None:
         reference = find_reference(frames, rings)
-    displacements = analytic_displacements(reference, rings, seed)
+    displacements = displacement_prior()(reference, rings, seed)
     everything = np.ones(displacements.shape[:2], bool)
     model = DisplacementModel.fit(reference, displacements, everything, modes)
     coefficients = (displacements.reshape(len(displacements), -1) - model.mean) @ model.basis.T

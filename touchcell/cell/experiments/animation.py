@@ -17,20 +17,13 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from touchcell.cell.analysis.outlines import ABOVE, SIDE, View, height_mm, solid_outlines_mm, tip_outlines_mm
-from touchcell.cell.analysis.run_folder import (
-    Poses,
-    RunFolder,
-    object_poses,
-    scene,
-    scene_time,
-    sensor_poses,
-    true_contacts,
-)
+from touchcell.cell.analysis.run_folder import Poses, RunFolder, object_poses, scene_time, sensor_poses, true_contacts
+from touchcell.cell.experiments.scenes import scene
 from touchcell.cell.recording.mcap import read
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array, ImageArray
+from touchcell.simulation.outlines import ABOVE, SIDE, View, height_mm, solid_outlines_mm, tip_outlines_mm
 from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.scene import SceneConfig
 from touchcell.simulation.tip import Tip

@@ -7,11 +7,11 @@ import itertools
 import numpy as np
 import pytest
 
-from touchcell.cell.analysis.outlines import ABOVE, SIDE, height_mm, solid_outlines_mm, tip_outlines_mm
 from touchcell.cell.cli.main import main
 from touchcell.cell.experiments.trials import Perform, Trial
 from touchcell.geometry import se3
 from touchcell.simulation.objects import BallShape, BottleShape, BoxShape, HexagonShape
+from touchcell.simulation.outlines import ABOVE, SIDE, height_mm, solid_outlines_mm, tip_outlines_mm
 from touchcell.simulation.surfaces import Dome, Ramp, Surface
 
 
@@ -63,7 +63,7 @@ def test_heights_are_those_of_the_surface():
 def test_report_animates_a_run(tmp_path, capsys):
     from PIL import Image
 
-    from touchcell.cell.analysis.animation import animate
+    from touchcell.cell.experiments.animation import animate
 
     changes = {"sensors.sensor.estimator": {"kind": "true_contact"}, "task.distance_mm": 20}
     Perform(lambda run: {}, tmp_path)(Trial("it", "it", "surface_follow_sim.yaml", changes))

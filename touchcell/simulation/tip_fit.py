@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array
 from touchcell.perception.calibration.least_squares import robust_fit
+from touchcell.perception.calibration.marked_data import MarkedContacts
 from touchcell.perception.errors import TrainingError
 from touchcell.perception.markers.detection import lattice
 from touchcell.simulation.mount import Rig
@@ -92,28 +92,6 @@ _FIRST = [
     ("depth_m", None),
 ]
 _Key = tuple[str, int | None]
-
-
-@dataclass(frozen=True)
-class MarkedContacts:
-    """Contacts that an arm was told to make, and where the markers were then.
-
-    Attributes:
-        T_f_s: (n, 4, 4) commanded.
-        pixels: (n, m, 2) px.
-        seen: (n, m) markers that were found.
-    """
-
-    T_f_s: Array
-    pixels: Array
-    seen: NDArray[np.bool_]
-
-    def __len__(self) -> int:
-        return len(self.T_f_s)
-
-    def chosen(self, which: Any) -> MarkedContacts:
-        """Some of the contacts."""
-        return MarkedContacts(self.T_f_s[which], self.pixels[which], self.seen[which])
 
 
 @dataclass(frozen=True)

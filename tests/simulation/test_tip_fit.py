@@ -5,11 +5,12 @@ import pytest
 
 from touchcell.geometry import se3
 from touchcell.perception.calibration.least_squares import robust_fit
-from touchcell.perception.calibration.tip_fit import MarkedContacts, Sensor, fit_tip
+from touchcell.perception.calibration.marked_data import MarkedContacts
+from touchcell.perception.contact_poses import random_poses
 from touchcell.perception.errors import TrainingError
 from touchcell.simulation.mount import Rig
-from touchcell.simulation.samples import random_poses
 from touchcell.simulation.tip import Tip, TipParameters
+from touchcell.simulation.tip_fit import Sensor, fit_tip
 
 TRUE = Sensor(
     replace(

@@ -1,0 +1,165 @@
+"""``touchcell bench structure``: files per room, arrows and cycles between rooms and modules, and how code is worded.
+
+A room is a folder with Python files. An arrow leads from one room to another that it imports, also inside functions and
+under TYPE_CHECKING. Two checkouts beside each other: ``touchcell bench structure . ../before``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from touchcell.cell.bench.provenance import provenance
+
+_OLD_TOPS: Final = ("geometry", "drivers", "perception", "control", "tasks", "cell", "benchmarks")
+_DIALECT: Final = re.compile(
+    r"\b(told|tells?|telling|nobody|whoever|somebody|anybody|hurts?|go(?:es)? on|going on|words?|said|sa(?:ys|id) so"
+    r"|is there|what there is|looks? at|who looks|gives? up|so far as|alike|lawful(?:ly)?)\b",
+    re.IGNORECASE,
+)
+"""Words of the dialect of version 0.1.0, which a roboticist would not search for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tree:
+    """The modules of a checkout.
+
+    Attributes:
+        files: path of each module by its dotted name.
+        imports: modules that each module imports.
+    """
+
+    files: Mapping[str, Path]
+    imports: Mapping[str, set[str]]
+
+
+def read_tree(root: Path) -> Tree:
+    """Read the package of ``root``, or the top-level packages of version 0.1.0."""
+    tops = ["touchcell"] if (root / "touchcell").is_dir() else [top for top in _OLD_TOPS if (root / top).is_dir()]
+    files = {}
+    for top in tops:
+        for path in sorted((root / top).rglob("*.py")):
+            parts = path.relative_to(root).with_suffix("").parts
+            files[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    imports = {name: _imports(name, path, files) for name, path in files.items()}
+    return Tree(files, imports)
+
+
+def _imports(name: str, path: Path, files: Mapping[str, Path]) -> set[str]:
+    wanted: list[str] = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            wanted += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            wanted += [f"{node.module}.{alias.name}" for alias in node.names]
+    found = set()
+    for each in wanted:
+        while each and each not in files:
+            each = each.rpartition(".")[0]
+        # A package's own __init__ is passed through, not used.
+        if each and each != name and (files[each].name != "__init__.py" or each in wanted):
+            found.add(each)
+    return found
+
+
+def cycles(graph: Mapping[str, Iterable[str]]) -> list[list[str]]:
+    """Strongly connected components of more than one node (Tarjan 1972)."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(node: str) -> None:
+        index[node] = low[node] = len(index)
+        stack.append(node)
+        for other in graph.get(node, ()):
+            if other not in index:
+                visit(other)
+                low[node] = min(low[node], low[other])
+            elif other in stack:
+                low[node] = min(low[node], index[other])
+        if low[node] == index[node]:
+            at = stack.index(node)
+            component = stack[at:]
+            del stack[at:]
+            if len(component) > 1:
+                found.append(sorted(component))
+
+    for node in graph:
+        if node not in index:
+            visit(node)
+    return found
+
+
+def rooms(tree: Tree) -> tuple[dict[str, int], dict[str, set[str]], int]:
+    """Files per room, the rooms that each imports, and the number of arrows between modules of different rooms."""
+    # Modules at the package's root stand alone: a facade is no room.
+    room = {
+        name: name if path.name == "__init__.py" or (name.count(".") < 2 and name.startswith("touchcell.")) else
+        name.rpartition(".")[0]
+        for name, path in tree.files.items()
+    }  # fmt: skip
+    files: dict[str, int] = defaultdict(int)
+    graph: dict[str, set[str]] = defaultdict(set)
+    arrows = 0
+    for name in tree.files:
+        files[room[name]] += 1
+        for other in tree.imports[name]:
+            if room[other] != room[name]:
+                graph[room[name]].add(room[other])
+                arrows += 1
+    return dict(files), dict(graph), arrows
+
+
+def dialect(tree: Tree) -> tuple[int, int]:
+    """Docstrings that contain a word of the old dialect, and all docstrings."""
+    hit = count = 0
+    for path in tree.files.values():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+                text = ast.get_docstring(node)
+                if text:
+                    count += 1
+                    hit += bool(_DIALECT.search(text))
+    return hit, count
+
+
+def measure(root: Path) -> dict[str, Any]:
+    """All figures of one checkout."""
+    tree = read_tree(root)
+    files, graph, arrows = rooms(tree)
+    hit, docstrings = dialect(tree)
+    lines = sum(len(path.read_text().splitlines()) for path in tree.files.values())
+    return {
+        "modules": len(tree.files),
+        "lines": lines,
+        "rooms": len(files),
+        "largest rooms": dict(sorted(files.items(), key=lambda item: -item[1])[:6]),
+        "arrows between rooms": sum(len(others) for others in graph.values()),
+        "imports between rooms": arrows,
+        "cycles between rooms": cycles(graph),
+        "cycles between modules": cycles(tree.imports),
+        "docstrings in dialect": f"{hit} of {docstrings} ({100 * hit / max(docstrings, 1):.1f} %)",
+    }
+
+
+def run(arguments: Sequence[str], out: Path) -> None:
+    """Print the figures of each checkout; writes ``structure.json`` into ``out``."""
+    parser = argparse.ArgumentParser("touchcell bench structure", description=__doc__.partition("\n")[0])
+    parser.add_argument("roots", nargs="*", type=Path, default=[Path(__file__).parent.parent], metavar="checkout")
+    roots = parser.parse_args(arguments).roots
+    found = {str(root): measure(root) for root in roots}
+    for root, figures in found.items():
+        print(root)
+        for name, value in figures.items():
+            print(f"  {name:26} {len(value) if name.startswith('cycles') else value}")
+            for cycle in value if name.startswith("cycles") else ():
+                print(f"    {' '.join(cycle)}")
+    (out / "structure.json").write_text(json.dumps({**provenance(), "figures": found}, indent=1) + "\n")
