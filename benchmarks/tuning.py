@@ -25,7 +25,7 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.simulation.objects import BoxShape
 from touchcell.simulation.solids import friction_radius_m
-from touchcell.tasks.contact_servo import HandConfig
+from touchcell.tasks.contact_servo import ContactServoConfig
 from touchcell.tasks.dual_arm_pushing import FollowerConfig
 from touchcell.tasks.object_tracking import ObjectTrackingConfig
 from touchcell.tasks.single_arm_pushing import PushConfig, SingleArmPushingConfig
@@ -81,7 +81,7 @@ class _Frames:
         return new
 
 
-def servo_answer(config: HandConfig, axis: int, duration_s: float = 4.0) -> Answer:
+def servo_answer(config: ContactServoConfig, axis: int, duration_s: float = 4.0) -> Answer:
     """Of one axis of a servo to a step of 1 mm or 1 deg in it."""
     unit = 1e-3 if axis < 3 else math.radians(1.0)
 
@@ -89,13 +89,13 @@ def servo_answer(config: HandConfig, axis: int, duration_s: float = 4.0) -> Answ
         scaled = {name: tuple(factor * g for g in getattr(config, name)) for name in ("kp_per_s", "ki_per_s2", "kd")}
         wide = {"max_speed_mm_s": 1e6, "max_turn_deg_s": 1e6}
         wide |= {"max_integral_speed_mm_s": 1e6, "max_integral_turn_deg_s": 1e6}
-        servo = TactileServo(np.eye(4), np.eye(4), config.model_copy(update=scaled | wide).gains(), PERIOD_S)
+        controller = TactileServo(np.eye(4), np.eye(4), config.model_copy(update=scaled | wide).gains(), PERIOD_S)
         start = np.zeros(6)
         start[axis] = -unit
         T_f_s, frames, errors = se3.exp(start), _Frames(frame_rate_hz, latency_ms), []
         for i in range(round(duration_s / PERIOD_S)):
             frames.look(i * PERIOD_S, se3.inverse(T_f_s))
-            V = servo.step(frames.newest, frames.t_ns, np.zeros(6))
+            V = controller.step(frames.newest, frames.t_ns, np.zeros(6))
             T_f_s = se3.compose(T_f_s, se3.exp(V * PERIOD_S))
             errors.append(-float(se3.log(T_f_s)[axis]) / unit)
             if abs(errors[-1]) > 50.0:
@@ -110,7 +110,7 @@ def alignment_answer(config: PushConfig, duration_s: float = 20.0) -> Answer:
     half_m = 0.04
     c = friction_radius_m(BoxShape(kind="box", size_mm=(80, 80, 60)).build())  # type: ignore[arg-type]
     turn_per_m = half_m / (half_m**2 + c**2)
-    speed_m_s, lead_m = 1e-3 * config.push_speed_mm_s, 1e-3 * config.middle_mm
+    speed_m_s, lead_m = 1e-3 * config.push_speed_mm_s, 1e-3 * config.object_center_offset_mm
 
     def answer(factor: float, frame_rate_hz: float, latency_ms: float) -> Array:
         gains = config.model_copy(
@@ -189,7 +189,7 @@ def lines() -> list[Line]:
         ("follower", FollowerConfig(), (1, 2, 3)),
         ("leader", SingleArmPushingConfig(target_mm=(300.0, 0.0)), (3,)),
     ):
-        assert isinstance(config, HandConfig)
+        assert isinstance(config, ContactServoConfig)
         for axis in axes:
             gains = f"kp {config.kp_per_s[axis]:g}/s, ki {config.ki_per_s2[axis]:g}/s2"
             found.append(Line(f"{name}, {_AXES[axis]}", gains, servo_answer(config, axis)))

@@ -43,7 +43,7 @@ def test_a_push_through_the_middle_turns_nothing() -> None:
 
 
 def test_time_is_counted_where_it_is_spent() -> None:
-    with cpu_shares({"test_bench_simulation": "here", "simulation_checks": "there"}, "elsewhere") as counts:
+    with cpu_shares({"tests/benchmarks/test_simulation": "here", "simulation_checks": "there"}, "elsewhere") as counts:
         until = time.process_time() + 5.0
         while counts["here"] < 10 and time.process_time() < until:
             pass

@@ -41,7 +41,7 @@ def test_a_path_is_told_by_its_length():
 )
 def test_a_place_is_how_far_along_and_how_far_aside(p, along, aside):
     place = CORNER.place(p, 0.0, 1.0)
-    assert (place.along_m, place.aside_m) == pytest.approx((along, aside))
+    assert (place.along_m, place.cross_track_error_m) == pytest.approx((along, aside))
 
 
 def test_a_place_is_looked_for_near_where_one_was_last():
@@ -55,7 +55,7 @@ def test_points_beside_a_path_are_found_again(s, off):
     x, y = CORNER.point(s)
     dx, dy = CORNER.direction(s)
     place = CORNER.place((x - off * dy, y + off * dx), 0.0, 1.0)
-    assert abs(place.aside_m) <= abs(off) + 1e-12
+    assert abs(place.cross_track_error_m) <= abs(off) + 1e-12
     assert place.along_m == pytest.approx(s, abs=0.015)
 
 
@@ -70,8 +70,8 @@ def test_the_contact_goes_to_the_other_side_of_the_target():
         alignment = TargetAlignment(lambda middle, heading, y=target_y: [(0.3, y)], GAINS)
         aim = alignment.aim(FORWARD, np.eye(4))
         assert math.copysign(1.0, aim.theta_rad) == -sign
-        assert aim.target_aside_m == pytest.approx(target_y)
-        assert aim.rest_m == pytest.approx(math.hypot(0.3, 0.1))
+        assert aim.target_lateral_error_m == pytest.approx(target_y)
+        assert aim.remaining_m == pytest.approx(math.hypot(0.3, 0.1))
         assert alignment.step(aim, 0.01) == pytest.approx(sign * GAINS.limit_m_s)
 
 
@@ -99,8 +99,8 @@ def steered(gains: AlignmentGains, points: list[tuple[float, float]], crab_rad: 
         c, s = math.cos(heading), math.sin(heading)
         T = np.array([[0.0, -s, c, x - 0.06 * c], [0.0, c, s, y - 0.06 * s], [-1.0, 0.0, 0.0, 0.0], [0, 0, 0, 1.0]])
         aim = alignment.aim(T, np.eye(4))
-        asides.append(aim.aside_m)
-        if aim.rest_m <= 0.0:
+        asides.append(aim.cross_track_error_m)
+        if aim.remaining_m <= 0.0:
             break
         heading -= 15.8 * alignment.step(aim, 0.01) * 0.01
         x, y = x + 0.0002 * math.cos(heading + crab_rad), y + 0.0002 * math.sin(heading + crab_rad)

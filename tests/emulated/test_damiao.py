@@ -102,7 +102,7 @@ def test_it_is_registered_and_says_that_it_falls() -> None:
     spec = registry.spec("damiao_can")
     assert spec.capabilities.falls_on_power_loss
     assert not spec.capabilities.has_brakes
-    assert not spec.capabilities.seen_on_metal
+    assert not spec.capabilities.hardware_validated
 
 
 def test_connecting_and_configuring_energise_nothing(arm: DamiaoCanArm, emulator: EmulatorProcess) -> None:

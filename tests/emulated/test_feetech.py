@@ -107,7 +107,7 @@ def test_it_is_registered_and_says_what_it_cannot() -> None:
     assert not capabilities.has_brakes
     assert capabilities.max_watchdog_s is None
     assert capabilities.twist_axes == (True, True, True, False, False, True)
-    assert not capabilities.seen_on_metal
+    assert not capabilities.hardware_validated
 
 
 def test_connecting_and_configuring_energise_nothing(arm: FeetechSerialArm, servos: EmulatorProcess) -> None:

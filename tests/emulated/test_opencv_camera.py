@@ -24,7 +24,7 @@ import json, sys, threading
 from touchcell.drivers.core.clock import MonotonicClock
 from touchcell.drivers.core.device import OperatorToken
 from touchcell.drivers.core.errors import ConnectError, DeviceGone
-from touchcell.drivers.core.camera import SettingRefused
+from touchcell.drivers.core.camera import UnsupportedSetting
 from touchcell.drivers.opencv.driver import OpencvCamera, OpencvCameraConfig
 
 def make(**settings):
@@ -71,7 +71,7 @@ class Program:
             text=True,
         )
 
-    def said(self) -> Any:
+    def last_reply(self) -> Any:
         """Its next answer."""
         assert self._process.stdout is not None
         return json.loads(self._process.stdout.readline())
@@ -120,7 +120,7 @@ def test_the_driver_is_found_by_name() -> None:
 def test_connecting_changes_no_control(run: Callable[[str], Program], emulator: EmulatorProcess) -> None:
     controls = emulator.state()["controls"]
     program = run("camera = make(); camera.connect(); say(camera.state.value); wait()")
-    assert program.said() == "passive"
+    assert program.last_reply() == "passive"
     state = emulator.state()
     assert (state["controls"], state["energising"]) == (controls, 0)
 
@@ -134,15 +134,15 @@ say([thread.name for thread in threading.enumerate()])
 camera.disconnect()
 say([thread.name for thread in threading.enumerate()])
 """)
-    seqs, stamps, shapes, qualities, gains = zip(*program.said(), strict=True)
+    seqs, stamps, shapes, qualities, gains = zip(*program.last_reply(), strict=True)
     assert list(seqs) == sorted(set(seqs))
     assert list(stamps) == sorted(set(stamps))
     assert {tuple(shape) for shape in shapes} == {(480, 640)}
     assert (set(qualities), set(gains)) == ({"good"}, {10.0})
-    health = program.said()
+    health = program.last_reply()
     assert (health["sequence_numbers"], health["exposure_us"], health["frames_bad"]) == (False, 15700, 0)
-    assert program.said() == ["MainThread", "tip reader"]
-    assert program.said() == ["MainThread"]
+    assert program.last_reply() == ["MainThread", "tip reader"]
+    assert program.last_reply() == ["MainThread"]
 
 
 @pytest.mark.parametrize("pixel_format", ["YUYV", "GREY"])
@@ -152,17 +152,17 @@ image = ready(pixel_format={pixel_format!r}).latest().value.image
 say([image.shape, int(image.min()), int(image.max())])
 """)
     # Skin 24, pins 230 and noise up to 2, in 1.2 times the light.
-    assert program.said() == [[480, 640], 28, 255]
+    assert program.last_reply() == [[480, 640], 28, 255]
 
 
 def test_refused_settings_are_named(run: Callable[[str], Program]) -> None:
     program = run("""
 try:
     ready(width_px=700)
-except SettingRefused as refused:
+except UnsupportedSetting as refused:
     say([refused.setting, refused.asked, refused.given])
 """)
-    assert program.said() == ["width_px", 700, 640]
+    assert program.last_reply() == ["width_px", 700, 640]
 
 
 def test_short_frames_are_refused_and_lost_ones_noticed(
@@ -176,13 +176,13 @@ say(until(camera, "frames_bad", 2))
 wait()
 say(until(camera, "frames_lost", 4))
 """)
-    assert program.said()["frames_bad"] == 0
+    assert program.last_reply()["frames_bad"] == 0
     emulator.fault("corrupt", 2)
     program.go_on()
-    assert program.said()["frames_bad_damaged"] == 2
+    assert program.last_reply()["frames_bad_damaged"] == 2
     emulator.fault("drop", 4)
     program.go_on()
-    assert program.said()["frames_lost"] >= 4
+    assert program.last_reply()["frames_lost"] >= 4
 
 
 def test_an_unplugged_camera_is_a_fault_until_recovered(
@@ -203,10 +203,10 @@ wait()
 camera.recover(token)
 say(len(read(camera, 3)))
 """)
-    assert program.said() == "ready"
+    assert program.last_reply() == "ready"
     emulator.fault("unplug")
-    assert program.said() == "faulted"
-    assert program.said() == "faulted"
+    assert program.last_reply() == "faulted"
+    assert program.last_reply() == "faulted"
     emulator.clear("unplug")
     program.go_on()
-    assert program.said() == 3
+    assert program.last_reply() == 3

@@ -25,7 +25,7 @@ from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
 from touchcell.cell.runtime.compose import Cell, compose
 from touchcell.cell.runtime.loop import Outcome, RunLoop, StopRequest
-from touchcell.cell.runtime.operator_channel import Ask, OperatorDesk
+from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest
 from touchcell.cell.runtime.process_watchdog import ProcessWatch, hosted_groups
 from touchcell.cell.runtime.watchdog import NOTES
 from touchcell.control.latch import LatchState
@@ -241,13 +241,13 @@ def test_both_arms_stand_in_time_whatever_dies(tmp_path: Path, name: str, told_b
         assert case.outcome["causes"][0][0] == "watchdog"
 
 
-class Waiting:
+class ResetProcedure:
     """A run with two swaying arms that waits for its operator after a trip; the operator is the test."""
 
     def __init__(self, cell: Cell) -> None:
         watch = cell.watch
         assert isinstance(watch, ProcessWatch)
-        self.cell, self.chain, self.desk, self.stop = cell, watch.chain, OperatorDesk(), StopRequest()
+        self.cell, self.chain, self.desk, self.stop = cell, watch.chain, OperatorChannel(), StopRequest()
         self.loop = RunLoop(cell, None, stop=self.stop, desk=self.desk)
         self.loop.begin()
 
@@ -257,11 +257,11 @@ class Waiting:
             assert time.monotonic() < deadline_s
             assert self.loop.step()
 
-    def ask(self, ask: Ask) -> str:
-        self.desk.said = ""
+    def ask(self, ask: OperatorRequest) -> str:
+        self.desk.last_reply = ""
         self.desk.ask(ask, "ada")
         assert self.loop.step()
-        return self.desk.said
+        return self.desk.last_reply
 
     def positions(self) -> Any:
         return [arm.tcp().value.T_base_tcp[:3, 3] for arm in self.cell.arms.values()]
@@ -275,20 +275,20 @@ class Waiting:
 
 def test_a_stop_by_the_chain_is_reset_when_its_cause_has_gone_and_the_run_goes_on_to_its_end(tmp_path: Path) -> None:
     with compose(two_arm_plan(tmp_path, RATE_HZ, categories={"right": 1}, on_trip="wait_for_reset")) as cell:
-        run = Waiting(cell)
+        run = ResetProcedure(cell)
         run.until(run.moves)
         run.chain.hold_watchdog(True)
         run.until(lambda: cell.task.finished)
         assert cell.supervisor.latch.first_cause is not None
         assert cell.supervisor.latch.first_cause.interlock == "watchdog"
         assert run.is_latched()
-        assert run.ask(Ask.RESET).startswith("refused"), "the watchdog still hangs"
-        assert run.ask(Ask.RESUME) == "refused: reset first"
+        assert run.ask(OperatorRequest.RESET).startswith("refused"), "the watchdog still hangs"
+        assert run.ask(OperatorRequest.RESUME) == "refused: reset first"
         assert run.is_latched()
         run.chain.hold_watchdog(False)
         run.until(lambda: cell.supervisor.latch.state is LatchState.CAUSE_GONE)
         stood = run.positions()
-        run.until(lambda: run.ask(Ask.RESET).startswith("reset; nothing moves"))
+        run.until(lambda: run.ask(OperatorRequest.RESET).startswith("reset; nothing moves"))
         assert not any(link.latched() for link in run.chain.hosts)
         for _ in range(5):
             assert run.loop.step()
@@ -297,7 +297,7 @@ def test_a_stop_by_the_chain_is_reset_when_its_cause_has_gone_and_the_run_goes_o
         with pytest.raises(CommandRejected, match="no watchdog guards it"):
             cell.arms["left"].send_twist(twist(cell), lease)
         cell.arms["left"].release(lease)
-        assert "starts again" in run.ask(Ask.RESUME)
+        assert "starts again" in run.ask(OperatorRequest.RESUME)
         run.until(run.moves)
         run.stop.ask()
         while run.loop.step():
@@ -309,14 +309,14 @@ def test_a_stop_by_the_chain_is_reset_when_its_cause_has_gone_and_the_run_goes_o
 
 def test_a_reset_is_refused_for_good_when_a_host_has_died(tmp_path: Path) -> None:
     with compose(two_arm_plan(tmp_path, RATE_HZ, on_trip="wait_for_reset")) as cell:
-        run = Waiting(cell)
+        run = ResetProcedure(cell)
         run.until(run.moves)
         os.kill(run.chain.hosts[0].pid, signal.SIGKILL)
         run.until(lambda: cell.task.finished)
         for _ in range(5):
             assert run.loop.step()
-        assert run.ask(Ask.RESET).startswith("refused")
-        assert run.ask(Ask.RESUME) == "refused: reset first"
+        assert run.ask(OperatorRequest.RESET).startswith("refused")
+        assert run.ask(OperatorRequest.RESUME) == "refused: reset first"
         assert cell.arms["right"].at_rest()
         run.stop.ask()
         assert not run.loop.step()

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from touchcell.drivers.core.camera import SettingRefused
+from touchcell.drivers.core.camera import UnsupportedSetting
 from touchcell.drivers.core.clock import MonotonicClock, VirtualClock
 from touchcell.drivers.core.device import Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
@@ -193,7 +193,7 @@ def test_a_setting_that_the_camera_changes_is_refused(
 ) -> None:
     camera = make(**settings)
     camera.connect()
-    with pytest.raises(SettingRefused) as caught:
+    with pytest.raises(UnsupportedSetting) as caught:
         camera.configure()
     assert caught.value.setting == setting
     assert caught.value.asked == settings[setting]
@@ -209,7 +209,7 @@ def test_a_control_that_only_seems_to_obey_is_refused(
     emulator.fault("stuck_controls")
     camera = make(gain=30)
     camera.connect()
-    with pytest.raises(SettingRefused) as caught:
+    with pytest.raises(UnsupportedSetting) as caught:
         camera.configure()
     assert (caught.value.setting, caught.value.asked, caught.value.given) == ("gain", 30, 20)
     emulator.clear("stuck_controls")

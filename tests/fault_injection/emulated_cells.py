@@ -14,7 +14,7 @@ import numpy as np
 
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.testing.emulation.rig import Rig
+from touchcell.testing.emulation.rig import DeviceFixture
 
 HURT: Final = {
     "surface_following": ("arm",),
@@ -61,7 +61,7 @@ def sensor_of(role: str) -> str:
     return "sensor" if role == "arm" else f"{role}_sensor"
 
 
-def arm_cell(task: str, role: str, rig: Rig, T_base_tcp: Array, collected: str) -> dict[str, Any]:
+def arm_cell(task: str, role: str, rig: DeviceFixture, T_base_tcp: Array, collected: str) -> dict[str, Any]:
     """A cell in which the emulated arm of ``rig``, its tool at ``T_base_tcp`` (4, 4), plays ``role`` in ``task``.
 
     Args:
@@ -110,7 +110,7 @@ def arm_cell(task: str, role: str, rig: Rig, T_base_tcp: Array, collected: str) 
     return _cell(task, arms, sensors, tips, {"scene": scene}, target)
 
 
-def camera_cell(task: str, cameras: Mapping[str, Rig], collected: str) -> dict[str, Any]:
+def camera_cell(task: str, cameras: Mapping[str, DeviceFixture], collected: str) -> dict[str, Any]:
     """A cell in which the emulated cameras, by role of their sensor, sit on simulated arms."""
     roles = HURT.get(task, ())
     arms, sensors, tips = {}, {}, {}
@@ -222,7 +222,7 @@ def _simulated_sensor(arm: str, T_tcp_s: Array, estimator: Mapping[str, Any]) ->
 
 
 def _emulated_sensor(
-    rig: Rig, estimator: Mapping[str, Any], arm: str | None = None, T_tcp_s: Array | None = None
+    rig: DeviceFixture, estimator: Mapping[str, Any], arm: str | None = None, T_tcp_s: Array | None = None
 ) -> dict[str, Any]:
     assert rig.config is not None
     place = (

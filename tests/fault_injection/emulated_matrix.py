@@ -34,7 +34,7 @@ from touchcell.tasks import registry as tasks_registry
 from touchcell.tasks.interface import TaskContext
 from touchcell.tasks.servoing import ServoTask
 from touchcell.tasks.state_machine_task import MachineTask
-from touchcell.testing.emulation.rig import Emulated, Rig, rig_of
+from touchcell.testing.emulation.rig import DeviceFixture, Emulated, rig_of
 
 ARMS: Final = ("ur", "franka", "damiao_can", "feetech_serial")
 CAMERAS: Final = ("v4l2",)
@@ -245,14 +245,14 @@ class Bench:
             except TouchcellError as error:
                 return replace(case, reached=False, problem=f"before the fault: {error}")
 
-    def _arm_plan(self, place: Place, rig: Rig) -> CellPlan:
+    def _arm_plan(self, place: Place, rig: DeviceFixture) -> CellPlan:
         # Every fresh emulator has its tool at the same place.
         if place.driver not in self._poses:
             self._poses[place.driver] = _told_pose(rig)
         collected = self._collected()
         return self._planned(arm_cell(place.task, place.role, rig, self._poses[place.driver], str(collected)))
 
-    def _camera_plan(self, place: Place, rig: Rig, exits: ExitStack) -> CellPlan:
+    def _camera_plan(self, place: Place, rig: DeviceFixture, exits: ExitStack) -> CellPlan:
         rigs = {}
         for number, sensor in enumerate(sensors_of(place.task), start=1):
             rigs[sensor] = rig if sensor == place.role else rig_of(place.driver, self.folder, self.address + number)
@@ -277,18 +277,18 @@ class Bench:
         return plan_cell(path)
 
 
-def _started(rig: Rig, exits: ExitStack) -> Emulated:
+def _started(rig: DeviceFixture, exits: ExitStack) -> Emulated:
     assert rig.start is not None
     emulator = rig.start()
     exits.callback(emulator.stop)
     return emulator
 
 
-def _on_shim(rig: Rig) -> Callable[[str, Any, DriverContext], Device]:
+def _on_shim(rig: DeviceFixture) -> Callable[[str, Any, DriverContext], Device]:
     return lambda name, config, context: rig.build(context.clock)
 
 
-def _run(case: EmulatedCase, rig: Rig, emulator: Emulated, plan: CellPlan, value: Any) -> EmulatedCase:
+def _run(case: EmulatedCase, rig: DeviceFixture, emulator: Emulated, plan: CellPlan, value: Any) -> EmulatedCase:
     place = case.place
     cell, stop, sent = compose(plan), StopRequest(), SentCommands()
     injected_s: float | None = None
@@ -382,8 +382,8 @@ def _emulated_arm(case: EmulatedCase) -> str:
 def _with_rest(case: EmulatedCase, witness: _Witness, ended_s: float) -> EmulatedCase:
     if not witness.seen:
         return case
-    moved_s, way_m = witness.last_moved(ended_s)
-    case = replace(case, rest_s=max(0.0, moved_s - ended_s), distance_m=way_m)
+    moved_s, travelled_m = witness.last_moved(ended_s)
+    case = replace(case, rest_s=max(0.0, moved_s - ended_s), distance_m=travelled_m)
     if witness.seen[-1][0] - moved_s < _STILL_S / 2:
         return replace(case, problem=f"{case.problem}; the tool still moves".strip("; "))
     return case
@@ -418,7 +418,7 @@ class _Witness:
     Nobody else may talk to the emulator in that time.
     """
 
-    def __init__(self, rig: Rig, emulator: Emulated) -> None:
+    def __init__(self, rig: DeviceFixture, emulator: Emulated) -> None:
         self._rig = rig
         self._emulator = emulator
         self._done = threading.Event()
@@ -445,16 +445,16 @@ class _Witness:
         last = self.seen[-1][1]
         moved_s = max((t for t, p in self.seen if np.linalg.norm(p - last) > _STILL_M), default=since_s)
         start = next((p for t, p in self.seen if t >= since_s), last)
-        way_m = max(float(np.linalg.norm(p - start)) for t, p in self.seen if t >= since_s or p is last)
-        return moved_s, way_m
+        travelled_m = max(float(np.linalg.norm(p - start)) for t, p in self.seen if t >= since_s or p is last)
+        return moved_s, travelled_m
 
 
-def _true_pose(rig: Rig, emulator: Emulated) -> Array:
+def _true_pose(rig: DeviceFixture, emulator: Emulated) -> Array:
     assert rig.pose is not None
     return np.array(emulator.state()[rig.pose], dtype=np.float64).reshape(4, 4)
 
 
-def _told_pose(rig: Rig) -> Array:
+def _told_pose(rig: DeviceFixture) -> Array:
     device = rig.build(MonotonicClock())
     assert isinstance(device, Arm)
     with device:

@@ -106,7 +106,7 @@ def _row(fault: ProcessFault, cases: Sequence[ProcessCase]) -> str:
     arms = [arm for case in cases for arm in case.arms]
     told = _pair([1e3 * arm.detected_s for arm in arms if arm.detected_s is not None], 18, 0)
     stop = _pair([1e3 * arm.stop_s for arm in arms if arm.stop_s is not None], 16, 0)
-    way = _pair([1e3 * arm.way_m for arm in arms], 16, 2)
+    way = _pair([1e3 * arm.travelled_m for arm in arms], 16, 2)
     rest = max((1e3 * arm.rest_s for arm in arms if arm.rest_s is not None), default=None)
     declared = max((1e3 * case.declared_s for case in cases), default=0.0)
     return f"{fault.name:<20}{told}{stop}{way}{'-' if rest is None else f'{rest:.0f}':>10}{declared:>10.0f}"

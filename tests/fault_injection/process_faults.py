@@ -83,14 +83,14 @@ class ArmCase:
         detected_s: from the fault until it was told to stop; None if nobody had to tell it.
         stop_s: from then until it stood; None if it never did.
         rest_s: from the fault until it stood.
-        way_m: how far it went from where it was at the fault.
+        travelled_m: how far it went from where it was at the fault.
     """
 
     arm: str
     detected_s: float | None
     stop_s: float | None
     rest_s: float | None
-    way_m: float
+    travelled_m: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from touchcell.cell.config.find import find_cell
 from touchcell.cell.runtime.planning_scene import link_capsules
 from touchcell.control.interlocks.collision import TOOL, Capsule
 from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, build_interlocks, parse_interlocks
-from touchcell.control.interlocks.planning_scene import Body, Surroundings
+from touchcell.control.interlocks.planning_scene import Body, PlanningScene
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
 from touchcell.control.latch import Latch
 from touchcell.control.supervisor import Supervisor
@@ -27,7 +27,7 @@ from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.gate import TwistGate, TwistLimits
-from touchcell.drivers.core.lease import LeaseDesk
+from touchcell.drivers.core.lease import LeaseManager
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, LocalIk, SerialChain
 from touchcell.geometry import se3
@@ -101,10 +101,10 @@ def _time_us(call: Callable[[int], object]) -> float:
 
 
 def _review_us(
-    section: Mapping[str, Any], views: Sequence[CellView], surroundings: Surroundings | None = None
+    section: Mapping[str, Any], views: Sequence[CellView], planning_scene: PlanningScene | None = None
 ) -> float:
     poses = {role: np.eye(4) for role in ("sensor", "leader_sensor", "follower_sensor")}
-    supervisor = Supervisor(build_interlocks(parse_interlocks(section), poses, surroundings), Latch())
+    supervisor = Supervisor(build_interlocks(parse_interlocks(section), poses, planning_scene), Latch())
     median_us = _time_us(lambda k: supervisor.review(views[k]))
     assert supervisor.latch.first_cause is None, supervisor.latch.first_cause
     return median_us
@@ -153,7 +153,7 @@ def _clearance_us(pairs: int, views: Sequence[CellView], bare_us: float, *, slow
     aside = se3.from_euler_mm_deg(np.array([0.0, 500.0, 0.0, 0.0, 0.0, 0.0]))
     bodies = {"leader": Body(np.eye(4), parts), "follower": Body(aside, parts)}
     section = {"clear": {"kind": "clearance", "limit_mm": 20, "slow_mm": slow_mm}}
-    return round(_review_us(section, views, Surroundings({}, bodies)) - bare_us, 2)
+    return round(_review_us(section, views, PlanningScene({}, bodies)) - bare_us, 2)
 
 
 def _links_us() -> tuple[float, int]:
@@ -165,7 +165,7 @@ def _links_us() -> tuple[float, int]:
         role: Body(T, parts, lambda: ik, _CHAIN.joint_count) for role, T in (("leader", np.eye(4)), ("follower", away))
     }
     section = {"clear": {"kind": "clearance", "limit_mm": 20, "slow_mm": 30}}
-    (rule,) = build_interlocks(parse_interlocks(section), {}, Surroundings({}, bodies))
+    (rule,) = build_interlocks(parse_interlocks(section), {}, PlanningScene({}, bodies))
     T = _CHAIN.forward(_WORKING)
     views = []
     for k in range(_REPEATS):
@@ -174,7 +174,7 @@ def _links_us() -> tuple[float, int]:
         arm = ArmView(Stamped(TcpState(T, _TWIST), k * _PERIOD_NS, k), command, joints=joints)
         views.append(CellView(k * _PERIOD_NS, {"leader": arm, "follower": arm}))
     supervisor = Supervisor([], Latch())
-    with_rule = _review_us(section, views, Surroundings({}, bodies))
+    with_rule = _review_us(section, views, PlanningScene({}, bodies))
     bare = _time_us(lambda k: supervisor.review(views[k]))
     return round(with_rule - bare, 2), len(rule.clearances.pairs)  # type: ignore[union-attr]
 
@@ -195,7 +195,7 @@ class _Gate:
 
     def __init__(self, q: Array | None) -> None:
         self._clock = VirtualClock()
-        desk = LeaseDesk("arm")
+        desk = LeaseManager("arm")
         self._gate = TwistGate("arm", TwistLimits(0.1, 10.0, 1.0, 100.0, 1e4, 1e5), desk, self._clock)
         self._lease = desk.acquire("bench")
         self._T = np.eye(4)

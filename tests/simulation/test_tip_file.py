@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from touchcell.errors import ConfigError
-from touchcell.simulation.mount import Rig
+from touchcell.simulation.mount import MountModel
 from touchcell.simulation.tip import Tip, TipParameters
 from touchcell.simulation.tip_file import SHIPPED, TipFile, load_tip, save_tip
 
@@ -13,7 +13,7 @@ from touchcell.simulation.tip_file import SHIPPED, TipFile, load_tip, save_tip
 def test_comes_back_as_it_was_saved(tmp_path: Path) -> None:
     path = tmp_path / "folder" / "sensor.yaml"
     tip = TipParameters(focal_px=512.5, centre_px=(330.0, 240.5), rings=9)
-    saved = TipFile(tip=tip, rig=Rig(offset_m=(1e-3, 0.0)), measured={"frames": 20})
+    saved = TipFile(tip=tip, rig=MountModel(offset_m=(1e-3, 0.0)), measured={"frames": 20})
     save_tip(saved, path)
     found = load_tip(str(path))
     assert found.tip.centre_px == (330.0, 240.5)

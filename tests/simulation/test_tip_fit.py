@@ -8,7 +8,7 @@ from touchcell.perception.calibration.least_squares import robust_fit
 from touchcell.perception.calibration.marked_data import MarkedContacts
 from touchcell.perception.contact_poses import random_poses
 from touchcell.perception.errors import TrainingError
-from touchcell.simulation.mount import Rig
+from touchcell.simulation.mount import MountModel
 from touchcell.simulation.tip import Tip, TipParameters
 from touchcell.simulation.tip_fit import Sensor, fit_tip
 
@@ -23,7 +23,9 @@ TRUE = Sensor(
         dent_follow=1.15,
         rock=-0.9,
     ),
-    Rig(offset_m=(0.5e-3, 2.0e-3), depth_m=0.2e-3, level_rad=(0.01, 0.0), slip_at_1mm_m=0.25e-3, slip_exponent=2.1),
+    MountModel(
+        offset_m=(0.5e-3, 2.0e-3), depth_m=0.2e-3, level_rad=(0.01, 0.0), slip_at_1mm_m=0.25e-3, slip_exponent=2.1
+    ),
 )
 REFERENCE = Tip(TRUE.tip).pixels(np.eye(4))
 
@@ -41,7 +43,7 @@ def test_a_score_of_contacts_tell_camera_mount_and_skin() -> None:
     told: list[tuple[int, int]] = []
     fitted = fit_tip(contacts(24, 1), REFERENCE, 10, told=lambda done, total: told.append((done, total)))
     held_out = contacts(40, 2)
-    assert np.nanmean(Sensor(TipParameters(), Rig()).errors(held_out)) > 10.0
+    assert np.nanmean(Sensor(TipParameters(), MountModel()).errors(held_out)) > 10.0
     assert np.nanmean(fitted.errors(held_out)) < 0.8
     assert np.isnan(fitted.errors(held_out)).sum() == (~held_out.seen).sum()
     assert fitted.tip.image_rotation_rad == pytest.approx(1.1, abs=0.03)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from touchcell.simulation.objects import Prism
 from touchcell.simulation.solids import friction_radius_m
-from touchcell.tasks.push_path import STEP_M, NoWay, Obstacle, length_m, narrowest_turn_m, plan
+from touchcell.tasks.push_path import STEP_M, NoPathFound, Obstacle, length_m, min_turning_radius_m, plan
 
 START = (0.0, 0.0, 0.0)
 TURN_M = 0.08
@@ -76,14 +76,14 @@ def test_an_obstacle_is_passed_on_the_nearer_side(beside_m):
 
 
 def test_without_a_clear_way_it_says_so():
-    with pytest.raises(NoWay, match="400"):
+    with pytest.raises(NoPathFound, match="400"):
         plan(START, (0.4, 0.0, 0.0), TURN_M, [Obstacle(0.4, 0.0, 0.05)])
 
 
 def test_the_narrowest_turn_leans_on_the_friction_cone():
     square = Prism(0.04 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]), 0.06)
     c = friction_radius_m(square)
-    turn_m = narrowest_turn_m(0.04, c, 0.9)
+    turn_m = min_turning_radius_m(0.04, c, 0.9)
     # The force that leans to the edge of the cone, and the motion that the limit surface gives it.
     fx, fy = math.cos(math.atan(0.9)), math.sin(math.atan(0.9))
     assert turn_m == pytest.approx(abs(fx / (-0.04 * fy / c**2)))

@@ -265,7 +265,7 @@ def test_the_way_is_counted_along_the_sensors_direction_only():
 
     def go_on(*displacement_mm: float) -> bool:
         moved = T @ se3.from_euler_mm_deg(np.array([*displacement_mm, 0.0, 0.0, 0.0]))
-        return follow.advance(DT, T, moved, None)
+        return follow.update(DT, T, moved, None)
 
     assert not go_on(1000.0, 0.0, 1000.0)
     assert not go_on(0.0, -10.0, 0.0)

@@ -46,16 +46,16 @@ class Aim:
 
     Attributes:
         theta_rad: bearing of the point aimed at, from the contact normal, positive to its left.
-        rest_m: way that is left.
-        aside_m: distance of the object from its path, positive to its left.
-        target_aside_m: distance of the target from the contact normal, positive to its left.
+        remaining_m: way that is left.
+        cross_track_error_m: distance of the object from its path, positive to its left.
+        target_lateral_error_m: distance of the target from the contact normal, positive to its left.
         heading_rad: of the contact normal in the base frame.
     """
 
     theta_rad: float
-    rest_m: float
-    aside_m: float
-    target_aside_m: float
+    remaining_m: float
+    cross_track_error_m: float
+    target_lateral_error_m: float
     heading_rad: float
 
 
@@ -122,10 +122,10 @@ class TargetAlignment:
         theta = math.atan2(nx * dy - ny * dx, nx * dx + ny * dy)
         target = self._path.end
         target_aside = nx * (target[1] - tip[1]) - ny * (target[0] - tip[0])
-        rest_m = self._path.length_m - place.along_m
-        return Aim(theta, rest_m, place.aside_m, target_aside, heading)
+        remaining_m = self._path.length_m - place.along_m
+        return Aim(theta, remaining_m, place.cross_track_error_m, target_aside, heading)
 
     def step(self, aim: Aim, dt_s: float) -> float:
         """Speed of the contact to the left of the contact normal, m/s."""
-        e = np.array([-aim.aside_m, aim.theta_rad, 0.0, 0.0, 0.0, 0.0])
+        e = np.array([-aim.cross_track_error_m, aim.theta_rad, 0.0, 0.0, 0.0, 0.0])
         return -float(self._pid.step(e, np.zeros(6), dt_s)[1])

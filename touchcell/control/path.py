@@ -19,11 +19,11 @@ class Place:
 
     Attributes:
         along_m: how far along the path its nearest point lies; beyond the path's length after the end.
-        aside_m: distance from the path, positive to its left.
+        cross_track_error_m: distance from the path, positive to its left.
     """
 
     along_m: float
-    aside_m: float
+    cross_track_error_m: float
 
 
 class Path:

@@ -12,7 +12,7 @@ from touchcell.control.interlocks.basic import Finite
 from touchcell.control.interlocks.errors import SafetyTrip
 from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.snapshot import CellView
-from touchcell.control.interlocks.timers import Past, TimedInterlock
+from touchcell.control.interlocks.timers import InterlockState, TimedInterlock
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.control.latch import Latch, LatchState, ResetDone, ResetRefused
 from touchcell.drivers.core.device import OperatorToken
@@ -48,10 +48,10 @@ class _Remembered:
         self.name = rule.name
         self.severity = rule.severity
         self._rule = rule
-        self._past: Past = {}
+        self._past: InterlockState = {}
 
     def check(self, view: CellView) -> Violation | None:
-        violation, self._past = self._rule.judge(view, self._past)
+        violation, self._past = self._rule.evaluate(view, self._past)
         return violation
 
 

@@ -20,7 +20,7 @@ _STEEPEST = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Rig:
+class MountModel:
     """How one sensor is mounted, and how it slips. The defaults are a perfect mount.
 
     Attributes:

@@ -10,7 +10,7 @@ import numpy as np
 from touchcell.geometry.types import Array
 from touchcell.perception.contact_poses import PUBLIC_DEPTH_MM, random_poses
 from touchcell.simulation.contact import ContactLaw, contact_at
-from touchcell.simulation.mount import Rig
+from touchcell.simulation.mount import MountModel
 from touchcell.simulation.tip import Tip, TipParameters
 
 _IMAGES_PER_TIP = 16
@@ -65,7 +65,7 @@ def contacts(
     depth_mm: tuple[float, float] = PUBLIC_DEPTH_MM,
     parameters: TipParameters | None = None,
     law: ContactLaw | None = None,
-    rig: Rig | None = None,
+    rig: MountModel | None = None,
     variation: Variation | None = None,
 ) -> Iterator[SampledContact]:
     """Yield ``n`` random contacts, the same for the same seed.
@@ -104,7 +104,7 @@ def contacts(
             yield SampledContact(T_f_s[i], pixels[i][seen[i]], float(radius[i]))
 
 
-def _slipping(rig: Rig, variation: Variation, rng: np.random.Generator) -> Rig:
+def _slipping(rig: MountModel, variation: Variation, rng: np.random.Generator) -> MountModel:
     longer, steeper, looser = 1.0 + variation.slip * rng.normal(0.0, 1.0, 3)
     return replace(
         rig,

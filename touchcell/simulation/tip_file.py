@@ -10,7 +10,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from touchcell.errors import ConfigError, suggest
-from touchcell.simulation.mount import Rig
+from touchcell.simulation.mount import MountModel
 from touchcell.simulation.tip import TipParameters
 
 SHIPPED = Path(__file__).parent / "tips"
@@ -29,13 +29,13 @@ class TipFile(BaseModel):
 
     schema_: Literal[1] = Field(default=1, alias="schema")
     tip: TipParameters
-    rig: Rig = Rig()
+    rig: MountModel = MountModel()
     measured: dict[str, str | int | float | dict[str, float]] = {}
 
     @model_validator(mode="before")
     @classmethod
     def _known(cls, data: Any) -> Any:
-        for section, kind in (("tip", TipParameters), ("rig", Rig)):
+        for section, kind in (("tip", TipParameters), ("rig", MountModel)):
             given = data.get(section) if isinstance(data, dict) else None
             names = [each.name for each in fields(kind)]
             for name in given if isinstance(given, dict) else ():

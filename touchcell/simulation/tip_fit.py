@@ -18,7 +18,7 @@ from touchcell.perception.calibration.least_squares import robust_fit
 from touchcell.perception.calibration.marked_data import MarkedContacts
 from touchcell.perception.errors import TrainingError
 from touchcell.perception.markers.detection import lattice
-from touchcell.simulation.mount import Rig
+from touchcell.simulation.mount import MountModel
 from touchcell.simulation.tip import Tip, TipParameters
 
 _SOFT_PX = 2.0
@@ -99,7 +99,7 @@ class Sensor:
     """A simulated tip in its rig."""
 
     tip: TipParameters
-    rig: Rig
+    rig: MountModel
 
     def pixels(self, commanded: Array, *, every: int = 1) -> Array:
         """(n, markers, 2) px in contacts that the arm is told to make (n, 4, 4)."""
@@ -133,7 +133,7 @@ def fit_tip(
     """
     if len(contacts) < 8:
         raise TrainingError(f"{len(contacts)} contacts cannot tell a camera from a mount", hint="give 20 or more")
-    start = start or Sensor(TipParameters(), Rig())
+    start = start or Sensor(TipParameters(), MountModel())
     start = Sensor(_laid_onto(replace(start.tip, rings=rings), reference), start.rig)
     turned = [
         Sensor(replace(start.tip, image_rotation_rad=float(angle)), start.rig)

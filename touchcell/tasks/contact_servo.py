@@ -17,7 +17,7 @@ from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.tasks.interface import Observation, TaskConfig, TaskContext
 
 
-class RunPhase(Protocol):
+class Behavior(Protocol):
     """What a hand does besides holding its contact, once that has settled."""
 
     @property
@@ -30,7 +30,7 @@ class RunPhase(Protocol):
         """Longest time that it may take."""
         ...
 
-    def advance(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
+    def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
         """Take in one cycle and tell whether the work is done.
 
         Args:
@@ -52,7 +52,7 @@ Six = tuple[float, float, float, float, float, float]
 SixGains = Annotated[Six, Field(description="x, y, z, alpha, beta, gamma of the sensor's twist; zeros: not controlled")]
 
 
-class HandConfig(TaskConfig):
+class ContactServoConfig(TaskConfig):
     """Parameters of one hand's servo.
 
     Attributes:
@@ -101,7 +101,7 @@ def _six(linear_mm: float, angular_deg: float) -> Array:
     return np.repeat([1e-3 * linear_mm, np.radians(angular_deg)], 3)
 
 
-class Hand:
+class ContactServo:
     """An arm and its sensor under servo control.
 
     Args:
@@ -124,9 +124,9 @@ class Hand:
         self,
         arm: str,
         sensor: str,
-        config: HandConfig,
+        config: ContactServoConfig,
         reference_mm_deg: Six,
-        run: RunPhase,
+        run: Behavior,
         context: TaskContext,
     ) -> None:
         self.arm = arm
@@ -136,19 +136,19 @@ class Hand:
         self._T_tcp_sensor = context.T_tcp_sensor[sensor]
         self._Ad_tcp_sensor = se3.adjoint(self._T_tcp_sensor)
         T_f_sref = se3.from_euler_mm_deg(np.array(reference_mm_deg))
-        self.servo = TactileServo(se3.inverse(T_f_sref), self._T_tcp_sensor, config.gains(), 1.0 / context.rate_hz)
+        self.controller = TactileServo(se3.inverse(T_f_sref), self._T_tcp_sensor, config.gains(), 1.0 / context.rate_hz)
         self.T_base_sensor: Array | None = None
         self.contact: ContactEstimate | None = None
         self._before: Array | None = None
         self._start: Array | None = None
 
     @property
-    def sees(self) -> bool:
+    def has_fresh_data(self) -> bool:
         """Whether there are a fresh frame and a fresh arm state."""
         return self.T_base_sensor is not None and self.contact is not None
 
     @property
-    def touches(self) -> bool:
+    def in_contact(self) -> bool:
         """Whether the newest frame is of a contact."""
         return self.contact is not None and self.contact.in_contact
 
@@ -159,7 +159,7 @@ class Hand:
             return None
         return None if self.contact.belief is None else self.contact.belief.mean
 
-    def look(self, observation: Observation) -> None:
+    def update(self, observation: Observation) -> None:
         """Take what can be relied on from a cycle's observation."""
         now_ns, limits = observation.now_ns, self._config
         arm = observation.arms.get(self.arm)
@@ -170,12 +170,12 @@ class Hand:
         if self.contact is not None and not 0.0 <= now_ns - self.contact.t_frame_ns <= 1e6 * limits.max_frame_age_ms:
             self.contact = None
 
-    def start_way(self) -> None:
+    def reset_travel(self) -> None:
         """Measure the way from here."""
         self._start = self.T_base_sensor
 
-    def way_m(self) -> float:
-        """Way of the sensor since ``start_way``; 0 while it cannot be told."""
+    def travelled_m(self) -> float:
+        """Way of the sensor since ``reset_travel``; 0 while it cannot be told."""
         if self.T_base_sensor is None:
             return 0.0
         if self._start is None:
@@ -184,9 +184,9 @@ class Hand:
 
     def steady(self) -> bool:
         """Whether the errors of the latest servo step are small and it was not held back."""
-        if self.T_s_f is None or not self.servo.active:
+        if self.T_s_f is None or not self.controller.active:
             return False
-        e = self.servo.latest_error
+        e = self.controller.latest_error
         small = np.linalg.norm(e[:3]) <= 1e-3 * self._config.settle_tolerance_mm
         return bool(small and np.linalg.norm(e[3:]) <= np.radians(self._config.settle_tolerance_deg))
 
@@ -194,7 +194,7 @@ class Hand:
         """Let ``run`` take in a cycle of which the motion is known; returns whether its work is done."""
         if self.T_base_sensor is None or self._before is None:
             return False
-        return self.run.advance(dt_s, self._before, self.T_base_sensor, self.T_s_f)
+        return self.run.update(dt_s, self._before, self.T_base_sensor, self.T_s_f)
 
     def along_z(self, speed_m_s: float) -> Array:
         """Twist (6,) of the tool that moves the sensor along its axis."""
@@ -203,7 +203,7 @@ class Hand:
 
     def servo_step(self, V_ff: Array) -> Array | None:
         """Twist (6,) of the tool that holds the contact; None while there is no valid one."""
-        V_tcp = self.servo.step(self.T_s_f, 0 if self.contact is None else self.contact.t_ns, V_ff)
+        V_tcp = self.controller.step(self.T_s_f, 0 if self.contact is None else self.contact.t_ns, V_ff)
         return None if self.T_s_f is None else V_tcp
 
     def telemetry(self, observation: Observation, *, servoing: bool) -> Mapping[str, float]:
@@ -212,9 +212,9 @@ class Hand:
         contact = observation.contacts.get(self.sensor)
         if contact is not None:
             told["frame_age_ms"] = 1e-6 * (observation.now_ns - contact.t_frame_ns)
-        if not (servoing and self.servo.active):
+        if not (servoing and self.controller.active):
             return told
-        errors, references = (_UNITS * self.servo.latest_error).tolist(), self.servo.reference_mm_deg.tolist()
+        errors, references = (_UNITS * self.controller.latest_error).tolist(), self.controller.reference_mm_deg.tolist()
         for name, error, reference in zip(_COMPONENTS, errors, references, strict=True):
             if math.isfinite(reference):
                 told[f"error_{name}"], told[f"reference_{name}"] = error, reference

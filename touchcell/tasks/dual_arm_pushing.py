@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import Hand, HandConfig, Six, SixGains
+from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig, Six, SixGains
 from touchcell.tasks.interface import TaskContext, TaskSpec
 from touchcell.tasks.servoing import ServoConfig, ServoTask
 from touchcell.tasks.single_arm_pushing import Push, PushConfig
@@ -21,7 +21,7 @@ LEADER_SENSOR: Final = "leader_sensor"
 FOLLOWER_SENSOR: Final = "follower_sensor"
 
 
-class FollowerConfig(HandConfig):
+class FollowerConfig(ContactServoConfig):
     """Parameters of the follower: object tracking at a depth that presses the object on the leader.
 
     Attributes:
@@ -65,7 +65,7 @@ class Follow:
     def __init__(self, config: DualArmPushingConfig, push: Push | None) -> None:
         self._push = push
         self._speed_m_s = 1e-3 * config.push_speed_mm_s
-        self._middle_m = 1e-3 * config.middle_mm
+        self._middle_m = 1e-3 * config.object_center_offset_mm
         self._turn_per_m = 1e3 * np.radians(config.follower.turn_deg_per_mm)
         self._y_is_left = 1.0
 
@@ -84,7 +84,7 @@ class Follow:
         """As long as the leader takes."""
         return float("inf")
 
-    def advance(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
+    def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
         """Never done by itself."""
         self._y_is_left = -float(np.sign(now[2, 0]))
         return False
@@ -97,9 +97,9 @@ class Follow:
 def build(config: DualArmPushingConfig, context: TaskContext) -> ServoTask:
     """The task in a cell that has ``leader`` and ``follower`` with a sensor each."""
     push, hold = Push(config), config.follower
-    leader = Hand(LEADER, LEADER_SENSOR, config, config.reference_mm_deg, push, context)
+    leader = ContactServo(LEADER, LEADER_SENSOR, config, config.reference_mm_deg, push, context)
     follow = Follow(config, push if hold.active else None)
-    follower = Hand(FOLLOWER, FOLLOWER_SENSOR, hold, hold.reference_mm_deg, follow, context)
+    follower = ContactServo(FOLLOWER, FOLLOWER_SENSOR, hold, hold.reference_mm_deg, follow, context)
     return ServoTask("dual_arm_pushing", config, context, leader, follower)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import Hand, SixGains
+from touchcell.tasks.contact_servo import ContactServo, SixGains
 from touchcell.tasks.interface import TaskContext, TaskSpec
 from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
 
@@ -46,7 +46,7 @@ class Track:
         """A second more than the run takes."""
         return self._timeout_s
 
-    def advance(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
+    def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
         """Count the time."""
         self._left_s -= dt_s
         return self._left_s <= 0.0
@@ -59,8 +59,8 @@ class Track:
 def build(config: ObjectTrackingConfig, context: TaskContext) -> ServoTask:
     """The task in a cell that has ``arm`` and ``sensor``."""
     reference = (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0)
-    hand = Hand(ARM, SENSOR, config, reference, Track(config), context)
-    return ServoTask("object_tracking", config, context, hand)
+    servo = ContactServo(ARM, SENSOR, config, reference, Track(config), context)
+    return ServoTask("object_tracking", config, context, servo)
 
 
 SPEC = TaskSpec(

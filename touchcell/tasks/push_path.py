@@ -26,7 +26,7 @@ _KINDS = (("LSL", 0), ("RSR", 0), ("LSR", 0), ("RSL", 0), ("LRL", 1), ("LRL", -1
 _VIA_DIRECTIONS = 24
 
 
-class NoWay(TouchcellError, ValueError):
+class NoPathFound(TouchcellError, ValueError):
     """There is no way that is smooth enough and clear of the obstacles.
 
     Attributes:
@@ -59,7 +59,7 @@ class Obstacle:
         return any(math.hypot(x - self.x_m, y - self.y_m) < limit for x, y in points)
 
 
-def narrowest_turn_m(contact_m: float, friction_radius_m: float, friction: float) -> float:
+def min_turning_radius_m(contact_m: float, friction_radius_m: float, friction: float) -> float:
     """Least radius of a stable push's turn.
 
     Args:
@@ -86,11 +86,11 @@ def plan(start: Pose, goal: Pose, turn_m: float, obstacles: Sequence[Obstacle] =
     """
     best: list[Point] | None = None
     length = math.inf
-    for way, way_m in _ways(start, goal, turn_m, obstacles):
-        if way_m < length and not any(obstacle.hits(way) for obstacle in obstacles):
-            best, length = way, way_m
+    for way, travelled_m in _ways(start, goal, turn_m, obstacles):
+        if travelled_m < length and not any(obstacle.hits(way) for obstacle in obstacles):
+            best, length = way, travelled_m
     if best is None:
-        raise NoWay(start, goal)
+        raise NoPathFound(start, goal)
     return best
 
 

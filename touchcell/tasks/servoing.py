@@ -12,7 +12,7 @@ from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import Hand, HandConfig
+from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig
 from touchcell.tasks.interface import Action, Observation, TaskContext, TransitionRecord
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
 from touchcell.tasks.state_machine_task import MachineTask
@@ -23,7 +23,7 @@ SENSOR: Final = "sensor"
 """Role of the tactile sensor that it carries."""
 
 
-class ServoConfig(HandConfig):
+class ServoConfig(ContactServoConfig):
     """Parameters of every task that holds contacts; what is said of one hand holds for the one that leads.
 
     Attributes:
@@ -124,11 +124,11 @@ class ServoTask(MachineTask):
         TaskDefinitionError: the table is wrong.
     """
 
-    def __init__(self, name: str, config: ServoConfig, context: TaskContext, *hands: Hand) -> None:
+    def __init__(self, name: str, config: ServoConfig, context: TaskContext, *servos: ContactServo) -> None:
         self._config = config
         self._period_s = 1.0 / context.rate_hz
-        self._hands = hands
-        self._machine = TaskMachine(servo_table(name, config, min(hand.run.timeout_s for hand in hands)), self)
+        self._servos = servos
+        self._machine = TaskMachine(servo_table(name, config, min(servo.run.timeout_s for servo in servos)), self)
         self._now_ns = 0
         self._steady_s = 0.0
         self._blind_s = 0.0
@@ -143,15 +143,18 @@ class ServoTask(MachineTask):
         dt_s = (observation.now_ns - self._now_ns) * 1e-9
         self._now_ns = observation.now_ns
         try:
-            for hand in self._hands:
-                hand.look(observation)
+            for servo in self._servos:
+                servo.update(observation)
             self._watch(observation, dt_s)
             self._machine.tick(observation.now_ns)
             twists = self._twists()
         except TouchcellError as error:
             self._machine.fire(FAULT, str(error), now_ns=observation.now_ns)
             return Action()
-        return Action({hand.arm: self._command(hand, V) for hand, V in twists}, self._telemetry(observation))
+        return Action(
+            {servo.arm: self._command(servo, V) for servo, V in twists},
+            self._telemetry(observation),
+        )
 
     def may_reapproach(self) -> bool:
         """Guard: a lost contact may be searched for again."""
@@ -168,14 +171,14 @@ class ServoTask(MachineTask):
     def start_approach(self, record: TransitionRecord) -> None:
         """On entry: measure the way from here."""
         self._reapproaches += record.event == "lost"
-        for hand in self._hands:
-            hand.start_way()
+        for servo in self._servos:
+            servo.reset_travel()
         self._blind_s = 0.0
 
     def start_settle(self, record: TransitionRecord) -> None:
         """On entry: begin to servo, without a past."""
-        for hand in self._hands:
-            hand.servo.reset()
+        for servo in self._servos:
+            servo.controller.reset()
         self._steady_s = 0.0
         self._blind_s = 0.0
 
@@ -186,8 +189,8 @@ class ServoTask(MachineTask):
     def start_retract(self, record: TransitionRecord) -> None:
         """On entry: measure the way from here, or go on measuring if a stop only confirms it."""
         if record.source != state_name(ServoState.RETRACT):
-            for hand in self._hands:
-                hand.start_way()
+            for servo in self._servos:
+                servo.reset_travel()
         self._finished_run = self._finished_run or record.event == "finished"
 
     def _watch(self, observation: Observation, dt_s: float) -> None:
@@ -195,40 +198,43 @@ class ServoTask(MachineTask):
         if observation.operator_stop and not self._stop_seen:
             self._stop_seen = True
             self._machine.post(STOP, "operator")
-        hands = self._hands
+        servos = self._servos
         match self._machine.state:
             case ServoState.PREPARE:
-                if all(hand.sees for hand in hands):
+                if all(servo.has_fresh_data for servo in servos):
                     self._post("ready")
             case ServoState.APPROACH:
-                self._watch_sight(dt_s, blind=not all(hand.sees for hand in hands))
-                searching = [hand for hand in hands if not hand.touches]
+                self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in servos))
+                searching = [servo for servo in servos if not servo.in_contact]
                 if not searching:
                     self._post("contact")
-                elif max(hand.way_m() for hand in searching) >= 1e-3 * self._config.approach_distance_mm:
+                elif max(servo.travelled_m() for servo in searching) >= 1e-3 * self._config.approach_distance_mm:
                     self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
             case ServoState.SETTLE:
                 self._watch_contact(dt_s)
-                steady = all(hand.steady() for hand in hands)
+                steady = all(servo.steady() for servo in servos)
                 self._steady_s = self._steady_s + dt_s if steady else 0.0
                 if steady and self._steady_s >= self._config.settle_time_s:
                     self._post("settled")
             case ServoState.RUN:
                 self._watch_contact(dt_s)
                 # Every hand takes the cycle in, whether another one has finished already or not.
-                finished = [hand.advance(dt_s) for hand in hands]
+                finished = [servo.advance(dt_s) for servo in servos]
                 if any(finished):
                     self._post("finished")
             case ServoState.RETRACT:
-                if all(hand.way_m() >= 1e-3 * self._config.retract_mm for hand in hands):
+                if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in servos):
                     self._post("retracted")
 
     def _watch_contact(self, dt_s: float) -> None:
-        for hand in self._hands:
-            if hand.contact is not None and not hand.contact.in_contact:
-                self._post("lost", f"{hand.sensor}, frame {hand.contact.seq}")
+        for servo in self._servos:
+            if servo.contact is not None and not servo.contact.in_contact:
+                self._post("lost", f"{servo.sensor}, frame {servo.contact.seq}")
                 break
-        self._watch_sight(dt_s, blind=any(hand.T_base_sensor is None or hand.T_s_f is None for hand in self._hands))
+        self._watch_sight(
+            dt_s,
+            blind=any(servo.T_base_sensor is None or servo.T_s_f is None for servo in self._servos),
+        )
 
     def _watch_sight(self, dt_s: float, *, blind: bool) -> None:
         self._blind_s = self._blind_s + dt_s if blind else 0.0
@@ -238,44 +244,44 @@ class ServoTask(MachineTask):
     def _post(self, event: str, reason: str = "") -> None:
         self._machine.post(event, reason, epoch=self._machine.epoch)
 
-    def _twists(self) -> list[tuple[Hand, Array]]:
+    def _twists(self) -> list[tuple[ContactServo, Array]]:
         """Twist (6,) of each tool that moves in the present state."""
         state = self._machine.state
         if state is ServoState.RETRACT:
             speed_m_s = -1e-3 * self._config.retract_speed_mm_s
-            return [(hand, hand.along_z(speed_m_s)) for hand in self._hands if hand.T_base_sensor is not None]
+            return [(servo, servo.along_z(speed_m_s)) for servo in self._servos if servo.T_base_sensor is not None]
         if state not in (ServoState.APPROACH, ServoState.SETTLE, ServoState.RUN):
             return []
         searching = state is ServoState.APPROACH
-        if not all(hand.sees and (searching or hand.T_s_f is not None) for hand in self._hands):
-            for hand in self._hands:
-                hand.servo.reset()
+        if not all(servo.has_fresh_data and (searching or servo.T_s_f is not None) for servo in self._servos):
+            for servo in self._servos:
+                servo.controller.reset()
             return []
         twists = []
-        for hand in self._hands:
+        for servo in self._servos:
             V_tcp: Array | None
-            if searching and not hand.touches:
-                V_tcp = hand.along_z(1e-3 * self._config.approach_speed_mm_s)
+            if searching and not servo.in_contact:
+                V_tcp = servo.along_z(1e-3 * self._config.approach_speed_mm_s)
             else:
-                V_tcp = hand.servo_step(hand.run.feedforward if state is ServoState.RUN else np.zeros(6))
+                V_tcp = servo.servo_step(servo.run.feedforward if state is ServoState.RUN else np.zeros(6))
             if V_tcp is not None:
-                twists.append((hand, V_tcp))
+                twists.append((servo, V_tcp))
         return twists
 
-    def _command(self, hand: Hand, V_tcp: Array) -> TwistCommand:
+    def _command(self, servo: ContactServo, V_tcp: Array) -> TwistCommand:
         return TwistCommand(
             V_tcp,
             TwistFrame.TCP,
             t_ns=self._now_ns,
             ttl_s=3.0 * self._period_s,
-            t_cause_ns=None if hand.contact is None else hand.contact.t_frame_ns,
+            t_cause_ns=None if servo.contact is None else servo.contact.t_frame_ns,
         )
 
     def _telemetry(self, observation: Observation) -> Mapping[str, float]:
         servoing = self._machine.state in (ServoState.SETTLE, ServoState.RUN)
         telemetry: dict[str, float] = {}
-        for hand in self._hands:
-            prefix = f"{hand.sensor}_" if len(self._hands) > 1 else ""
-            told = hand.telemetry(observation, servoing=servoing)
+        for servo in self._servos:
+            prefix = f"{servo.sensor}_" if len(self._servos) > 1 else ""
+            told = servo.telemetry(observation, servoing=servoing)
             telemetry |= {f"{prefix}{name}": value for name, value in told.items()}
         return telemetry

@@ -12,7 +12,7 @@ from pydantic import NonNegativeFloat, PositiveFloat, model_validator
 from touchcell.control.alignment import Aim, AlignmentGains, TargetAlignment
 from touchcell.control.path import Point
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import Hand, HandConfig, Six, SixGains
+from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig, Six, SixGains
 from touchcell.tasks.interface import TaskContext, TaskSpec
 from touchcell.tasks.push_path import Obstacle, plan
 from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
@@ -20,7 +20,7 @@ from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
 Mm = tuple[float, float]
 
 
-class PushConfig(HandConfig):
+class PushConfig(ContactServoConfig):
     """Parameters of whoever pushes. The servo keeps the sensor normal to the object; how deep it is pressed is left to
     the object's friction, and where it touches, to target alignment.
 
@@ -34,7 +34,8 @@ class PushConfig(HandConfig):
         clearance_mm: how far the object's middle keeps from obstacles.
         turning_radius_mm: of planned ways; no less than a stable push can turn.
         push_speed_mm_s: speed along the sensor's axis.
-        middle_mm: the object's middle, ahead of the middle of the tip: the tip's radius and half of the object. It is
+        object_center_offset_mm: the object's middle, ahead of the middle of the tip: the tip's radius and half of the
+        object. It is
             what is brought to the target, and about which the object turns.
         look_ahead_mm: how far ahead on the way the middle is aimed.
         align_kp_mm_s_per_deg: sideways speed per degree of the bearing of the point that is aimed at.
@@ -54,7 +55,7 @@ class PushConfig(HandConfig):
     clearance_mm: PositiveFloat = 60.0
     turning_radius_mm: PositiveFloat = 120.0
     push_speed_mm_s: PositiveFloat = 20.0
-    middle_mm: PositiveFloat = 60.0
+    object_center_offset_mm: PositiveFloat = 60.0
     look_ahead_mm: PositiveFloat = 60.0
     align_kp_mm_s_per_deg: PositiveFloat = 5.0
     align_ki_deg_per_mm_s: NonNegativeFloat = 0.2
@@ -71,7 +72,7 @@ class PushConfig(HandConfig):
             kd=self.align_kd_mm_per_deg * per_rad,
             limit_m_s=1e-3 * self.align_max_mm_s,
             look_ahead_m=1e-3 * self.look_ahead_mm,
-            lead_m=1e-3 * self.middle_mm,
+            lead_m=1e-3 * self.object_center_offset_mm,
         )
         return TargetAlignment(self.route, gains)
 
@@ -124,7 +125,7 @@ class Push:
         """As the parameters say."""
         return self._timeout_s
 
-    def advance(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
+    def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
         """Look where the object stands to its target."""
         if T_s_f is None:
             self._alignment.pause()
@@ -133,7 +134,7 @@ class Push:
         self._y_is_left = -float(np.sign(now[2, 0]))
         self._aim = self._alignment.aim(now, T_s_f)
         self._left_m_s = self._alignment.step(self._aim, dt_s)
-        return self._aim.rest_m <= 0.0
+        return self._aim.remaining_m <= 0.0
 
     def telemetry(self) -> Mapping[str, float]:
         """Way that is left, distance of the target from the contact normal, and how the object is steered."""
@@ -143,9 +144,9 @@ class Push:
         goal_deg = self._goal_heading_deg
         off = {} if goal_deg is None else {"heading_error_deg": math.remainder(heading_deg - goal_deg, 360.0)}
         return {
-            "rest_mm": 1e3 * self._aim.rest_m,
-            "target_aside_mm": 1e3 * self._aim.target_aside_m,
-            "aside_mm": 1e3 * self._aim.aside_m,
+            "rest_mm": 1e3 * self._aim.remaining_m,
+            "target_aside_mm": 1e3 * self._aim.target_lateral_error_m,
+            "aside_mm": 1e3 * self._aim.cross_track_error_m,
             "bearing_deg": float(np.degrees(self._aim.theta_rad)),
             "heading_deg": heading_deg,
             "align_mm_s": 1e3 * self._left_m_s,
@@ -155,8 +156,8 @@ class Push:
 
 def build(config: SingleArmPushingConfig, context: TaskContext) -> ServoTask:
     """The task in a cell that has ``arm`` and ``sensor``."""
-    hand = Hand(ARM, SENSOR, config, config.reference_mm_deg, Push(config), context)
-    return ServoTask("single_arm_pushing", config, context, hand)
+    servo = ContactServo(ARM, SENSOR, config, config.reference_mm_deg, Push(config), context)
+    return ServoTask("single_arm_pushing", config, context, servo)
 
 
 SPEC = TaskSpec(

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import Hand, SixGains
+from touchcell.tasks.contact_servo import ContactServo, SixGains
 from touchcell.tasks.interface import TaskContext, TaskSpec
 from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
 
@@ -51,7 +51,7 @@ class Follow:
         """Twice the time that the way takes, and a second."""
         return self._timeout_s
 
-    def advance(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
+    def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
         """Count the way along the direction of travel, so that noise and corrections do not add to it."""
         self._left_m -= float(self._direction @ now[:3, :3].T @ (now[:3, 3] - before[:3, 3]))
         return self._left_m <= 0.0
@@ -64,8 +64,8 @@ class Follow:
 def build(config: SurfaceFollowingConfig, context: TaskContext) -> ServoTask:
     """The task in a cell that has ``arm`` and ``sensor``."""
     reference = (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0)
-    hand = Hand(ARM, SENSOR, config, reference, Follow(config), context)
-    return ServoTask("surface_following", config, context, hand)
+    servo = ContactServo(ARM, SENSOR, config, reference, Follow(config), context)
+    return ServoTask("surface_following", config, context, servo)
 
 
 SPEC = TaskSpec(

@@ -14,7 +14,7 @@ import pytest
 
 if TYPE_CHECKING:
     from touchcell.cell.config.schema import CellPlan, DevicePlan
-    from touchcell.testing.emulation.rig import Rig, RigFunction
+    from touchcell.testing.emulation.rig import DeviceFixture, FixtureFactory
 
 _CONFIRMED = pytest.StashKey[set[str]]()
 
@@ -80,14 +80,14 @@ class BenchModule(pytest.Module):
         return module
 
 
-def _rig_of(plan: CellPlan, device: DevicePlan) -> RigFunction:
+def _rig_of(plan: CellPlan, device: DevicePlan) -> FixtureFactory:
     """A rig that knows nothing but the device itself."""
     from touchcell.cell.runtime.compose import build_devices
     from touchcell.drivers.core.clock import MonotonicClock, VirtualClock
-    from touchcell.testing.emulation.rig import Rig
+    from touchcell.testing.emulation.rig import DeviceFixture
 
-    def rig(folder: Path, address: int) -> Rig:
-        return Rig(
+    def rig(folder: Path, address: int) -> DeviceFixture:
+        return DeviceFixture(
             spec=device.spec,
             start=None,
             build=lambda clock: build_devices(plan, plan.devices, clock)[device.name],

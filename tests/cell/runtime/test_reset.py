@@ -26,8 +26,8 @@ from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
 from touchcell.cell.runtime.compose import Cell, compose
 from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
-from touchcell.cell.runtime.operator_channel import Ask, OperatorDesk, Request, ask_run, is_waiting
-from touchcell.cell.runtime.watchdog import OneProcess
+from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest, Request, ask_run, is_waiting
+from touchcell.cell.runtime.watchdog import NullWatchdog
 from touchcell.control.latch import LatchState
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.errors import DeviceFault
@@ -52,7 +52,7 @@ class Run:
         path = folder / "cell.yaml"
         path.write_text(yaml.safe_dump(cell or data()))
         self.cell: Cell = compose(plan_cell(path))
-        self.desk = OperatorDesk()
+        self.desk = OperatorChannel()
         self.stop = StopRequest()
         self.trips: list[RunResult] = []
         self.waiting = ""
@@ -88,11 +88,11 @@ class Run:
     def fault(self, **changes: Any) -> None:
         self.arm.faults = replace(self.arm.faults, **changes)
 
-    def ask(self, ask: Ask) -> str:
-        self.desk.said = ""
+    def ask(self, ask: OperatorRequest) -> str:
+        self.desk.last_reply = ""
         self.desk.ask(ask, "ada")
         self.go(1)
-        return self.desk.said
+        return self.desk.last_reply
 
     def end(self) -> RunResult:
         result = self.loop.end()
@@ -119,20 +119,20 @@ def test_reset_then_resume_starts_the_task_from_its_first_state_and_it_ends_well
     assert run.trips[0].stops["arm"].kept
     run.go(5)
     assert "cause is still there" in run.waiting
-    assert run.ask(Ask.RESET) == "refused: a cause is still present"
+    assert run.ask(OperatorRequest.RESET) == "refused: a cause is still present"
     run.fault(stale=False)
     run.go(2)
     assert run.cell.supervisor.latch.state is LatchState.CAUSE_GONE
     assert "r resets" in run.waiting
-    assert run.ask(Ask.RESUME) == "refused: reset first"
+    assert run.ask(OperatorRequest.RESUME) == "refused: reset first"
     stood = run.pose()
-    assert run.ask(Ask.RESET).startswith("reset; nothing moves")
-    assert run.ask(Ask.RESET) == "refused: nothing is latched"
+    assert run.ask(OperatorRequest.RESET).startswith("reset; nothing moves")
+    assert run.ask(OperatorRequest.RESET) == "refused: nothing is latched"
     run.go(200)
     np.testing.assert_array_equal(run.pose(), stood)
     assert run.cell.task.state == "tripped"
     first = run.cell.task
-    assert "starts again" in run.ask(Ask.RESUME)
+    assert "starts again" in run.ask(OperatorRequest.RESUME)
     assert run.cell.task is not first
     assert run.cell.task.state == "prepare"
     run.go(2000)
@@ -163,8 +163,8 @@ def test_without_anybody_to_ask_a_trip_ends_the_run(tmp_path: Path) -> None:
 def test_what_was_asked_before_the_trip_counts_for_nothing(tmp_path: Path) -> None:
     run = Run(tmp_path)
     run.until("run")
-    run.desk.ask(Ask.RESET, "ada")
-    run.desk.ask(Ask.RESUME, "ada")
+    run.desk.ask(OperatorRequest.RESET, "ada")
+    run.desk.ask(OperatorRequest.RESUME, "ada")
     run.fault(stale=True)
     run.until("tripped")
     run.fault(stale=False)
@@ -188,8 +188,8 @@ def test_an_arm_that_moves_while_it_waits_is_stopped_again_by_stronger_means(tmp
     np.testing.assert_array_equal(run.pose(), stood)
     run.fault(drift_m_s=0.0)
     run.go(5)
-    assert run.ask(Ask.RESET).startswith("reset")
-    assert "starts again" in run.ask(Ask.RESUME)
+    assert run.ask(OperatorRequest.RESET).startswith("reset")
+    assert "starts again" in run.ask(OperatorRequest.RESUME)
     assert run.arm.state is Lifecycle.ACTIVE
     run.go(2000)
     assert run.end().outcome is Outcome.DONE
@@ -205,9 +205,9 @@ def test_category_1_takes_the_power_and_resume_gives_it_back(tmp_path: Path) -> 
     assert run.arm.state is Lifecycle.READY
     run.fault(stale=False)
     run.go(2)
-    assert run.ask(Ask.RESET).startswith("reset")
+    assert run.ask(OperatorRequest.RESET).startswith("reset")
     assert run.arm.state is Lifecycle.READY
-    assert "starts again" in run.ask(Ask.RESUME)
+    assert "starts again" in run.ask(OperatorRequest.RESUME)
     assert run.arm.state is Lifecycle.ACTIVE
     run.go(2000)
     assert run.end().outcome is Outcome.DONE
@@ -222,9 +222,9 @@ def test_a_device_fault_waits_too_and_a_reset_recovers_the_device(tmp_path: Path
     assert [(cause.interlock, cause.subject) for cause in causes] == [("device", "arm")]
     run.go(3)
     assert run.arm.state is Lifecycle.FAULTED
-    assert run.ask(Ask.RESET).startswith("reset")
+    assert run.ask(OperatorRequest.RESET).startswith("reset")
     assert run.arm.state is Lifecycle.READY
-    assert "starts again" in run.ask(Ask.RESUME)
+    assert "starts again" in run.ask(OperatorRequest.RESUME)
     run.go(2000)
     assert run.end().outcome is Outcome.DONE
 
@@ -233,15 +233,15 @@ def test_a_second_trip_needs_a_second_reset(tmp_path: Path) -> None:
     run = tripped(tmp_path)
     run.fault(stale=False)
     run.go(2)
-    run.ask(Ask.RESET)
+    run.ask(OperatorRequest.RESET)
     run.fault(stale=True)
     run.go(20)
     assert run.cell.supervisor.latch.state is LatchState.TRIPPED
-    assert run.ask(Ask.RESUME) == "refused: reset first"
+    assert run.ask(OperatorRequest.RESUME) == "refused: reset first"
     run.fault(stale=False)
     run.go(2)
-    assert run.ask(Ask.RESET).startswith("reset")
-    run.ask(Ask.RESUME)
+    assert run.ask(OperatorRequest.RESET).startswith("reset")
+    run.ask(OperatorRequest.RESUME)
     run.go(2000)
     result = run.end()
     assert (result.outcome, len(result.resets)) == (Outcome.DONE, 2)
@@ -251,8 +251,8 @@ def test_a_stop_ends_the_waiting_and_time_spent_in_it_does_not_count(tmp_path: P
     run = tripped(tmp_path, max_duration_s=6.0)
     run.fault(stale=False)
     run.go(600)
-    run.ask(Ask.RESET)
-    run.ask(Ask.RESUME)
+    run.ask(OperatorRequest.RESET)
+    run.ask(OperatorRequest.RESUME)
     run.go(50)
     assert run.going
     run.fault(stale=True)
@@ -263,7 +263,7 @@ def test_a_stop_ends_the_waiting_and_time_spent_in_it_does_not_count(tmp_path: P
     assert run.end().outcome is Outcome.TRIPPED
 
 
-class NotedWatch(OneProcess):
+class NotedWatch(NullWatchdog):
     """Writes down when it is told to guard and when not."""
 
     def __init__(self) -> None:
@@ -281,9 +281,9 @@ def test_nobody_guards_while_it_waits_so_that_no_arm_obeys(tmp_path: Path) -> No
     watch = run.cell.watch = NotedWatch()
     run.fault(stale=False)
     run.go(2)
-    run.ask(Ask.RESET)
+    run.ask(OperatorRequest.RESET)
     assert watch.told == []
-    run.ask(Ask.RESUME)
+    run.ask(OperatorRequest.RESUME)
     assert watch.told == ["begin"]
     run.go(5)
     run.fault(stale=True)
@@ -324,8 +324,8 @@ class Impatient(RuleBasedStateMachine):
     def fault(self, stale: bool) -> None:
         self.run.fault(stale=stale)
 
-    @rule(asks=st.lists(st.sampled_from(Ask), min_size=1, max_size=3))
-    def press(self, asks: list[Ask]) -> None:
+    @rule(asks=st.lists(st.sampled_from(OperatorRequest), min_size=1, max_size=3))
+    def press(self, asks: list[OperatorRequest]) -> None:
         latch = self.run.cell.supervisor.latch
         before, present = latch.first_cause, latch.state in (LatchState.TRIPPED, LatchState.FAULTED)
         waits = self.run.cell.task.state == "tripped"
@@ -342,7 +342,9 @@ class Impatient(RuleBasedStateMachine):
         restarted = waits and self.run.cell.task.state != "tripped"
         if restarted:
             # Only a reset clears, and only what came after it goes on.
-            assert before is None or (cleared and asks.index(Ask.RESET) < len(asks) - 1 - asks[::-1].index(Ask.RESUME))
+            assert before is None or (
+                cleared and asks.index(OperatorRequest.RESET) < len(asks) - 1 - asks[::-1].index(OperatorRequest.RESUME)
+            )
         self.allowed = latch.first_cause is None and self.run.cell.task.state != "tripped"
 
     @invariant()
@@ -410,31 +412,34 @@ def test_a_pair_of_what_is_not_there_is_refused(tmp_path: Path, pair: dict[str, 
 
 
 def test_requests_come_from_keys_and_files_in_order_and_are_answered(tmp_path: Path) -> None:
-    desk = OperatorDesk(tmp_path)
-    desk.ask(Ask.RESET, "ada")
+    desk = OperatorChannel(tmp_path)
+    desk.ask(OperatorRequest.RESET, "ada")
     assert desk.take() is None
     desk.open()
     assert is_waiting(tmp_path)
     told: list[tuple[bool, str]] = []
-    other = threading.Thread(target=lambda: told.append(ask_run(tmp_path, Ask.RESUME, "bob", DEADLINE_S)))
+    other = threading.Thread(target=lambda: told.append(ask_run(tmp_path, OperatorRequest.RESUME, "bob", DEADLINE_S)))
     other.start()
-    desk.ask(Ask.RESET, "ada")
+    desk.ask(OperatorRequest.RESET, "ada")
     taken: list[Request] = []
     deadline_s = time.monotonic() + DEADLINE_S
     while len(taken) < 2:
         assert time.monotonic() < deadline_s
         if (request := desk.take()) is not None:
             taken.append(request)
-            desk.answer(request, request.ask is Ask.RESUME, f"to {request.operator}")
+            desk.answer(request, request.ask is OperatorRequest.RESUME, f"to {request.operator}")
     other.join()
     assert told == [(True, "to bob")]
-    assert {(request.ask, request.operator) for request in taken} == {(Ask.RESET, "ada"), (Ask.RESUME, "bob")}
+    assert {(request.ask, request.operator) for request in taken} == {
+        (OperatorRequest.RESET, "ada"),
+        (OperatorRequest.RESUME, "bob"),
+    }
     desk.close()
     assert not is_waiting(tmp_path)
 
 
 def test_a_run_that_does_not_answer_is_told(tmp_path: Path) -> None:
-    done, words = ask_run(tmp_path, Ask.RESET, "ada", wait_s=0.0)
+    done, words = ask_run(tmp_path, OperatorRequest.RESET, "ada", wait_s=0.0)
     assert not done
     assert "no answer" in words
     assert not (tmp_path / "request.json").exists()

@@ -19,7 +19,7 @@ from touchcell.cell.runtime.planning_scene import link_capsules
 from touchcell.control.interlocks.clearance import Clearance, ClearanceConfig
 from touchcell.control.interlocks.collision import BASE, TOOL, Box, Capsule, Clearances
 from touchcell.control.interlocks.config import build_interlocks, parse_interlocks
-from touchcell.control.interlocks.planning_scene import Body, Surroundings
+from touchcell.control.interlocks.planning_scene import Body, PlanningScene
 from touchcell.control.interlocks.snapshot import ArmView, CellView
 from touchcell.control.interlocks.violation import Severity
 from touchcell.control.latch import Latch
@@ -53,7 +53,7 @@ def apart(gap_mm: float, left: Any = None, right: Any = None) -> CellView:
 
 
 def rule(boxes: tuple[Box, ...] = (), **changes: Any) -> Clearance:
-    (built,) = build_interlocks(parse_interlocks({"clear": {**ENTRY, **changes}}), {}, Surroundings({}, BODIES, boxes))
+    (built,) = build_interlocks(parse_interlocks({"clear": {**ENTRY, **changes}}), {}, PlanningScene({}, BODIES, boxes))
     assert isinstance(built, Clearance)
     return built
 
@@ -115,7 +115,9 @@ def test_a_table_counts_too_and_names_itself():
 
 
 def test_slow_may_last_and_near_does_not():
-    supervisor = Supervisor(build_interlocks(parse_interlocks({"clear": ENTRY}), {}, Surroundings({}, BODIES)), Latch())
+    supervisor = Supervisor(
+        build_interlocks(parse_interlocks({"clear": ENTRY}), {}, PlanningScene({}, BODIES)), Latch()
+    )
     for k in range(100):
         verdict = supervisor.review(replace(apart(40, FORTH), now_ns=NOW + k * LIMIT_FOR_NS // 10))
         assert (verdict.allow, verdict.speed) == (True, REDUCED)
@@ -161,7 +163,7 @@ def test_an_arm_that_folds_onto_itself_is_slowed():
         Capsule("gripper", (TOOL, TOOL), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.15)), 0.03),
     ]
     bodies = {"arm": Body(np.eye(4), parts, lambda: IK, 6)}
-    (clear,) = build_interlocks(parse_interlocks({"clear": {**ENTRY, "slow_mm": 80}}), {}, Surroundings({}, bodies))
+    (clear,) = build_interlocks(parse_interlocks({"clear": {**ENTRY, "slow_mm": 80}}), {}, PlanningScene({}, bodies))
     q = np.deg2rad([0.0, 20.0, 140.0, 0.0, 85.0, 0.0])
     bend = np.array([0.0, 0.0, 0.0, 0.0, 0.3, 0.0])
     found = clear.check(CellView(NOW, {"arm": jointed(q, bend)}))
@@ -228,7 +230,7 @@ def problems(path: Path) -> dict[str, str]:
 
 def test_a_limit_that_leaves_no_room_to_stop_is_refused_with_its_remedy(tmp_path):
     path = following(tmp_path)
-    way = plan_cell(path).overshoots["clear"]
+    way = plan_cell(path).stopping_distances["clear"]
     data = yaml.safe_load(path.read_text())
     data["interlocks"]["clear"]["limit_mm"] = 1
     path.write_text(yaml.safe_dump(data))
@@ -243,7 +245,7 @@ def test_a_limit_that_leaves_no_room_to_stop_is_refused_with_its_remedy(tmp_path
 
 def test_the_speeds_of_two_arms_add_up(tmp_path):
     path = following(tmp_path)
-    one = plan_cell(path).overshoots["clear"]
+    one = plan_cell(path).stopping_distances["clear"]
     data = yaml.safe_load(path.read_text())
     data["arms"]["other"] = {**data["arms"]["arm"], "base_pose_mm_deg": [900, 0, 0, 0, 0, 180]}
     data["sensors"]["second"] = {**data["sensors"]["sensor"], "mounted_on": "other"}
@@ -251,7 +253,7 @@ def test_the_speeds_of_two_arms_add_up(tmp_path):
     plan = plan_cell(path)
     # The task needs one arm only: the other is not built and does not move.
     assert "other" in plan.skipped
-    assert plan.overshoots["clear"] == one
+    assert plan.stopping_distances["clear"] == one
     assert plan.devices["other"].config.base_pose_mm_deg[0] == 900
 
 

@@ -74,7 +74,7 @@ def rule(name):
 @pytest.mark.parametrize("name", GOOD)
 def test_a_quiet_cell_breaks_no_rule(name):
     quiet = rule(name)
-    assert (quiet.judge(view(), {})[0] if isinstance(quiet, TimedInterlock) else quiet.check(view())) is None
+    assert (quiet.evaluate(view(), {})[0] if isinstance(quiet, TimedInterlock) else quiet.check(view())) is None
 
 
 @pytest.mark.parametrize(

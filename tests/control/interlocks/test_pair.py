@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from touchcell.control.interlocks.config import build_interlocks, parse_interlocks
-from touchcell.control.interlocks.planning_scene import Surroundings
+from touchcell.control.interlocks.planning_scene import PlanningScene
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
-from touchcell.control.interlocks.timers import Past, TimedInterlock
+from touchcell.control.interlocks.timers import InterlockState, TimedInterlock
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.errors import ConfigError
@@ -80,18 +80,18 @@ def rule(kind: str, **changes: Any) -> TimedInterlock:
         "markers_lost": {"limit_percent": 10, "frames": 3},
     }
     entry = {"kind": kind, **defaults[kind], **changes}
-    (built,) = build_interlocks(parse_interlocks({kind: entry}), MOUNTS, Surroundings(BASES))
+    (built,) = build_interlocks(parse_interlocks({kind: entry}), MOUNTS, PlanningScene(BASES))
     assert isinstance(built, TimedInterlock)
     return built
 
 
 def watch(
-    judge: TimedInterlock, hands: Hands, seconds: float, move: Callable[[float], None] = lambda t: None
+    evaluate: TimedInterlock, hands: Hands, seconds: float, move: Callable[[float], None] = lambda t: None
 ) -> Iterator[Violation | None]:
-    past: Past = {}
+    past: InterlockState = {}
     for k in range(round(seconds / DT_S)):
         move(k * DT_S)
-        found, past = judge.judge(hands.view(), past)
+        found, past = evaluate.evaluate(hands.view(), past)
         yield found
 
 
@@ -202,8 +202,8 @@ def test_falling_over_trips_by_the_rate_long_before_the_angle() -> None:
 @pytest.mark.parametrize("sensors", [["leader_sensor"], ["follower_sensor", "leader_sensor"]])
 def test_it_is_seen_with_one_sensor_and_in_either_order(sensors: list[str]) -> None:
     hands = Hands()
-    judge = rule("toppling", sensors=sensors, arms=[sensor.removesuffix("_sensor") for sensor in sensors])
-    _, found = first(judge, hands, 3.0, lean(hands, 4.0))
+    evaluate = rule("toppling", sensors=sensors, arms=[sensor.removesuffix("_sensor") for sensor in sensors])
+    _, found = first(evaluate, hands, 3.0, lean(hands, 4.0))
     assert (found.unit, found.value) == ("deg", pytest.approx(5.2, abs=0.1))
 
 
@@ -267,12 +267,12 @@ def test_a_contact_too_shallow_to_tell_is_not_judged_for_slip() -> None:
 
 def test_markers_that_are_missing_in_several_frames_on_end_trip() -> None:
     view = Hands().view()
-    judge = rule("markers_lost")
-    past: Past = {}
+    evaluate = rule("markers_lost")
+    past: InterlockState = {}
     found = []
     for k, share in enumerate([1.0, 0.85, 0.95, 0.85, 0.85, 0.85]):
         sensor = replace(view.sensors["leader_sensor"], seq=k, markers=share)
-        violation, past = judge.judge(replace(view, sensors={"leader_sensor": sensor}), past)
+        violation, past = evaluate.evaluate(replace(view, sensors={"leader_sensor": sensor}), past)
         found.append(violation)
     assert [violation is not None for violation in found] == [False] * 5 + [True]
     assert (found[-1].value, found[-1].unit) == (pytest.approx(15.0), "%")

@@ -48,11 +48,11 @@ def arm_cycle(
     return CellView(k * CYCLE_NS, {"arm": ArmView(state, sent=sent)})
 
 
-def judge(interlock: TimedInterlock, views: list[CellView]) -> list[Violation | None]:
+def evaluate(interlock: TimedInterlock, views: list[CellView]) -> list[Violation | None]:
     past: Any = {}
     found = []
     for view in views:
-        violation, past = interlock.judge(view, past)
+        violation, past = interlock.evaluate(view, past)
         found.append(violation)
     return found
 
@@ -65,7 +65,7 @@ def first(found: list[Violation | None]) -> int:
 def test_a_frozen_picture_is_found_although_frames_keep_coming() -> None:
     interlock = rule(kind="frame_frozen", limit_ms=50)
     live = [sensor_cycle(k, content=k) for k in range(5)]
-    found = judge(interlock, live + [sensor_cycle(k, content=4) for k in range(5, 12)])
+    found = evaluate(interlock, live + [sensor_cycle(k, content=4) for k in range(5, 12)])
     # Content 4 was first seen in cycle 4; more than 50 ms later is cycle 10.
     assert first(found) == 10
     violation = found[10]
@@ -77,15 +77,15 @@ def test_a_frozen_picture_is_found_although_frames_keep_coming() -> None:
 def test_without_a_picture_the_number_has_to_move() -> None:
     interlock = rule(kind="frame_frozen", limit_ms=50)
     stuck = [replace(sensor_cycle(k), sensors={"sensor": replace(SENSOR, seq=7)}) for k in range(8)]
-    assert first(judge(interlock, stuck)) == 6
-    assert judge(interlock, [sensor_cycle(k) for k in range(20)]) == [None] * 20
+    assert first(evaluate(interlock, stuck)) == 6
+    assert evaluate(interlock, [sensor_cycle(k) for k in range(20)]) == [None] * 20
 
 
 def test_exposure_is_held_against_the_first_ten_frames() -> None:
     interlock = rule(kind="exposure", limit_percent=20)
     cycles = [sensor_cycle(k, brightness=50.0 + (k % 2)) for k in range(10)]
     cycles += [sensor_cycle(10, brightness=60.5), sensor_cycle(11, brightness=60.7), sensor_cycle(12, brightness=40.3)]
-    found = judge(interlock, cycles)
+    found = evaluate(interlock, cycles)
     assert found[:11] == [None] * 11
     assert found[11] is not None
     assert found[11].value == pytest.approx(100 * (60.7 / 50.5 - 1))
@@ -98,13 +98,13 @@ def test_a_lost_contact_trips_only_after_it_was_made_and_while_it_is_wanted() ->
     def cycle(k: int, contact: bool, state: str) -> CellView:
         return sensor_cycle(k, in_contact=contact, task_state=state)
 
-    assert judge(interlock, [cycle(k, False, "approach") for k in range(20)]) == [None] * 20
+    assert evaluate(interlock, [cycle(k, False, "approach") for k in range(20)]) == [None] * 20
     lost = [cycle(0, True, "run"), cycle(1, False, "run"), *(cycle(k, False, "approach") for k in range(2, 6))]
-    assert first(judge(interlock, lost)) == 4
+    assert first(evaluate(interlock, lost)) == 4
     regained = [cycle(0, True, "run"), cycle(1, False, "run"), cycle(2, True, "run"), cycle(5, False, "run")]
-    assert judge(interlock, regained) == [None] * 4
+    assert evaluate(interlock, regained) == [None] * 4
     withdrawn = [cycle(0, True, "run"), *(cycle(k, False, "retract") for k in range(1, 20)), cycle(20, False, "run")]
-    assert judge(interlock, withdrawn) == [None] * 21
+    assert evaluate(interlock, withdrawn) == [None] * 21
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_values_count_from_the_limit_down_to_the_leave_limit(
     interlock = rule(**settings)
 
     def run(values: list[float]) -> list[Violation | None]:
-        return judge(interlock, [sensor_cycle(k, **{name: per_unit * value}) for k, value in enumerate(values)])
+        return evaluate(interlock, [sensor_cycle(k, **{name: per_unit * value}) for k, value in enumerate(values)])
 
     assert run([0.99] * 20) == [None] * 20
     # 0.9 lies between the leave limit of 0.8 and the limit: it keeps what 1.1 began.
@@ -135,22 +135,22 @@ def test_values_count_from_the_limit_down_to_the_leave_limit(
 def test_innovations_are_counted_by_frame_not_by_cycle() -> None:
     interlock = rule(kind="inconsistent", limit_nis=20, frames=3)
     views = [replace(sensor_cycle(k), sensors={"sensor": replace(SENSOR, seq=k // 4, nis=25.0)}) for k in range(12)]
-    found = judge(interlock, views)
+    found = evaluate(interlock, views)
     assert first(found) == 8
-    assert judge(interlock, [sensor_cycle(k, nis=25.0 if k % 3 else 1.0) for k in range(30)]) == [None] * 30
+    assert evaluate(interlock, [sensor_cycle(k, nis=25.0 if k % 3 else 1.0) for k in range(30)]) == [None] * 30
 
 
 def test_out_of_range_is_forgiven_for_a_while() -> None:
     interlock = rule(kind="out_of_range", limit_ms=50)
-    assert first(judge(interlock, [sensor_cycle(k, in_range=False) for k in range(10)])) == 6
-    assert judge(interlock, [sensor_cycle(k, in_range=k % 5 == 0) for k in range(40)]) == [None] * 40
+    assert first(evaluate(interlock, [sensor_cycle(k, in_range=False) for k in range(10)])) == 6
+    assert evaluate(interlock, [sensor_cycle(k, in_range=k % 5 == 0) for k in range(40)]) == [None] * 40
 
 
 def test_tracking_error_is_measured_against_what_was_sent() -> None:
     interlock = rule(kind="tracking", limit_mm_s=5, hold_ms=30)
-    good = judge(interlock, [arm_cycle(k, vx_mm_s=20, sent_mm_s=24) for k in range(20)])
+    good = evaluate(interlock, [arm_cycle(k, vx_mm_s=20, sent_mm_s=24) for k in range(20)])
     assert good == [None] * 20
-    bad = judge(interlock, [arm_cycle(k, vx_mm_s=0, sent_mm_s=20) for k in range(20)])
+    bad = evaluate(interlock, [arm_cycle(k, vx_mm_s=0, sent_mm_s=20) for k in range(20)])
     assert first(bad) == 3
     assert bad[3] is not None
     assert bad[3].value == pytest.approx(20.0)
@@ -159,21 +159,21 @@ def test_tracking_error_is_measured_against_what_was_sent() -> None:
 def test_an_arm_told_to_stand_may_settle_and_then_must_not_drift() -> None:
     interlock = rule(kind="standstill", limit_mm=1, settle_ms=50)
     settling = [arm_cycle(k, x_mm=5.0 * min(k, 5)) for k in range(30)]
-    assert judge(interlock, settling) == [None] * 30
+    assert evaluate(interlock, settling) == [None] * 30
     drifting = [arm_cycle(k, x_mm=0.1 * k) for k in range(30)]
-    found = judge(interlock, drifting)
+    found = evaluate(interlock, drifting)
     # Anchored in cycle 5, at 0.5 mm; beyond 1.5 mm from cycle 16.
     assert first(found) == 16
-    assert judge(interlock, [arm_cycle(k, x_mm=k, sent_mm_s=100) for k in range(30)]) == [None] * 30
+    assert evaluate(interlock, [arm_cycle(k, x_mm=k, sent_mm_s=100) for k in range(30)]) == [None] * 30
 
 
 def test_a_gate_that_holds_back_for_long_trips() -> None:
     interlock = rule(kind="limited", limit_ms=300)
-    found = judge(interlock, [arm_cycle(k, sent_mm_s=100, held=True) for k in range(40)])
+    found = evaluate(interlock, [arm_cycle(k, sent_mm_s=100, held=True) for k in range(40)])
     assert first(found) == 31
     assert found[31] is not None
     assert "tcp linear speed" in found[31].reason
-    assert judge(interlock, [arm_cycle(k, sent_mm_s=100, held=k % 30 != 0) for k in range(90)]) == [None] * 90
+    assert evaluate(interlock, [arm_cycle(k, sent_mm_s=100, held=k % 30 != 0) for k in range(90)]) == [None] * 90
 
 
 def test_a_limit_slows_down_and_trips_when_it_lasts() -> None:
@@ -207,8 +207,8 @@ def test_a_sustained_rule_is_pure_and_never_fires_below_its_leave_limit(
 ) -> None:
     interlock = rule(kind="shear", limit_mm=limit, leave_mm=share * limit, hold_ms=20)
     views = [sensor_cycle(k, shear_m=value) for k, value in enumerate(values)]
-    found = judge(interlock, views)
-    assert found == judge(interlock, views)
+    found = evaluate(interlock, views)
+    assert found == evaluate(interlock, views)
     for value, violation in zip(values, found, strict=True):
         if violation is not None:
             assert 1e3 * value > share * limit

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from touchcell.drivers.core.frame_monitor import FrameWatch
+from touchcell.drivers.core.frame_monitor import FrameMonitor
 
 
 def test_counts_what_was_lost_and_whose_fault_it_was() -> None:
-    watch = FrameWatch()
+    watch = FrameMonitor()
     watch.miss(2, overrun=False)
     watch.miss(5, overrun=True)
     readings = watch.readings()
@@ -16,7 +16,7 @@ def test_counts_what_was_lost_and_whose_fault_it_was() -> None:
 
 
 def test_identical_bytes_are_frozen_until_they_change() -> None:
-    watch = FrameWatch()
+    watch = FrameMonitor()
     for data in (b"a", b"b", b"b", b"b"):
         watch.admit(data)
     assert (watch.frozen, watch.frozen_run) == (2, 2)
@@ -25,7 +25,7 @@ def test_identical_bytes_are_frozen_until_they_change() -> None:
 
 
 def test_raw_frames_that_differ_only_in_noise_at_their_centre_are_not_frozen() -> None:
-    watch = FrameWatch()
+    watch = FrameMonitor()
     generator = np.random.default_rng(0)
     for _ in range(5):
         frame = np.zeros((480, 640, 2), np.uint8)
@@ -35,7 +35,7 @@ def test_raw_frames_that_differ_only_in_noise_at_their_centre_are_not_frozen() -
 
 
 def test_the_budget_is_ten_bad_frames_in_thirty() -> None:
-    watch = FrameWatch()
+    watch = FrameMonitor()
     for number in range(10):
         watch.refuse("damaged")
         watch.admit(bytes([number]))
@@ -49,7 +49,7 @@ def test_the_budget_is_ten_bad_frames_in_thirty() -> None:
 
 
 def test_brightness_is_compared_with_the_first_sixty_frames() -> None:
-    watch = FrameWatch()
+    watch = FrameMonitor()
     for _ in range(60):
         watch.look(np.full((48, 64), 100, np.uint8))
     assert watch.readings()["brightness_drift"] == 0.0

@@ -14,7 +14,7 @@ from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.gate import TwistGate, TwistLimits
-from touchcell.drivers.core.lease import LeaseDesk
+from touchcell.drivers.core.lease import LeaseManager
 from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain
 from touchcell.drivers.kinematics.joint_limits import IkSettings
 from touchcell.geometry.types import Array
@@ -31,7 +31,7 @@ class Bench:
 
     def __init__(self, limits: TwistLimits = LIMITS, ik: DifferentialIk | None = None) -> None:
         self.clock = VirtualClock(10**9)
-        desk = LeaseDesk("arm")
+        desk = LeaseManager("arm")
         self.gate = TwistGate("arm", limits, desk, self.clock)
         self.lease = desk.acquire("test")
         self.ik = ik

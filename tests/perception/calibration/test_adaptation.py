@@ -18,11 +18,11 @@ from touchcell.drivers.replay.dataset import PUBLIC_CROP
 from touchcell.geometry import se3
 from touchcell.perception.calibration.adaptation import (
     AdaptSettings,
-    FewContacts,
+    FewShotDataset,
     about_z,
     adapt,
     adapt_to,
-    bring,
+    align_to_sensor,
     layers_of,
     outputs_of,
     tune,
@@ -38,11 +38,11 @@ from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.marker_learning import train_guess
 from touchcell.perception.runtime.calibrated_estimator import turned
 from touchcell.perception.runtime.estimators import load_estimator
-from touchcell.simulation.mount import Rig
+from touchcell.simulation.mount import MountModel
 from touchcell.simulation.tip import Tip, TipParameters
 from touchcell.simulation.tip_file import load_tip
 
-TIP, RIG = TipParameters(), Rig()
+TIP, RIG = TipParameters(), MountModel()
 SETTINGS = AdaptSettings(steps=80)
 SIZE_OF_MARKERS = MarkerSize.of_disc(np.pi * TIP.disc_radius_px**2)
 
@@ -116,8 +116,8 @@ def test_another_camera_and_other_axes_cost_next_to_nothing(model: Model) -> Non
     spin = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     middle = np.array([222.0, 219.0])
     frames = [Discs((each.centres - middle) @ spin.T * 1.05 + middle + 4.0, each.areas) for each in own.frames]
-    other = FewContacts(frames, about_z(np.radians(35.0), own.xi))
-    brought = bring(model, other)
+    other = FewShotDataset(frames, about_z(np.radians(35.0), own.xi))
+    brought = align_to_sensor(model, other)
     assert brought.camera.zoom == pytest.approx(1 / 1.05, abs=0.03)
     assert brought.matched.mean() > 0.9
     # The lattice leaves a sixth of a turn open, which camera and labels have to share.
@@ -125,7 +125,7 @@ def test_another_camera_and_other_axes_cost_next_to_nothing(model: Model) -> Non
     assert off % 60 == pytest.approx(0.0, abs=2.0) or off % 60 == pytest.approx(60.0, abs=2.0)
     before, _ = _errors(model, own)
     adapted = adapt_to(model, other, preprocessing=model.header.preprocessing, size=SIZE_OF_MARKERS, settings=SETTINGS)
-    after, matched = _errors(adapted, FewContacts(frames, other.xi))
+    after, matched = _errors(adapted, FewShotDataset(frames, other.xi))
     assert matched > 0.9
     assert (after < 1.5 * before + 0.1).all()
 
@@ -181,9 +181,9 @@ def test_what_cannot_be_adapted_is_refused(model: Model, tmp_path: Path) -> None
         Discs(np.random.default_rng(i).uniform(20, 420, (331, 2)), each.areas) for i, each in enumerate(few.frames)
     ]
     with pytest.raises(TrainingError):
-        bring(model, dataclasses.replace(few, frames=shuffled))
+        align_to_sensor(model, dataclasses.replace(few, frames=shuffled))
     with pytest.raises(TrainingError, match="are needed"):
-        bring(model, FewContacts(few.frames[:6], few.xi[:6]))
+        align_to_sensor(model, FewShotDataset(few.frames[:6], few.xi[:6]))
 
 
 def test_samples_of_a_real_sensor_are_labelled_with_the_command() -> None:

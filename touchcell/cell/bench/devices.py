@@ -25,7 +25,7 @@ import numpy as np
 from touchcell.cell.bench.provenance import provenance
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.testing.conformance.client import MovingClient
-from touchcell.testing.conformance.context import Bench, Seat
+from touchcell.testing.conformance.context import Bench, DeviceUnderTest
 from touchcell.testing.emulation.rig import rig_of
 
 _RIGS = ("ur", "franka", "damiao_can", "feetech_serial", "v4l2")
@@ -59,7 +59,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
         print(f"{name} ...", flush=True)
         with tempfile.TemporaryDirectory(prefix="touchcell-bench-") as folder:
             address = 1000 + (os.getpid() % 30_000) * 16 + number
-            seat = Seat(partial(rig_of, name), Path(folder), address)
+            seat = DeviceUnderTest(partial(rig_of, name), Path(folder), address)
             try:
                 rows[name] = _measure(seat)
                 rows[f"{name}, vendor"] = _vendor(seat)
@@ -77,7 +77,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
     (out / "devices.json").write_text(json.dumps({"provenance": provenance(), "rows": rows}, indent=1) + "\n")
 
 
-def _measure(seat: Seat) -> dict[str, Any]:
+def _measure(seat: DeviceUnderTest) -> dict[str, Any]:
     name = seat.function.__module__.rpartition(".")[2]
     seat.emulator()
     row = _client("ours", seat, name)
@@ -94,13 +94,13 @@ def _measure(seat: Seat) -> dict[str, Any]:
     return row
 
 
-def _vendor(seat: Seat) -> dict[str, Any]:
+def _vendor(seat: DeviceUnderTest) -> dict[str, Any]:
     name = seat.function.__module__.rpartition(".")[2]
     seat.emulator()
     return _client("vendor", seat, name)
 
 
-def _client(who: str, seat: Seat, name: str) -> dict[str, Any]:
+def _client(who: str, seat: DeviceUnderTest, name: str) -> dict[str, Any]:
     environment = dict(os.environ)
     if name == "v4l2":
         from touchcell.drivers.v4l2.shim import environment as shim
@@ -133,7 +133,7 @@ def _client(who: str, seat: Seat, name: str) -> dict[str, Any]:
     return row
 
 
-def _wire(seat: Seat) -> dict[str, Any]:
+def _wire(seat: DeviceUnderTest) -> dict[str, Any]:
     """From the call of ``send_twist`` to the emulator's own receive stamp, each time from rest."""
     bench = Bench(seat)
     try:
@@ -161,7 +161,7 @@ def _wire(seat: Seat) -> dict[str, Any]:
         bench.close()
 
 
-def _ttl(seat: Seat) -> dict[str, Any]:
+def _ttl(seat: DeviceUnderTest) -> dict[str, Any]:
     """From the expiry of the last command until the tool truly rests."""
     bench = Bench(seat)
     try:
@@ -175,7 +175,7 @@ def _ttl(seat: Seat) -> dict[str, Any]:
         bench.close()
 
 
-def _kill(seat: Seat) -> dict[str, Any]:
+def _kill(seat: DeviceUnderTest) -> dict[str, Any]:
     """From kill -9 of the client until the tool rests, or motors that carry an arm without brakes let go."""
     bench = Bench(seat)
     falls = seat.rig.spec.capabilities.falls_on_power_loss
@@ -192,7 +192,7 @@ def _kill(seat: Seat) -> dict[str, Any]:
         bench.close()
 
 
-def _frozen(seat: Seat) -> dict[str, Any]:
+def _frozen(seat: DeviceUnderTest) -> dict[str, Any]:
     """From SIGSTOP of the device until the driver is FAULTED."""
     bench = Bench(seat)
     bench.spoiled = True

@@ -21,7 +21,7 @@ from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlie
 from touchcell.cell.runtime.compose import Cell, compose
 from touchcell.cell.runtime.heap import trim_heap
 from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
-from touchcell.cell.runtime.operator_channel import OperatorDesk
+from touchcell.cell.runtime.operator_channel import OperatorChannel
 from touchcell.cell.runtime.operator_input import reachable, stop_on_keys, stop_on_signals
 from touchcell.drivers.core.clock import VirtualClock
 
@@ -75,7 +75,7 @@ def run_cell(
 
 
 def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
-    stop, desk = StopRequest(), OperatorDesk(folder)
+    stop, desk = StopRequest(), OperatorChannel(folder)
     box = BlackBox()
     with (
         reachable(folder),

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag, model_validator
 
-from touchcell.cell.config.stopping_distance import Overshoot, overshoot, together
+from touchcell.cell.config.stopping_distance import StoppingDistance, overshoot, together
 from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile, load
 from touchcell.control.interlocks.basic import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
@@ -281,7 +281,7 @@ class CellPlan:
     task_config: TaskConfig
     skipped: tuple[str, ...]
     devices: Mapping[str, DevicePlan]
-    overshoots: Mapping[str, Overshoot] = field(default_factory=dict)
+    stopping_distances: Mapping[str, StoppingDistance] = field(default_factory=dict)
 
 
 def plan_cell(path: Path, overrides: Mapping[str, Any] | None = None, *, model: str | None = None) -> CellPlan:
@@ -332,7 +332,7 @@ class _Planner:
             self._require_processes(cell, task, arm_roles)
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
         self._require_pairs(cell)
-        overshoots = self._require_margins(cell, arm_roles, sensor_roles, arms)
+        stopping_distances = self._require_margins(cell, arm_roles, sensor_roles, arms)
         if self._problems:
             raise InvalidCell(self._problems)
         assert task is not None
@@ -349,7 +349,7 @@ class _Planner:
             task_config,
             tuple(skipped),
             devices,
-            overshoots,
+            stopping_distances,
         )
 
     def _require_scene_fits(self, cell: CellFile) -> None:
@@ -507,7 +507,7 @@ class _Planner:
         arm_roles: Mapping[str, str],
         sensor_roles: Mapping[str, str],
         arms: Mapping[str, DevicePlan],
-    ) -> dict[str, Overshoot]:
+    ) -> dict[str, StoppingDistance]:
         """What an arm may get beyond its workspace before it stands has to fit the margin that there is."""
         found = {}
         for name, entry in cell.interlocks.items():
@@ -539,7 +539,7 @@ class _Planner:
 
     def _require_clearance(
         self, cell: CellFile, name: str, entry: ClearanceConfig, arms: Mapping[str, DevicePlan]
-    ) -> Overshoot:
+    ) -> StoppingDistance:
         """Two arms that come near each other must stand before they touch, whatever way they go meanwhile."""
         ways = []
         for arm in arms.values():
@@ -590,7 +590,7 @@ class _Planner:
         self._problems.append(self._file.problem(path, reason, value=value, hint=hint))
 
 
-def _overshoot(arm: DevicePlan, lever_m: float, rate_hz: float) -> Overshoot | None:
+def _overshoot(arm: DevicePlan, lever_m: float, rate_hz: float) -> StoppingDistance | None:
     """Of a point ``lever_m`` from the tool centre point; None for what has no limits, as a replay."""
     limits = getattr(arm.config, "limits", None)
     if not isinstance(limits, LimitsConfig):

@@ -9,7 +9,7 @@ from touchcell.drivers.core.gate import TwistLimits
 
 
 @dataclass(frozen=True, slots=True)
-class Overshoot:
+class StoppingDistance:
     """The way of a point of the tool from the limit to rest, in the worst case that the arm's gate allows.
 
     Attributes:
@@ -37,18 +37,18 @@ class Overshoot:
         )
 
 
-def overshoot(limits: TwistLimits, lever_m: float, rate_hz: float, latency_s: float) -> Overshoot:
+def overshoot(limits: TwistLimits, lever_m: float, rate_hz: float, latency_s: float) -> StoppingDistance:
     """The overshoot of a point ``lever_m`` away from the tool centre point of an arm with these limits."""
     turning_m_s = limits.rot_speed_rad_s * lever_m
     speed_m_s = limits.speed_m_s + turning_m_s
     braking_m = 0.5 * limits.speed_m_s**2 / limits.accel_m_s2
     braking_m += 0.5 * turning_m_s * limits.rot_speed_rad_s / limits.rot_accel_rad_s2
-    return Overshoot(speed_m_s, speed_m_s / rate_hz, speed_m_s * latency_s, braking_m)
+    return StoppingDistance(speed_m_s, speed_m_s / rate_hz, speed_m_s * latency_s, braking_m)
 
 
-def together(ways: Sequence[Overshoot]) -> Overshoot:
+def together(ways: Sequence[StoppingDistance]) -> StoppingDistance:
     """The overshoot of two points that come towards each other: the sum of theirs."""
-    return Overshoot(
+    return StoppingDistance(
         sum(way.speed_m_s for way in ways),
         sum(way.cycle_m for way in ways),
         sum(way.latency_m for way in ways),

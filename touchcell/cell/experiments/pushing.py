@@ -36,7 +36,7 @@ ESTIMATORS: Mapping[str, Mapping[str, Any] | None] = {"learned": None, "true con
 COLUMNS = (
     Column("error_mm", "error mm", below=2.0),
     Column("error_mm", "worst", "worst"),
-    Column("middle_mm", "middle to target mm"),
+    Column("object_center_offset_mm", "middle to target mm"),
     Column("lean_max_deg", "lean deg", "worst"),
 )
 ERROR_NOTE = "error: from the target to the true contact normal when the push ends, from above"
@@ -99,7 +99,7 @@ class Arms:
             "scene.physics": "dynamic",
             "scene.table": {"friction": surface},
             f"arms.{self.leader}.start_pose_mm_deg": [x_mm, 0, height_mm, 180, 0, 0],
-            "task.middle_mm": pushed.reach_mm + _TIP_MM,
+            "task.object_center_offset_mm": pushed.reach_mm + _TIP_MM,
         }
         if len(self.sensors) > 1:
             # The follower's base is a metre away and turned round.
@@ -210,7 +210,7 @@ def push_measures(run: RunFolder) -> dict[str, float]:
     middle = 1e3 * object_poses(run)[OBJECT].at(np.array([end_s]))[0, :2, 3]
     return found | {
         "error_mm": off_normal_mm(_surface_pose(run, pushing, end_s), target),
-        "middle_mm": float(np.linalg.norm(target - middle)),
+        "object_center_offset_mm": float(np.linalg.norm(target - middle)),
     }
 
 

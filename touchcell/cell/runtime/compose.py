@@ -24,8 +24,8 @@ from touchcell.cell.config.schema import (
 from touchcell.cell.recording.dataset_writer import Collection
 from touchcell.cell.recording.messages import belief_message, pose_message
 from touchcell.cell.runtime.known_surface import KnownSurfaceSource
-from touchcell.cell.runtime.planning_scene import build_surroundings
-from touchcell.cell.runtime.watchdog import OneProcess, Watch
+from touchcell.cell.runtime.planning_scene import build_planning_scene
+from touchcell.cell.runtime.watchdog import NullWatchdog, Watchdog
 from touchcell.control.interlocks.config import build_interlocks
 from touchcell.control.latch import Latch
 from touchcell.control.supervisor import Supervisor
@@ -166,7 +166,7 @@ class Cell:
     watched_joints: frozenset[str] = frozenset()
     scene: SceneTruth | None = None
     collection: Collection | None = None
-    watch: Watch = field(default_factory=OneProcess)
+    watch: Watchdog = field(default_factory=NullWatchdog)
     start_ns: int = 0
     _exit: ExitStack = field(default_factory=ExitStack, init=False)
 
@@ -241,8 +241,8 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
     sensors = {role: _sensor(plan, name, devices, scene, arm_of) for role, name in plan.sensor_roles.items()}
     poses = {role: sensor.T_tcp_sensor for role, sensor in sensors.items()}
     arms = {role: cast(Arm, devices[name]) for name, role in arm_of.items()}
-    surroundings = build_surroundings(plan, arms, {role: name for name, role in arm_of.items()})
-    supervisor = Supervisor(build_interlocks(plan.cell.interlocks, poses, surroundings), Latch())
+    planning_scene = build_planning_scene(plan, arms, {role: name for name, role in arm_of.items()})
+    supervisor = Supervisor(build_interlocks(plan.cell.interlocks, poses, planning_scene), Latch())
     collection = _collection(plan)
     kept = 0 if collection is None else collection.kept
 
@@ -262,10 +262,10 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
         holding=frozenset(
             arm_of[pair.follower] for pair in plan.cell.pairs if pair.on_stop == "hold" and pair.follower in arm_of
         ),
-        watched_joints=frozenset(role for role, body in surroundings.bodies.items() if body.link_count),
+        watched_joints=frozenset(role for role, body in planning_scene.bodies.items() if body.link_count),
         scene=scene,
         collection=collection,
-        watch=OneProcess() if chain is None else _process_watch(chain, arm_of),
+        watch=NullWatchdog() if chain is None else _process_watch(chain, arm_of),
     )
 
 
@@ -309,7 +309,7 @@ def _chain(plan: CellPlan, clock: Clock) -> Chain | None:
     return build_chain(plan, clock)
 
 
-def _process_watch(chain: Chain, role_of: Mapping[str, str]) -> Watch:
+def _process_watch(chain: Chain, role_of: Mapping[str, str]) -> Watchdog:
     from touchcell.cell.runtime.process_watchdog import ProcessWatch
 
     return ProcessWatch(chain, role_of)

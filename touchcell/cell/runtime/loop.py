@@ -25,8 +25,8 @@ from touchcell.cell.recording.messages import (
     verdict_message,
 )
 from touchcell.cell.runtime.compose import Cell, Sensor
-from touchcell.cell.runtime.operator_channel import OperatorDesk
-from touchcell.cell.runtime.reset_procedure import Waiting
+from touchcell.cell.runtime.operator_channel import OperatorChannel
+from touchcell.cell.runtime.reset_procedure import ResetProcedure
 from touchcell.cell.runtime.stopping import Stopper, StopReport
 from touchcell.cell.runtime.timing import CycleTimes
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
@@ -141,7 +141,7 @@ class RunLoop:
         box: Box | None = None,
         stop: StopRequest | None = None,
         on_cycle: Callable[[Progress], None] | None = None,
-        desk: OperatorDesk | None = None,
+        desk: OperatorChannel | None = None,
         on_trip: Callable[[RunResult], None] | None = None,
     ) -> None:
         self._cell = cell
@@ -157,7 +157,7 @@ class RunLoop:
         self._sent: Mapping[str, Sent[TwistCommand]] = {}
         self._desk = desk if cell.plan.cell.on_trip == "wait_for_reset" else None
         self._on_trip = on_trip
-        self._waiting: Waiting | None = None
+        self._waiting: ResetProcedure | None = None
         self._resets: tuple[ResetDone, ...] = ()
         self._waited_from_ns = self._waited_ns = 0
         self._start_ns = self._due_ns = cell.clock.now_ns()
@@ -255,19 +255,19 @@ class RunLoop:
             self._stop_arms(tripped=True)
             self._come_to_rest()
 
-    def _begin_waiting(self, desk: OperatorDesk) -> None:
+    def _begin_waiting(self, desk: OperatorChannel) -> None:
         self._waited_from_ns = self._cell.clock.now_ns()
         stops = self._come_to_rest()
         # A black box takes longer to write than a watchdog waits. Arms that nobody guards obey no motion.
         self._cell.watch.end()
-        self._waiting = Waiting(self._cell, self._leases, desk)
+        self._waiting = ResetProcedure(self._cell, self._leases, desk)
         desk.open()
         self._due_ns = self._cell.clock.now_ns()
         self._event("waiting", "for a reset")
         if self._on_trip is not None:
             self._on_trip(self._result(stops))
 
-    def _wait(self, waiting: Waiting) -> bool:
+    def _wait(self, waiting: ResetProcedure) -> bool:
         """One cycle of a run that has tripped: the arms stand and are watched, and people are answered."""
         cell = self._cell
         if self._stop.count:

@@ -23,7 +23,7 @@ _WAIT_S: Final = 10.0
 _POLL_S: Final = 0.02
 
 
-class Ask(Enum):
+class OperatorRequest(Enum):
     """What may be asked of a run that waits."""
 
     RESET = "reset"
@@ -40,12 +40,12 @@ class Request:
         number: by which another shell knows its answer; None for a key.
     """
 
-    ask: Ask
+    ask: OperatorRequest
     operator: str
     number: int | None = None
 
 
-class OperatorDesk:
+class OperatorChannel:
     """Takes requests while it is open.
 
     Args:
@@ -56,12 +56,12 @@ class OperatorDesk:
         self._folder = folder
         self._asked: deque[Request] = deque()
         self._open = False
-        self.said = ""
+        self.last_reply = ""
 
     def open(self) -> None:
         """The run waits from now on. Whatever was asked before is forgotten."""
         self._asked.clear()
-        self.said = ""
+        self.last_reply = ""
         self._open = True
         if self._folder is not None:
             (self._folder / _REQUEST).unlink(missing_ok=True)
@@ -75,7 +75,7 @@ class OperatorDesk:
             for name in (_WAITING, _REQUEST):
                 (self._folder / name).unlink(missing_ok=True)
 
-    def ask(self, ask: Ask, operator: str) -> None:
+    def ask(self, ask: OperatorRequest, operator: str) -> None:
         """Ask from within this process."""
         if self._open:
             self._asked.append(Request(ask, operator))
@@ -85,12 +85,12 @@ class OperatorDesk:
         if self._open and self._folder is not None and (data := _read(self._folder / _REQUEST)) is not None:
             (self._folder / _REQUEST).unlink(missing_ok=True)
             with contextlib.suppress(KeyError, ValueError, TypeError):
-                self._asked.append(Request(Ask(data["ask"]), str(data["operator"]), int(data["number"])))
+                self._asked.append(Request(OperatorRequest(data["ask"]), str(data["operator"]), int(data["number"])))
         return self._asked.popleft() if self._asked else None
 
     def answer(self, request: Request, done: bool, words: str) -> None:
         """Tell whoever asked what became of it."""
-        self.said = words
+        self.last_reply = words
         if request.number is not None and self._folder is not None:
             with contextlib.suppress(OSError):
                 _write(self._folder / _ANSWER, {"number": request.number, "done": done, "words": words})
@@ -101,7 +101,7 @@ def is_waiting(folder: Path) -> bool:
     return (folder / _WAITING).exists()
 
 
-def ask_run(folder: Path, ask: Ask, operator: str, wait_s: float = _WAIT_S) -> tuple[bool, str]:
+def ask_run(folder: Path, ask: OperatorRequest, operator: str, wait_s: float = _WAIT_S) -> tuple[bool, str]:
     """Ask the waiting run in ``folder``; returns whether it was done, and in words what became of it."""
     number = time.monotonic_ns()
     _write(folder / _REQUEST, {"ask": ask.value, "operator": operator, "number": number})

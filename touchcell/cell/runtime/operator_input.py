@@ -18,14 +18,14 @@ from pathlib import Path
 from typing import IO, Final
 
 from touchcell.cell.runtime.loop import StopRequest
-from touchcell.cell.runtime.operator_channel import Ask, OperatorDesk
+from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest
 from touchcell.errors import TouchcellError
 
 PID_FILE: Final = "pid"
 AT_ONCE_KEYS: Final = b" \x1b"
 """Space and Esc; so does every arrow or function key, which begins with Esc."""
 ORDERLY_KEYS: Final = b"sSqQ"
-ASK_KEYS: Final = {ord("r"): Ask.RESET, ord("g"): Ask.RESUME}
+ASK_KEYS: Final = {ord("r"): OperatorRequest.RESET, ord("g"): OperatorRequest.RESUME}
 _WAIT_S = 20.0
 _POLL_S = 0.05
 
@@ -68,7 +68,7 @@ def stop_on_signals(stop: StopRequest) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stop_on_keys(
-    stop: StopRequest, stream: IO[str] | None = None, desk: OperatorDesk | None = None
+    stop: StopRequest, stream: IO[str] | None = None, desk: OperatorChannel | None = None
 ) -> Iterator[Callable[[], None]]:
     """Yields what the loop calls once a cycle: space or Esc stop at once, s or q end in an orderly way; r asks ``desk``
     for a reset, and g to go on.
@@ -101,7 +101,7 @@ def _terminal(stream: IO[str]) -> int | None:
         return None
 
 
-def _look(fd: int, stop: StopRequest, desk: OperatorDesk | None) -> None:
+def _look(fd: int, stop: StopRequest, desk: OperatorChannel | None) -> None:
     if not select.select([fd], [], [], 0.0)[0]:
         return
     try:

@@ -10,7 +10,7 @@ import numpy as np
 from touchcell.cell.config.schema import ArmSection, BoxSection, CapsuleSection, CellPlan
 from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.control.interlocks.collision import BASE, TOOL, Box, Capsule
-from touchcell.control.interlocks.planning_scene import Body, Surroundings
+from touchcell.control.interlocks.planning_scene import Body, PlanningScene
 from touchcell.drivers.core.protocols import ServoArm, TwistSink
 from touchcell.drivers.kinematics.chain import CapsuleShape, ChainDescription
 from touchcell.errors import ConfigError
@@ -18,7 +18,7 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 
-def build_surroundings(plan: CellPlan, arms: Mapping[str, Any], names: Mapping[str, str]) -> Surroundings:
+def build_planning_scene(plan: CellPlan, arms: Mapping[str, Any], names: Mapping[str, str]) -> PlanningScene:
     """Where the arms of a cell stand, and what they look like if it has a ``clearance``.
 
     Args:
@@ -32,13 +32,13 @@ def build_surroundings(plan: CellPlan, arms: Mapping[str, Any], names: Mapping[s
     sections = {role: plan.cell.arms[names[role]] for role in arms}
     placed = {role: each.T_world_base for role, each in sections.items()}
     if not any(isinstance(entry, ClearanceConfig) for entry in plan.cell.interlocks.values()):
-        return Surroundings(placed)
+        return PlanningScene(placed)
     bodies = {
         role: _body(sections[role], placed[role], cast(ServoArm, arm))
         for role, arm in arms.items()
         if isinstance(arm, TwistSink)
     }
-    return Surroundings(placed, bodies, [_box(name, section) for name, section in plan.cell.obstacles.items()])
+    return PlanningScene(placed, bodies, [_box(name, section) for name, section in plan.cell.obstacles.items()])
 
 
 def _body(section: ArmSection, T_world_base: Array, arm: ServoArm) -> Body:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from touchcell.cell.runtime.compose import Cell
-from touchcell.cell.runtime.operator_channel import Ask, OperatorDesk, Request
+from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest, Request
 from touchcell.control.interlocks.snapshot import CellView
 from touchcell.control.latch import LatchState, ResetDone
 from touchcell.drivers.core.device import Device, Lifecycle, OperatorToken
@@ -11,7 +11,7 @@ from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.lease import Lease
 
 
-class Waiting:
+class ResetProcedure:
     """From a trip until the task starts again.
 
     Args:
@@ -23,7 +23,7 @@ class Waiting:
         resets: what has been cleared, and by whom.
     """
 
-    def __init__(self, cell: Cell, leases: dict[str, Lease], desk: OperatorDesk) -> None:
+    def __init__(self, cell: Cell, leases: dict[str, Lease], desk: OperatorChannel) -> None:
         self._cell = cell
         self._leases = leases
         self._desk = desk
@@ -46,10 +46,10 @@ class Waiting:
         """
         done_so_far = []
         while (request := self._desk.take()) is not None:
-            done, words = self._reset(request, view) if request.ask is Ask.RESET else self._resume()
+            done, words = self._reset(request, view) if request.ask is OperatorRequest.RESET else self._resume()
             self._desk.answer(request, done, words)
             done_so_far.append(f"{request.ask.value} by {request.operator}: {words}")
-            if done and request.ask is Ask.RESUME:
+            if done and request.ask is OperatorRequest.RESUME:
                 return True, done_so_far
         return False, done_so_far
 

@@ -13,7 +13,7 @@ NOTES: Final = "watchdog.json"
 """What the watchdog leaves in the run folder when it has stopped the arms."""
 
 
-class Watch(Protocol):
+class Watchdog(Protocol):
     """What a run loop tells and asks in every cycle. As a context manager it lives as long as the cell."""
 
     def __enter__(self) -> Self:
@@ -59,7 +59,7 @@ class Watch(Protocol):
         ...
 
 
-class OneProcess:
+class NullWatchdog:
     """Nobody: the arms stop when their last command has expired."""
 
     def __enter__(self) -> Self:

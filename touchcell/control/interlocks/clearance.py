@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import PositiveFloat, model_validator
 
 from touchcell.control.interlocks.collision import Clearances, Pair
-from touchcell.control.interlocks.planning_scene import Body, PlacedSettings, Surroundings
+from touchcell.control.interlocks.planning_scene import Body, PlanningScene, SpatialInterlockConfig
 from touchcell.control.interlocks.snapshot import CellView
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.errors import ConfigError
@@ -69,7 +69,7 @@ class Clearance:
         )
 
 
-class ClearanceConfig(PlacedSettings):
+class ClearanceConfig(SpatialInterlockConfig):
     """Least distance of every arm from the others, from the cell's ``obstacles:`` and from itself.
 
     Nearer than ``slow_mm`` motion towards each other is slowed to a quarter, for as long as it lasts.
@@ -85,11 +85,11 @@ class ClearanceConfig(PlacedSettings):
             raise ValueError(f"slow_mm {self.slow_mm:g} is below limit_mm {self.limit_mm:g}")
         return self
 
-    def build_placed(self, name: str, T_tcp_sensor: Mapping[str, Array], surroundings: Surroundings) -> Clearance:
+    def build_in_scene(self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene) -> Clearance:
         """The rule. Raises ConfigError where there is nothing that could come near anything."""
-        bodies = surroundings.bodies
+        bodies = planning_scene.bodies
         counts = {role: body.link_count + 2 for role, body in bodies.items()}
-        clearances = Clearances({role: body.capsules for role, body in bodies.items()}, counts, surroundings.boxes)
+        clearances = Clearances({role: body.capsules for role, body in bodies.items()}, counts, planning_scene.boxes)
         if not clearances.pairs:
             raise ConfigError(
                 "there are no two things to be kept apart",

@@ -26,7 +26,7 @@ from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.motion import LimitedConfig, StandstillConfig, TrackingConfig
 from touchcell.control.interlocks.pair import ObjectLostConfig, OutOfStepConfig, TopplingConfig
-from touchcell.control.interlocks.planning_scene import PlacedSettings, Surroundings
+from touchcell.control.interlocks.planning_scene import PlanningScene, SpatialInterlockConfig
 from touchcell.control.interlocks.tactile import (
     ContactLostConfig,
     ExposureConfig,
@@ -151,7 +151,7 @@ def parse_interlocks(section: Mapping[str, Any]) -> dict[str, InterlockConfig]:
 def build_interlocks(
     settings: Mapping[str, InterlockConfig],
     T_tcp_sensor: Mapping[str, Array],
-    surroundings: Surroundings | None = None,
+    planning_scene: PlanningScene | None = None,
 ) -> tuple[Interlock | TimedInterlock, ...]:
     """The rules of a cell.
 
@@ -164,8 +164,8 @@ def build_interlocks(
         ConfigError: a rule is about something that is not there.
     """
     return tuple(
-        config.build_placed(name, T_tcp_sensor, surroundings or Surroundings())
-        if isinstance(config, PlacedSettings)
+        config.build_in_scene(name, T_tcp_sensor, planning_scene or PlanningScene())
+        if isinstance(config, SpatialInterlockConfig)
         else config.build(name, T_tcp_sensor)
         for name, config in settings.items()
     )

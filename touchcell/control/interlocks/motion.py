@@ -11,7 +11,15 @@ from pydantic import NonNegativeFloat, PositiveFloat
 
 from touchcell.control.interlocks.settings import LEAVE, InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
-from touchcell.control.interlocks.timers import Judgement, Lasting, Mark, Past, Reading, Sustained, TimedInterlock
+from touchcell.control.interlocks.timers import (
+    InterlockState,
+    Judgement,
+    OnDelay,
+    Reading,
+    Sustained,
+    TimedInterlock,
+    TimerState,
+)
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.geometry.types import Array
 
@@ -25,20 +33,20 @@ class Standstill:
     limit_m: float
     settle_s: float
 
-    def judge(self, view: CellView, past: Past) -> Judgement:
+    def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
         """The first arm that has drifted too far."""
-        marks: dict[str, Mark] = {}
+        marks: dict[str, TimerState] = {}
         found: Violation | None = None
         for role, arm in view.arms.items():
             if arm.sent is not None:
                 continue
             position = arm.state.value.T_base_tcp[:3, 3]
-            mark = past.get(role, Mark(view.now_ns))
+            mark = past.get(role, TimerState(view.now_ns))
             if not mark.values and view.now_ns - mark.since_ns >= round(1e9 * self.settle_s):
-                mark = Mark(mark.since_ns, values=tuple(position.tolist()))
+                mark = TimerState(mark.since_ns, values=tuple(position.tolist()))
             drift_m = math.dist(position, mark.values) if mark.values else 0.0
             # Told once: where it stands from now on is what counts, or nobody could ever reset this.
-            marks[role] = Mark(view.now_ns) if drift_m > self.limit_m else mark
+            marks[role] = TimerState(view.now_ns) if drift_m > self.limit_m else mark
             if found is None and drift_m > self.limit_m:
                 reason = f"has drifted by {1e3 * drift_m:.2f} mm while told to stand, limit {1e3 * self.limit_m:g} mm"
                 found = Violation(
@@ -98,4 +106,4 @@ class LimitedConfig(InterlockSettings):
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """The rule."""
-        return Lasting(name, self.level, _limited, 1e-3 * self.limit_ms)
+        return OnDelay(name, self.level, _limited, 1e-3 * self.limit_ms)

@@ -13,17 +13,17 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from touchcell.control.interlocks.planning_scene import PlacedSettings, Surroundings
+from touchcell.control.interlocks.planning_scene import PlanningScene, SpatialInterlockConfig
 from touchcell.control.interlocks.settings import LEAVE
 from touchcell.control.interlocks.snapshot import CellView, SensorView
 from touchcell.control.interlocks.timers import (
     AnyOf,
+    InterlockState,
     Judgement,
-    Mark,
-    Past,
     Reading,
     Sustained,
     TimedInterlock,
+    TimerState,
     overdue,
     share,
     shared,
@@ -122,14 +122,14 @@ class ObjectLost:
     limit_s: float
     states: frozenset[str]
 
-    def judge(self, view: CellView, past: Past) -> Judgement:
+    def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
         """The sensor whose contact has been missing for longest, if too long."""
         if not view.works_in(self.states):
             return None, {}
         touching = {role: role in view.sensors and view.sensors[role].in_contact for role in self.sensors}
         if not past and not all(touching.values()):
             return None, {}
-        marks = {role: Mark(view.now_ns) if touching[role] else past[role] for role in self.sensors}
+        marks = {role: TimerState(view.now_ns) if touching[role] else past[role] for role in self.sensors}
 
         def words(role: str) -> str:
             other = self.sensors[1 - self.sensors.index(role)]
@@ -160,11 +160,11 @@ class Toppling:
     slide: Sustained
     states: frozenset[str]
 
-    def judge(self, view: CellView, past: Past) -> Judgement:
+    def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
         """The first of lean, rate and slide that is too large for too long."""
         if not view.works_in(self.states):
             return None, {}
-        marks: dict[str, Mark] = {}
+        marks: dict[str, TimerState] = {}
         turned, slides, seq = [], [], None
         for k, carried in enumerate(self.sensors):
             if (sensor := carried.contact(view)) is None:
@@ -177,7 +177,7 @@ class Toppling:
             slides.append(Reading(carried.role, 1e3 * abs(float(R[2, :2] @ shear[:2])), sensor.seq))
             mark = past.get(carried.role)
             if mark is None and (sensor.depth_m or 0.0) >= _REFERENCE_DEPTH_M:
-                mark = Mark(view.now_ns, values=(elevation,))
+                mark = TimerState(view.now_ns, values=(elevation,))
             if mark is not None:
                 marks[carried.role] = mark
                 turned.append((-1.0 if k else 1.0) * (elevation - mark.values[0]))
@@ -196,21 +196,21 @@ class Toppling:
         return found, marks
 
 
-def _rate(value: float, now_ns: int, mark: Mark | None) -> tuple[float, Mark]:
+def _rate(value: float, now_ns: int, mark: TimerState | None) -> tuple[float, TimerState]:
     """Rate of ``value`` per second over about ``_RATE_S``, and the mark for the next cycle."""
     if mark is None:
-        return 0.0, Mark(now_ns, values=(value,))
+        return 0.0, TimerState(now_ns, values=(value,))
     slow = mark.values[0]
     rate = (value - slow) / _RATE_S
     slow += (value - slow) * -math.expm1(-(now_ns - mark.since_ns) * 1e-9 / _RATE_S)
-    return rate, Mark(now_ns, values=(slow,))
+    return rate, TimerState(now_ns, values=(slow,))
 
 
 def _taken_elsewhere(view: CellView) -> tuple[Reading, ...]:
     return ()
 
 
-class _PairSettings(PlacedSettings):
+class _PairSettings(SpatialInterlockConfig):
     severity: Literal["limit", "trip", "fault"] = "trip"  # type: ignore[assignment]
     leader_sensor: str = "leader_sensor"
     follower_sensor: str = "follower_sensor"
@@ -227,10 +227,12 @@ class OutOfStepConfig(_PairSettings):
     limit_mm: PositiveFloat
     hold_ms: NonNegativeFloat
 
-    def build_placed(self, name: str, T_tcp_sensor: Mapping[str, Array], surroundings: Surroundings) -> TimedInterlock:
+    def build_in_scene(
+        self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene
+    ) -> TimedInterlock:
         """The rule. Raises ConfigError for a sensor that the cell does not have."""
-        leader = _carried(name, "leader_sensor", self.leader_sensor, self.leader, T_tcp_sensor, surroundings)
-        follower = _carried(name, "follower_sensor", self.follower_sensor, self.follower, T_tcp_sensor, surroundings)
+        leader = _carried(name, "leader_sensor", self.leader_sensor, self.leader, T_tcp_sensor, planning_scene)
+        follower = _carried(name, "follower_sensor", self.follower_sensor, self.follower, T_tcp_sensor, planning_scene)
         pair, hold_s = _Pair(leader, follower, frozenset(self.states)), 1e-3 * self.hold_ms
         speed, depth = self.limit_mm_s, self.limit_mm
         return AnyOf(
@@ -252,7 +254,9 @@ class ObjectLostConfig(_PairSettings):
     severity: Literal["trip", "fault"] = "trip"
     limit_ms: PositiveFloat
 
-    def build_placed(self, name: str, T_tcp_sensor: Mapping[str, Array], surroundings: Surroundings) -> TimedInterlock:
+    def build_in_scene(
+        self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene
+    ) -> TimedInterlock:
         """The rule. Raises ConfigError for a sensor that the cell does not have."""
         for key, role in (("leader_sensor", self.leader_sensor), ("follower_sensor", self.follower_sensor)):
             _require_sensor(name, key, role, T_tcp_sensor)
@@ -260,7 +264,7 @@ class ObjectLostConfig(_PairSettings):
         return ObjectLost(name, self.level, sensors, 1e-3 * self.limit_ms, frozenset(self.states))
 
 
-class TopplingConfig(PlacedSettings):
+class TopplingConfig(SpatialInterlockConfig):
     """Largest angle and rate of leaning of what is touched, and largest shear up or down; how long each may be larger.
 
     ``sensors`` are one that pushes, or the one that pushes and the one that holds against it, with the ``arms`` that
@@ -277,12 +281,14 @@ class TopplingConfig(PlacedSettings):
     hold_ms: NonNegativeFloat
     states: tuple[str, ...] = ()
 
-    def build_placed(self, name: str, T_tcp_sensor: Mapping[str, Array], surroundings: Surroundings) -> TimedInterlock:
+    def build_in_scene(
+        self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene
+    ) -> TimedInterlock:
         """The rule. Raises ConfigError for a sensor that the cell does not have."""
         if len(self.arms) < len(self.sensors):
             raise ConfigError("names fewer arms than sensors", key=f"interlocks.{name}.arms", value=self.arms)
         carried = tuple(
-            _carried(name, "sensors", sensor, arm, T_tcp_sensor, surroundings)
+            _carried(name, "sensors", sensor, arm, T_tcp_sensor, planning_scene)
             for sensor, arm in zip(self.sensors, self.arms, strict=False)
         )
 
@@ -307,10 +313,10 @@ def _carried(
     sensor: str,
     arm: str,
     T_tcp_sensor: Mapping[str, Array],
-    surroundings: Surroundings,
+    planning_scene: PlanningScene,
 ) -> Carried:
     _require_sensor(name, key, sensor, T_tcp_sensor)
-    return Carried(sensor, surroundings.T_world_base.get(arm, np.eye(4)), T_tcp_sensor[sensor])
+    return Carried(sensor, planning_scene.T_world_base.get(arm, np.eye(4)), T_tcp_sensor[sensor])
 
 
 def _require_sensor(name: str, key: str, sensor: str, T_tcp_sensor: Mapping[str, Array]) -> None:

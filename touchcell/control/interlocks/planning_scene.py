@@ -59,7 +59,7 @@ class Body:
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class PlanningScene:
     """What rules about several things at once have to know besides the view.
 
     Attributes:
@@ -73,11 +73,11 @@ class Surroundings:
     boxes: Sequence[Box] = ()
 
 
-class PlacedSettings(InterlockSettings):
+class SpatialInterlockConfig(InterlockSettings):
     """Settings of a rule that has to know where things are."""
 
     @abstractmethod
-    def build_placed(
-        self, name: str, T_tcp_sensor: Mapping[str, Array], surroundings: Surroundings
+    def build_in_scene(
+        self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene
     ) -> Interlock | TimedInterlock:
         """The rule. Raises ConfigError for what is not there."""

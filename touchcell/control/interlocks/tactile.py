@@ -12,13 +12,13 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from touchcell.control.interlocks.settings import LEAVE, GradedSettings, InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
 from touchcell.control.interlocks.timers import (
+    InterlockState,
     Judgement,
-    Lasting,
-    Mark,
-    Past,
+    OnDelay,
     Reading,
     Sustained,
     TimedInterlock,
+    TimerState,
     overdue,
 )
 from touchcell.control.interlocks.violation import Severity, Violation
@@ -35,14 +35,14 @@ class FrameFrozen:
     severity: Severity
     limit_s: float
 
-    def judge(self, view: CellView, past: Past) -> Judgement:
+    def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
         """The sensor whose picture has stood still for longest, if too long."""
         marks = {}
         for role, sensor in view.sensors.items():
             identity = (float(sensor.seq if sensor.content is None else sensor.content),)
             mark = past.get(role)
             if mark is None or mark.values != identity:
-                mark = Mark(view.now_ns, values=identity)
+                mark = TimerState(view.now_ns, values=identity)
             marks[role] = mark
         return overdue(self.name, self.severity, view, marks, self.limit_s, lambda _: "the same picture"), marks
 
@@ -55,18 +55,18 @@ class Exposure:
     severity: Severity
     limit_percent: float
 
-    def judge(self, view: CellView, past: Past) -> Judgement:
+    def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
         """The first sensor whose frames have become too bright or too dark."""
         marks = dict(past)
         found: Violation | None = None
         for role, sensor in view.sensors.items():
             if sensor.brightness is None:
                 continue
-            mark = past.get(role, Mark(view.now_ns, count=0, values=(0.0,)))
+            mark = past.get(role, TimerState(view.now_ns, count=0, values=(0.0,)))
             if mark.count < _BASELINE_FRAMES:
                 if mark.seq != sensor.seq:
                     mean = (mark.values[0] * mark.count + sensor.brightness) / (mark.count + 1)
-                    mark = Mark(view.now_ns, mark.count + 1, sensor.seq, (mean,))
+                    mark = TimerState(view.now_ns, mark.count + 1, sensor.seq, (mean,))
             else:
                 change = 100.0 * abs(sensor.brightness / max(mark.values[0], 1e-6) - 1.0)
                 if found is None and change > self.limit_percent:
@@ -95,12 +95,12 @@ class ContactLost:
     limit_s: float
     states: frozenset[str]
 
-    def judge(self, view: CellView, past: Past) -> Judgement:
+    def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
         """The sensor whose contact has been missing for longest, if too long."""
         if view.task_state not in self.states:
             return None, {}
         marks = {
-            role: Mark(view.now_ns) if sensor.in_contact else past[role]
+            role: TimerState(view.now_ns) if sensor.in_contact else past[role]
             for role, sensor in view.sensors.items()
             if sensor.in_contact or role in past
         }
@@ -214,7 +214,7 @@ class OutOfRangeConfig(GradedSettings):
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """The rule."""
-        return Lasting(name, self.level, _out_of_range, 1e-3 * self.limit_ms)
+        return OnDelay(name, self.level, _out_of_range, 1e-3 * self.limit_ms)
 
 
 class InconsistentConfig(GradedSettings):

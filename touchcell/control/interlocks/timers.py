@@ -15,7 +15,7 @@ from touchcell.control.interlocks.violation import Severity, Violation
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
+class TimerState:
     """What a rule remembers of one arm or sensor.
 
     Attributes:
@@ -31,10 +31,10 @@ class Mark:
     values: tuple[float, ...] = ()
 
 
-Past = Mapping[str, Mark]
+InterlockState = Mapping[str, TimerState]
 """The marks of one rule, by the role of the arm or the sensor."""
 
-Judgement = tuple[Violation | None, Past]
+Judgement = tuple[Violation | None, InterlockState]
 """The worst violation, or None, and the marks for the next cycle."""
 
 
@@ -52,7 +52,7 @@ class TimedInterlock(Protocol):
         """What a violation asks for."""
         ...
 
-    def judge(self, view: CellView, past: Past) -> Judgement:
+    def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
         """The violation in ``view``, if any, given the marks of the cycle before."""
         ...
 
@@ -90,20 +90,20 @@ class Sustained:
     hold_s: float = 0.0
     frames: int = 1
 
-    def judge(self, view: CellView, past: Past) -> Judgement:
+    def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
         """The first subject that is above for too long."""
         return self.over(view, self.measure(view), past)
 
-    def over(self, view: CellView, readings: Iterable[Reading], past: Past) -> Judgement:
+    def over(self, view: CellView, readings: Iterable[Reading], past: InterlockState) -> Judgement:
         """The same for readings that somebody else has taken."""
-        marks: dict[str, Mark] = {}
+        marks: dict[str, TimerState] = {}
         found: Violation | None = None
         for reading in readings:
             mark = past.get(reading.subject)
             if not reading.value > (self.limit if mark is None else self.leave):
                 continue
             if mark is None:
-                mark = Mark(view.now_ns, seq=reading.seq)
+                mark = TimerState(view.now_ns, seq=reading.seq)
             elif reading.seq != mark.seq:
                 mark = replace(mark, count=mark.count + 1, seq=reading.seq)
             marks[reading.subject] = mark
@@ -138,30 +138,30 @@ class AnyOf:
     severity: Severity
     rules: tuple[TimedInterlock, ...]
 
-    def judge(self, view: CellView, past: Past) -> Judgement:
+    def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
         """The violation of the first rule that has one."""
-        marks: dict[str, Mark] = {}
+        marks: dict[str, TimerState] = {}
         found: Violation | None = None
         for k, rule in enumerate(self.rules):
-            violation, left = rule.judge(view, share(past, k))
+            violation, left = rule.evaluate(view, share(past, k))
             marks.update(shared(left, k))
             found = found or violation
         return found, marks
 
 
-def share(past: Past, number: int) -> Past:
+def share(past: InterlockState, number: int) -> InterlockState:
     """The marks of the rule with that number, of several under one name."""
     prefix = f"{number}:"
     return {key.removeprefix(prefix): mark for key, mark in past.items() if key.startswith(prefix)}
 
 
-def shared(marks: Past, number: int) -> Past:
+def shared(marks: InterlockState, number: int) -> InterlockState:
     """``marks`` of the rule with that number, to be kept with those of others."""
     return {f"{number}:{key}": mark for key, mark in marks.items()}
 
 
 @dataclass(frozen=True, slots=True)
-class Lasting:
+class OnDelay:
     """A condition does not last longer than allowed.
 
     Attributes:
@@ -174,15 +174,15 @@ class Lasting:
     condition: Callable[[CellView], Mapping[str, str]]
     limit_s: float
 
-    def judge(self, view: CellView, past: Past) -> Judgement:
+    def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
         """The subject for which it has lasted longest, if too long."""
         matters = self.condition(view)
-        marks = {subject: past.get(subject, Mark(view.now_ns)) for subject in matters}
+        marks = {subject: past.get(subject, TimerState(view.now_ns)) for subject in matters}
         return overdue(self.name, self.severity, view, marks, self.limit_s, lambda s: matters[s]), marks
 
 
 def overdue(
-    name: str, severity: Severity, view: CellView, marks: Past, limit_s: float, words: Callable[[str], str]
+    name: str, severity: Severity, view: CellView, marks: InterlockState, limit_s: float, words: Callable[[str], str]
 ) -> Violation | None:
     """A violation about the oldest mark if it is older than ``limit_s``; ``words`` say what is the matter with it."""
     subject = min(marks, key=lambda s: marks[s].since_ns, default=None)

@@ -27,7 +27,7 @@ from touchcell.drivers.core.errors import (
     Rejection,
 )
 from touchcell.drivers.core.gate import TwistGate, TwistLimits
-from touchcell.drivers.core.lease import Lease, LeaseDesk
+from touchcell.drivers.core.lease import Lease, LeaseManager
 from touchcell.drivers.core.protocols import StopCategory
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.drivers.core.spec import DriverConfig
@@ -92,7 +92,7 @@ class Arm(Device):
         self._limits = limits
         self._stop_categories = frozenset(StopCategory(category) for category in stop_categories)
         self._max_state_age_s = max_state_age_s
-        self._desk = LeaseDesk(name)
+        self._desk = LeaseManager(name)
         self._gate = TwistGate(name, limits, self._desk, clock, max_ttl_s=max_ttl_s)
 
     @property
@@ -133,7 +133,9 @@ class Arm(Device):
             CommandRejected: nothing was sent; ``reason`` tells why.
             StaleData: the pose is too old to turn a twist along tool axes, or the joints to be kept within limits.
         """
-        sent = self._gate.admit(command, lease, self.state, self._tool_pose(command), self._followable, self._local_ik)
+        sent = self._gate.admit(
+            command, lease, self.state, self._tool_pose(command), self._project_to_feasible, self._local_ik
+        )
         left_s = command.ttl_s - (sent.t_ns - command.t_ns) * 1e-9
         self._stream_twist(sent.command.twist, max(left_s, _SHORTEST_TTL_S), sent.t_ns)
         return sent
@@ -184,7 +186,7 @@ class Arm(Device):
     def _begin_stop(self, category: StopCategory) -> None:
         """Begin to stop at once and return; called in ACTIVE and FAULTED, with an offered category only."""
 
-    def _followable(self, twist_base: Array) -> tuple[Array, tuple[Adjustment, ...]]:
+    def _project_to_feasible(self, twist_base: Array) -> tuple[Array, tuple[Adjustment, ...]]:
         """What the arm can follow of a twist, and why it differs: all of it, unless a driver knows better."""
         return twist_base, ()
 

@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import CorruptMessage, DeviceError, StaleData, TransportTimeout
-from touchcell.drivers.core.frame_monitor import FrameWatch
+from touchcell.drivers.core.frame_monitor import FrameMonitor
 from touchcell.drivers.core.samples import Frame, Quality, Stamped
 from touchcell.drivers.core.spec import DriverConfig
 from touchcell.errors import ConfigError
@@ -61,7 +61,7 @@ class CameraConfig(DriverConfig):
         return self
 
 
-class SettingRefused(ConfigError):
+class UnsupportedSetting(ConfigError):
     """The camera did not take a setting.
 
     Attributes:
@@ -119,7 +119,7 @@ class Camera(Device):
     def __init__(self, name: str, clock: Clock, config: CameraConfig) -> None:
         super().__init__(name, clock)
         self._config = config
-        self._watch = FrameWatch()
+        self._watch = FrameMonitor()
         self._newest: RawFrame | None = None
         self._last_seq = -1
         self._decoded: Stamped[Frame] | None = None
@@ -181,7 +181,7 @@ class Camera(Device):
 
     def _begin_stream(self) -> None:
         """To be called once frames flow: waits for the first good one. Raises TransportTimeout, DeviceGone."""
-        self._watch.forgive()
+        self._watch.reset_errors()
         self._overflowed = False
         self._since_ns = self._clock.now_ns()
         before = self._last_seq

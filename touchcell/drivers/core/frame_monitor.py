@@ -17,7 +17,7 @@ _SMOOTHING = 0.1
 _BRIGHTNESS_STEP = 8
 
 
-class FrameWatch:
+class FrameMonitor:
     """Counts what is wrong with the frames of one camera.
 
     A frame is *lost* when the sequence number jumps, *unread* when it was lost because nobody emptied the queue,
@@ -76,7 +76,7 @@ class FrameWatch:
         else:
             self._brightness += _SMOOTHING * (brightness - self._brightness)
 
-    def forgive(self) -> None:
+    def reset_errors(self) -> None:
         """Begin a new stream: its first frame follows nothing, and its budget is whole. Counters go on."""
         self._recent_bad.clear()
         self._fingerprint = None

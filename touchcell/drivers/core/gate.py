@@ -17,7 +17,7 @@ from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame, in_base_axes
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, Rejection
-from touchcell.drivers.core.lease import Lease, LeaseDesk
+from touchcell.drivers.core.lease import Lease, LeaseManager
 from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.drivers.kinematics.chain import LocalIk
 from touchcell.geometry.finite import all_finite
@@ -60,7 +60,7 @@ class TwistGate:
     """
 
     def __init__(
-        self, device: str, limits: TwistLimits, desk: LeaseDesk, clock: Clock, *, max_ttl_s: float = 1.0
+        self, device: str, limits: TwistLimits, desk: LeaseManager, clock: Clock, *, max_ttl_s: float = 1.0
     ) -> None:
         self._device = device
         self._limits = limits

@@ -16,7 +16,7 @@ class Lease:
     epoch: int
 
 
-class LeaseDesk:
+class LeaseManager:
     """Hands out the lease of one device, to one owner at a time."""
 
     def __init__(self, device: str) -> None:

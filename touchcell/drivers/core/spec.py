@@ -40,7 +40,7 @@ class Capabilities:
         twist_axes: which of [vx vy vz wx wy wz] it can follow.
         has_brakes: whether it stays up without power.
         falls_on_power_loss: whether power loss lets it sink.
-        seen_on_metal: False while the driver has only met emulators.
+        hardware_validated: False while the driver has only met emulators.
         virtual_time: whether it runs on an injected clock; real hardware does not.
     """
 
@@ -54,7 +54,7 @@ class Capabilities:
     twist_axes: tuple[bool, bool, bool, bool, bool, bool] = (True, True, True, True, True, True)
     has_brakes: bool = False
     falls_on_power_loss: bool = False
-    seen_on_metal: bool = False
+    hardware_validated: bool = False
     virtual_time: bool = False
 
 

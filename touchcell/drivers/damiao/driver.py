@@ -234,7 +234,7 @@ class DamiaoCanArm(BusArm):
             self._trouble = None
 
     def _fresh_answer(self, index: int) -> Answer:
-        """The loop's newest answer. Waiting for a silent motor here would let the others' timeouts run out."""
+        """The loop's newest answer. ResetProcedure for a silent motor here would let the others' timeouts run out."""
         answer, limit_s = self._answers[index], self._config.max_silence_s
         if answer is None or (self._clock.now_ns() - answer.t_ns) * 1e-9 > limit_s:
             raise TransportTimeout(self.name, f"answer of motor {self._config.motors[index].esc_id}", limit_s)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from touchcell.drivers.damiao import driver as damiao_can
 from touchcell.testing.emulation.process import EmulatorProcess
-from touchcell.testing.emulation.rig import Rig
+from touchcell.testing.emulation.rig import DeviceFixture
 
 PARK_DEG = (0.0, -60.0, 130.0, 0.0, 20.0, 0.0)
 TOOL = {"origin_mm": [0, 0, 80], "mass_kg": 0.15, "com_mm": [0, 0, 40]}
@@ -33,7 +33,7 @@ def config(channel: Path, **changes: object) -> damiao_can.DamiaoCanConfig:
     return damiao_can.DamiaoCanConfig.model_validate(settings | changes)
 
 
-def rig(folder: Path, address: int) -> Rig:
+def rig(folder: Path, address: int) -> DeviceFixture:
     """One arm on a hub of its own in ``folder``; ``address`` tells several apart."""
     channel = folder / f"can-{address}"
 
@@ -41,7 +41,7 @@ def rig(folder: Path, address: int) -> Rig:
         tool = config(channel).tool.model_dump_json()
         return EmulatorProcess("damiao", str(channel), "--tool", tool).start()
 
-    return Rig(
+    return DeviceFixture(
         spec=damiao_can.SPEC,
         start=start,
         build=lambda clock: damiao_can.DamiaoCanArm("arm", config(channel), clock),

@@ -267,7 +267,7 @@ class FeetechSerialArm(BusArm):
             self._missed.clear()
             self._trouble = None
 
-    def _followable(self, twist_base: Array) -> tuple[Array, tuple[Adjustment, ...]]:
+    def _project_to_feasible(self, twist_base: Array) -> tuple[Array, tuple[Adjustment, ...]]:
         twist, self._lost = followable(self._chain.jacobian(self._setpoint.q), twist_base)
         return twist, self._lost
 

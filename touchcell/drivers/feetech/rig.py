@@ -6,7 +6,7 @@ from pathlib import Path
 
 from touchcell.drivers.feetech import driver as feetech_serial
 from touchcell.testing.emulation.process import EmulatorProcess
-from touchcell.testing.emulation.rig import Rig
+from touchcell.testing.emulation.rig import DeviceFixture
 
 PARK_DEG = (0.0, -60.0, 140.0, 60.0, 0.0)
 TOOL = {"origin_mm": [0, 0, 40]}
@@ -41,10 +41,10 @@ def emulator(port: Path, *arguments: str) -> EmulatorProcess:
     )
 
 
-def rig(folder: Path, address: int) -> Rig:
+def rig(folder: Path, address: int) -> DeviceFixture:
     """One arm on a pseudo-terminal of its own, linked in ``folder``; ``address`` tells several apart."""
     port = folder / f"servos-{address}"
-    return Rig(
+    return DeviceFixture(
         spec=feetech_serial.SPEC,
         start=lambda: emulator(port).start(),
         build=lambda clock: feetech_serial.FeetechSerialArm("arm", config(port), clock),

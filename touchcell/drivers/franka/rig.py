@@ -8,7 +8,7 @@ from pathlib import Path
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.franka.driver import SPEC, FrankaArm, FrankaConfig
 from touchcell.testing.emulation.process import EmulatorProcess
-from touchcell.testing.emulation.rig import Rig
+from touchcell.testing.emulation.rig import DeviceFixture
 
 
 def host_of(address: int) -> str:
@@ -16,7 +16,7 @@ def host_of(address: int) -> str:
     return str(IPv4Address("127.96.0.1") + address)
 
 
-def rig(folder: Path, address: int) -> Rig:
+def rig(folder: Path, address: int) -> DeviceFixture:
     """An arm at a loopback address of its own; it keeps nothing in ``folder``."""
     host = host_of(address)
     # Emulators run where no real-time kernel is.
@@ -28,7 +28,7 @@ def rig(folder: Path, address: int) -> Rig:
     def build(clock: Clock) -> FrankaArm:
         return FrankaArm("arm", config, clock)
 
-    return Rig(
+    return DeviceFixture(
         spec=SPEC,
         start=start,
         build=build,

@@ -60,7 +60,7 @@ REST_MARGIN_S: Final = 0.1
 _LAST_REST_NS: Final = 2_000_000_000
 
 
-class ArmSeat:
+class HostedArm:
     """One arm in its host: the driver object, its blocks, and the record of what it obeyed and how it stopped.
 
     Args:
@@ -212,7 +212,7 @@ class ArmSeat:
                 self.arm.stop(min(self.arm.stop_categories))
 
 
-class CameraSeat:
+class HostedCamera:
     """One camera in its host. A camera that fails shows by the age of its newest frame."""
 
     def __init__(self, camera: Device, fd: int) -> None:
@@ -267,21 +267,21 @@ class Host:
         self.devices, scene = _build(spec, clock)
         self._policies = {each["name"]: DeactivatePolicy(each["policy"]) for each in spec["devices"] if each["policy"]}
         self._arms = {
-            each["name"]: ArmSeat(arm, StopCategory(each["category"]), fds["devices"][each["name"]])
+            each["name"]: HostedArm(arm, StopCategory(each["category"]), fds["devices"][each["name"]])
             for each in spec["devices"]
             if isinstance(arm := self.devices[each["name"]], Arm)
         }
         self._cameras = [
-            CameraSeat(device, fds["devices"][name]["frame"])
+            HostedCamera(device, fds["devices"][name]["frame"])
             for name, device in self.devices.items()
             if name not in self._arms
         ]
         self._truth = None
         if scene is not None:
-            from touchcell.drivers.hosting.truth import TruthSeat
+            from touchcell.drivers.hosting.truth import HostedScene
 
             sensors = {name: each["truth"] for name, each in fds["devices"].items() if "truth" in each}
-            self._truth = TruthSeat(scene, sensors, fds["objects"])
+            self._truth = HostedScene(scene, sensors, fds["objects"])
         self._cause: Cause | None = None
         self._guarded = False
         self._turn = 0

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from touchcell.drivers.core.scene import Scene
 
 
-class TruthSeat:
+class HostedScene:
     """The scene in its host: publishes the truth of every sensor that has been mounted, and of every object.
 
     Args:

@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
-from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, SettingRefused
+from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.errors import ConnectError, DeviceGone
@@ -131,7 +131,7 @@ class OpencvCamera(Camera):
         self._expect("height_px", config.height_px, int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
         rate_hz = capture.get(cv2.CAP_PROP_FPS)
         if abs(rate_hz - config.rate_hz) > _RATE_TOLERANCE * config.rate_hz:
-            raise SettingRefused(self.name, "rate_hz", config.rate_hz, rate_hz)
+            raise UnsupportedSetting(self.name, "rate_hz", config.rate_hz, rate_hz)
 
     def _set_controls(self, capture: cv2.VideoCapture) -> None:
         import cv2
@@ -157,7 +157,7 @@ class OpencvCamera(Camera):
 
     def _expect(self, setting: str, asked: object, given: object) -> None:
         if asked != given:
-            raise SettingRefused(self.name, setting, asked, given)
+            raise UnsupportedSetting(self.name, setting, asked, given)
 
     def _collect(self) -> bool:
         reader = self._reader

@@ -140,7 +140,7 @@ class UrArm(Arm):
         self._receive: Any = None
         self._reader: StateReader | None = None
         self._link: ControlLink | None = None
-        self._keeper: threading.Thread | None = None
+        self._supervision_thread: threading.Thread | None = None
         self._ending = threading.Event()
         self._supervised_from_seq: int | None = None
         self._power_off_by: StopCategory | None = None
@@ -248,12 +248,12 @@ class UrArm(Arm):
         with dashboard(self.name, self._config.host) as client:
             self._model = f"{client.getRobotModel()}, PolyScope {client.polyscopeVersion()}"
         self._ending.clear()
-        self._keeper = threading.Thread(target=self._keep, name=f"{self.name} keeper", daemon=True)
-        self._keeper.start()
+        self._supervision_thread = threading.Thread(target=self._keep, name=f"{self.name} keeper", daemon=True)
+        self._supervision_thread.start()
 
     def _close(self) -> None:
         self._ending.set()
-        keeper, self._keeper = self._keeper, None
+        keeper, self._supervision_thread = self._supervision_thread, None
         if keeper is not None:
             keeper.join(_KEEPER_JOIN_S)
         # The thread may have latched a fault while the state was already DISCONNECTED.

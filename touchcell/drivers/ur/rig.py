@@ -9,7 +9,7 @@ from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.spec import DriverContext
 from touchcell.drivers.ur.driver import SPEC, UrConfig
 from touchcell.testing.emulation.process import EmulatorProcess
-from touchcell.testing.emulation.rig import Rig
+from touchcell.testing.emulation.rig import DeviceFixture
 
 UNLOCK_AFTER_S = 0.1
 """A real controller keeps a protective stop locked for 5 s; nobody wants to wait for that in a test."""
@@ -34,7 +34,7 @@ def config_of(address: int) -> UrConfig:
     )
 
 
-def rig(folder: Path, address: int) -> Rig:
+def rig(folder: Path, address: int) -> DeviceFixture:
     """The rig on its own loopback address; it keeps nothing in ``folder``."""
     host = host_of(address)
 
@@ -44,7 +44,7 @@ def rig(folder: Path, address: int) -> Rig:
     def build(clock: Clock) -> Device:
         return SPEC.build("ur", config_of(address), DriverContext(clock))
 
-    return Rig(
+    return DeviceFixture(
         spec=SPEC,
         start=start,
         build=build,

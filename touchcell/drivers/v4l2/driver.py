@@ -9,7 +9,7 @@ import math
 import time
 from typing import Any
 
-from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, SettingRefused
+from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.errors import ConnectError, DeviceGone, TransportError
@@ -92,22 +92,22 @@ class V4l2Camera(Camera):
 
     def _set_picture(self, node: VideoNode) -> None:
         config = self._config
-        picture = node.set_picture(config.pixel_format, config.width_px, config.height_px)
+        picture = node.set_format(config.pixel_format, config.width_px, config.height_px)
         for setting, given in (
             ("pixel_format", picture.pixel_format),
             ("width_px", picture.width_px),
             ("height_px", picture.height_px),
         ):
             if given != getattr(config, setting):
-                raise SettingRefused(self.name, setting, getattr(config, setting), given)
+                raise UnsupportedSetting(self.name, setting, getattr(config, setting), given)
         line = config.width_px * _BYTES_PER_PIXEL.get(config.pixel_format, 0)
         if line and picture.bytes_per_line != line:
-            raise SettingRefused(
+            raise UnsupportedSetting(
                 self.name, "pixel_format", config.pixel_format, f"lines of {picture.bytes_per_line} bytes"
             )
         rate_hz = node.set_rate(config.rate_hz)
         if not math.isclose(rate_hz, config.rate_hz, rel_tol=_RATE_TOLERANCE):
-            raise SettingRefused(self.name, "rate_hz", config.rate_hz, rate_hz)
+            raise UnsupportedSetting(self.name, "rate_hz", config.rate_hz, rate_hz)
 
     def _set_controls(self, node: VideoNode) -> None:
         for identity, setting, value in (
@@ -126,7 +126,7 @@ class V4l2Camera(Camera):
     def _set_value(self, node: VideoNode, identity: int, setting: str, value: int | None, unit: int) -> int | None:
         if not node.has_control(identity):
             if value is not None:
-                raise SettingRefused(self.name, setting, value * unit, None)
+                raise UnsupportedSetting(self.name, setting, value * unit, None)
             return None
         if value is None:
             return node.control(identity)
@@ -136,7 +136,7 @@ class V4l2Camera(Camera):
 
     def _expect(self, setting: str, asked: int, given: int) -> None:
         if asked != given:
-            raise SettingRefused(self.name, setting, asked, given)
+            raise UnsupportedSetting(self.name, setting, asked, given)
 
     def _collect(self) -> bool:
         node = self._opened()

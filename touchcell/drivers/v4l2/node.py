@@ -132,7 +132,7 @@ class VideoNode:
                 raise self._error(error, "list the picture formats") from None
             names.append(codec.fourcc_text(description.pixelformat))
 
-    def set_picture(self, pixel_format: str, width_px: int, height_px: int) -> Picture:
+    def set_format(self, pixel_format: str, width_px: int, height_px: int) -> Picture:
         """Ask for a format and return what the device chose. Raises TransportError, DeviceGone."""
         request = codec.Format(type=codec.VIDEO_CAPTURE)
         request.pix.width, request.pix.height = width_px, height_px

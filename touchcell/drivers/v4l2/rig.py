@@ -9,12 +9,12 @@ from touchcell.drivers.core.device import Device
 from touchcell.drivers.v4l2.driver import SPEC, V4l2Camera, V4l2Config
 from touchcell.drivers.v4l2.shim import ShimCalls
 from touchcell.testing.emulation.process import EmulatorProcess
-from touchcell.testing.emulation.rig import Rig
+from touchcell.testing.emulation.rig import DeviceFixture
 
 _RATE_HZ = 60.0
 
 
-def rig(folder: Path, address: int) -> Rig:
+def rig(folder: Path, address: int) -> DeviceFixture:
     """A camera at /dev/video``address`` whose sockets live in ``folder``."""
     config = V4l2Config(
         device=f"/dev/v4l/by-id/usb-TacTip_{address:04d}-video-index0", rate_hz=_RATE_HZ, exposure_us=15700, gain=10
@@ -26,7 +26,7 @@ def rig(folder: Path, address: int) -> Rig:
     def build(clock: Clock) -> Device:
         return V4l2Camera("tip", clock, config, ShimCalls(folder))
 
-    return Rig(
+    return DeviceFixture(
         spec=SPEC,
         start=start,
         build=build,

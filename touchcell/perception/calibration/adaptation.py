@@ -71,7 +71,7 @@ class AdaptSettings:
 
 
 @dataclass(frozen=True)
-class FewContacts:
+class FewShotDataset:
     """Discs of labelled images of the new sensor.
 
     Attributes:
@@ -84,7 +84,7 @@ class FewContacts:
 
 
 @dataclass(frozen=True)
-class Brought:
+class CameraAlignment:
     """How a new sensor's images and labels are brought to those of the old.
 
     Attributes:
@@ -137,7 +137,7 @@ def adapt(
     images = [read_image(split.images[i]) for i in chosen]
     preprocessing = preprocessing_for(images[0])
     size = typical_size(preprocessing.reduce(images[0]))
-    few = FewContacts(
+    few = FewShotDataset(
         [detect_markers(preprocessing.reduce(image), size) for image in images],
         xi_from_contact(split.contact_mm_deg[chosen]),
     )
@@ -148,7 +148,7 @@ def adapt(
 
 def adapt_to(
     old: Model,
-    few: FewContacts,
+    few: FewShotDataset,
     *,
     preprocessing: Preprocessing,
     size: MarkerSize,
@@ -158,7 +158,7 @@ def adapt_to(
     settings = settings or AdaptSettings()
     architecture = old.header.architecture
     assert isinstance(architecture, MarkerArchitecture)
-    brought = bring(old, few)
+    brought = align_to_sensor(old, few)
     xi, displacements = few.xi[brought.matched], brought.displacements[brought.matched]
     layers, labels = _regained(layers_of(old), brought), old.header.labels
     target = labels.targets(about_z(brought.turn_rad, xi))
@@ -205,7 +205,7 @@ def adapt_to(
     )
 
 
-def bring(old: Model, few: FewContacts) -> Brought:
+def align_to_sensor(old: Model, few: FewShotDataset) -> CameraAlignment:
     """Find camera and label axes.
 
     A lattice looks the same after a sixth of a turn: of the six cameras that are possible, that one is right, together
@@ -259,7 +259,7 @@ def bring(old: Model, few: FewContacts) -> Brought:
     refined = _refined(old, layers, there, displacements[matched], few.xi[matched], turn)
     camera, turn = _composed(camera, refined), turn + float(refined[4])
     displacements, matched = _seen_by(camera, matcher, few.frames)
-    return Brought(camera, turn, float(refined[5]), refined[6:], displacements, matched)
+    return CameraAlignment(camera, turn, float(refined[5]), refined[6:], displacements, matched)
 
 
 def _refined(
@@ -342,7 +342,7 @@ def layers_of(model: Model) -> Layers:
     ]
 
 
-def _regained(layers: Layers, brought: Brought) -> Layers:
+def _regained(layers: Layers, brought: CameraAlignment) -> Layers:
     first, last = layers[0], layers[-1]
     shifted = (last[0], last[1] + np.concatenate([brought.offset, np.zeros(6)]))
     return [(brought.gain * first[0], first[1]), *layers[1:-1], shifted]

@@ -21,7 +21,7 @@ from touchcell.simulation.devices.arm import SimArm
 from touchcell.simulation.devices.joint_arm import SimJointArm
 from touchcell.simulation.faults import FrameFaults
 from touchcell.simulation.scene import SceneConfig
-from touchcell.testing.emulation.rig import Rig
+from touchcell.testing.emulation.rig import DeviceFixture
 
 _START = (400.0, 0.0, 300.0, 180.0, 0.0, 30.0)
 _IMAGES = 90
@@ -70,17 +70,17 @@ class StandIn:
         self._end()
 
 
-def sim_arm_rig(folder: Path, address: int) -> Rig:
+def sim_arm_rig(folder: Path, address: int) -> DeviceFixture:
     """A simulated arm with no scene around it."""
     return _arm_rig(sim_arm.SPEC, sim_arm.SimArmConfig(start_pose_mm_deg=_START))
 
 
-def sim_joint_arm_rig(folder: Path, address: int) -> Rig:
+def sim_joint_arm_rig(folder: Path, address: int) -> DeviceFixture:
     """A simulated Panda with no scene around it."""
     return _arm_rig(sim_joint_arm.SPEC, sim_joint_arm.SimJointArmConfig(model="panda", start_pose_mm_deg=_START))
 
 
-def _arm_rig(spec: DriverSpec, config: DriverConfig) -> Rig:
+def _arm_rig(spec: DriverSpec, config: DriverConfig) -> DeviceFixture:
     arms: list[SimArm | SimJointArm] = []
 
     def build(clock: Clock) -> Device:
@@ -94,7 +94,7 @@ def _arm_rig(spec: DriverSpec, config: DriverConfig) -> Rig:
         T = arms[-1].T_world_tcp()
         return {"T_base_tcp": T.tolist(), "position_m": T[:3, 3].tolist()}
 
-    return Rig(
+    return DeviceFixture(
         spec=spec,
         start=lambda: StandIn(truth),
         build=build,
@@ -105,7 +105,7 @@ def _arm_rig(spec: DriverSpec, config: DriverConfig) -> Rig:
     )
 
 
-def sim_tactip_rig(folder: Path, address: int) -> Rig:
+def sim_tactip_rig(folder: Path, address: int) -> DeviceFixture:
     """A simulated sensor on a simulated arm above a plane."""
     cameras: list[sim_tactip.SimTactip] = []
     clocks: list[Clock] = []
@@ -127,7 +127,7 @@ def sim_tactip_rig(folder: Path, address: int) -> Rig:
     def delay(value: Any) -> None:
         cameras[-1].faults = FrameFaults(extra_latency_s=value or 0.0)
 
-    return Rig(
+    return DeviceFixture(
         spec=sim_tactip.SPEC,
         start=lambda: StandIn(faults={"pause": pause, "delay": delay}),
         build=build,
@@ -139,7 +139,7 @@ def sim_tactip_rig(folder: Path, address: int) -> Rig:
     )
 
 
-def replay_camera_rig(folder: Path, address: int) -> Rig:
+def replay_camera_rig(folder: Path, address: int) -> DeviceFixture:
     """A folder of small images, as a camera."""
     images = folder / "images"
 
@@ -151,7 +151,7 @@ def replay_camera_rig(folder: Path, address: int) -> Rig:
         return StandIn(end=lambda: shutil.rmtree(images))
 
     config = replay_camera.ReplayCameraConfig(data=images, rate_hz=30.0)
-    return Rig(
+    return DeviceFixture(
         spec=replay_camera.SPEC,
         start=start,
         build=lambda clock: replay_camera.SPEC.build("replay", config, DriverContext(clock)),

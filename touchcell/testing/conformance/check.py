@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from touchcell.drivers.core.commands import C
-from touchcell.testing.emulation.rig import Rig
+from touchcell.testing.emulation.rig import DeviceFixture
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Needs:
     on_bench: bool
     of_faults: Callable[[str, Any, str], bool] | None
 
-    def missing(self, rig: Rig) -> str | None:
+    def missing(self, rig: DeviceFixture) -> str | None:
         """Why the check does not apply to ``rig``, or None."""
         capabilities = rig.spec.capabilities
         if rig.start is None and not self.on_bench:

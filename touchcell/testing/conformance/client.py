@@ -25,7 +25,7 @@ from touchcell.drivers.core.clock import MonotonicClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.errors import DeviceGone, TransportTimeout
 from touchcell.drivers.core.protocols import NativeWatchdog
-from touchcell.testing.emulation.rig import RigFunction
+from touchcell.testing.emulation.rig import FixtureFactory
 
 _PERIOD_NS = 20_000_000
 _WARM_UP = 20
@@ -40,7 +40,7 @@ class MovingClient:
         silence_s: silence after which the device should stop by itself: its watchdog, or the time-to-live without one.
     """
 
-    def __init__(self, function: RigFunction, folder: Path, address: int, speed_m_s: float) -> None:
+    def __init__(self, function: FixtureFactory, folder: Path, address: int, speed_m_s: float) -> None:
         source = inspect.getsourcefile(function)
         assert source is not None
         self._arguments = [source, function.__name__, str(folder), str(address), str(speed_m_s)]
@@ -103,7 +103,7 @@ def main(arguments: Sequence[str]) -> None:
     assert module_spec.loader is not None
     module = importlib.util.module_from_spec(module_spec)
     module_spec.loader.exec_module(module)
-    rig = cast(RigFunction, getattr(module, function))(Path(folder), int(address))
+    rig = cast(FixtureFactory, getattr(module, function))(Path(folder), int(address))
     clock = MonotonicClock()
     arm = cast(Arm, rig.build(clock))
     arm.connect()

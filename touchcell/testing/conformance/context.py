@@ -19,7 +19,7 @@ from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.testing.emulation.rig import Emulated, Rig, RigFunction
+from touchcell.testing.emulation.rig import DeviceFixture, Emulated, FixtureFactory
 
 CREEP_M_S = 0.005
 CREEP_RAD_S = 0.02
@@ -100,14 +100,14 @@ class _Recorder:
         return Track(np.array(t_ns, dtype=np.float64), np.array(poses), np.array(true))
 
 
-class Seat:
+class DeviceUnderTest:
     """One rig and its emulator, which the checks of one driver share until one of them spoils it."""
 
-    def __init__(self, function: RigFunction, folder: Path, address: int) -> None:
+    def __init__(self, function: FixtureFactory, folder: Path, address: int) -> None:
         self.function = function
         self.folder = folder
         self.address = address
-        self.rig: Rig = function(folder, address)
+        self.rig: DeviceFixture = function(folder, address)
         self._emulator: Emulated | None = None
 
     def emulator(self) -> Emulated:
@@ -145,7 +145,7 @@ class Bench:
         spoiled: set it if the emulator cannot serve another check.
     """
 
-    def __init__(self, seat: Seat) -> None:
+    def __init__(self, seat: DeviceUnderTest) -> None:
         self.seat = seat
         self.rig = seat.rig
         self.clock = self.rig.clock()

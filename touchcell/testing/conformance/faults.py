@@ -32,7 +32,7 @@ def _counted(fault: str, value: Any, answer: str) -> bool:
 
 
 @check("truth", of_faults=_every)
-def fault_has_its_lawful_answer(bench: Bench, fault: str) -> None:
+def fault_triggers_expected_reaction(bench: Bench, fault: str) -> None:
     """Each fault of the rig is counted, called stale, or latched, as the rig says; and the device serves again."""
     value, answer = bench.rig.faults[fault]
     bench.changed = True

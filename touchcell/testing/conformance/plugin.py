@@ -27,11 +27,11 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture(scope="class")
 def conformance_seat(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """The rig of a suite's class and its emulator."""
-    from touchcell.testing.conformance.context import Seat
+    from touchcell.testing.conformance.context import DeviceUnderTest
 
     suite: Any = request.cls
     folder = tmp_path_factory.mktemp(suite.driver)
-    seat = Seat(suite.rig_function, folder, _address(request.config))
+    seat = DeviceUnderTest(suite.rig_function, folder, _address(request.config))
     yield seat
     seat.clear()
 

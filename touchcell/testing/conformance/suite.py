@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from touchcell.testing.conformance.check import Needs
-from touchcell.testing.emulation.rig import RigFunction
+from touchcell.testing.emulation.rig import FixtureFactory
 
 
-def suite(rig: RigFunction, *, prefix: str = "Test") -> type:
+def suite(rig: FixtureFactory, *, prefix: str = "Test") -> type:
     """The test class of ``rig``; assign it to a name that begins with ``prefix``.
 
     Args:

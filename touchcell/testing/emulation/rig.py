@@ -47,7 +47,7 @@ class Emulated(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Rig:
+class DeviceFixture:
     """How to bring up one driver on its emulator.
 
     Attributes:
@@ -88,12 +88,12 @@ class Rig:
     notes: tuple[str, ...] = ()
 
 
-RigFunction = Callable[[Path, int], Rig]
+FixtureFactory = Callable[[Path, int], DeviceFixture]
 """Makes a rig that keeps its files in a folder of its own and, by a number of its own, shares no address."""
 
 GROUP = "touchcell.rigs"
 
 
-def rig_of(driver: str, folder: Path, address: int) -> Rig:
+def rig_of(driver: str, folder: Path, address: int) -> DeviceFixture:
     """The registered rig of ``driver``. Raises ConfigError when it has none."""
-    return cast(RigFunction, registry.load(GROUP, "rig", driver, FunctionType))(folder, address)
+    return cast(FixtureFactory, registry.load(GROUP, "rig", driver, FunctionType))(folder, address)
