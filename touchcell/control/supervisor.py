@@ -12,13 +12,16 @@ from touchcell.control.interlocks.basic import Finite
 from touchcell.control.interlocks.errors import SafetyTrip
 from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.snapshot import CellView
-from touchcell.control.interlocks.timers import InterlockState, TimedInterlock
+from touchcell.control.interlocks.timers import NO_MARKS, InterlockState, TimedInterlock
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.control.latch import Latch, LatchState, ResetDone, ResetRefused
 from touchcell.drivers.core.device import OperatorToken
 
 LIMIT_FOR_NS: Final = 300_000_000
-"""A violation that only limits becomes a trip when it lasts longer (PEERS 4.2)."""
+"""A rule that only limits trips when it has done so for longer, whatever it was about and however it flickered."""
+
+FORGIVEN: Final = 4
+"""While a rule does not limit, the time that it has limited is forgotten this many times slower than it was counted."""
 
 REDUCED: Final = 0.25
 """Share of the speed that is left while a violation limits."""
@@ -41,6 +44,14 @@ class Verdict:
     trip: SafetyTrip | None
 
 
+@dataclass(frozen=True, slots=True)
+class _Limiting:
+    """For how long a rule has limited, less what has been forgotten, and whether it does now."""
+
+    total_ns: int
+    now: bool
+
+
 class _Remembered:
     """A timed rule with its marks, to be asked like any other."""
 
@@ -48,7 +59,7 @@ class _Remembered:
         self.name = rule.name
         self.severity = rule.severity
         self._rule = rule
-        self._past: InterlockState = {}
+        self._past: InterlockState = NO_MARKS
 
     def check(self, view: CellView) -> Violation | None:
         violation, self._past = self._rule.evaluate(view, self._past)
@@ -82,7 +93,8 @@ class Supervisor:
         self._latch = latch
         self._rest_m_s = rest_m_s
         self._rest_rad_s = rest_rad_s
-        self._limited_since_ns: dict[tuple[str, str], int] = {}
+        self._limiting: dict[str, _Limiting] = {}
+        self._reviewed_ns = 0
 
     @property
     def latch(self) -> Latch:
@@ -109,11 +121,14 @@ class Supervisor:
     def reset(self, token: OperatorToken, view: CellView, alarms: Sequence[Violation] = ()) -> ResetDone | ResetRefused:
         """Clear the latch on a person's request, judged on ``view`` and ``alarms`` as they are; nothing moves by it."""
         self._latch.update((*alarms, *self._violations(view)))
-        return self._latch.reset(
+        outcome = self._latch.reset(
             token,
             at_rest=all(self._at_rest(arm.state.value.twist) for arm in view.arms.values()),
             commanded=any(arm.command is not None and np.any(arm.command.twist) for arm in view.arms.values()),
         )
+        if isinstance(outcome, ResetDone):
+            self._limiting = {}
+        return outcome
 
     def _violations(self, view: CellView) -> tuple[Violation, ...]:
         if (first := _checked(self._finite, view)) is not None:
@@ -122,13 +137,28 @@ class Supervisor:
         return self._escalated(found, view.now_ns)
 
     def _escalated(self, found: Sequence[Violation], now_ns: int) -> tuple[Violation, ...]:
-        """``found``, with a trip in place of each limit that has lasted for too long."""
-        limiting = {(v.interlock, v.subject) for v in found if v.severity is Severity.LIMIT and not v.may_last}
-        self._limited_since_ns = {key: self._limited_since_ns.get(key, now_ns) for key in limiting}
-        lasting = {key for key, since_ns in self._limited_since_ns.items() if now_ns - since_ns > LIMIT_FOR_NS}
+        """``found``, with a trip in place of each limit of a rule that has limited for too long.
+
+        Time is counted for each rule, not for each subject: which of two sensors is the deeper one may change in every
+        cycle. It is counted from one review to the next by what the first of them found, and forgotten more slowly than
+        it is counted, so that a value that hops about its limit trips as well.
+        """
+        passed_ns, self._reviewed_ns = now_ns - self._reviewed_ns, now_ns
+        names = {v.interlock for v in found if v.severity is Severity.LIMIT and not v.may_last}
+        if not names and not self._limiting:
+            return tuple(found)
+        counted = {}
+        for name in names | self._limiting.keys():
+            before = self._limiting.get(name, _Limiting(0, False))
+            total_ns = before.total_ns + (passed_ns if before.now else -(passed_ns // FORGIVEN))
+            total_ns = min(max(total_ns, 0), 2 * LIMIT_FOR_NS)
+            if total_ns or name in names:
+                counted[name] = _Limiting(total_ns, name in names)
+        self._limiting = counted
+        lasting = {name for name in names if counted[name].total_ns > LIMIT_FOR_NS}
         return tuple(
             replace(v, severity=Severity.TRIP, reason=f"{v.reason}, limiting for over {1e-6 * LIMIT_FOR_NS:g} ms")
-            if (v.interlock, v.subject) in lasting
+            if v.interlock in lasting and v.severity is Severity.LIMIT and not v.may_last
             else v
             for v in found
         )

@@ -14,9 +14,10 @@ from touchcell.control.interlocks.config import build_interlocks, parse_interloc
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
 from touchcell.control.interlocks.timers import TimedInterlock
 from touchcell.control.interlocks.violation import Severity, Violation
-from touchcell.control.latch import Latch
+from touchcell.control.latch import Latch, ResetDone
 from touchcell.control.supervisor import LIMIT_FOR_NS, REDUCED, Supervisor
 from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
+from touchcell.drivers.core.device import OperatorToken
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.geometry import se3
@@ -190,11 +191,75 @@ def test_a_limit_slows_down_and_trips_when_it_lasts() -> None:
     assert "limiting for over 300 ms" in trip.reason
 
 
-def test_a_limit_that_comes_and_goes_does_not_trip() -> None:
-    settings = {"it": {"kind": "shear", "limit_mm": 1.0, "severity": "limit"}}
-    supervisor = Supervisor(build_interlocks(parse_interlocks(settings), {}), Latch())
-    for k in range(200):
-        assert supervisor.review(sensor_cycle(k, shear_m=0.0 if k % 25 == 0 else 2e-3)).allow
+def limiting(kind: str = "shear", **settings: Any) -> Supervisor:
+    section = {"it": {"kind": kind, "limit_mm": 1.0, "severity": "limit", **settings}}
+    return Supervisor(build_interlocks(parse_interlocks(section), {}), Latch())
+
+
+def first_refused(supervisor: Supervisor, views: list[CellView]) -> int | None:
+    return next((k for k, view in enumerate(views) if not supervisor.review(view).allow), None)
+
+
+def test_a_limit_that_flickers_trips_almost_as_soon_as_one_that_stays() -> None:
+    views = [sensor_cycle(k, shear_m=0.0 if k % 29 == 28 else 2e-3) for k in range(100)]
+    assert first_refused(limiting(), views) == LIMIT_FOR_NS // CYCLE_NS + 2, "one cycle lost"
+
+
+def test_a_limit_that_is_there_half_of_the_time_trips_and_one_in_ten_never_does() -> None:
+    half = [sensor_cycle(k, shear_m=2e-3 * (k % 2)) for k in range(200)]
+    at = first_refused(limiting(), half)
+    assert at is not None
+    assert at * CYCLE_NS == pytest.approx(LIMIT_FOR_NS / 0.375, rel=0.05)
+    seldom = [sensor_cycle(k, shear_m=2e-3 * (k % 10 == 0)) for k in range(2000)]
+    assert first_refused(limiting(), seldom) is None
+
+
+@pytest.mark.parametrize("every", [1, 2, 7])
+def test_a_limit_trips_whichever_of_two_sensors_is_the_worse(every: int) -> None:
+    """Both are too deep all the time; which one is reported alternates."""
+    supervisor = limiting("depth")
+    views = []
+    for k in range(60):
+        deeper = (k // every) % 2
+        depths = {"left": 1.5e-3 + 1e-4 * deeper, "right": 1.5e-3 + 1e-4 * (1 - deeper)}
+        sensors = {role: replace(SENSOR, t_frame_ns=k * CYCLE_NS, seq=k, depth_m=d) for role, d in depths.items()}
+        views.append(CellView(k * CYCLE_NS, {}, sensors, "run"))
+    assert first_refused(supervisor, views) == LIMIT_FOR_NS // CYCLE_NS + 1
+
+
+def test_time_of_one_rule_is_not_counted_for_another() -> None:
+    section = {
+        "shear": {"kind": "shear", "limit_mm": 1.0, "severity": "limit"},
+        "depth": {"kind": "depth", "limit_mm": 4.0, "severity": "limit"},
+    }
+    supervisor = Supervisor(build_interlocks(parse_interlocks(section), {}), Latch())
+    one = [sensor_cycle(k, shear_m=2e-3, depth_m=3e-3) for k in range(25)]
+    other = [sensor_cycle(k, shear_m=0.0, depth_m=5e-3) for k in range(25, 55)]
+    assert first_refused(supervisor, one + other) is None
+
+
+def test_a_reset_forgets_for_how_long_a_rule_has_limited() -> None:
+    supervisor = limiting()
+    views = [sensor_cycle(k, shear_m=2e-3) for k in range(40)]
+    assert first_refused(supervisor, views) is not None
+    calm = sensor_cycle(40, shear_m=0.0)
+    supervisor.review(calm)
+    assert isinstance(supervisor.reset(OperatorToken("ada", calm.now_ns + 1), calm), ResetDone)
+    again = [sensor_cycle(k, shear_m=2e-3) for k in range(41, 41 + LIMIT_FOR_NS // CYCLE_NS)]
+    assert first_refused(supervisor, again) is None
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=150))
+def test_a_limit_never_trips_before_its_time_and_always_once_it_outweighs_the_pauses(above: list[bool]) -> None:
+    supervisor = limiting()
+    total = 0.0
+    tripped = False
+    for k, now in enumerate(above):
+        if k:
+            total = max(0.0, total + (1.0 if above[k - 1] else -0.25))
+        allowed = supervisor.review(sensor_cycle(k, shear_m=2e-3 if now else 0.0)).allow
+        tripped = tripped or (now and total > LIMIT_FOR_NS / CYCLE_NS)
+        assert allowed == (not tripped)
 
 
 @given(

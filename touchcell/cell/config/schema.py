@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat,
 
 from touchcell.cell.config.stopping_distance import StoppingDistance, overshoot, together
 from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile, load
-from touchcell.control.interlocks.basic import WorkspaceConfig
+from touchcell.control.interlocks.boundary import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.control.interlocks.config import INTERLOCKS, REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
 from touchcell.drivers.core import spec as driver_registry
@@ -522,7 +522,7 @@ class _Planner:
             if arm is None or way is None:
                 continue
             found[name] = way
-            if entry.margin_mm is not None and found[name].total_m > 1e-3 * entry.margin_mm:
+            if found[name].total_m > 1e-3 * entry.margin_mm:
                 self._add(
                     ("interlocks", name, "margin_mm"),
                     f"the arm may get further out than the margin of {entry.margin_mm:g} mm: {found[name]}",

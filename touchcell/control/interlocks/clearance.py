@@ -9,6 +9,7 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import PositiveFloat, model_validator
 
+from touchcell.control.interlocks.boundary import REST_M_S
 from touchcell.control.interlocks.collision import Clearances, Pair
 from touchcell.control.interlocks.planning_scene import Body, PlanningScene, SpatialInterlockConfig
 from touchcell.control.interlocks.snapshot import CellView
@@ -24,7 +25,8 @@ _NEGLIGIBLE_M = 1e-7
 class Clearance:
     """Nothing comes nearer to an arm than ``limit_m``, and towards what is nearer than ``slow_m`` it goes slowly.
 
-    Motion that takes the two apart is allowed. What counts is where a command would lead within 10 ms.
+    Motion that takes the two apart is allowed. What counts is where a command would lead within 10 ms; nearer than
+    ``limit_m`` it has to take them apart faster than standing still, while they are not measured to close.
     """
 
     name: str
@@ -41,15 +43,20 @@ class Clearance:
             return None
         commanded = any(view.arms[role].command is not None for role in self.bodies)
         change = self.clearances.distances(self._frames(view, _AHEAD_S)) - apart if commanded else np.zeros_like(apart)
-        wrong = (apart < self.limit_m) & (change <= _NEGLIGIBLE_M)
-        wrong |= (apart < self.slow_m) & (change < -_NEGLIGIBLE_M)
+        wrong = (apart < self.slow_m) & (change < -_NEGLIGIBLE_M)
+        if (too_near := apart < self.limit_m).any():
+            measured = self.clearances.distances(self._frames(view, _AHEAD_S, measured=True)) - apart
+            parting = (change >= REST_M_S * _AHEAD_S) & (measured > -2.0 * REST_M_S * _AHEAD_S)
+            wrong |= too_near & ~parting
         if not wrong.any():
             return None
         nearest = int(np.argmin(np.where(wrong, apart, np.inf)))
         return self._violation(view, self.clearances.pairs[nearest], float(apart[nearest]))
 
-    def _frames(self, view: CellView, ahead_s: float) -> Array:
-        return np.concatenate([body.frames(view.arms[role], ahead_s) for role, body in self.bodies.items()])
+    def _frames(self, view: CellView, ahead_s: float, *, measured: bool = False) -> Array:
+        return np.concatenate(
+            [body.frames(view.arms[role], ahead_s, measured=measured) for role, body in self.bodies.items()]
+        )
 
     def _violation(self, view: CellView, pair: Pair, apart_m: float) -> Violation:
         too_near = apart_m < self.limit_m

@@ -19,9 +19,8 @@ from touchcell.control.interlocks.basic import (
     DepthConfig,
     FrameAgeConfig,
     TcpSpeedConfig,
-    TiltConfig,
-    WorkspaceConfig,
 )
+from touchcell.control.interlocks.boundary import TiltConfig, WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.motion import LimitedConfig, StandstillConfig, TrackingConfig

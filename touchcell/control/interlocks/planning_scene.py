@@ -37,18 +37,25 @@ class Body:
     kinematics: Callable[[], DifferentialIk | None] = lambda: None
     link_count: int = 0
 
-    def frames(self, arm: ArmView, ahead_s: float = 0.0) -> Array:
-        """(link_count + 2, 4, 4) in the world as measured, or as its command would move them within ``ahead_s``."""
-        T_base_tcp, twist = arm.state.value.T_base_tcp, arm.commanded_twist() if ahead_s else None
+    def frames(self, arm: ArmView, ahead_s: float = 0.0, *, measured: bool = False) -> Array:
+        """(link_count + 2, 4, 4) in the world as measured, or ``ahead_s`` later.
+
+        Args:
+            arm: in this cycle.
+            ahead_s: how much later.
+            measured: moved on as it is measured to move; else as its command would move it.
+        """
+        T_base_tcp = arm.state.value.T_base_tcp
+        twist = (arm.state.value.twist if measured else arm.commanded_twist()) if ahead_s else None
         ik = self.kinematics()
         T = np.empty((self.link_count + 2, 4, 4))
         T[0] = np.eye(4)
         if ik is not None:
             if arm.joints is None:
-                raise ValueError("nobody has read the joints")
+                raise ValueError("the view has no joints of an arm whose links are guarded")
             q = arm.joints.value.q
             if twist is not None:
-                q = q + ahead_s * ik.solve(q, twist).dq
+                q = q + ahead_s * (arm.joints.value.dq if measured else ik.solve(q, twist).dq)
             T[1:-1] = ik.chain.link_poses(q)
         T[-1] = T_base_tcp
         if twist is not None:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from types import MappingProxyType
+from typing import Final, Protocol, runtime_checkable
 
 from touchcell.control.interlocks.snapshot import CellView
 from touchcell.control.interlocks.violation import Severity, Violation
@@ -33,6 +34,9 @@ class TimerState:
 
 InterlockState = Mapping[str, TimerState]
 """The marks of one rule, by the role of the arm or the sensor."""
+
+NO_MARKS: Final[InterlockState] = MappingProxyType({})
+"""Nothing to remember."""
 
 Judgement = tuple[Violation | None, InterlockState]
 """The worst violation, or None, and the marks for the next cycle."""

@@ -1,0 +1,259 @@
+"""Where an arm may be: a box for a point of it, a cone for an axis of it. Motion back is allowed, if it really is.
+
+Once outside, a point or an axis counts as outside until it is back by a fifth: of the margin of a box, of the opening
+of a cone. Meanwhile a command passes that leads back: mostly inwards, faster than standing still, while the arm is not
+measured to move outwards, and after a moment is measured to move inwards too. A command of -1 nm/s is no way back, nor
+is one that an arm does not follow.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal
+
+import numpy as np
+from pydantic import Field, PositiveFloat, model_validator
+
+from touchcell.control.interlocks.settings import LEAVE, GradedSettings
+from touchcell.control.interlocks.snapshot import ArmView, CellView
+from touchcell.control.interlocks.timers import NO_MARKS, InterlockState, Judgement, TimedInterlock, TimerState
+from touchcell.control.interlocks.violation import Severity, Violation
+from touchcell.errors import ConfigError
+from touchcell.geometry.types import Array
+
+REST_M_S: Final = 1e-3
+"""A point that moves no faster stands still."""
+REST_RAD_S: Final = 1e-2
+"""The same for an axis."""
+PROGRESS_NS: Final = 300_000_000
+"""Within this time an arm that is commanded back has to be measured on its way back."""
+_INWARD_SHARE = 1.0 / 3.0
+"""Least share of a motion's speed that leads back: within 70 deg of straight back."""
+
+_OUT, _BACK = "outside", "coming back"
+
+
+@dataclass(frozen=True, slots=True)
+class WayBack:
+    """How a command and the measured motion lead back inside, in m/s or rad/s.
+
+    Attributes:
+        inward: how fast the command leads back.
+        speed: how fast it leads anywhere.
+        measured_inward: how fast the arm is measured to move back; negative outwards.
+        rest: speeds up to this are none.
+    """
+
+    inward: float
+    speed: float
+    measured_inward: float
+    rest: float
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether the command really leads back."""
+        return self.inward >= self.rest and self.inward >= _INWARD_SHARE * self.speed
+
+    def is_followed(self, lasted_ns: int) -> bool:
+        """Whether the arm does not move outwards, and inwards once it has been commanded back for a while."""
+        least = 0.5 * self.rest if lasted_ns >= PROGRESS_NS else -2.0 * self.rest
+        return self.measured_inward >= least
+
+
+_NO_WAY = WayBack(0.0, 0.0, 0.0, REST_M_S)
+
+
+def _judge(violation: Violation, way: WayBack, past: InterlockState) -> Judgement:
+    """What is outside is a violation unless it comes back, and stays outside until it is well inside."""
+    marks = {_OUT: past[_OUT]} if _OUT in past else {}
+    if way.is_asked:
+        since = marks[_BACK] = past.get(_BACK, TimerState(violation.t_ns))
+        if way.is_followed(violation.t_ns - since.since_ns):
+            return None, marks
+    marks[_OUT] = TimerState(violation.t_ns)
+    return violation, marks
+
+
+def point_velocity(twist: Array, R_base_tcp: Array, lever_m: Array) -> tuple[float, float, float]:
+    """Velocity along base axes of a point ``lever_m`` (3,) from the tool centre point, along tool axes."""
+    vx, vy, vz, wx, wy, wz = twist.tolist()
+    x, y, z = (R_base_tcp @ lever_m).tolist()
+    return vx + wy * z - wz * y, vy + wz * x - wx * z, vz + wx * y - wy * x
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Workspace:
+    """A point of an arm's tool stays inside a box along the axes of the arm's base; motion back into it is allowed.
+
+    Attributes:
+        arm: role of the arm.
+        T_tcp_point: pose (4, 4) of the guarded point in the tool frame: the sensor's, so that its length counts, or the
+            identity.
+        min_m: lower corner (3,).
+        max_m: upper corner (3,).
+        leave_m: how far inside a point that was outside has to be to count as inside.
+        sensor: role of the sensor that is the point; None for the tool centre point.
+        margin_m: what may lie outside before anything is hit.
+    """
+
+    name: str
+    severity: Severity
+    arm: str
+    T_tcp_point: Array
+    min_m: Array
+    max_m: Array
+    leave_m: float
+    sensor: str | None = None
+    margin_m: float = 0.0
+
+    def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
+        """The axis along which the point is furthest outside, unless it comes back."""
+        arm = view.arms[self.arm]
+        T = arm.state.value.T_base_tcp
+        p = (T[:3, :3] @ self.T_tcp_point[:3, 3] + T[:3, 3]).tolist()
+        inset_m = self.leave_m if _OUT in past else 0.0
+        low, high = self.min_m.tolist(), self.max_m.tolist()
+        out = [max(a + inset_m - x, x - b + inset_m) for x, a, b in zip(p, low, high, strict=True)]
+        if max(out) <= 0.0:
+            return None, NO_MARKS
+        axis = out.index(max(out))
+        above = p[axis] - high[axis] > low[axis] - p[axis]
+        limit = high[axis] if above else low[axis]
+        reason = f"{'xyz'[axis]} = {1e3 * p[axis]:.1f} mm is outside the box, limit {1e3 * limit:g} mm"
+        if out[axis] <= inset_m:
+            reason = f"{'xyz'[axis]} = {1e3 * p[axis]:.1f} mm is not yet {1e3 * inset_m:g} mm inside {1e3 * limit:g} mm"
+        violation = Violation(
+            self.name, self.severity, self.arm, reason, view.now_ns, value=p[axis], limit=limit, unit="m"
+        )
+        outward = [
+            0.0 if excess <= 0.0 else excess if x - b > a - x else -excess
+            for excess, x, a, b in zip(out, p, low, high, strict=True)
+        ]
+        return _judge(violation, self._way_back(arm, outward), past)
+
+    def _way_back(self, arm: ArmView, outward: list[float]) -> WayBack:
+        twist = arm.commanded_twist()
+        if twist is None:
+            return _NO_WAY
+        R, lever_m = arm.state.value.T_base_tcp[:3, :3], self.T_tcp_point[:3, 3]
+        v = point_velocity(twist, R, lever_m)
+        # Along each axis: one that is left alone would keep it outside.
+        if any(out and -math.copysign(1.0, out) * part < REST_M_S for out, part in zip(outward, v, strict=True)):
+            return _NO_WAY
+        size = math.hypot(*outward)
+        measured = point_velocity(arm.state.value.twist, R, lever_m)
+        inward = -sum(out * part for out, part in zip(outward, v, strict=True)) / size
+        measured_inward = -sum(out * part for out, part in zip(outward, measured, strict=True)) / size
+        return WayBack(inward, math.hypot(*v), measured_inward, REST_M_S)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tilt:
+    """The z axis of an arm's tool, or of the sensor on it, stays in a cone; motion back into it is allowed.
+
+    Attributes:
+        arm: role of the arm.
+        axis_tcp: (3,) unit vector of the guarded axis in the tool frame.
+        direction: (3,) unit vector of the cone's axis along base axes.
+        limit_rad: half of the cone's opening.
+        sensor: role of the sensor whose axis it is; None for the tool's.
+    """
+
+    name: str
+    severity: Severity
+    arm: str
+    axis_tcp: Array
+    direction: Array
+    limit_rad: float
+    sensor: str | None = None
+
+    def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
+        """How far the axis is outside the cone, unless it comes back."""
+        arm = view.arms[self.arm]
+        axis = arm.state.value.T_base_tcp[:3, :3] @ self.axis_tcp
+        tilt_rad = math.acos(max(-1.0, min(1.0, float(axis @ self.direction))))
+        limit_rad = LEAVE * self.limit_rad if _OUT in past else self.limit_rad
+        if tilt_rad <= limit_rad:
+            return None, NO_MARKS
+        reason = f"tilted by {math.degrees(tilt_rad):.1f} deg, limit {math.degrees(limit_rad):g} deg"
+        violation = Violation(
+            self.name, self.severity, self.arm, reason, view.now_ns, value=tilt_rad, limit=limit_rad, unit="rad"
+        )
+        way = _NO_WAY
+        if (twist := arm.commanded_twist()) is not None:
+            measured_inward, _ = self._inward(arm.state.value.twist, axis, tilt_rad)
+            way = WayBack(*self._inward(twist, axis, tilt_rad), measured_inward, REST_RAD_S)
+        return _judge(violation, way, past)
+
+    def _inward(self, twist: Array, axis: Array, tilt_rad: float) -> tuple[float, float]:
+        """How fast a twist turns the axis into the cone, and how fast it turns it at all, rad/s."""
+        turning = np.cross(twist[3:], axis)
+        return float(turning @ self.direction) / max(math.sin(tilt_rad), 1e-9), math.sqrt(float(turning @ turning))
+
+
+class WorkspaceConfig(GradedSettings):
+    """Box for a sensor, or for the tool centre point of an arm without one, along the axes of the arm's base.
+
+    ``margin_mm`` is how far outside the box nothing stands: a cell whose arm may overshoot by more is refused. What was
+    outside counts as inside when it is a fifth of that inside the box.
+    """
+
+    kind: Literal["workspace"]
+    arm: str
+    sensor: str | None = None
+    min_mm: tuple[float, float, float]
+    max_mm: tuple[float, float, float]
+    margin_mm: PositiveFloat
+
+    @model_validator(mode="after")
+    def _corners_in_order(self) -> WorkspaceConfig:
+        if not all(low < high for low, high in zip(self.min_mm, self.max_mm, strict=True)):
+            raise ValueError(f"min_mm {list(self.min_mm)} is not below max_mm {list(self.max_mm)} in every axis")
+        return self
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule. Raises ConfigError for a sensor that the cell does not have."""
+        T_tcp_point = _guarded(name, self.sensor, T_tcp_sensor)
+        min_m, max_m = 1e-3 * np.array(self.min_mm), 1e-3 * np.array(self.max_mm)
+        # A box that is thinner than its margin still has an inside.
+        leave_m = min((1.0 - LEAVE) * 1e-3 * self.margin_mm, 0.25 * float(np.min(max_m - min_m)))
+        margin_m = 1e-3 * self.margin_mm
+        return Workspace(name, self.level, self.arm, T_tcp_point, min_m, max_m, leave_m, self.sensor, margin_m)
+
+
+class TiltConfig(GradedSettings):
+    """Cone for the z axis of a sensor, or of the tool of an arm without one; ``direction`` is along base axes."""
+
+    kind: Literal["tilt"]
+    arm: str
+    sensor: str | None = None
+    direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    limit_deg: Annotated[float, Field(gt=0.0, le=180.0)]
+
+    @model_validator(mode="after")
+    def _has_direction(self) -> TiltConfig:
+        if not any(self.direction):
+            raise ValueError("direction is zero")
+        return self
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
+        """The rule. Raises ConfigError for a sensor that the cell does not have."""
+        axis = _guarded(name, self.sensor, T_tcp_sensor)[:3, 2]
+        direction = np.array(self.direction) / np.linalg.norm(self.direction)
+        return Tilt(name, self.level, self.arm, axis, direction, math.radians(self.limit_deg), self.sensor)
+
+
+def _guarded(name: str, sensor: str | None, T_tcp_sensor: Mapping[str, Array]) -> Array:
+    """Pose (4, 4) of the sensor in the tool frame, or the identity. Raises ConfigError for one that is not there."""
+    if sensor is None:
+        return np.eye(4)
+    if sensor not in T_tcp_sensor:
+        raise ConfigError(
+            f"the task has no sensor {sensor!r}",
+            key=f"interlocks.{name}.sensor",
+            value=sensor,
+            hint=f"sensors: {', '.join(sorted(T_tcp_sensor)) or 'none'}",
+        )
+    return T_tcp_sensor[sensor]
