@@ -13,14 +13,14 @@ import yaml
 from tests.fault_injection.fault_matrix import FAULTS, Case, cells, matrix, run_case
 from touchcell.paths import MODELS
 from touchcell.simulation.faults import ArmFaults, FrameFaults
-from touchcell.tasks import registry
+from touchcell.tasks.interface import TASKS
 
 
 def test_every_fault_and_every_task_is_in_the_matrix() -> None:
     names = {fault.name for fault in FAULTS}
     assert {f"arm: {field.name}" for field in fields(ArmFaults)} <= names
     assert {f"camera: {field.name}" for field in fields(FrameFaults)} <= names
-    assert set(cells()) == set(registry.installed())
+    assert set(cells()) == set(TASKS.names())
 
 
 MOVING = ("surface_following", "object_tracking", "single_arm_pushing", "dual_arm_pushing", "data_collection")

@@ -19,16 +19,14 @@ from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile, load
 from touchcell.control.interlocks.basic import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.control.interlocks.config import INTERLOCKS, REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
-from touchcell.drivers.core import spec as driver_registry
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.device import DeactivatePolicy
 from touchcell.drivers.core.scene import scene_section
-from touchcell.drivers.core.spec import DriverConfig, DriverSpec
+from touchcell.drivers.core.spec import DRIVERS, DriverConfig, DriverSpec
 from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.tasks import registry as task_registry
-from touchcell.tasks.interface import TaskConfig, TaskSpec
+from touchcell.tasks.interface import TASKS, TaskConfig, TaskSpec
 
 M = TypeVar("M", bound=BaseModel)
 Three = tuple[float, float, float]
@@ -360,7 +358,7 @@ class _Planner:
 
     def _task(self, cell: CellFile) -> tuple[TaskSpec | None, TaskConfig | None]:
         try:
-            spec = task_registry.spec(cell.task.name)
+            spec = TASKS.load(cell.task.name)
         except ConfigError as error:
             self._add(("task", "name"), error.reason, value=cell.task.name, hint=error.hint)
             return None, None
@@ -425,7 +423,7 @@ class _Planner:
         kind: str,
     ) -> DevicePlan | None:
         try:
-            spec = driver_registry.spec(section.driver)
+            spec = DRIVERS.load(section.driver)
         except ConfigError as error:
             self._add((*at, "driver"), error.reason, value=section.driver, hint=error.hint)
             return None
