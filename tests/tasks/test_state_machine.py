@@ -1,4 +1,4 @@
-"""The state machine: the table's linter, time, order of events, and the faults E6 and E7 of PEERS."""
+"""The state machine: the table's linter, time, order of events, and the traps of `transitions` that it closes."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class SelfTestFailed(DeviceError):
         super().__init__(
             device,
             f"self-test, {link} withheld: {reason}",
-            hint="do not use this cell; docs/safety-processes.md tells what was tested",
+            hint="do not use this cell; docs/explanation/safety-processes.md tells what was tested",
         )
         self.link = link
         self.declared_s = declared_s
