@@ -1,4 +1,4 @@
-"""State diagrams of the tasks in ``docs/tasks.md``: ``python -m touchcell.tasks.diagrams [FILE]`` regenerates them."""
+"""State diagrams of the tasks in ``docs/explanation/tasks.md``: ``python -m touchcell.tasks.diagrams [FILE]`` regenerates them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from touchcell.tasks.servoing import servo_table
 from touchcell.tasks.state_machine import Table, mermaid
 from touchcell.tasks.surface_following import SurfaceFollowingConfig
 
-PAGE: Final = Path(__file__).parents[2] / "docs" / "tasks.md"
+PAGE: Final = Path(__file__).parents[2] / "docs" / "explanation" / "tasks.md"
 
 _BLOCK: Final = re.compile(r"(<!-- diagram: (\w+) -->\n).*?(<!-- end of diagram -->)", re.DOTALL)
 
@@ -43,7 +43,7 @@ def redrawn(page: str) -> str:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Redraw the diagrams of the given page, or of ``docs/tasks.md``."""
+    """Redraw the diagrams of the given page, or of ``docs/explanation/tasks.md``."""
     page = Path(arguments[0]) if arguments else PAGE
     page.write_text(redrawn(page.read_text(encoding="utf-8")), encoding="utf-8")
 
