@@ -1,4 +1,4 @@
-"""State diagrams of the tasks in ``docs/explanation/tasks.md``: ``python -m touchcell.tasks.diagrams [FILE]`` regenerates them."""
+"""State diagrams of the tasks: ``python -m touchcell.tasks.diagrams [FILE]`` redraws docs/explanation/tasks.md."""
 
 from __future__ import annotations
 

@@ -319,10 +319,11 @@ def plan_cell(
     file = load(Path(path))
     if settings:
         file = replace(file, data=with_settings(file.data, settings))
-    if model is not None:
-        for sensor in file.data.get("sensors", {}).values():
-            if sensor.get("estimator", {}).get("kind") == "network":
-                sensor["estimator"]["model"] = model
+    if model is not None and isinstance(sensors := file.data.get("sensors"), dict):
+        for sensor in sensors.values():
+            estimator = sensor.get("estimator") if isinstance(sensor, dict) else None
+            if isinstance(estimator, dict) and estimator.get("kind") == "network":
+                estimator["model"] = model
     return _Planner(file, overrides or {}, settings or {}).plan()
 
 
@@ -457,7 +458,7 @@ class _Planner:
         if spec.capabilities.kind != kind:
             self._add(
                 (*at, "driver"),
-                f"{spec.name} drives a {spec.capabilities.kind}, not a {kind}",
+                f"{spec.name} drives {_a(spec.capabilities.kind)}, not {_a(kind)}",
                 value=section.driver,
                 hint="`touchcell list` tells which drivers there are",
             )
@@ -613,6 +614,10 @@ class _Planner:
 
     def _add(self, path: tuple[str, ...], reason: str, *, value: Any = None, hint: str = "") -> None:
         self._problems.append(self._file.problem(path, reason, value=value, hint=hint))
+
+
+def _a(word: str) -> str:
+    return f"{'an' if word[0] in 'aeiou' else 'a'} {word}"
 
 
 def _overshoot(arm: DevicePlan, lever_m: float, rate_hz: float) -> StoppingDistance | None:

@@ -56,7 +56,7 @@ class TwistCommand:
 
 @dataclass(frozen=True, slots=True)
 class Sent(Generic[C]):
-    """The command actually sent, and the adjustments that made it differ from the request. Read-only like the command."""
+    """The command actually sent, and why it differs from the request. Read-only like the command."""
 
     command: C
     t_ns: int
