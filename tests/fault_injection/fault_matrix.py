@@ -17,7 +17,8 @@ import yaml
 from tests.fault_injection.sent_commands import SentCommands
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import CellPlan, plan_cell
-from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop, RunResult, StopRequest
 from touchcell.simulation.devices.arm import SimArm
 from touchcell.simulation.devices.tactip import SimTactip
