@@ -184,11 +184,16 @@ class SensorSection(_OpenSection):
 
 
 class TaskSection(_OpenSection):
-    """The task, which arms and sensors play its roles, and the task's own keys."""
+    """The task, which arms and sensors play its roles, and the task's own keys; ``steps:`` alone names the task too."""
 
     name: str
     arms: dict[str, str] = {}
     sensors: dict[str, str] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named_by_its_steps(cls, section: Any) -> Any:
+        return {"name": "steps", **section} if isinstance(section, dict) and "steps" in section else section
 
 
 class RecordingSection(_Section):
