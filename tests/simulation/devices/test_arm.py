@@ -4,14 +4,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, LifecycleError, Rejection, StaleData
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.protocols import HealthSource, StopCategory, Stoppable, TcpSource, TwistSink
-from touchcell.drivers.core.spec import DriverContext
+from touchcell.drivers.core.spec import DRIVERS, DriverContext
 from touchcell.geometry import se3
 from touchcell.simulation.devices.arm import SimArm, SimArmConfig
 from touchcell.simulation.faults import ArmFaults
@@ -21,7 +20,7 @@ START = (400.0, 0.0, 300.0, 180.0, 0.0, 0.0)
 
 def make(clock: VirtualClock, **changes: object) -> SimArm:
     config = SimArmConfig.model_validate({"start_pose_mm_deg": START, **changes})
-    arm = registry.spec("sim_arm").build("arm", config, DriverContext(clock))
+    arm = DRIVERS.load("sim_arm").build("arm", config, DriverContext(clock))
     assert isinstance(arm, SimArm)
     return arm
 
@@ -53,7 +52,7 @@ def get_going(arm: SimArm, lease: Lease, clock: VirtualClock, twist: list[float]
 
 
 def test_the_spec_tells_the_truth() -> None:
-    spec = registry.spec("sim_arm")
+    spec = DRIVERS.load("sim_arm")
     arm = make(VirtualClock())
     for ability in (TcpSource, TwistSink, Stoppable, HealthSource):
         assert isinstance(arm, ability)

@@ -226,7 +226,7 @@ class Arm(Device):
     def _deactivate(self, policy: DeactivatePolicy) -> None:
         self._give_up_command()
         self._begin_stop(StopCategory.STOP_AND_HOLD)
-        self._await_rest()
+        self.await_rest()
         self._after_rest(policy)
 
     @final
@@ -245,7 +245,9 @@ class Arm(Device):
         self._desk.revoke()
         self._gate.reset()
 
-    def _await_rest(self) -> None:
+    @final
+    def await_rest(self) -> None:
+        """Wait until it stands. Raises DeviceFault if it still moves long after it could have stopped."""
         limits = self._limits
         braking_s = max(limits.speed_m_s / limits.accel_m_s2, limits.rot_speed_rad_s / limits.rot_accel_rad_s2)
         deadline_ns = self._clock.now_ns() + round((braking_s + _REST_MARGIN_S) * 1e9)
