@@ -18,14 +18,10 @@ from touchcell.control.latch import Latch, LatchState, ResetDone, ResetRefused
 from touchcell.drivers.core.device import OperatorToken
 
 LIMIT_FOR_NS: Final = 300_000_000
-<<<<<<< HEAD
-"""A rule that only limits trips when it has done so for longer, whatever it was about and however it flickered."""
+"""An interlock that limits for longer trips, whatever its subjects were and however it flickered."""
 
 FORGIVEN: Final = 4
-"""While a rule does not limit, the time that it has limited is forgotten this many times slower than it was counted."""
-=======
-"""A LIMIT violation that lasts longer becomes a trip."""
->>>>>>> main
+"""While an interlock does not limit, its counted time decreases this many times more slowly than it increased."""
 
 REDUCED: Final = 0.25
 """Speed scaling while a LIMIT violation is present."""
@@ -50,7 +46,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class _Limiting:
-    """For how long a rule has limited, less what has been forgotten, and whether it does now."""
+    """Counted time of one interlock's LIMIT violations, and True if it limits now."""
 
     total_ns: int
     now: bool
@@ -141,15 +137,14 @@ class Supervisor:
         return self._escalated(found, view.now_ns)
 
     def _escalated(self, found: Sequence[Violation], now_ns: int) -> tuple[Violation, ...]:
-<<<<<<< HEAD
-        """``found``, with a trip in place of each limit of a rule that has limited for too long.
+        """Return ``found`` with a trip in place of each LIMIT violation of an interlock that has limited for too long.
 
-        Time is counted for each rule, not for each subject: which of two sensors is the deeper one may change in every
+        Time is counted per interlock, not per subject: which of two sensors is the deeper one may change in every
         cycle. It is counted from one review to the next by what the first of them found, and forgotten more slowly than
         it is counted, so that a value that hops about its limit trips as well.
         """
         passed_ns, self._reviewed_ns = now_ns - self._reviewed_ns, now_ns
-        names = {v.interlock for v in found if v.severity is Severity.LIMIT and not v.may_last}
+        names = {v.interlock for v in found if v.severity is Severity.LIMIT and v.escalates}
         if not names and not self._limiting:
             return tuple(found)
         counted = {}
@@ -161,15 +156,9 @@ class Supervisor:
                 counted[name] = _Limiting(total_ns, name in names)
         self._limiting = counted
         lasting = {name for name in names if counted[name].total_ns > LIMIT_FOR_NS}
-=======
-        """Return ``found`` with a trip in place of each LIMIT violation that has lasted too long."""
-        limiting = {(v.interlock, v.subject) for v in found if v.severity is Severity.LIMIT and v.escalates}
-        self._limited_since_ns = {key: self._limited_since_ns.get(key, now_ns) for key in limiting}
-        lasting = {key for key, since_ns in self._limited_since_ns.items() if now_ns - since_ns > LIMIT_FOR_NS}
->>>>>>> main
         return tuple(
             replace(v, severity=Severity.TRIP, reason=f"{v.reason}, limiting for over {1e-6 * LIMIT_FOR_NS:g} ms")
-            if v.interlock in lasting and v.severity is Severity.LIMIT and not v.may_last
+            if v.interlock in lasting and v.severity is Severity.LIMIT and v.escalates
             else v
             for v in found
         )

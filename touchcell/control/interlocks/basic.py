@@ -1,8 +1,4 @@
-<<<<<<< HEAD
-"""Limits that every cell needs: finite numbers, speed, depth, and the age of what was measured."""
-=======
-"""Interlocks that every cell needs: finite numbers, workspace, tilt, speed, depth, and age of the measurements."""
->>>>>>> main
+"""Interlocks that every cell needs: finite numbers, speed, depth, and age of the measurements."""
 
 from __future__ import annotations
 
@@ -62,84 +58,9 @@ class Finite:
                     yield role, sensor.seq, what, value
 
 
-<<<<<<< HEAD
 @dataclass(frozen=True, slots=True)
 class TcpSpeed:
-    """No tool centre point moves, or is told to move, faster than the limits; one that did is slow at 80 % of them."""
-=======
-@dataclass(frozen=True, slots=True, eq=False)
-class Workspace:
-    """Keep a point of an arm's tool inside a box along the axes of the arm's base; motion back into it is allowed.
-
-    Attributes:
-        arm: role of the arm.
-        T_tcp_point: pose (4, 4) of the guarded point in the tool frame: the sensor's, so that its length counts, or the
-            identity.
-        min_m: lower corner (3,).
-        max_m: upper corner (3,).
-    """
-
-    name: str
-    severity: Severity
-    arm: str
-    T_tcp_point: Array
-    min_m: Array
-    max_m: Array
-
-    def check(self, view: CellView) -> Violation | None:
-        arm = view.arms[self.arm]
-        p = (arm.state.value.T_base_tcp @ self.T_tcp_point)[:3, 3]
-        excess = np.maximum(self.min_m - p, p - self.max_m)
-        axis = int(np.argmax(excess))
-        if excess[axis] <= 0.0:
-            return None
-        v = arm.commanded_velocity(self.T_tcp_point)
-        if v is not None and np.all(np.where(p > self.max_m, v < 0.0, np.where(p < self.min_m, v > 0.0, True))):
-            return None
-        limit = self.max_m[axis] if p[axis] > self.max_m[axis] else self.min_m[axis]
-        reason = f"{'xyz'[axis]} = {1e3 * p[axis]:.1f} mm is outside the box, limit {1e3 * limit:g} mm"
-        return Violation(
-            self.name, self.severity, self.arm, reason, view.now_ns, value=float(p[axis]), limit=float(limit), unit="m"
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tilt:
-    """Keep the z axis of an arm's tool, or of the sensor on it, in a cone; motion back into it is allowed.
-
-    Attributes:
-        arm: role of the arm.
-        axis_tcp: (3,) unit vector of the guarded axis in the tool frame.
-        direction: (3,) unit vector of the cone's axis along base axes.
-        limit_rad: half of the cone's opening.
-    """
-
-    name: str
-    severity: Severity
-    arm: str
-    axis_tcp: Array
-    direction: Array
-    limit_rad: float
-
-    def check(self, view: CellView) -> Violation | None:
-        arm = view.arms[self.arm]
-        axis = arm.state.value.T_base_tcp[:3, :3] @ self.axis_tcp
-        tilt_rad = math.acos(max(-1.0, min(1.0, float(axis @ self.direction))))
-        if tilt_rad <= self.limit_rad:
-            return None
-        twist = arm.commanded_twist()
-        if twist is not None and float(np.cross(twist[3:], axis) @ self.direction) > 0.0:
-            return None
-        reason = f"tilted by {math.degrees(tilt_rad):.1f} deg, limit {math.degrees(self.limit_rad):g} deg"
-        return Violation(
-            self.name, self.severity, self.arm, reason, view.now_ns, value=tilt_rad, limit=self.limit_rad, unit="rad"
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class TcpSpeed:
-    """Limit the measured and the commanded speed of every tool centre point."""
->>>>>>> main
+    """Limit the measured and the commanded speed of every tool centre point, with hysteresis down to 80 %."""
 
     name: str
     severity: Severity
@@ -147,7 +68,7 @@ class TcpSpeed:
     limit_rad_s: float
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
-        """The arm that exceeds a limit by the largest factor, measured or commanded."""
+        """Return a violation for the arm that exceeds a limit by the largest factor, measured or commanded."""
         marks: dict[str, TimerState] = {}
         worst: Violation | None = None
         worst_ratio = 0.0
@@ -177,18 +98,14 @@ class TcpSpeed:
 
 @dataclass(frozen=True, slots=True)
 class Depth:
-<<<<<<< HEAD
-    """No sensor is pressed in deeper than the limit; one that was has to come out to 80 % of it."""
-=======
-    """Limit the indentation of every sensor."""
->>>>>>> main
+    """Limit the indentation of every sensor, with hysteresis down to 80 %."""
 
     name: str
     severity: Severity
     limit_m: float
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
-        """The deepest of the sensors that are too deep."""
+        """Return a violation for the deepest of the sensors that are too deep."""
         marks: dict[str, TimerState] = {}
         deepest: Violation | None = None
         for role, sensor in view.sensors.items():
@@ -215,11 +132,7 @@ class Depth:
 
 @dataclass(frozen=True, slots=True)
 class FrameAge:
-<<<<<<< HEAD
-    """Every sensor's newest frame is younger than the limit, none comes from the future, and none is missing."""
-=======
-    """Limit the age of every sensor's newest frame; a time stamp in the future is a violation too."""
->>>>>>> main
+    """Limit the age of every sensor's newest frame; a stamp in the future and a missing sensor are violations too."""
 
     name: str
     severity: Severity
@@ -227,7 +140,7 @@ class FrameAge:
     sensors: tuple[str, ...] = ()
 
     def check(self, view: CellView) -> Violation | None:
-        """A sensor that is not in the view, or the one with the oldest frame."""
+        """Return a violation for a sensor that is not in the view, or for the one with the oldest frame."""
         for role in self.sensors:
             if role not in view.sensors:
                 return _missing(self, "frame", role, view.now_ns)
@@ -237,11 +150,7 @@ class FrameAge:
 
 @dataclass(frozen=True, slots=True)
 class ArmStateAge:
-<<<<<<< HEAD
-    """Every arm's newest state is younger than the limit, none comes from the future, and none is missing."""
-=======
-    """Limit the age of every arm's newest state; a time stamp in the future is a violation too."""
->>>>>>> main
+    """Limit the age of every arm's newest state; a stamp in the future and a missing arm are violations too."""
 
     name: str
     severity: Severity
@@ -249,7 +158,7 @@ class ArmStateAge:
     arms: tuple[str, ...] = ()
 
     def check(self, view: CellView) -> Violation | None:
-        """An arm that is not in the view, or the one with the oldest state."""
+        """Return a violation for an arm that is not in the view, or for the one with the oldest state."""
         for role in self.arms:
             if role not in view.arms:
                 return _missing(self, "state", role, view.now_ns)
@@ -265,8 +174,7 @@ def _missing(rule: FrameAge | ArmStateAge, what: str, role: str, now_ns: int) ->
 def _check_ages(
     rule: FrameAge | ArmStateAge, what: str, stamps: Sequence[tuple[int, str, int | None]], now_ns: int
 ) -> Violation | None:
-<<<<<<< HEAD
-    """The oldest of ``stamps`` (time, role and frame number) if it is too old, or one that lies in the future."""
+    """Return a violation for the oldest of ``stamps`` (time, role and frame number), or for one in the future."""
     longest_ns = round(1e9 * rule.limit_s)
     wrong = [stamp for stamp in stamps if not 0 <= now_ns - stamp[0] <= longest_ns]
     if not wrong:
@@ -277,91 +185,6 @@ def _check_ages(
     return Violation(
         rule.name, rule.severity, role, reason, now_ns, value=age_s, limit=rule.limit_s, unit="s", frame_seq=seq
     )
-=======
-    """Return a violation for the oldest of ``stamps`` (time and frame number by role), or for one in the future."""
-    for role, (t_ns, seq) in sorted(stamps.items(), key=lambda item: item[1][0]):
-        age_s = (now_ns - t_ns) * 1e-9
-        if not 0.0 <= age_s <= rule.limit_s:
-            reason = f"{what} is {1e3 * age_s:.1f} ms old, limit {1e3 * rule.limit_s:g} ms"
-            return Violation(
-                rule.name,
-                rule.severity,
-                role,
-                reason,
-                now_ns,
-                value=age_s,
-                limit=rule.limit_s,
-                unit="s",
-                frame_seq=seq,
-            )
-    return None
-
-
-class WorkspaceConfig(GradedSettings):
-    """Box for a sensor, or for the tool centre point of an arm without one, along the axes of the arm's base.
-
-    ``margin_mm`` is the free space around the box: a cell whose stopping distance may exceed it is refused.
-    """
-
-    kind: Literal["workspace"]
-    arm: str
-    sensor: str | None = None
-    min_mm: tuple[float, float, float]
-    max_mm: tuple[float, float, float]
-    margin_mm: PositiveFloat | None = None
-
-    @model_validator(mode="after")
-    def _corners_in_order(self) -> WorkspaceConfig:
-        if not all(low < high for low, high in zip(self.min_mm, self.max_mm, strict=True)):
-            raise ValueError(f"min_mm {list(self.min_mm)} is not below max_mm {list(self.max_mm)} in every axis")
-        return self
-
-    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
-        """Return the ``Workspace`` interlock. Raises ConfigError for a sensor that the cell does not have."""
-        T_tcp_point = _guarded(name, self.sensor, T_tcp_sensor)
-        min_m, max_m = 1e-3 * np.array(self.min_mm), 1e-3 * np.array(self.max_mm)
-        return Workspace(name, self.level, self.arm, T_tcp_point, min_m, max_m)
-
-
-def _guarded(name: str, sensor: str | None, T_tcp_sensor: Mapping[str, Array]) -> Array:
-    """Return the pose (4, 4) of the sensor in the tool frame, or the identity without one.
-
-    Raises:
-        ConfigError: the task has no such sensor.
-    """
-    if sensor is None:
-        return np.eye(4)
-    if sensor not in T_tcp_sensor:
-        raise ConfigError(
-            f"the task has no sensor {sensor!r}",
-            key=f"interlocks.{name}.sensor",
-            value=sensor,
-            hint=f"sensors: {', '.join(sorted(T_tcp_sensor)) or 'none'}",
-        )
-    return T_tcp_sensor[sensor]
-
-
-class TiltConfig(GradedSettings):
-    """Cone for the z axis of a sensor, or of the tool of an arm without one; ``direction`` is along base axes."""
-
-    kind: Literal["tilt"]
-    arm: str
-    sensor: str | None = None
-    direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
-    limit_deg: Annotated[float, Field(gt=0.0, le=180.0)]
-
-    @model_validator(mode="after")
-    def _has_direction(self) -> TiltConfig:
-        if not any(self.direction):
-            raise ValueError("direction is zero")
-        return self
-
-    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
-        """Return the ``Tilt`` interlock. Raises ConfigError for a sensor that the cell does not have."""
-        axis = _guarded(name, self.sensor, T_tcp_sensor)[:3, 2]
-        direction = np.array(self.direction) / np.linalg.norm(self.direction)
-        return Tilt(name, self.level, self.arm, axis, direction, math.radians(self.limit_deg))
->>>>>>> main
 
 
 class TcpSpeedConfig(InterlockSettings):
@@ -371,13 +194,8 @@ class TcpSpeedConfig(InterlockSettings):
     limit_m_s: PositiveFloat
     limit_rad_s: PositiveFloat
 
-<<<<<<< HEAD
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
-=======
-    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
         """Return the ``TcpSpeed`` interlock."""
->>>>>>> main
         return TcpSpeed(name, self.level, self.limit_m_s, self.limit_rad_s)
 
 
@@ -387,13 +205,8 @@ class DepthConfig(GradedSettings):
     kind: Literal["depth"]
     limit_mm: PositiveFloat
 
-<<<<<<< HEAD
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
-=======
-    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
         """Return the ``Depth`` interlock."""
->>>>>>> main
         return Depth(name, self.level, 1e-3 * self.limit_mm)
 
 
@@ -404,31 +217,16 @@ class FrameAgeConfig(InterlockSettings):
     limit_ms: PositiveFloat
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
-<<<<<<< HEAD
-        """The rule."""
+        """Return the ``FrameAge`` interlock."""
         return FrameAge(name, self.level, 1e-3 * self.limit_ms, tuple(sorted(T_tcp_sensor)))
 
 
 class ArmStateAgeConfig(SpatialInterlockConfig):
-    """Oldest arm state."""
-=======
-        """Return the ``FrameAge`` interlock."""
-        return FrameAge(name, self.level, 1e-3 * self.limit_ms)
-
-
-class ArmStateAgeConfig(InterlockSettings):
     """Largest age of an arm state."""
->>>>>>> main
 
     kind: Literal["arm_state_age"]
     limit_ms: PositiveFloat
 
-<<<<<<< HEAD
     def build_in_scene(self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene) -> Interlock:
-        """The rule."""
-        return ArmStateAge(name, self.level, 1e-3 * self.limit_ms, tuple(sorted(planning_scene.T_world_base)))
-=======
-    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
         """Return the ``ArmStateAge`` interlock."""
-        return ArmStateAge(name, self.level, 1e-3 * self.limit_ms)
->>>>>>> main
+        return ArmStateAge(name, self.level, 1e-3 * self.limit_ms, tuple(sorted(planning_scene.T_world_base)))

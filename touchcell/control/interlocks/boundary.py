@@ -37,7 +37,7 @@ _OUT, _BACK = "outside", "coming back"
 
 @dataclass(frozen=True, slots=True)
 class WayBack:
-    """How a command and the measured motion lead back inside, in m/s or rad/s.
+    """Commanded and measured motion back inside, in m/s or rad/s.
 
     Attributes:
         inward: how fast the command leads back.
@@ -53,11 +53,11 @@ class WayBack:
 
     @property
     def is_asked(self) -> bool:
-        """Whether the command really leads back."""
+        """True if the command really leads back."""
         return self.inward >= self.rest and self.inward >= _INWARD_SHARE * self.speed
 
     def is_followed(self, lasted_ns: int) -> bool:
-        """Whether the arm does not move outwards, and inwards once it has been commanded back for a while."""
+        """Return True if the arm does not move outwards, and inwards once it has been commanded back for a while."""
         least = 0.5 * self.rest if lasted_ns >= PROGRESS_NS else -2.0 * self.rest
         return self.measured_inward >= least
 
@@ -66,7 +66,7 @@ _NO_WAY = WayBack(0.0, 0.0, 0.0, REST_M_S)
 
 
 def _judge(violation: Violation, way: WayBack, past: InterlockState) -> Judgement:
-    """What is outside is a violation unless it comes back, and stays outside until it is well inside."""
+    """Return ``violation`` unless the way back is taken; the state lasts until the caller finds it well inside."""
     marks = {_OUT: past[_OUT]} if _OUT in past else {}
     if way.is_asked:
         since = marks[_BACK] = past.get(_BACK, TimerState(violation.t_ns))
@@ -77,7 +77,7 @@ def _judge(violation: Violation, way: WayBack, past: InterlockState) -> Judgemen
 
 
 def point_velocity(twist: Array, R_base_tcp: Array, lever_m: Array) -> tuple[float, float, float]:
-    """Velocity along base axes of a point ``lever_m`` (3,) from the tool centre point, along tool axes."""
+    """Return the velocity along base axes of a point ``lever_m`` (3,) from the tool centre point, along tool axes."""
     vx, vy, vz, wx, wy, wz = twist.tolist()
     x, y, z = (R_base_tcp @ lever_m).tolist()
     return vx + wy * z - wz * y, vy + wz * x - wx * z, vz + wx * y - wy * x
@@ -85,7 +85,7 @@ def point_velocity(twist: Array, R_base_tcp: Array, lever_m: Array) -> tuple[flo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Workspace:
-    """A point of an arm's tool stays inside a box along the axes of the arm's base; motion back into it is allowed.
+    """Keep a point of an arm's tool inside a box along the axes of the arm's base; motion back into it is allowed.
 
     Attributes:
         arm: role of the arm.
@@ -109,7 +109,7 @@ class Workspace:
     margin_m: float = 0.0
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
-        """The axis along which the point is furthest outside, unless it comes back."""
+        """Return a violation for the axis along which the point is furthest outside, unless it comes back."""
         arm = view.arms[self.arm]
         T = arm.state.value.T_base_tcp
         p = (T[:3, :3] @ self.T_tcp_point[:3, 3] + T[:3, 3]).tolist()
@@ -151,7 +151,7 @@ class Workspace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tilt:
-    """The z axis of an arm's tool, or of the sensor on it, stays in a cone; motion back into it is allowed.
+    """Keep the z axis of an arm's tool, or of the sensor on it, in a cone; motion back into it is allowed.
 
     Attributes:
         arm: role of the arm.
@@ -170,7 +170,7 @@ class Tilt:
     sensor: str | None = None
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
-        """How far the axis is outside the cone, unless it comes back."""
+        """Return a violation while the axis is outside the cone, unless it comes back."""
         arm = view.arms[self.arm]
         axis = arm.state.value.T_base_tcp[:3, :3] @ self.axis_tcp
         tilt_rad = math.acos(max(-1.0, min(1.0, float(axis @ self.direction))))
@@ -188,7 +188,7 @@ class Tilt:
         return _judge(violation, way, past)
 
     def _inward(self, twist: Array, axis: Array, tilt_rad: float) -> tuple[float, float]:
-        """How fast a twist turns the axis into the cone, and how fast it turns it at all, rad/s."""
+        """Return the rates at which a twist turns the axis into the cone, and at all, rad/s."""
         turning = np.cross(twist[3:], axis)
         return float(turning @ self.direction) / max(math.sin(tilt_rad), 1e-9), math.sqrt(float(turning @ turning))
 
@@ -196,8 +196,8 @@ class Tilt:
 class WorkspaceConfig(GradedSettings):
     """Box for a sensor, or for the tool centre point of an arm without one, along the axes of the arm's base.
 
-    ``margin_mm`` is how far outside the box nothing stands: a cell whose arm may overshoot by more is refused. What was
-    outside counts as inside when it is a fifth of that inside the box.
+    ``margin_mm`` is the free space around the box: a cell whose stopping distance may exceed it is refused. A point
+    that was outside counts as inside again a fifth of the margin inside the box.
     """
 
     kind: Literal["workspace"]
@@ -214,7 +214,7 @@ class WorkspaceConfig(GradedSettings):
         return self
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule. Raises ConfigError for a sensor that the cell does not have."""
+        """Return the ``Workspace`` interlock. Raises ConfigError for a sensor that the cell does not have."""
         T_tcp_point = _guarded(name, self.sensor, T_tcp_sensor)
         min_m, max_m = 1e-3 * np.array(self.min_mm), 1e-3 * np.array(self.max_mm)
         # A box that is thinner than its margin still has an inside.
@@ -239,14 +239,18 @@ class TiltConfig(GradedSettings):
         return self
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule. Raises ConfigError for a sensor that the cell does not have."""
+        """Return the ``Tilt`` interlock. Raises ConfigError for a sensor that the cell does not have."""
         axis = _guarded(name, self.sensor, T_tcp_sensor)[:3, 2]
         direction = np.array(self.direction) / np.linalg.norm(self.direction)
         return Tilt(name, self.level, self.arm, axis, direction, math.radians(self.limit_deg), self.sensor)
 
 
 def _guarded(name: str, sensor: str | None, T_tcp_sensor: Mapping[str, Array]) -> Array:
-    """Pose (4, 4) of the sensor in the tool frame, or the identity. Raises ConfigError for one that is not there."""
+    """Return the pose (4, 4) of the sensor in the tool frame, or the identity without one.
+
+    Raises:
+        ConfigError: the task has no such sensor.
+    """
     if sensor is None:
         return np.eye(4)
     if sensor not in T_tcp_sensor:

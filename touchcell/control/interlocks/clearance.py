@@ -25,12 +25,8 @@ _NEGLIGIBLE_M = 1e-7
 class Clearance:
     """Keep every arm at least ``limit_m`` from everything, and slow its approach to what is nearer than ``slow_m``.
 
-<<<<<<< HEAD
-    Motion that takes the two apart is allowed. What counts is where a command would lead within 10 ms; nearer than
+        Motion that takes the two apart is allowed. What counts is where a command would lead within 10 ms; nearer than
     ``limit_m`` it has to take them apart faster than standing still, while they are not measured to close.
-=======
-    Motion that increases the distance is allowed. The check uses the pose to which a command would lead within 10 ms.
->>>>>>> main
     """
 
     name: str

@@ -37,9 +37,8 @@ class Body:
     kinematics: Callable[[], DifferentialIk | None] = lambda: None
     link_count: int = 0
 
-<<<<<<< HEAD
     def frames(self, arm: ArmView, ahead_s: float = 0.0, *, measured: bool = False) -> Array:
-        """(link_count + 2, 4, 4) in the world as measured, or ``ahead_s`` later.
+        """Return (link_count + 2, 4, 4) frames in the world as measured, or ``ahead_s`` later.
 
         Args:
             arm: in this cycle.
@@ -48,25 +47,12 @@ class Body:
         """
         T_base_tcp = arm.state.value.T_base_tcp
         twist = (arm.state.value.twist if measured else arm.commanded_twist()) if ahead_s else None
-=======
-    def frames(self, arm: ArmView, ahead_s: float = 0.0) -> Array:
-        """Return (link_count + 2, 4, 4) frames in the world, measured or moved along the command for ``ahead_s``.
-
-        Raises:
-            ValueError: link frames are needed but the joint angles were not read.
-        """
-        T_base_tcp, twist = arm.state.value.T_base_tcp, arm.commanded_twist() if ahead_s else None
->>>>>>> main
         ik = self.kinematics()
         T = np.empty((self.link_count + 2, 4, 4))
         T[0] = np.eye(4)
         if ik is not None:
             if arm.joints is None:
-<<<<<<< HEAD
-                raise ValueError("the view has no joints of an arm whose links are guarded")
-=======
                 raise ValueError("the joint angles were not read")
->>>>>>> main
             q = arm.joints.value.q
             if twist is not None:
                 q = q + ahead_s * (arm.joints.value.dq if measured else ik.solve(q, twist).dq)
