@@ -1,1 +1,1 @@
-"""Tasks as state machines over abilities: what the cell does, without knowing which devices do it."""
+"""Tasks as state machines over protocols: what the cell does, without knowing which devices do it."""

@@ -21,12 +21,13 @@ from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.control.interlocks.config import INTERLOCKS, REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.device import DeactivatePolicy
+from touchcell.drivers.core.protocols import JointSource, TwistSink, protocol_names
 from touchcell.drivers.core.scene import scene_section
-from touchcell.drivers.core.spec import DRIVERS, DriverConfig, DriverSpec
+from touchcell.drivers.core.spec import DRIVERS, AnyDriver, DriverConfig
 from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.tasks.interface import TASKS, TaskConfig, TaskSpec
+from touchcell.tasks.interface import TASKS, AnyTask, TaskConfig
 
 M = TypeVar("M", bound=BaseModel)
 Three = tuple[float, float, float]
@@ -248,7 +249,7 @@ class DevicePlan:
     """A device that will be built: its section, spec and validated configuration."""
 
     name: str
-    spec: DriverSpec
+    spec: AnyDriver
     config: DriverConfig
 
 
@@ -275,7 +276,7 @@ class CellPlan:
     sensors: Mapping[str, DevicePlan]
     arm_roles: Mapping[str, str]
     sensor_roles: Mapping[str, str]
-    task: TaskSpec
+    task: AnyTask
     task_config: TaskConfig
     skipped: tuple[str, ...]
     devices: Mapping[str, DevicePlan]
@@ -325,7 +326,7 @@ class _Planner:
         sensors = {name: plan for name, plan in devices.items() if name in needed_sensors}
         if task:
             self._require_collection(cell, task)
-            self._require_abilities(task, arm_roles, arms)
+            self._require_protocols(task, arm_roles, arms)
             self._require_interlocks(cell, task)
             self._require_processes(cell, task, arm_roles)
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
@@ -356,7 +357,7 @@ class _Planner:
         if cell.emulated_scene is not None:
             self._validated(scene_section(), cell.emulated_scene, ("emulated_scene",))
 
-    def _task(self, cell: CellFile) -> tuple[TaskSpec | None, TaskConfig | None]:
+    def _task(self, cell: CellFile) -> tuple[AnyTask | None, TaskConfig | None]:
         try:
             spec = TASKS.load(cell.task.name)
         except ConfigError as error:
@@ -443,9 +444,9 @@ class _Planner:
         config = self._validated(spec.config, {**(section.model_extra or {}), **settings}, at)
         return DevicePlan(at[1], spec, config) if config is not None else None
 
-    def _require_interlocks(self, cell: CellFile, task: TaskSpec) -> None:
+    def _require_interlocks(self, cell: CellFile, task: AnyTask) -> None:
         """What moves must be bounded; limits have no defaults, so the file has to name them."""
-        moves = any("TwistSink" in abilities for abilities in task.arms.values())
+        moves = any(TwistSink in protocols for protocols in task.arms.values())
         required = REQUIRED_TO_MOVE if moves else frozenset()
         if moves and task.sensors:
             required |= REQUIRED_TO_TOUCH
@@ -457,21 +458,21 @@ class _Planner:
                 hint=f"add one: {INTERLOCKS[kind].summary}",
             )
 
-    def _require_processes(self, cell: CellFile, task: TaskSpec, arm_roles: Mapping[str, str]) -> None:
+    def _require_processes(self, cell: CellFile, task: AnyTask, arm_roles: Mapping[str, str]) -> None:
         """What devices in other processes cannot do is not asked of them."""
         if cell.processes == "one":
             return
-        from touchcell.drivers.hosting.groups import REMOTE_ABILITIES
+        from touchcell.drivers.hosting.groups import REMOTE_PROTOCOLS
 
         if cell.time == "simulated":
             self._add(
                 ("processes",), "several processes share real time only", value=cell.processes, hint="`time: real`"
             )
-        for role, abilities in task.arms.items():
-            if missing := abilities - REMOTE_ABILITIES:
+        for role, protocols in task.arms.items():
+            if missing := protocols - REMOTE_PROTOCOLS:
                 self._add(
                     ("processes",),
-                    f"{task.name} needs {', '.join(sorted(missing))} of {role!r}, which no other process passes on",
+                    f"{task.name} needs {protocol_names(missing)} of {role!r}, which no other process passes on",
                     hint="leave out `processes:`",
                 )
 
@@ -529,7 +530,7 @@ class _Planner:
                 )
         return found
 
-    def _require_collection(self, cell: CellFile, task: TaskSpec) -> None:
+    def _require_collection(self, cell: CellFile, task: AnyTask) -> None:
         if task.labels_frames and cell.collect is None:
             self._add(("collect",), f"{task.name} labels frames, and nothing says where they go", hint="add `collect:`")
         if cell.collect is not None and not task.labels_frames:
@@ -542,7 +543,7 @@ class _Planner:
         ways = []
         for arm in arms.values():
             body = cell.arms[arm.name].body
-            if not body and "JointSource" not in arm.spec.capabilities.abilities:
+            if not body and JointSource not in arm.spec.capabilities.provides:
                 self._add(
                     ("arms", arm.name, "body"),
                     f"{arm.spec.name} tells only where its tool is; interlocks.{name} has to know its shape",
@@ -563,18 +564,18 @@ class _Planner:
             )
         return both
 
-    def _require_abilities(self, task: TaskSpec, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]) -> None:
-        for role, abilities in task.arms.items():
+    def _require_protocols(self, task: AnyTask, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]) -> None:
+        for role, protocols in task.arms.items():
             name = arm_roles.get(role)
             if name is None or name not in arms:
                 continue
-            missing = abilities - arms[name].spec.capabilities.abilities
+            missing = protocols - arms[name].spec.capabilities.provides
             if missing:
                 self._add(
                     ("arms", name, "driver"),
-                    f"{arms[name].spec.name} lacks {', '.join(sorted(missing))}, which {task.name} needs",
+                    f"{arms[name].spec.name} does not provide {protocol_names(missing)}, which {task.name} needs",
                     value=arms[name].spec.name,
-                    hint="choose another driver; `touchcell list` shows abilities",
+                    hint="choose another driver; `touchcell list` names all",
                 )
 
     def _validated(self, model: type[M], data: Any, at: KeyPath) -> M | None:

@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from touchcell.drivers.core.spec import DriverConfig, DriverSpec
+from touchcell.drivers.core.protocols import SERVO_ARM, FrameSource, HealthSource, JointSource
+from touchcell.drivers.core.spec import AnyDriver, DriverConfig
 
 FASTEST_HZ: Final = 500.0
 """Device cycles per second of a host at most: a process in Python holds no more beside others."""
 
-REMOTE_ABILITIES: Final = frozenset(
-    {"TcpSource", "TwistSink", "Stoppable", "JointSource", "FrameSource", "HealthSource"}
-)
+REMOTE_PROTOCOLS: Final = SERVO_ARM | {JointSource, FrameSource, HealthSource}
 """What devices can do for a task in another process."""
 
 
@@ -29,7 +28,7 @@ class HostedDevice:
     """
 
     name: str
-    spec: DriverSpec
+    spec: AnyDriver
     config: DriverConfig
     category: int = 0
     policy: str = ""

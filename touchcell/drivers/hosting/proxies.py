@@ -1,4 +1,4 @@
-"""Devices of another process, with the abilities that they have there: a run loop does not see the difference."""
+"""Devices of another process, with the protocols that they provide there: a run loop does not see the difference."""
 
 from __future__ import annotations
 
