@@ -21,7 +21,8 @@ import yaml
 from tests.fault_injection.emulated_cells import HURT, arm_cell, camera_cell, sensor_of, sensors_of
 from tests.fault_injection.sent_commands import SentCommands
 from touchcell.cell.config.schema import CellPlan, plan_cell
-from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import Outcome, RunLoop, RunResult, StopRequest
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.clock import MonotonicClock

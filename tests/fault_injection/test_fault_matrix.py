@@ -23,7 +23,14 @@ def test_every_fault_and_every_task_is_in_the_matrix() -> None:
     assert set(cells()) == set(TASKS.names())
 
 
-MOVING = ("surface_following", "object_tracking", "single_arm_pushing", "dual_arm_pushing", "data_collection")
+MOVING = (
+    "surface_following",
+    "object_tracking",
+    "single_arm_pushing",
+    "dual_arm_pushing",
+    "data_collection",
+    "steps",
+)
 
 
 def run_all(folder: Path, kind: Literal["arm", "camera"], task: str) -> list[Case]:
@@ -47,7 +54,7 @@ def test_faults_of_arms_in_every_state(task: str, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not (MODELS / "sim_gdn.safetensors").exists(), reason="needs the model that ships")
-@pytest.mark.parametrize("task", ["surface_following", "object_tracking", "observe", "data_collection"])
+@pytest.mark.parametrize("task", ["surface_following", "object_tracking", "observe", "data_collection", "steps"])
 def test_faults_of_cameras_in_every_state(task: str, tmp_path: Path) -> None:
     """Those of the pushing tasks take minutes; ``touchcell bench safety`` has them."""
     run_all(tmp_path, "camera", task)

@@ -14,7 +14,7 @@ import numpy as np
 from touchcell.api.cells import load_cell
 from touchcell.cell.config.schema import CellPlan
 from touchcell.cell.config.yaml_file import YamlFile
-from touchcell.cell.runtime.compose import build_devices
+from touchcell.cell.runtime.devices import build_devices
 from touchcell.control.reach import Reach, is_there
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.clock import Clock, MonotonicClock, VirtualClock

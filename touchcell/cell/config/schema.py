@@ -17,7 +17,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag, model_validator
 
 from touchcell.cell.config.settings import with_settings
-from touchcell.cell.config.stopping_distance import StoppingDistance, overshoot, together
+from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
 from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile, load
 from touchcell.control.interlocks.basic import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
@@ -185,11 +185,16 @@ class SensorSection(_OpenSection):
 
 
 class TaskSection(_OpenSection):
-    """The task, which arms and sensors play its roles, and the task's own keys."""
+    """The task, which arms and sensors play its roles, and the task's own keys; ``steps:`` alone names the task too."""
 
     name: str
     arms: dict[str, str] = {}
     sensors: dict[str, str] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named_by_its_steps(cls, section: Any) -> Any:
+        return {"name": "steps", **section} if isinstance(section, dict) and "steps" in section else section
 
 
 class RecordingSection(_Section):
@@ -581,7 +586,7 @@ class _Planner:
             lever_m = 1e-3 * max((float(np.linalg.norm(end)) for end in ends), default=0.0)
             if (way := _overshoot(arm, lever_m, cell.rate_hz)) is not None:
                 ways.append(way)
-        both = together(sorted(ways, key=lambda way: way.total_m)[-2:])
+        both = combined(sorted(ways, key=lambda way: way.total_m)[-2:])
         if both.total_m > 1e-3 * entry.limit_mm:
             self._add(
                 ("interlocks", name, "limit_mm"),
