@@ -21,7 +21,9 @@ from touchcell.cell.config.stopping_distance import StoppingDistance, combined, 
 from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile, load
 from touchcell.control.interlocks.basic import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
-from touchcell.control.interlocks.config import INTERLOCKS, REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
+from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
+from touchcell.control.interlocks.spec import INTERLOCKS
+from touchcell.control.interlocks.violation import Severity
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.device import DeactivatePolicy
 from touchcell.drivers.core.protocols import JointSource, TwistSink, protocol_names
@@ -483,12 +485,12 @@ class _Planner:
         required = REQUIRED_TO_MOVE if moves else frozenset()
         if moves and task.sensors:
             required |= REQUIRED_TO_TOUCH
-        stopping = {entry.kind for entry in cell.interlocks.values() if entry.severity != "limit"}
+        stopping = {entry.kind for entry in cell.interlocks.values() if entry.level is not Severity.LIMIT}
         for kind in sorted(required - stopping):
             self._add(
                 ("interlocks",),
                 f"no interlock of kind {kind!r} that stops, which a task that moves an arm must have",
-                hint=f"add one: {INTERLOCKS[kind].summary}",
+                hint=f"add one: {INTERLOCKS.load(kind).summary}",
             )
 
     def _require_processes(self, cell: CellFile, task: AnyTask, arm_roles: Mapping[str, str]) -> None:
