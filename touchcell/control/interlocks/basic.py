@@ -3,19 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import PositiveFloat
 
+from touchcell.control.interlocks.coverage import (
+    RUNAWAY,
+    SILENCE_S,
+    CannotTrip,
+    CellFacts,
+    Change,
+    Fault,
+    SensorFacts,
+    just_beyond,
+    of_each_sensor,
+    with_arm,
+    with_motion,
+    with_sensor,
+)
 from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.planning_scene import PlanningScene, SpatialInterlockConfig
 from touchcell.control.interlocks.settings import LEAVE, GradedSettings, InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
+from touchcell.control.interlocks.spec import InterlockSpec
 from touchcell.control.interlocks.timers import NO_MARKS, InterlockState, Judgement, TimedInterlock, TimerState
 from touchcell.control.interlocks.violation import Severity, Violation
+from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.geometry.finite import all_finite
 from touchcell.geometry.types import Array
 
@@ -43,6 +59,10 @@ class Finite:
             yield role, None, "measured twist", arm.state.value.twist
             if arm.joints is not None:
                 yield role, None, "measured joint angles", arm.joints.value.q
+            if arm.wrench is not None:
+                yield role, None, "measured wrench", arm.wrench.value
+            if arm.external_torque is not None:
+                yield role, None, "external torque", arm.external_torque.value
         for role, sensor in view.sensors.items():
             for what, value in (
                 ("depth", sensor.depth_m),
@@ -194,9 +214,40 @@ class TcpSpeedConfig(InterlockSettings):
     limit_m_s: PositiveFloat
     limit_rad_s: PositiveFloat
 
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return arms that run away, linearly and in rotation, as measured and as commanded."""
+        for role, arm in facts.arms.items():
+            if arm.limits is None:
+                continue
+            for first, key, limit, gate, unit in (
+                (0, "limit_m_s", self.limit_m_s, arm.limits.speed_m_s, "m/s"),
+                (3, "limit_rad_s", self.limit_rad_s, arm.limits.rot_speed_rad_s, "rad/s"),
+            ):
+                speed = just_beyond(limit, RUNAWAY * gate)
+                twist = np.zeros(6)
+                twist[first] = speed
+                for source in ("measured", "commanded"):
+                    yield Fault(
+                        role,
+                        f"{source} speed {speed:.3g} {unit}",
+                        f"{limit:g} {unit}",
+                        _runs_away(role, twist, source),
+                        key=key,
+                        hint=f"lower it below {RUNAWAY:g} times the {gate:g} {unit} of this arm's gate",
+                    )
+
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the ``TcpSpeed`` interlock."""
         return TcpSpeed(name, self.level, self.limit_m_s, self.limit_rad_s)
+
+
+def _runs_away(role: str, twist: Array, source: str) -> Change:
+    def change(view: CellView, t_s: float) -> CellView:
+        if source == "measured":
+            return with_motion(view, role, twist=twist)
+        return with_arm(view, role, command=TwistCommand(twist, TwistFrame.BASE, view.now_ns, 0.03))
+
+    return change
 
 
 class DepthConfig(GradedSettings):
@@ -204,6 +255,22 @@ class DepthConfig(GradedSettings):
 
     kind: Literal["depth"]
     limit_mm: PositiveFloat
+
+    def faults(self, facts: CellFacts) -> Iterable[Fault | CannotTrip]:
+        """Return each sensor pressed in too deep, as far as its estimator can report."""
+
+        def pressed(role: str, sensor: SensorFacts) -> Fault:
+            depth_m = just_beyond(1e-3 * self.limit_mm, sensor.depth_m)
+            return Fault(
+                role,
+                f"pressed in by {1e3 * depth_m:.2f} mm",
+                f"{self.limit_mm:g} mm",
+                lambda view, t_s: with_sensor(view, role, in_contact=True, depth_m=depth_m),
+                key="limit_mm",
+                hint=f"lower it: {sensor.estimator} reports {1e3 * sensor.depth_m:.2f} mm at most",
+            )
+
+        return of_each_sensor(facts, lambda sensor: sensor.depth_m > 0.0, "reports no depth", pressed)
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the ``Depth`` interlock."""
@@ -216,6 +283,14 @@ class FrameAgeConfig(InterlockSettings):
     kind: Literal["frame_age"]
     limit_ms: PositiveFloat
 
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return each sensor silent, and missing."""
+        if not facts.sensors:
+            yield CannotTrip("", "the task has no tactile sensor")
+        for role in facts.sensors:
+            yield _silence(role, "sensors", self.limit_ms)
+            yield _absence(role, "sensors", self.limit_ms)
+
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
         """Return the ``FrameAge`` interlock."""
         return FrameAge(name, self.level, 1e-3 * self.limit_ms, tuple(sorted(T_tcp_sensor)))
@@ -227,6 +302,40 @@ class ArmStateAgeConfig(SpatialInterlockConfig):
     kind: Literal["arm_state_age"]
     limit_ms: PositiveFloat
 
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return each arm silent, and missing."""
+        if not facts.arms:
+            yield CannotTrip("", "the task has no arm")
+        for role in facts.arms:
+            yield _silence(role, "arms", self.limit_ms)
+            yield _absence(role, "arms", self.limit_ms)
+
     def build_in_scene(self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene) -> Interlock:
         """Return the ``ArmStateAge`` interlock."""
         return ArmStateAge(name, self.level, 1e-3 * self.limit_ms, tuple(sorted(planning_scene.T_world_base)))
+
+
+def _silence(role: str, group: Literal["arms", "sensors"], limit_ms: float) -> Fault:
+    def change(view: CellView, t_s: float) -> CellView:
+        t_ns = view.now_ns - round(1e9 * t_s)
+        if group == "sensors":
+            return with_sensor(view, role, t_frame_ns=t_ns)
+        return with_arm(view, role, state=replace(view.arms[role].state, t_ns=t_ns))
+
+    hint = f"lower it below {1e3 * SILENCE_S:g} ms"
+    return Fault(role, "silent", f"{limit_ms:g} ms", change, within_s=SILENCE_S, key="limit_ms", hint=hint)
+
+
+def _absence(role: str, group: Literal["arms", "sensors"], limit_ms: float) -> Fault:
+    def change(view: CellView, t_s: float) -> CellView:
+        if group == "sensors":
+            return replace(view, sensors={key: each for key, each in view.sensors.items() if key != role})
+        return replace(view, arms={key: each for key, each in view.arms.items() if key != role})
+
+    return Fault(role, "missing", f"{limit_ms:g} ms", change, within_s=SILENCE_S)
+
+
+TCP_SPEED = InterlockSpec("tcp_speed", "measured and commanded tool speed stay below limits", TcpSpeedConfig)
+DEPTH = InterlockSpec("depth", "no sensor is pressed in too deep", DepthConfig)
+FRAME_AGE = InterlockSpec("frame_age", "tactile frames are fresh", FrameAgeConfig)
+ARM_STATE_AGE = InterlockSpec("arm_state_age", "arm states are fresh", ArmStateAgeConfig)

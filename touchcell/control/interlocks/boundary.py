@@ -9,18 +9,30 @@ is one that an arm does not follow.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
+from touchcell.control.interlocks.coverage import (
+    CannotTrip,
+    CellFacts,
+    Change,
+    Fault,
+    just_beyond,
+    mount_problem,
+    role_problem,
+    with_motion,
+)
 from touchcell.control.interlocks.settings import LEAVE, GradedSettings
 from touchcell.control.interlocks.snapshot import ArmView, CellView
+from touchcell.control.interlocks.spec import InterlockSpec
 from touchcell.control.interlocks.timers import NO_MARKS, InterlockState, Judgement, TimedInterlock, TimerState
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.errors import ConfigError
+from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 REST_M_S: Final = 1e-3
@@ -213,6 +225,29 @@ class WorkspaceConfig(GradedSettings):
             raise ValueError(f"min_mm {list(self.min_mm)} is not below max_mm {list(self.max_mm)} in every axis")
         return self
 
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return the guarded point beyond each wall, wherever the arm can take it."""
+        if (problem := _guard_problem(self.arm, self.sensor, facts)) is not None:
+            yield problem
+            return
+        T_tcp_point = np.eye(4) if self.sensor is None else facts.sensors[self.sensor].T_tcp_sensor
+        reach_m = facts.arms[self.arm].reach_m + float(np.linalg.norm(T_tcp_point[:3, 3]))
+        low, high = np.array(self.min_mm), np.array(self.max_mm)
+        inside = _placed(self.arm, 0.5e-3 * (low + high), T_tcp_point)
+        covers = (self.arm,) if self.sensor is None else (self.arm, self.sensor)
+        for axis in range(3):
+            for key, wall_mm, sign in (("min_mm", low[axis], -1.0), ("max_mm", high[axis], 1.0)):
+                place_mm = np.clip(0.0, low, high)
+                place_mm[axis] = wall_mm
+                what = f"{'xyz'[axis]} = {wall_mm + sign * self.margin_mm:g} mm"
+                if 1e-3 * np.linalg.norm(place_mm) > reach_m:
+                    reason = f"its wall at {'xyz'[axis]} = {wall_mm:g} mm is out of the arm's reach of {reach_m:.2f} m"
+                    yield CannotTrip(self.arm, reason, key, "move the wall to where the arm must not pass")
+                    continue
+                place_mm[axis] += sign * self.margin_mm
+                outside = _placed(self.arm, 1e-3 * place_mm, T_tcp_point)
+                yield Fault(self.arm, what, f"{wall_mm:g} mm", outside, inside, covers=covers, key=key)
+
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the ``Workspace`` interlock. Raises ConfigError for a sensor that the cell does not have."""
         T_tcp_point = _guarded(name, self.sensor, T_tcp_sensor)
@@ -238,11 +273,71 @@ class TiltConfig(GradedSettings):
             raise ValueError("direction is zero")
         return self
 
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return the guarded axis tilted out of the cone."""
+        if (problem := _guard_problem(self.arm, self.sensor, facts)) is not None:
+            yield problem
+            return
+        axis_tcp = np.array([0.0, 0.0, 1.0])
+        if self.sensor is not None:
+            axis_tcp = facts.sensors[self.sensor].T_tcp_sensor[:3, 2]
+        direction = np.array(self.direction) / np.linalg.norm(self.direction)
+        tilt_deg = just_beyond(self.limit_deg, 180.0)
+        covers = (self.arm,) if self.sensor is None else (self.arm, self.sensor)
+        yield Fault(
+            self.arm,
+            f"tilted by {tilt_deg:.1f} deg",
+            f"{self.limit_deg:g} deg",
+            _pointed(self.arm, axis_tcp, direction, math.radians(tilt_deg)),
+            _pointed(self.arm, axis_tcp, direction, 0.0),
+            covers=covers,
+            key="limit_deg",
+            hint="lower it below 180 deg",
+        )
+
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the ``Tilt`` interlock. Raises ConfigError for a sensor that the cell does not have."""
         axis = _guarded(name, self.sensor, T_tcp_sensor)[:3, 2]
         direction = np.array(self.direction) / np.linalg.norm(self.direction)
         return Tilt(name, self.level, self.arm, axis, direction, math.radians(self.limit_deg), self.sensor)
+
+
+def _guard_problem(arm: str, sensor: str | None, facts: CellFacts) -> CannotTrip | None:
+    """Return why an arm's tool, or a sensor on it, is not what has to be guarded; None if it is."""
+    if sensor is not None:
+        return mount_problem(sensor, arm, facts, "sensor")
+    if (problem := role_problem(arm, facts.arms, "arm", "arm")) is not None:
+        return problem
+    carried = sorted(role for role, each in facts.sensors.items() if each.arm == arm)
+    if not carried:
+        return None
+    return CannotTrip(arm, f"it guards the tool, and {carried[0]} at its end is not guarded", "sensor", "name it")
+
+
+def _placed(arm: str, place_m: Array, T_tcp_point: Array) -> Change:
+    """Return the change that puts a point of an arm's tool at ``place_m`` (3,) in its base's frame."""
+    T_base_point = np.eye(4)
+    T_base_point[:3, 3] = place_m
+    T_base_tcp = T_base_point @ se3.inverse(T_tcp_point)
+    return lambda view, t_s: with_motion(view, arm, T_base_tcp)
+
+
+def _pointed(arm: str, axis_tcp: Array, direction: Array, tilt_rad: float) -> Change:
+    """Return the change that tilts an axis of an arm's tool out of a direction along base axes."""
+    R_axis, R_direction = _frame_along(axis_tcp), _frame_along(direction)
+    tilted = se3.exp(np.array([0.0, 0.0, 0.0, tilt_rad, 0.0, 0.0]))[:3, :3]
+    T_base_tcp = np.eye(4)
+    T_base_tcp[:3, :3] = R_direction @ tilted @ R_axis.T
+    return lambda view, t_s: with_motion(view, arm, T_base_tcp)
+
+
+def _frame_along(axis: Array) -> Array:
+    """Return a rotation (3, 3) whose z axis is ``axis`` (3,)."""
+    other = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    x = np.cross(other, axis)
+    x /= np.linalg.norm(x)
+    frame: Array = np.stack([x, np.cross(axis, x), axis], axis=1)
+    return frame
 
 
 def _guarded(name: str, sensor: str | None, T_tcp_sensor: Mapping[str, Array]) -> Array:
@@ -261,3 +356,7 @@ def _guarded(name: str, sensor: str | None, T_tcp_sensor: Mapping[str, Array]) -
             hint=f"sensors: {', '.join(sorted(T_tcp_sensor)) or 'none'}",
         )
     return T_tcp_sensor[sensor]
+
+
+WORKSPACE = InterlockSpec("workspace", "sensor or tool stays inside a box in the arm's base frame", WorkspaceConfig)
+TILT = InterlockSpec("tilt", "sensor or tool points along a direction within a cone", TiltConfig)

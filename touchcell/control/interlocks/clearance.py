@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Self
 
@@ -11,14 +11,27 @@ from pydantic import PositiveFloat, model_validator
 
 from touchcell.control.interlocks.boundary import REST_M_S
 from touchcell.control.interlocks.collision import Clearances, Pair
+from touchcell.control.interlocks.coverage import (
+    CannotTrip,
+    CellFacts,
+    Change,
+    Fault,
+    unchanged,
+    with_arm,
+    with_motion,
+)
 from touchcell.control.interlocks.planning_scene import Body, PlanningScene, SpatialInterlockConfig
 from touchcell.control.interlocks.snapshot import CellView
+from touchcell.control.interlocks.spec import InterlockSpec
 from touchcell.control.interlocks.violation import Severity, Violation
+from touchcell.drivers.core.samples import JointState, Stamped
 from touchcell.errors import ConfigError
+from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 _AHEAD_S = 0.01
 _NEGLIGIBLE_M = 1e-7
+_TRIED = 400
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +105,23 @@ class ClearanceConfig(SpatialInterlockConfig):
             raise ValueError(f"slow_mm {self.slow_mm:g} is below limit_mm {self.limit_mm:g}")
         return self
 
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return each arm where something of it is too near to something else, if there is such a pose."""
+        bodies = facts.scene.bodies
+        for role in facts.arms.keys() - bodies.keys():
+            yield CannotTrip(role, "its shape is not known", "kind", "give it a `body:`")
+        if not bodies:
+            return
+        counts = {role: body.link_count + 2 for role, body in bodies.items()}
+        clearances = Clearances({role: body.capsules for role, body in bodies.items()}, counts, facts.scene.boxes)
+        near, apart = _search(clearances, facts, 1e-3 * self.limit_mm, 1e-3 * self.slow_mm)
+        for role in bodies:
+            if role in near:
+                yield Fault(role, "too near", f"{self.limit_mm:g} mm", near[role], apart, key="limit_mm")
+            else:
+                reason = f"in none of {_TRIED} poses anything of it is nearer than {self.limit_mm:g} mm to anything"
+                yield CannotTrip(role, reason, "limit_mm", "give it a `body:`, or name the `obstacles:` around it")
+
     def build_in_scene(self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene) -> Clearance:
         """Return the ``Clearance`` interlock. Raises ConfigError if there are no two bodies that could collide."""
         bodies = planning_scene.bodies
@@ -104,3 +134,63 @@ class ClearanceConfig(SpatialInterlockConfig):
                 hint="give the arms a `body:`, or name `obstacles:`",
             )
         return Clearance(name, self.level, bodies, clearances, 1e-3 * self.limit_mm, 1e-3 * self.slow_mm)
+
+
+def _search(
+    clearances: Clearances, facts: CellFacts, limit_m: float, slow_m: float
+) -> tuple[dict[str, Change], Change]:
+    """Return, for each arm, a pose of the cell in which it is too near to something, and one in which nothing is."""
+    bodies = facts.scene.bodies
+    rng = np.random.default_rng(0)
+    targets = [box.T_world_box[:3, 3] for box in facts.scene.boxes]
+    targets += [body.T_world_base[:3, 3] for body in bodies.values()]
+    near: dict[str, Change] = {}
+    apart: Change | None = None
+    for k in range(_TRIED):
+        posed = _Posed({role: _random_pose(role, facts, targets, k, rng) for role in bodies})
+        view = posed(facts.healthy(0, ""), 0.0)
+        frames = [body.frames(view.arms[role]) for role, body in bodies.items()]
+        distances = clearances.distances(np.concatenate(frames))
+        if apart is None and np.min(distances) > slow_m:
+            apart = posed
+        for pair, distance in zip(clearances.pairs, distances.tolist(), strict=True):
+            if distance < limit_m:
+                near.setdefault(pair.arm, posed)
+                near.setdefault(pair.other_arm or pair.arm, posed)
+        if apart is not None and len(near) == len(bodies):
+            break
+    return near, apart or unchanged
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Posed:
+    """A change to a pose of the whole cell: T_base_tcp (4, 4) and joint angles of each arm that has any."""
+
+    poses: Mapping[str, tuple[Array, Array | None]]
+
+    def __call__(self, view: CellView, t_s: float) -> CellView:
+        for role, (T_base_tcp, q) in self.poses.items():
+            view = with_motion(view, role, T_base_tcp)
+            if q is not None:
+                view = with_arm(view, role, joints=Stamped(JointState(q, np.zeros_like(q)), view.now_ns, 0))
+        return view
+
+
+def _random_pose(
+    role: str, facts: CellFacts, targets: Sequence[Array], number: int, rng: np.random.Generator
+) -> tuple[Array, Array | None]:
+    """Return a pose of one arm: in turns anywhere within reach, and with its tool at what it could collide with."""
+    body = facts.scene.bodies[role]
+    if (ik := body.kinematics()) is not None:
+        q = rng.uniform(ik.chain.lower, ik.chain.upper)
+        return ik.chain.forward(q), q
+    T = np.eye(4)
+    if number % 2:
+        T[:3, 3] = rng.uniform(-facts.arms[role].reach_m, facts.arms[role].reach_m, 3)
+        return T, None
+    T[:3, 3] = targets[(number // 2) % len(targets)]
+    placed: Array = se3.inverse(body.T_world_base) @ T
+    return placed, None
+
+
+CLEARANCE = InterlockSpec("clearance", "arms keep clear of each other, obstacles and themselves", ClearanceConfig)

@@ -1,8 +1,8 @@
 """Armed coverage: the faults that must trip an interlock, described by the interlock's own settings.
 
-Settings that have a method ``faults`` take part in the proof (``touchcell.control.proof``), whoever has written them. It
-returns, for each arm or sensor that the interlock guards, a change to a healthy snapshot that must make it trip, or the
-reason why no snapshot of this cell ever could. See docs/explanation/armed-coverage.md.
+Settings that have a method ``faults`` take part in the proof (``touchcell.control.proof``), also those of another
+package. It returns, for each arm or sensor that the interlock guards, a change to a healthy snapshot that must make it
+trip, or the reason why no snapshot of this cell ever could. See docs/explanation/armed-coverage.md.
 """
 
 from __future__ import annotations

@@ -7,10 +7,22 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
+from touchcell.control.interlocks.coverage import (
+    HELD_S,
+    CannotTrip,
+    CellFacts,
+    Change,
+    Fault,
+    just_beyond,
+    with_arm,
+    with_motion,
+)
 from touchcell.control.interlocks.settings import LEAVE, InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
+from touchcell.control.interlocks.spec import InterlockSpec
 from touchcell.control.interlocks.timers import (
     InterlockState,
     Judgement,
@@ -21,6 +33,8 @@ from touchcell.control.interlocks.timers import (
     TimerState,
 )
 from touchcell.control.interlocks.violation import Severity, Violation
+from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
+from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.geometry.types import Array
 
 
@@ -73,12 +87,51 @@ def _limited(view: CellView) -> Mapping[str, str]:
     }
 
 
+_LIMITED_S = 10.0
+"""A gate that limits for this long must trip."""
+
+
+def _creeps(role: str, speed_m_s: float) -> Change:
+    def change(view: CellView, t_s: float) -> CellView:
+        T = np.eye(4)
+        T[0, 3] = speed_m_s * t_s
+        return with_motion(view, role, T)
+
+    return change
+
+
+def _sent(role: str, speed_m_s: float, adjustments: tuple[Adjustment, ...] = ()) -> Change:
+    twist = np.array([speed_m_s, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+    def change(view: CellView, t_s: float) -> CellView:
+        command = TwistCommand(twist, TwistFrame.BASE, view.now_ns, 0.03)
+        return with_arm(view, role, sent=Sent(command, view.now_ns, adjustments))
+
+    return change
+
+
 class StandstillConfig(InterlockSettings):
     """Largest drift of an arm that is commanded to stop, and the time that it may take to come to rest."""
 
     kind: Literal["standstill"]
     limit_mm: PositiveFloat
     settle_ms: NonNegativeFloat
+
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return each arm that moves on although commanded to stop."""
+        for role, arm in facts.arms.items():
+            if arm.limits is None:
+                continue
+            yield Fault(
+                role,
+                f"moves on at {1e3 * arm.limits.speed_m_s:g} mm/s",
+                f"{self.limit_mm:g} mm",
+                _creeps(role, arm.limits.speed_m_s),
+                before_s=1e-3 * self.settle_ms if self.settle_ms <= 1e3 * HELD_S else HELD_S,
+                key="limit_mm",
+                hint=f"lower it, and settle_ms below {1e3 * HELD_S:g}: within {HELD_S:g} s the arm gets "
+                f"{1e3 * HELD_S * arm.limits.speed_m_s:.0f} mm far",
+            )
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the ``Standstill`` interlock."""
@@ -92,6 +145,21 @@ class TrackingConfig(InterlockSettings):
     limit_mm_s: PositiveFloat
     leave_mm_s: PositiveFloat | None = None
     hold_ms: NonNegativeFloat
+
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return each arm that stays at rest although commanded."""
+        for role, arm in facts.arms.items():
+            if arm.limits is None:
+                continue
+            speed_m_s = just_beyond(1e-3 * self.limit_mm_s, arm.limits.speed_m_s)
+            yield Fault(
+                role,
+                f"at rest, commanded at {1e3 * speed_m_s:.3g} mm/s",
+                f"{self.limit_mm_s:g} mm/s",
+                _sent(role, speed_m_s),
+                key="limit_mm_s",
+                hint=f"lower it below the {1e3 * arm.limits.speed_m_s:g} mm/s of this arm's gate",
+            )
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the interlock on the velocity error."""
@@ -107,6 +175,27 @@ class LimitedConfig(InterlockSettings):
     kind: Literal["limited"]
     limit_ms: PositiveFloat
 
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return each arm whose gate limits every command."""
+        for role, arm in facts.arms.items():
+            if arm.limits is None:
+                continue
+            speed = arm.limits.speed_m_s
+            yield Fault(
+                role,
+                "limited by its gate",
+                f"{self.limit_ms:g} ms",
+                _sent(role, speed, (Adjustment("tcp linear speed", 2.0 * speed, speed),)),
+                within_s=_LIMITED_S,
+                key="limit_ms",
+                hint=f"lower it below {1e3 * _LIMITED_S:g} ms",
+            )
+
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the interlock on limited commands."""
         return OnDelay(name, self.level, _limited, 1e-3 * self.limit_ms)
+
+
+TRACKING = InterlockSpec("tracking", "an arm follows its commanded velocity", TrackingConfig)
+STANDSTILL = InterlockSpec("standstill", "an arm that is commanded to stop stays at rest", StandstillConfig)
+LIMITED = InterlockSpec("limited", "no gate limits an arm's command for long", LimitedConfig)

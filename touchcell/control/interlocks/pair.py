@@ -13,9 +13,23 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
+from touchcell.control.interlocks.coverage import (
+    HELD_S,
+    CannotTrip,
+    CellFacts,
+    Change,
+    Fault,
+    just_beyond,
+    mount_problem,
+    role_problem,
+    states_of,
+    with_motion,
+    with_sensor,
+)
 from touchcell.control.interlocks.planning_scene import PlanningScene, SpatialInterlockConfig
 from touchcell.control.interlocks.settings import LEAVE
 from touchcell.control.interlocks.snapshot import CellView, SensorView
+from touchcell.control.interlocks.spec import InterlockSpec
 from touchcell.control.interlocks.timers import (
     AnyOf,
     InterlockState,
@@ -31,10 +45,14 @@ from touchcell.control.interlocks.timers import (
 from touchcell.control.interlocks.violation import Severity
 from touchcell.drivers.core.samples import TcpState
 from touchcell.errors import ConfigError
+from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 _REFERENCE_DEPTH_M = 1e-3
 """Shallower contacts determine the surface normal too poorly to be a reference."""
+_FALLEN_DEG = 45.0
+_FALLING_DEG_S = 90.0
+"""An object that leans this far, or this fast, must trip."""
 _RATE_S = 0.2
 """Time over which the tilt rate is taken; a single frame's tilt is too noisy."""
 
@@ -227,6 +245,38 @@ class OutOfStepConfig(_PairSettings):
     limit_mm: PositiveFloat
     hold_ms: NonNegativeFloat
 
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return tips that part, and tips pressed in unevenly."""
+        states, wrong = _pair_states(self, facts)
+        yield from wrong
+        places = ((self.leader_sensor, self.leader), (self.follower_sensor, self.follower))
+        for key, (sensor, arm) in zip(("leader", "follower"), places, strict=True):
+            if (problem := mount_problem(sensor, arm, facts, key)) is not None:
+                wrong = (*wrong, problem)
+                yield problem
+        if wrong:
+            return
+        fastest_m_s = sum(limits.speed_m_s for _, arm in places if (limits := facts.arms[arm].limits) is not None)
+        speed_m_s = just_beyond(1e-3 * self.limit_mm_s, fastest_m_s)
+        deepest_m = min(facts.sensors[sensor].depth_m for sensor, _ in places)
+        uneven_m = just_beyond(1e-3 * self.limit_mm, 0.99 * deepest_m)
+
+        def step(parting_m_s: float, deeper_m: float) -> Change:
+            def change(view: CellView, t_s: float) -> CellView:
+                view = _facing(view, facts, *places[0], -1.0, 0.01 * deepest_m + deeper_m)
+                view = _facing(view, facts, *places[1], 1.0, 0.01 * deepest_m)
+                twist = np.zeros(6)
+                twist[:3] = facts.base(self.follower)[:3, :3].T @ np.array([parting_m_s, 0.0, 0.0])
+                return with_motion(view, self.follower, twist=twist)
+
+            return change
+
+        for what, limit, key, change in (
+            (f"tips part at {1e3 * speed_m_s:.3g} mm/s", f"{self.limit_mm_s:g} mm/s", "limit_mm_s", step(speed_m_s, 0)),
+            (f"depths differ by {1e3 * uneven_m:.2f} mm", f"{self.limit_mm:g} mm", "limit_mm", step(0, uneven_m)),
+        ):
+            yield Fault(self.follower_sensor, what, limit, change, step(0, 0), states=states, key=key, hint="lower it")
+
     def build_in_scene(
         self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene
     ) -> TimedInterlock:
@@ -254,6 +304,36 @@ class ObjectLostConfig(_PairSettings):
     severity: Literal["trip", "fault"] = "trip"
     limit_ms: PositiveFloat
 
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return each of the two contacts lost."""
+        states, wrong = _pair_states(self, facts)
+        yield from wrong
+        for key, role in (("leader_sensor", self.leader_sensor), ("follower_sensor", self.follower_sensor)):
+            if (problem := role_problem(role, facts.sensors, "sensor", key)) is not None:
+                wrong = (*wrong, problem)
+                yield problem
+        if wrong:
+            return
+
+        def held(view: CellView, t_s: float) -> CellView:
+            view = with_sensor(view, self.leader_sensor, in_contact=True)
+            return with_sensor(view, self.follower_sensor, in_contact=True)
+
+        def without(role: str) -> Change:
+            return lambda view, t_s: with_sensor(held(view, t_s), role, in_contact=False)
+
+        for role in (self.leader_sensor, self.follower_sensor):
+            yield Fault(
+                role,
+                "contact lost",
+                f"{self.limit_ms:g} ms",
+                without(role),
+                held,
+                states=states,
+                key="limit_ms",
+                hint=f"lower it below {1e3 * HELD_S:g} ms",
+            )
+
     def build_in_scene(
         self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene
     ) -> TimedInterlock:
@@ -279,6 +359,64 @@ class TopplingConfig(SpatialInterlockConfig):
     limit_mm: PositiveFloat
     hold_ms: NonNegativeFloat
     states: tuple[str, ...] = ()
+
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return an object that topples slowly, and one that slides down."""
+        states, wrong = states_of(self.states, facts)
+        yield from wrong
+        if len(set(self.sensors)) < len(self.sensors):
+            wrong = (*wrong, CannotTrip(self.sensors[0], "names one sensor twice", "sensors"))
+            yield wrong[-1]
+        places = tuple(zip(self.sensors, self.arms, strict=False))
+        for sensor, arm in places:
+            if (problem := mount_problem(sensor, arm, facts, "arms")) is not None:
+                wrong = (*wrong, problem)
+                yield problem
+        for key, limit, most, unit in (
+            ("limit_deg", self.limit_deg, _FALLEN_DEG, "deg"),
+            ("limit_deg_s", self.limit_deg_s, _FALLING_DEG_S, "deg/s"),
+        ):
+            if limit >= most:
+                wrong = (
+                    *wrong,
+                    CannotTrip(self.sensors[0], f"{limit:g} {unit} is not below {most:g}", key, "lower it"),
+                )
+                yield wrong[-1]
+        if wrong:
+            return
+        depth_m = min(2.0 * _REFERENCE_DEPTH_M, *(facts.sensors[sensor].depth_m for sensor, _ in places))
+        slide_m = just_beyond(1e-3 * self.limit_mm, min(facts.sensors[sensor].shear_m for sensor, _ in places))
+        lean_s = self.limit_deg / (0.5 * self.limit_deg_s)
+
+        def topple(rate_deg_s: float, slides_m: float) -> Change:
+            def change(view: CellView, t_s: float) -> CellView:
+                lean_rad = math.radians(min(rate_deg_s * max(t_s, 0.0), _FALLEN_DEG))
+                for k, (sensor, arm) in enumerate(places):
+                    side = 1.0 if k else -1.0
+                    view = _facing(view, facts, sensor, arm, side, depth_m, lean_rad=lean_rad, slides_m=slides_m)
+                return view
+
+            return change
+
+        lean, slide = topple(0.5 * self.limit_deg_s, 0.0), topple(0.0, slide_m)
+        first = self.sensors[0]
+        leans = f"leans by up to {_FALLEN_DEG:g} deg, at {0.5 * self.limit_deg_s:g} deg/s"
+        within_s, covers = 1.1 * lean_s + HELD_S, self.sensors
+        still = topple(0.0, 0.0)
+        yield Fault(
+            first, leans, f"{self.limit_deg:g} deg", lean, still, 0.0, within_s, states, covers, "limit_deg", "lower it"
+        )
+        yield Fault(
+            first,
+            f"slides down by {1e3 * slide_m:.2f} mm",
+            f"{self.limit_mm:g} mm",
+            slide,
+            still,
+            states=states,
+            covers=covers,
+            key="limit_mm",
+            hint="lower it below the shear that the estimators report",
+        )
 
     def build_in_scene(
         self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene
@@ -306,6 +444,41 @@ class TopplingConfig(SpatialInterlockConfig):
         )
 
 
+def _pair_states(
+    settings: OutOfStepConfig | ObjectLostConfig, facts: CellFacts
+) -> tuple[tuple[str, ...], tuple[CannotTrip, ...]]:
+    """Return the states in which a rule about a pair counts, and what is wrong with them and with the pair."""
+    states, wrong = states_of(settings.states, facts)
+    if settings.leader_sensor == settings.follower_sensor:
+        reason = f"leader and follower are one sensor, {settings.leader_sensor!r}"
+        wrong = (*wrong, CannotTrip(settings.leader_sensor, reason, "follower_sensor", "name two"))
+    return states, wrong
+
+
+def _facing(
+    view: CellView,
+    facts: CellFacts,
+    sensor: str,
+    arm: str,
+    side: float,
+    depth_m: float,
+    *,
+    lean_rad: float = 0.0,
+    slides_m: float = 0.0,
+) -> CellView:
+    """Return ``view`` with a sensor pressed along the world's x axis from ``side``, its tip leaning and sheared."""
+    upright = np.array([0.0, 0.0, 0.0, 0.0, -0.5 * math.pi * side, 0.0])
+    leaning = np.array([0.0, 0.0, 0.0, 0.0, -lean_rad, 0.0])
+    T_world_sensor = se3.exp(leaning) @ se3.exp(upright)
+    T_world_sensor[:3, 3] = [0.1 * side, 0.0, 0.3]
+    T_base_tcp = se3.inverse(facts.base(arm)) @ T_world_sensor @ se3.inverse(facts.sensors[sensor].T_tcp_sensor)
+    down = T_world_sensor[:3, :3].T @ np.array([0.0, 0.0, -1.0])
+    T_s_f = np.eye(4)
+    T_s_f[:3, 3] = slides_m * down
+    view = with_motion(view, arm, T_base_tcp)
+    return with_sensor(view, sensor, in_contact=True, depth_m=depth_m, T_s_f=T_s_f)
+
+
 def _carried(
     name: str,
     key: str,
@@ -326,3 +499,10 @@ def _require_sensor(name: str, key: str, sensor: str, T_tcp_sensor: Mapping[str,
             value=sensor,
             hint=f"sensors: {', '.join(sorted(T_tcp_sensor)) or 'none'}",
         )
+
+
+OUT_OF_STEP = InterlockSpec(
+    "out_of_step", "leader and follower keep their distance and share the load", OutOfStepConfig
+)
+OBJECT_LOST = InterlockSpec("object_lost", "the object held by two sensors stays between them", ObjectLostConfig)
+TOPPLING = InterlockSpec("toppling", "the pushed or held object does not begin to topple", TopplingConfig)

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal, Self
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, model_validator
 
 from touchcell.control.interlocks.violation import Severity
+from touchcell.geometry.types import Array
+
+if TYPE_CHECKING:
+    from touchcell.control.interlocks.interlock import Interlock
+    from touchcell.control.interlocks.timers import TimedInterlock
 
 
 class InterlockSettings(BaseModel):
@@ -14,12 +20,33 @@ class InterlockSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+    kind: str
     severity: Literal["trip", "fault"] = "trip"
+
+    @model_validator(mode="after")
+    def _leaves_below_its_limit(self) -> Self:
+        for name in type(self).model_fields:
+            leave, limit = getattr(self, name), getattr(self, name.replace("leave_", "limit_", 1), None)
+            if name.startswith("leave_") and leave is not None and limit is not None and leave > limit:
+                raise ValueError(f"{name} {leave:g} is above {name.replace('leave_', 'limit_', 1)} {limit:g}")
+        return self
 
     @property
     def level(self) -> Severity:
         """The severity as the interlocks use it."""
         return Severity[self.severity.upper()]
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock | TimedInterlock:
+        """Return the interlock.
+
+        Args:
+            name: of the entry in the cell file.
+            T_tcp_sensor: (4, 4) pose of each sensor in the tool frame, by role.
+
+        Raises:
+            ConfigError: the entry names a sensor that the cell does not have.
+        """
+        raise NotImplementedError(f"{type(self).__name__} builds no interlock")
 
 
 class GradedSettings(InterlockSettings):

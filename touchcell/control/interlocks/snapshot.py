@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from touchcell.drivers.core.commands import Sent, TwistCommand, in_base_axes
+from touchcell.drivers.core.enabling import EnablingPosition
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.geometry.types import Array
 
@@ -21,12 +22,16 @@ class ArmView:
         command: the command about to be sent; None when the arm is commanded to stop.
         sent: the command that its gate passed in the previous cycle, and its adjustments; None for a stop.
         joints: newest joint angles, where an interlock needs them.
+        wrench: (6,) newest wrench on the tool, N and N m, where an interlock needs it.
+        external_torque: (n,) newest external torque of each joint, N m, where an interlock needs it.
     """
 
     state: Stamped[TcpState]
     command: TwistCommand | None = None
     sent: Sent[TwistCommand] | None = None
     joints: Stamped[JointState] | None = None
+    wrench: Stamped[Array] | None = None
+    external_torque: Stamped[Array] | None = None
 
     def commanded_twist(self) -> Array | None:
         """(6,) twist of the tool centre point along base axes that the command asks for; None without a command."""
@@ -82,7 +87,8 @@ class SensorView:
 class CellView:
     """Snapshot of the cell at ``now_ns``: arms and sensors by their role in the task, and the task's state.
 
-    ``at_work`` is False while a tripped run waits for an operator: then nothing is being pushed or held.
+    ``at_work`` is False while a tripped run waits for an operator: then nothing is being pushed or held. ``enabling``
+    is the position of the enabling device, where the cell has one.
     """
 
     now_ns: int
@@ -90,6 +96,7 @@ class CellView:
     sensors: Mapping[str, SensorView] = field(default_factory=dict)
     task_state: str = ""
     at_work: bool = True
+    enabling: Stamped[EnablingPosition] | None = None
 
     def works_in(self, states: frozenset[str]) -> bool:
         """Return True if the task is at work, and in one of ``states`` if any are named."""

@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
+from touchcell.control.interlocks.coverage import (
+    HELD_S,
+    CannotTrip,
+    CellFacts,
+    Fault,
+    SensorFacts,
+    just_beyond,
+    of_each_sensor,
+    states_of,
+    unchanged,
+    with_sensor,
+)
 from touchcell.control.interlocks.settings import LEAVE, GradedSettings, InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
+from touchcell.control.interlocks.spec import InterlockSpec
 from touchcell.control.interlocks.timers import (
     InterlockState,
     Judgement,
@@ -25,6 +38,8 @@ from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.geometry.types import Array
 
 _BASELINE_FRAMES = 10
+_WILD_NIS = 1000.0
+"""A normalised innovation squared of this size must trip: no filter of six degrees of freedom explains it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +178,22 @@ class FrameFrozenConfig(InterlockSettings):
     kind: Literal["frame_frozen"]
     limit_ms: PositiveFloat
 
+    def faults(self, facts: CellFacts) -> Iterable[Fault | CannotTrip]:
+        """Return each sensor with an image that stays the same while time goes on."""
+
+        def frozen(role: str, sensor: SensorFacts) -> Fault:
+            content = 0 if sensor.images else None
+            return Fault(
+                role,
+                "an image that stays the same",
+                f"{self.limit_ms:g} ms",
+                lambda view, t_s: with_sensor(view, role, seq=0, content=content),
+                key="limit_ms",
+                hint=f"lower it below {1e3 * HELD_S:g} ms",
+            )
+
+        return of_each_sensor(facts, lambda sensor: True, "", frozen)
+
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the ``FrameFrozen`` interlock."""
         return FrameFrozen(name, self.level, 1e-3 * self.limit_ms)
@@ -173,6 +204,22 @@ class ExposureConfig(InterlockSettings):
 
     kind: Literal["exposure"]
     limit_percent: PositiveFloat
+
+    def faults(self, facts: CellFacts) -> Iterable[Fault | CannotTrip]:
+        """Return each sensor with images that turn black."""
+
+        def dark(role: str, sensor: SensorFacts) -> Fault:
+            return Fault(
+                role,
+                "black images",
+                f"{self.limit_percent:g} %",
+                lambda view, t_s: with_sensor(view, role, brightness=0.0),
+                before_s=(_BASELINE_FRAMES + 2) / sensor.frame_rate_hz,
+                key="limit_percent",
+                hint="lower it below 100",
+            )
+
+        return of_each_sensor(facts, lambda sensor: sensor.images, "has no images", dark)
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the ``Exposure`` interlock."""
@@ -185,6 +232,27 @@ class ContactLostConfig(InterlockSettings):
     kind: Literal["contact_lost"]
     limit_ms: PositiveFloat
     states: tuple[str, ...] = Field(default=("approach", "settle", "run"), min_length=1)
+
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return each sensor with a contact that is lost."""
+        states, wrong = states_of(self.states, facts, chosen="states" in self.model_fields_set)
+        yield from wrong
+        if wrong:
+            return
+
+        def lost(role: str, sensor: SensorFacts) -> Fault:
+            return Fault(
+                role,
+                "contact lost",
+                f"{self.limit_ms:g} ms",
+                unchanged,
+                lambda view, t_s: with_sensor(view, role, in_contact=True),
+                states=states,
+                key="limit_ms",
+                hint=f"lower it below {1e3 * HELD_S:g} ms",
+            )
+
+        yield from of_each_sensor(facts, lambda sensor: True, "", lost)
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the ``ContactLost`` interlock."""
@@ -199,6 +267,22 @@ class UncertainConfig(GradedSettings):
     leave_mm: PositiveFloat | None = None
     hold_ms: NonNegativeFloat = 0.0
 
+    def faults(self, facts: CellFacts) -> Iterable[Fault | CannotTrip]:
+        """Return each sensor with a depth that is not well known."""
+
+        def beyond(role: str, sensor: SensorFacts) -> Fault:
+            value = just_beyond(self.limit_mm, 1e3 * sensor.sigma_m)
+            return Fault(
+                role,
+                f"standard deviation {value:.3g} mm",
+                f"{self.limit_mm:g} mm",
+                lambda view, t_s: with_sensor(view, role, in_contact=True, sigma_depth_m=1e-3 * value),
+                key="limit_mm",
+                hint=f"lower it: {sensor.estimator} reports {1e3 * sensor.sigma_m:.3g} mm at most",
+            )
+
+        return of_each_sensor(facts, lambda sensor: sensor.sigma_m > 0.0, "reports no standard deviation", beyond)
+
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the interlock on the standard deviation of the depth."""
         leave, hold_s = self.leave_mm or LEAVE * self.limit_mm, 1e-3 * self.hold_ms
@@ -211,6 +295,21 @@ class OutOfRangeConfig(GradedSettings):
 
     kind: Literal["out_of_range"]
     limit_ms: PositiveFloat
+
+    def faults(self, facts: CellFacts) -> Iterable[Fault | CannotTrip]:
+        """Return each sensor with an estimate outside the training range."""
+
+        def outside(role: str, sensor: SensorFacts) -> Fault:
+            return Fault(
+                role,
+                "outside the training range",
+                f"{self.limit_ms:g} ms",
+                lambda view, t_s: with_sensor(view, role, in_contact=True, in_range=False),
+                key="limit_ms",
+                hint=f"lower it below {1e3 * HELD_S:g} ms",
+            )
+
+        return of_each_sensor(facts, lambda sensor: sensor.leaves_range, "has no training range", outside)
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the interlock on the training range."""
@@ -228,6 +327,22 @@ class InconsistentConfig(GradedSettings):
     leave_nis: PositiveFloat | None = None
     frames: PositiveInt
 
+    def faults(self, facts: CellFacts) -> Iterable[Fault | CannotTrip]:
+        """Return each sensor with innovations that do not match its filter."""
+
+        def off(role: str, sensor: SensorFacts) -> Fault:
+            nis = just_beyond(self.limit_nis, _WILD_NIS)
+            return Fault(
+                role,
+                f"normalised innovation squared {nis:.3g}",
+                f"{self.limit_nis:g}",
+                lambda view, t_s: with_sensor(view, role, in_contact=True, nis=nis),
+                key="limit_nis",
+                hint=f"lower it below {_WILD_NIS:g}, and `frames` below {HELD_S * sensor.frame_rate_hz:g}",
+            )
+
+        return of_each_sensor(facts, lambda sensor: sensor.innovations, "has no filter", off)
+
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the interlock on the filter's consistency."""
         leave = self.leave_nis or LEAVE * self.limit_nis
@@ -243,6 +358,22 @@ class ShearConfig(GradedSettings):
     leave_mm: PositiveFloat | None = None
     hold_ms: NonNegativeFloat = 0.0
 
+    def faults(self, facts: CellFacts) -> Iterable[Fault | CannotTrip]:
+        """Return each sensor sheared too far."""
+
+        def beyond(role: str, sensor: SensorFacts) -> Fault:
+            value = just_beyond(self.limit_mm, 1e3 * sensor.shear_m)
+            return Fault(
+                role,
+                f"sheared by {value:.3g} mm",
+                f"{self.limit_mm:g} mm",
+                lambda view, t_s: with_sensor(view, role, in_contact=True, shear_m=1e-3 * value),
+                key="limit_mm",
+                hint=f"lower it: {sensor.estimator} reports {1e3 * sensor.shear_m:.3g} mm at most",
+            )
+
+        return of_each_sensor(facts, lambda sensor: sensor.shear_m > 0.0, "reports no shear", beyond)
+
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the interlock on shear."""
         leave, hold_s = self.leave_mm or LEAVE * self.limit_mm, 1e-3 * self.hold_ms
@@ -256,6 +387,22 @@ class TorsionConfig(GradedSettings):
     limit_deg: PositiveFloat
     leave_deg: PositiveFloat | None = None
     hold_ms: NonNegativeFloat = 0.0
+
+    def faults(self, facts: CellFacts) -> Iterable[Fault | CannotTrip]:
+        """Return each sensor twisted too far."""
+
+        def beyond(role: str, sensor: SensorFacts) -> Fault:
+            value = just_beyond(self.limit_deg, math.degrees(sensor.torsion_rad))
+            return Fault(
+                role,
+                f"twisted by {value:.3g} deg",
+                f"{self.limit_deg:g} deg",
+                lambda view, t_s: with_sensor(view, role, in_contact=True, torsion_rad=math.radians(value)),
+                key="limit_deg",
+                hint=f"lower it: {sensor.estimator} reports {math.degrees(sensor.torsion_rad):.3g} deg at most",
+            )
+
+        return of_each_sensor(facts, lambda sensor: sensor.torsion_rad > 0.0, "reports no torsion", beyond)
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the interlock on torsion."""
@@ -277,6 +424,31 @@ class SlipConfig(GradedSettings):
     min_depth_mm: PositiveFloat = 1.0
     states: tuple[str, ...] = ()
 
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return each sensor sheared too far for its depth."""
+        states, wrong = states_of(self.states, facts)
+        yield from wrong
+        if wrong:
+            return
+
+        def sliding(role: str, sensor: SensorFacts) -> Fault:
+            depth_m = min(1e-3 * self.min_depth_mm, 0.99 * sensor.depth_m)
+            shear_m = just_beyond(self.limit_ratio * depth_m, sensor.shear_m)
+            return Fault(
+                role,
+                f"sheared by {1e3 * shear_m:.2f} mm at {1e3 * depth_m:.2f} mm",
+                f"{self.limit_ratio:g}",
+                lambda view, t_s: with_sensor(view, role, in_contact=True, depth_m=depth_m, shear_m=shear_m),
+                states=states,
+                key="limit_ratio",
+                hint=f"{sensor.estimator} reports {1e3 * sensor.shear_m:.1f} mm of shear and "
+                f"{1e3 * sensor.depth_m:.1f} mm of depth at most",
+            )
+
+        yield from of_each_sensor(
+            facts, lambda sensor: sensor.shear_m > 0.0 < sensor.depth_m, "reports no shear", sliding
+        )
+
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the interlock on shear per depth."""
         leave, hold_s = self.leave_ratio or LEAVE * self.limit_ratio, 1e-3 * self.hold_ms
@@ -295,8 +467,36 @@ class MarkersLostConfig(InterlockSettings):
     leave_percent: PositiveFloat | None = None
     frames: PositiveInt = 1
 
+    def faults(self, facts: CellFacts) -> Iterable[Fault | CannotTrip]:
+        """Return each sensor with too many markers missing."""
+
+        def missing(role: str, sensor: SensorFacts) -> Fault:
+            percent = just_beyond(self.limit_percent, 100.0)
+            return Fault(
+                role,
+                f"{percent:.3g} % of the markers missing",
+                f"{self.limit_percent:g} %",
+                lambda view, t_s: with_sensor(view, role, markers=1.0 - 0.01 * percent),
+                key="frames",
+                hint=f"lower it below {HELD_S * sensor.frame_rate_hz:g}",
+            )
+
+        return of_each_sensor(facts, lambda sensor: sensor.markers, "detects no markers", missing)
+
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the interlock on missing markers."""
         leave = self.leave_percent or LEAVE * self.limit_percent
         what = "markers missing:"
         return Sustained(name, self.level, _markers_missing, what, self.limit_percent, leave, "%", frames=self.frames)
+
+
+FRAME_FROZEN = InterlockSpec("frame_frozen", "tactile frames are not frozen: their content changes", FrameFrozenConfig)
+EXPOSURE = InterlockSpec("exposure", "brightness stays near that of the first frames", ExposureConfig)
+UNCERTAIN = InterlockSpec("uncertain", "standard deviation of the depth is below a limit", UncertainConfig)
+OUT_OF_RANGE = InterlockSpec("out_of_range", "the estimate stays inside the network's training range", OutOfRangeConfig)
+INCONSISTENT = InterlockSpec("inconsistent", "innovations match the filter's covariance", InconsistentConfig)
+CONTACT_LOST = InterlockSpec("contact_lost", "an established contact is not lost for long", ContactLostConfig)
+SHEAR = InterlockSpec("shear", "shear of every contact stays below saturation or slip", ShearConfig)
+TORSION = InterlockSpec("torsion", "torsion of every contact stays below a limit", TorsionConfig)
+SLIP = InterlockSpec("slip", "shear per depth of every contact stays below slip", SlipConfig)
+MARKERS_LOST = InterlockSpec("markers_lost", "most of the markers expected in view are detected", MarkersLostConfig)
