@@ -29,7 +29,11 @@ def tables() -> Mapping[str, Table]:
 
 
 def redraw(page: str, known: Mapping[str, Table]) -> str:
-    """``page`` with every diagram between its markers drawn from ``known``. Raises KeyError for an unknown one."""
+    """Return ``page`` with every diagram between its markers drawn from ``known``.
+
+    Raises:
+        KeyError: a diagram's name is not in ``known``.
+    """
 
     def draw(block: re.Match[str]) -> str:
         return f"{block[1]}```mermaid\n{mermaid(known[block[2]])}\n```\n{block[3]}"
