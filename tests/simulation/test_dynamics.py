@@ -198,7 +198,7 @@ def test_numbers_that_are_not_finite_are_told_not_computed_with() -> None:
 
 
 def test_physics_asks_for_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValidationError, match="no multiple of physics_step_ms"):
+    with pytest.raises(ValidationError, match="not a multiple of physics_step_ms"):
         SceneConfig.model_validate({"physics": "dynamic", **FLOOR, "step_ms": 0.5})
     monkeypatch.setitem(sys.modules, "mujoco", None)
     for name in ("touchcell.simulation.dynamics", "touchcell.simulation.dynamics_model"):

@@ -181,7 +181,7 @@ def test_it_needs_a_scene_and_a_simulated_arm() -> None:
     config = SimTactipConfig(mounted_on="arm")
     with pytest.raises(ConfigError, match="needs a scene"):
         spec.build("tip2", config, DriverContext(cell.clock, {"arm": cell.arm}))
-    with pytest.raises(ConfigError, match="no arm of this cell") as caught:
+    with pytest.raises(ConfigError, match="not an arm of this cell") as caught:
         spec.build("tip2", config, DriverContext(cell.clock, {"tip": cell.tip}, cell.scene))
     assert caught.value.key == "tip2.mounted_on"
 
