@@ -18,21 +18,21 @@ GROUP = "touchcell.emulators"
 
 
 class EmulatorModule(Protocol):
-    """What an emulator's module offers."""
+    """Interface of an emulator's module."""
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Declare its command line."""
+        """Add the command-line arguments."""
         ...
 
     def build(self, arguments: argparse.Namespace) -> Emulator:
-        """Make the emulator, not yet started."""
+        """Build the emulator; it is not started yet."""
         ...
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the emulator named first in ``arguments`` until it is told to end; returns the exit code."""
+    """Run the emulator named first in ``arguments`` until it is stopped; return the exit code."""
     modules = {point.name: point for point in entry_points(group=GROUP)}
-    parser = argparse.ArgumentParser("touchcell emulate", description="Emulate a device on the wire.")
+    parser = argparse.ArgumentParser("touchcell emulate", description="Emulate a device at its interface.")
     parsers = parser.add_subparsers(dest="name", required=True, metavar=" | ".join(sorted(modules)))
     wanted = arguments[0] if arguments else ""
     for name, point in modules.items():
