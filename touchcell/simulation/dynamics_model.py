@@ -1,6 +1,6 @@
 """MuJoCo model of a dynamic scene: table, free objects, and soft tips on carriages.
 
-Settings and reasons: docs/simulation.md. Imported only for ``physics: dynamic``.
+Settings and reasons: docs/explanation/simulation.md. Imported only for ``physics: dynamic``.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class TipMechanics:
         radius_m: radius of the sphere.
         stiffness_n_m: along the surface normal.
         friction: coefficient of sliding friction against everything.
-        mass_kg: mass of the sphere. Lighter ones creep where they should stick (docs/simulation.md).
+        mass_kg: mass of the sphere. Lighter ones creep where they should stick (docs/explanation/simulation.md).
         torsion_friction_m: frictional torque about the contact normal, per normal force.
     """
 

@@ -324,10 +324,10 @@ class TipLawConfig(_Part):
 class SceneConfig(_Part, SceneSection):
     """The ``scene:`` section of a cell file. Poses are in the world frame.
 
-    ``physics`` is the fidelity (docs/simulation.md). ``kinematic``: surfaces with prescribed motion, unaffected by
-    contact. ``quasi_static``: in addition, objects slide on the table where tips push them, without inertia and always
-    upright. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms`` within ``step_ms``,
-    the grid on which arms move and contacts are stored.
+    ``physics`` is the fidelity (docs/explanation/simulation.md). ``kinematic``: surfaces with prescribed motion,
+    unaffected by contact. ``quasi_static``: in addition, objects slide on the table where tips push them, without
+    inertia and always upright. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms``
+    within ``step_ms``, the grid on which arms move and contacts are stored.
     """
 
     physics: Literal["kinematic", "quasi_static", "dynamic"] = "kinematic"

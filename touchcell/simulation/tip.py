@@ -2,7 +2,7 @@
 
 The deformation is a sum of smooth fields around the contact axis, which is the inward normal through the sphere's
 centre; psi is a marker's angle from it. The forms are those that were necessary to fit real images
-(docs/calibration.md).
+(docs/explanation/calibration.md).
 """
 
 from __future__ import annotations

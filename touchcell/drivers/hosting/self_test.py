@@ -45,7 +45,7 @@ class SelfTestFailed(DeviceError):
         super().__init__(
             device,
             f"self-test, {link} withheld: {reason}",
-            hint="do not use this cell; docs/safety-processes.md describes the test",
+            hint="do not use this cell; docs/explanation/safety-processes.md describes the test",
         )
         self.link = link
         self.declared_s = declared_s

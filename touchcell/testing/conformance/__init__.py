@@ -1,1 +1,1 @@
-"""Conformance suite for drivers, built-in and third-party; see ``docs/drivers.md``."""
+"""Conformance suite for drivers, built-in and third-party; see ``docs/how-to/write-a-driver.md``."""
