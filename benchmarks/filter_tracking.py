@@ -14,13 +14,13 @@ from pydantic import TypeAdapter
 
 from touchcell.cell.analysis.report import summarise
 from touchcell.cell.analysis.run_data import load_run
+from touchcell.cell.config.armed import REQUIRED_OF_ARMS, REQUIRED_OF_SENSORS
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import FilterSection, plan_cell
 from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.sensor import build_filter
-from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.types import Array
 from touchcell.perception.models.labels import XI_UNITS
@@ -117,7 +117,7 @@ def track(name: str, *, moving: bool, duration_s: float, seed: int, network: Pat
     cell_file["task"]["duration_s"] = duration_s
     # Interlocks that judge estimates and motion would end the runs of the worse filters, which are to be measured.
     cell_file["interlocks"] = {
-        k: v for k, v in cell_file["interlocks"].items() if v["kind"] in REQUIRED_TO_MOVE | REQUIRED_TO_TOUCH
+        k: v for k, v in cell_file["interlocks"].items() if v["kind"] in REQUIRED_OF_ARMS + REQUIRED_OF_SENSORS
     }
     if not moving:
         del cell_file["scene"]["surfaces"]["plate"]["motion"]

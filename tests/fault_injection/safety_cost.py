@@ -15,10 +15,11 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
+from touchcell.cell.config.armed import REQUIRED_OF_ARMS, REQUIRED_OF_SENSORS
 from touchcell.cell.config.find import find_cell
-from touchcell.cell.runtime.planning_scene import link_capsules
+from touchcell.cell.config.planning_scene import link_capsules
 from touchcell.control.interlocks.collision import TOOL, Capsule
-from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, build_interlocks, parse_interlocks
+from touchcell.control.interlocks.config import build_interlocks, parse_interlocks
 from touchcell.control.interlocks.planning_scene import Body, PlanningScene
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
 from touchcell.control.latch import Latch
@@ -58,8 +59,8 @@ def costs() -> dict[str, float]:
         "gate: and six joints near a singularity": _time_us(_Gate(_NEAR_SINGULAR)),
     }
     shipped = yaml.safe_load(find_cell(Path("configs/object_track_sim.yaml")).read_text())["interlocks"]
-    required = [n for n in shipped if shipped[n]["kind"] in REQUIRED_TO_MOVE | REQUIRED_TO_TOUCH]
-    to_move = [n for n in required if shipped[n]["kind"] in REQUIRED_TO_MOVE]
+    required = [n for n in shipped if shipped[n]["kind"] in REQUIRED_OF_ARMS + REQUIRED_OF_SENSORS]
+    to_move = [n for n in required if shipped[n]["kind"] in REQUIRED_OF_ARMS]
     one, two = _views(("arm",)), _views(("leader", "follower"))
     blind = [replace(view, sensors={}) for view in one]
     # Without a sensor the box is for the tool.

@@ -196,6 +196,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
+    from touchcell.cell.config.armed import proof_table
     from touchcell.cell.config.schema import plan_cell
 
     plan = plan_cell(find_cell(options.cell), _overrides(options.data))
@@ -203,9 +204,10 @@ def _check(options: argparse.Namespace) -> int:
     print(f"  task     {plan.task.name}: {plan.task.summary}")
     for device in [*plan.arms.values(), *plan.sensors.values()]:
         print(f"  {device.spec.capabilities.kind:<8} {device.name}: {device.spec.name}, {device.spec.summary}")
-    for name, interlock in plan.cell.interlocks.items():
-        way = plan.stopping_distances.get(name)
-        print(f"  interlock {name}: {interlock.kind}" + (f"; beyond its limit, {way}" if way else ""))
+    for name, way in plan.stopping_distances.items():
+        print(f"  beyond {name}: {way}")
+    for line in proof_table(plan):
+        print(f"  {line}")
     if plan.cell.processes == "separate":
         from touchcell.cell.runtime.process_watchdog import process_lines
 

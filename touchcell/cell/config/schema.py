@@ -7,7 +7,7 @@ task fit, and says which devices the task does not need, so that they are not ev
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -21,12 +21,11 @@ from touchcell.cell.config.stopping_distance import StoppingDistance, combined, 
 from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile
 from touchcell.control.interlocks.boundary import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
-from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
-from touchcell.control.interlocks.spec import INTERLOCKS
-from touchcell.control.interlocks.violation import Severity
+from touchcell.control.interlocks.config import InterlocksConfig
+from touchcell.control.proof import Proof
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.device import DeactivatePolicy
-from touchcell.drivers.core.protocols import JointSource, TwistSink, protocol_names
+from touchcell.drivers.core.protocols import JointSource, protocol_names
 from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DRIVERS, AnyDriver, DriverConfig
 from touchcell.errors import ConfigError, suggest
@@ -279,6 +278,7 @@ class CellPlan:
         stopping_distances: by the name of a workspace or clearance, how far its arm gets beyond it, or the two fastest
             arms towards each other, before they stand.
         settings: values that were set in place of the file's own, by dotted key.
+        proofs: what made each interlock trip.
     """
 
     file: Path
@@ -293,6 +293,7 @@ class CellPlan:
     devices: Mapping[str, DevicePlan]
     stopping_distances: Mapping[str, StoppingDistance] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
+    proofs: tuple[Proof, ...] = ()
 
     def __repr__(self) -> str:
         devices = [f"{name} {device.spec.name}" for name, device in {**self.arms, **self.sensors}.items()]
@@ -359,7 +360,6 @@ class _Planner:
         if task:
             self._require_collection(cell, task)
             self._require_protocols(task, arm_roles, arms)
-            self._require_interlocks(cell, task)
             self._require_processes(cell, task, arm_roles)
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
         self._require_pairs(cell)
@@ -369,7 +369,7 @@ class _Planner:
         assert task is not None
         assert task_config is not None
         skipped = sorted((set(cell.arms) - set(arms)) | (set(cell.sensors) - set(sensors)))
-        return CellPlan(
+        planned = CellPlan(
             file.path,
             cell,
             arms,
@@ -383,6 +383,7 @@ class _Planner:
             stopping_distances,
             self._settings,
         )
+        return self._require_armed(planned)
 
     def _require_scene_fits(self, cell: CellFile) -> None:
         if cell.scene is not None:
@@ -477,19 +478,21 @@ class _Planner:
         config = self._validated(spec.config, {**(section.model_extra or {}), **settings}, at)
         return DevicePlan(at[1], spec, config) if config is not None else None
 
-    def _require_interlocks(self, cell: CellFile, task: AnyTask) -> None:
-        """What moves must be bounded; limits have no defaults, so the file has to name them."""
-        moves = any(TwistSink in protocols for protocols in task.arms.values())
-        required = REQUIRED_TO_MOVE if moves else frozenset()
-        if moves and task.sensors:
-            required |= REQUIRED_TO_TOUCH
-        stopping = {entry.kind for entry in cell.interlocks.values() if entry.level is not Severity.LIMIT}
-        for kind in sorted(required - stopping):
-            self._add(
-                ("interlocks",),
-                f"no interlock of kind {kind!r} that stops, which a task that moves an arm must have",
-                hint=f"add one: {INTERLOCKS.load(kind).summary}",
-            )
+    def _require_armed(self, plan: CellPlan) -> CellPlan:
+        """An interlock that cannot trip, and what moves or feels and nothing guards, is refused."""
+        from touchcell.cell.config.armed import cell_facts, not_armed, prove_cell
+
+        try:
+            facts = cell_facts(plan)
+            proofs = prove_cell(plan, facts)
+        except ConfigError as error:
+            self._add(tuple(error.key.split(".")), error.reason, value=error.value, hint=error.hint)
+            raise InvalidCell(self._problems) from None
+        for problem in not_armed(plan, facts, proofs):
+            self._add(problem.path, problem.reason, hint=problem.hint)
+        if self._problems:
+            raise InvalidCell(self._problems)
+        return replace(plan, proofs=proofs)
 
     def _require_processes(self, cell: CellFile, task: AnyTask, arm_roles: Mapping[str, str]) -> None:
         """What devices in other processes cannot do is not asked of them."""

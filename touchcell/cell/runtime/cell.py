@@ -39,6 +39,8 @@ class Cell:
         scene: what is simulated around the arms, as far as it can be looked into; None in a cell of real devices.
         collection: where labelled frames go, None where the task labels none.
         watchdog: stops the arms when the loop falls silent.
+        require_armed: raises ConfigError unless every interlock trips on the faults that it guards against; called when
+            all devices have answered and none is energised.
     """
 
     plan: CellPlan
@@ -55,6 +57,7 @@ class Cell:
     scene: SceneTruth | None = None
     collection: Collection | None = None
     watchdog: Watchdog = field(default_factory=NullWatchdog)
+    require_armed: Callable[[], None] = lambda: None
     start_ns: int = 0
     _exit: ExitStack = field(default_factory=ExitStack, init=False)
 
@@ -83,6 +86,7 @@ class Cell:
             for device in self._devices():
                 self._exit.enter_context(device)
                 device.configure()
+            self.require_armed()
             # Every device must answer before the first one is energised.
             for device in self._devices():
                 device.activate()

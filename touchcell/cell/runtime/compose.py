@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import cast
 
+from touchcell.cell.config.armed import require_armed
+from touchcell.cell.config.planning_scene import build_planning_scene
 from touchcell.cell.config.schema import CellPlan
 from touchcell.cell.recording.dataset_writer import Collection
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.devices import build_devices, build_world
-from touchcell.cell.runtime.planning_scene import build_planning_scene
 from touchcell.cell.runtime.sensor import build_sensor
 from touchcell.control.interlocks.config import build_interlocks
 from touchcell.control.latch import Latch
@@ -66,6 +68,7 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
         scene=world.truth,
         collection=collection,
         watchdog=world.watchdog,
+        require_armed=partial(require_armed, plan, interlocks, planning_scene),
     )
 
 

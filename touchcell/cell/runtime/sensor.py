@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from touchcell.cell.config.model_path import model_path
 from touchcell.cell.config.schema import (
     CellPlan,
     KnownSurface,
@@ -27,14 +28,11 @@ from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.paths import MODELS
 from touchcell.perception.runtime.pipeline import ContactPipeline, ContactSource
 
 if TYPE_CHECKING:
     from touchcell.drivers.core.scene import SceneTruth
     from touchcell.perception.runtime.filter import ContactFilter
-
-BUILTIN = "builtin:"
 
 
 @dataclass
@@ -161,11 +159,6 @@ def _truth(name: str, mount: Device | None, scene: SceneTruth | None, T_tcp_sens
     if scene is not None:
         return TrueContactSource(scene, name)
     return LabelledContactSource(mount, T_tcp_sensor) if isinstance(mount, ReplayArm) else None
-
-
-def model_path(name: str) -> Path:
-    """The file behind a cell file's ``model:``: a path, or ``builtin:NAME`` for one that ships with touchcell."""
-    return MODELS / f"{name.removeprefix(BUILTIN)}.safetensors" if name.startswith(BUILTIN) else Path(name)
 
 
 def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Device) -> ContactPipeline:

@@ -8,7 +8,7 @@ the group ``touchcell.interlocks``.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Final, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -23,11 +23,6 @@ from touchcell.plugin_section import PluginSection
 
 InterlocksConfig: TypeAlias = dict[str, Annotated[InterlockSettings, PluginSection(INTERLOCKS)]]
 """The ``interlocks:`` section: settings by a user-chosen name; ``kind`` names the interlock."""
-
-REQUIRED_TO_MOVE: Final = frozenset({"workspace", "tcp_speed", "arm_state_age"})
-"""Kinds that a task which moves an arm requires."""
-REQUIRED_TO_TOUCH: Final = frozenset({"depth", "frame_age"})
-"""Kinds that such a task also requires if it uses a tactile sensor."""
 
 
 def parse_interlocks(section: Mapping[str, Any]) -> dict[str, InterlockSettings]:

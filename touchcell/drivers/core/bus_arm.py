@@ -79,6 +79,10 @@ class BusArmConfig(DriverConfig):
             raise ValueError("on_disconnect: park_then_off needs park_deg")
         return self
 
+    def described_chain(self) -> SerialChain:
+        """Return the named chain with the configured tool. Raises ConfigError."""
+        return SerialChain(ChainDescription.named(self.chain), self.tool)
+
     def named_chain(self, key: str) -> ChainDescription:
         """Return the chain description of the arm.
 

@@ -50,6 +50,15 @@ class WrenchSource(Protocol):
 
 
 @runtime_checkable
+class ExternalTorqueSource(Protocol):
+    """Estimates the torque of contacts on its joints."""
+
+    def external_torques(self, max_age_s: float | None = None) -> Stamped[Array]:
+        """Return (n,) N m of each joint, without gravity, friction and its own motion. Raises StaleData."""
+        ...
+
+
+@runtime_checkable
 class TwistSink(Protocol):
     """Follows twists with a time-to-live."""
 

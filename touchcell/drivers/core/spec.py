@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Generic, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
@@ -15,11 +15,22 @@ from touchcell.drivers.core.scene import SceneTruth
 from touchcell.geometry.types import Array
 from touchcell.registry import Registry
 
+if TYPE_CHECKING:
+    from touchcell.drivers.kinematics.chain import SerialChain
+
 
 class DriverConfig(BaseModel):
     """Base of every driver's configuration: unknown keys are rejected, instances are frozen, units are in the names."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def described_chain(self) -> SerialChain | None:
+        """Return the kinematic chain that an arm's configuration names, with its tool; None without one.
+
+        Raises:
+            ConfigError: its chain file cannot be read.
+        """
+        return None
 
 
 @dataclass(frozen=True, slots=True)

@@ -114,6 +114,12 @@ class FrankaConfig(DriverConfig):
     contact_torque_limit_nm: float = Field(default=10.0, gt=0.0, le=50.0)
     flange_to_tcp_mm_deg: tuple[float, float, float, float, float, float] | None = None
 
+    def described_chain(self) -> SerialChain:
+        """Return the chain of an FR3 with the configured tool, or with none where Desk has set it."""
+        x, y, z, alpha, beta, gamma = self.flange_to_tcp_mm_deg or (0.0,) * 6
+        tool = Tool(origin_mm=(x, y, z), rotation_deg=(alpha, beta, gamma))
+        return SerialChain(ChainDescription.shipped("fr3"), tool)
+
 
 @dataclass(frozen=True, slots=True)
 class _Scheduling:

@@ -182,6 +182,12 @@ class SerialChain:
         """Number of joints n."""
         return len(self.joint_names)
 
+    @property
+    def reach_m(self) -> float:
+        """Distance from the base that the tool centre point never exceeds: the lengths of all links together."""
+        links = np.linalg.norm(self._fixed[:, :3, 3], axis=1).sum()
+        return float(links + np.linalg.norm(self._T_joint_tcp[:3, 3]))
+
     def forward(self, q: Array) -> Array:
         """Return the pose ``T_base_tcp`` (4, 4) at ``q`` (n,) rad. Raises GeometryError for a wrong shape or NaN."""
         return self._place(q)[1]

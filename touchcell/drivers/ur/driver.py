@@ -113,6 +113,11 @@ class UrConfig(DriverConfig):
             )
         return self
 
+    def described_chain(self) -> SerialChain:
+        """Return the chain of the named model with the configured tool. Raises ConfigError."""
+        tool = Tool(origin_mm=self.flange_to_tcp_mm_deg[:3], rotation_deg=self.flange_to_tcp_mm_deg[3:])
+        return SerialChain(ChainDescription.named(self.chain), tool)
+
     @property
     def accel(self) -> float:
         """Acceleration parameter of speedL, m/s2 and rad/s2: the larger of both gate limits."""
@@ -139,11 +144,7 @@ class UrArm(Arm):
         super().__init__(name, clock, config.limits.build(), stop_categories=_STOPS)
         self._config = config
         self._flange_to_tcp = _pose_vector(se3.from_euler_mm_deg(np.array(config.flange_to_tcp_mm_deg)))
-        tool = Tool(
-            origin_mm=config.flange_to_tcp_mm_deg[:3],
-            rotation_deg=config.flange_to_tcp_mm_deg[3:],
-        )
-        self._chain = SerialChain(ChainDescription.named(config.chain), tool)
+        self._chain = config.described_chain()
         self._ik = DifferentialIk(self._chain, config.joint_limits.settings(own_controller=True))
         self._receive: Any = None
         self._reader: StateReader | None = None

@@ -247,6 +247,23 @@ def load_model(path: Path) -> Model:
     return model
 
 
+def load_header(path: Path) -> Header:
+    """Read the header of a model file, and none of its tensors.
+
+    Raises:
+        ModelError: the file is missing, not a touchcell model, or of a newer format.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise ModelError(path, "no such file", hint="train one with `touchcell train DATA --out NAME.safetensors`")
+    try:
+        with safe_open(path, framework="np") as stored:
+            return _parse_header((stored.metadata() or {}).get(_METADATA_KEY), path)
+    except (SafetensorError, OSError) as error:
+        raise ModelError(path, f"damaged or no safetensors file: {error}", hint="copy or train it again") from error
+
+
 def _parse_header(text: str | None, path: Path) -> Header:
     if text is None:
         raise ModelError(path, "a safetensors file, but no touchcell model", key=_METADATA_KEY)

@@ -76,6 +76,15 @@ class SimJointArmConfig(DriverConfig):
         description="checkout of MuJoCo Menagerie whose arm to use, else $MENAGERIE_ROOT; rods if neither is set",
     )
 
+    @property
+    def carried(self) -> Tool:
+        """The tool on its flange."""
+        return TOOLS[self.tool] if isinstance(self.tool, str) else self.tool
+
+    def described_chain(self) -> SerialChain:
+        """Return the chain of the model with its tool."""
+        return SerialChain(ChainDescription.shipped(self.model), self.carried)
+
 
 class SimJointArm(JointArm):
     """Driver of a simulated arm with joint dynamics.
@@ -100,9 +109,7 @@ class SimJointArm(JointArm):
             stop_categories=CAPABILITIES.stop_categories,
             max_ttl_s=config.max_ttl_s,
         )
-        description = ChainDescription.shipped(config.model)
-        tool = TOOLS[config.tool] if isinstance(config.tool, str) else config.tool
-        self._chain = SerialChain(description, tool)
+        self._chain = config.described_chain()
         self._ik = DifferentialIk(self._chain, config.joint_limits.settings())
         self._setpoint = JointSetpoint(self._chain, self._ik, self.limits)
         self._trouble = None
@@ -118,7 +125,7 @@ class SimJointArm(JointArm):
         self._setpoint.reset(q)
         # The setpoint at its last move, and the number of simulation steps since.
         self._from, self._phase = q, 0
-        self._body = _dynamics(config, description, tool, q, step_s / self._steps)
+        self._body = _dynamics(config, self._chain.description, config.carried, q, step_s / self._steps)
         self._joints = self._sample()
         self._timeline.add(Phase.MOTION, self._step)
         self._timeline.keep(self._snapshot)

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from touchcell.cell.config.schema import ArmSection, BoxSection, CapsuleSection, CellPlan
 from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.control.interlocks.collision import BASE, TOOL, Box, Capsule
 from touchcell.control.interlocks.planning_scene import Body, PlanningScene
 from touchcell.drivers.core.protocols import ServoArm, TwistSink
-from touchcell.drivers.kinematics.chain import CapsuleShape, ChainDescription
+from touchcell.drivers.kinematics.chain import CapsuleShape, ChainDescription, DifferentialIk
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+
+if TYPE_CHECKING:
+    from touchcell.cell.config.schema import ArmSection, BoxSection, CapsuleSection, CellPlan
 
 
 def build_planning_scene(plan: CellPlan, arms: Mapping[str, Any], names: Mapping[str, str]) -> PlanningScene:
@@ -41,20 +44,52 @@ def build_planning_scene(plan: CellPlan, arms: Mapping[str, Any], names: Mapping
     return PlanningScene(placed, bodies, [_box(name, section) for name, section in plan.cell.obstacles.items()])
 
 
+def planned_scene(plan: CellPlan, role_of: Mapping[str, str]) -> PlanningScene:
+    """The same before any device is built: links are those of the chains that the configurations name.
+
+    Args:
+        plan: a checked cell file.
+        role_of: role of each arm by its name in the cell file.
+
+    Raises:
+        ConfigError: an arm has no capsule at all, or a chain file cannot be read.
+    """
+    placed = {role: plan.cell.arms[name].T_world_base for name, role in role_of.items()}
+    if not any(isinstance(entry, ClearanceConfig) for entry in plan.cell.interlocks.values()):
+        return PlanningScene(placed)
+    bodies = {}
+    for name, role in role_of.items():
+        if TwistSink in plan.arms[name].spec.capabilities.provides:
+            chain = plan.arms[name].config.described_chain()
+            ik = None if chain is None else DifferentialIk(chain)
+            bodies[role] = _shape(plan.cell.arms[name], placed[role], name, partial(_same, ik))
+    return PlanningScene(placed, bodies, [_box(name, section) for name, section in plan.cell.obstacles.items()])
+
+
+def _same(ik: DifferentialIk | None) -> DifferentialIk | None:
+    return ik
+
+
 def _body(section: ArmSection, T_world_base: Array, arm: ServoArm) -> Body:
+    return _shape(section, T_world_base, arm.name, arm.kinematics)
+
+
+def _shape(
+    section: ArmSection, T_world_base: Array, name: str, kinematics: Callable[[], DifferentialIk | None]
+) -> Body:
     parts = [_part(k, part) for k, part in enumerate(section.body)]
-    ik = arm.kinematics()
+    ik = kinematics()
     links = [] if ik is None else link_capsules(ik.chain.description)
     if not links:
         if not parts:
             raise ConfigError(
                 "nobody knows what this arm looks like",
-                key=f"arms.{arm.name}.body",
+                key=f"arms.{name}.body",
                 hint="name capsules here, or in its chain file",
             )
         return Body(T_world_base, parts)
     assert ik is not None
-    return Body(T_world_base, links + parts, arm.kinematics, ik.chain.joint_count)
+    return Body(T_world_base, links + parts, kinematics, ik.chain.joint_count)
 
 
 def link_capsules(description: ChainDescription) -> list[Capsule]:
