@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Self
@@ -31,7 +32,8 @@ from touchcell.geometry.types import Array
 
 _AHEAD_S = 0.01
 _NEGLIGIBLE_M = 1e-7
-_TRIED = 400
+_TRIED = 300
+"""Poses of the cell among which two bodies that may collide are sought."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,21 +147,23 @@ def _search(
     targets = [box.T_world_box[:3, 3] for box in facts.scene.boxes]
     targets += [body.T_world_base[:3, 3] for body in bodies.values()]
     near: dict[str, Change] = {}
-    apart: Change | None = None
+    apart: Change = unchanged
+    widest_m = -math.inf
     for k in range(_TRIED):
         posed = _Posed({role: _random_pose(role, facts, targets, k, rng) for role in bodies})
         view = posed(facts.healthy(0, ""), 0.0)
         frames = [body.frames(view.arms[role]) for role, body in bodies.items()]
         distances = clearances.distances(np.concatenate(frames))
-        if apart is None and np.min(distances) > slow_m:
-            apart = posed
+        least_m = float(np.min(distances))
+        if widest_m <= slow_m and least_m > widest_m:
+            apart, widest_m = posed, least_m
         for pair, distance in zip(clearances.pairs, distances.tolist(), strict=True):
             if distance < limit_m:
                 near.setdefault(pair.arm, posed)
                 near.setdefault(pair.other_arm or pair.arm, posed)
-        if apart is not None and len(near) == len(bodies):
+        if widest_m > slow_m and len(near) == len(bodies):
             break
-    return near, apart or unchanged
+    return near, apart
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,12 +188,12 @@ def _random_pose(
     if (ik := body.kinematics()) is not None:
         q = rng.uniform(ik.chain.lower, ik.chain.upper)
         return ik.chain.forward(q), q
+    reach_m = facts.arms[role].reach_m
     T = np.eye(4)
-    if number % 2:
-        T[:3, 3] = rng.uniform(-facts.arms[role].reach_m, facts.arms[role].reach_m, 3)
-        return T, None
     T[:3, 3] = targets[(number // 2) % len(targets)]
     placed: Array = se3.inverse(body.T_world_base) @ T
+    if number % 2 or np.linalg.norm(placed[:3, 3]) > reach_m:
+        placed[:3, 3] = rng.uniform(-reach_m, reach_m, 3)
     return placed, None
 
 
