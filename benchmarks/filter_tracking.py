@@ -17,6 +17,7 @@ from touchcell.cell.analysis.run_data import load_run
 from touchcell.cell.config.armed import REQUIRED_OF_ARMS, REQUIRED_OF_SENSORS
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import FilterSection, plan_cell
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
@@ -126,7 +127,7 @@ def track(name: str, *, moving: bool, duration_s: float, seed: int, network: Pat
     if network is not None:
         estimator |= {"model": str(network), "filter": None if settings is None else dict(settings)}
     else:
-        cell_file["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+        put_on_true_contact(cell_file)
     pose_filter = None if settings is None else build_filter(TypeAdapter(FilterSection).validate_python(settings))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cell.yaml"

@@ -25,6 +25,7 @@ from benchmarks.simulation_checks import Check, checks
 from benchmarks.simulation_scripts import SCRIPTS, Script, Trace, perform
 from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.run_result import Progress
@@ -187,11 +188,9 @@ def _speed(cell_file: Mapping[str, Any], physics: str, *, images: bool, out: Pat
     if physics == "dynamic":
         data["scene"]["step_ms"] = _DYNAMIC_GRID_MS
     if not images:
-        for sensor in data["sensors"].values():
-            sensor["estimator"] = {"kind": "true_contact"}
+        put_on_true_contact(data)
         # Without images nobody can see a frozen one.
-        blind = ("frame_frozen", "exposure", "uncertain", "out_of_range", "inconsistent")
-        data["interlocks"] = {key: item for key, item in data["interlocks"].items() if item["kind"] not in blind}
+        data["interlocks"] = {key: item for key, item in data["interlocks"].items() if item["kind"] != "frame_frozen"}
     with tempfile.TemporaryDirectory(dir=out) as folder:
         path = Path(folder) / "cell.yaml"
         path.write_text(yaml.safe_dump(data))

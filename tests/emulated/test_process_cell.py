@@ -22,6 +22,7 @@ from tests.fault_injection.two_arms import EMULATORS, SPEED_M_S, pushing_plan, t
 from touchcell.cell.analysis.trip_report import explain
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.config.yaml_file import InvalidCell
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
@@ -379,7 +380,7 @@ def test_the_ground_truth_of_a_scene_in_a_host_is_published_and_recorded(tmp_pat
     data = yaml.safe_load((SHIPPED.parent / "single_push_sim.yaml").read_text())
     data |= {"time": "real", "processes": "separate", "rate_hz": RATE_HZ}
     data["arms"]["arm"]["limits"]["tcp_speed_m_s"] = 0.03
-    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(data)
     path = tmp_path / "cell.yaml"
     path.write_text(yaml.safe_dump(data))
     box = Topics()

@@ -17,6 +17,7 @@ import yaml
 from tests.fault_injection.sent_commands import SentCommands
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import CellPlan, plan_cell
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
@@ -223,11 +224,9 @@ def matrix(
 
 def on_true_contact(data: Mapping[str, Any]) -> dict[str, Any]:
     """The cell file ``data`` with the scene's own contact in place of a network's estimate."""
-    sensors = {name: dict(sensor) for name, sensor in data["sensors"].items()}
-    for sensor in sensors.values():
-        if sensor["estimator"]["kind"] == "network":
-            sensor["estimator"] = {"kind": "true_contact"}
-    return {**data, "sensors": sensors}
+    changed = {**data, "sensors": {name: dict(sensor) for name, sensor in data["sensors"].items()}}
+    put_on_true_contact(changed)
+    return changed
 
 
 def plan_anew(path: Path) -> CellPlan:

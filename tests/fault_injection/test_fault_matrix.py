@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from tests.fault_injection.fault_matrix import FAULTS, Case, cells, matrix, run_case
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.paths import MODELS
 from touchcell.simulation.faults import ArmFaults, FrameFaults
 from touchcell.tasks.interface import TASKS
@@ -62,7 +63,7 @@ def test_faults_of_cameras_in_every_state(task: str, tmp_path: Path) -> None:
 
 def test_the_matrix_would_notice_a_missing_interlock(tmp_path: Path) -> None:
     data = cells()["surface_following"]
-    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(data)
     for name, entry in list(data["interlocks"].items()):
         if entry["kind"] == "arm_state_age":
             data["interlocks"][name] = {**entry, "limit_ms": 10_000}

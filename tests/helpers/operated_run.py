@@ -10,6 +10,7 @@ import yaml
 
 from tests.fault_injection.fault_matrix import cells
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
@@ -23,7 +24,7 @@ from touchcell.simulation.devices.arm import SimArm
 
 def waiting_cell(**changes: Any) -> dict[str, Any]:
     cell = cells()["surface_following"]
-    cell["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(cell)
     cell["on_trip"] = "wait_for_reset"
     cell["task"]["distance_mm"] = 4
     return {**cell, **changes}

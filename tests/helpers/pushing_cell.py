@@ -14,6 +14,7 @@ import numpy as np
 import yaml
 
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
@@ -31,8 +32,7 @@ def _shipped(name: str) -> dict[str, Any]:
 def cell_file(name: str, **changes: Any) -> dict[str, Any]:
     """Return a shipped cell file with the true contact; ``changes`` by key, with ``__`` between levels."""
     data = deepcopy(_shipped(name))
-    for sensor in data["sensors"].values():
-        sensor["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(data)
     for key, value in changes.items():
         *path, last = key.split("__")
         section = data

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.run_result import Outcome, RunResult
@@ -34,7 +35,7 @@ def pushed(folder: Path, interlock: dict[str, Any] | None) -> tuple[RunResult, f
     data["scene"] |= {"physics": "dynamic", "table": {"friction": "foam"}}
     data["scene"]["objects"]["prism"]["shape"]["size_mm"] = [60, 60, 180]
     data["arms"]["arm"]["start_pose_mm_deg"] = [-55, 0, 165, 180, 0, 0]
-    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(data)
     for entry in data["interlocks"].values():
         if entry["kind"] == "workspace":
             entry["max_mm"][2] = 300

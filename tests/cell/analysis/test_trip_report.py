@@ -12,6 +12,7 @@ import yaml
 
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_TRIPPED
 from touchcell.cell.cli.main import main
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.recording.mcap import read
 from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.paths import CONFIGS
@@ -24,7 +25,7 @@ SHIPPED = CONFIGS / "surface_follow_sim.yaml"
 def run_into_the_wall(folder: Path, **arm: Any) -> Path:
     """The shipped cell on true contacts, with a workspace that ends 8 mm after the start."""
     data = yaml.safe_load(SHIPPED.read_text())
-    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(data)
     data["interlocks"]["workspace"]["max_mm"] = [-72, 50, 150]
     data["arms"]["arm"] |= arm
     cell = folder / "cell.yaml"
@@ -103,7 +104,7 @@ def test_an_arm_that_obeys_nothing_still_leaves_a_black_box(
 
     monkeypatch.setattr(SimArm, "__init__", broken)
     data = yaml.safe_load(SHIPPED.read_text())
-    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(data)
     data["interlocks"]["workspace"]["max_mm"] = [-72, 50, 150]
     cell, folder = tmp_path / "cell.yaml", tmp_path / "run"
     cell.write_text(yaml.safe_dump(data))

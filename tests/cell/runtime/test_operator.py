@@ -18,6 +18,7 @@ import yaml
 
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT
 from touchcell.cell.cli.main import main
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.runtime.operator_input import (
     FolderInUse,
     NoSuchRun,
@@ -149,7 +150,7 @@ def test_stop_without_a_run(
 @pytest.mark.parametrize("now", [False, True])
 def test_stop_from_another_shell(tmp_path: Path, now: bool, capsys: pytest.CaptureFixture[str]) -> None:
     data = yaml.safe_load(SHIPPED.read_text())
-    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(data)
     data["task"]["approach_speed_mm_s"] = 0.001
     data["task"]["retract_mm"] = 1
     cell, folder = tmp_path / "cell.yaml", tmp_path / "run"

@@ -17,6 +17,7 @@ import yaml
 
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.recording.mcap import Recorder, read
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
@@ -35,7 +36,7 @@ SHIPPED = CONFIGS / "surface_follow_sim.yaml"
 def true_contact_cell(tmp_path: Path, change: Callable[[dict[str, Any]], None] | None = None) -> Path:
     """The shipped cell on the simulator's own contacts, with a short way to go."""
     data = yaml.safe_load(SHIPPED.read_text())
-    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(data)
     data["task"]["distance_mm"] = 20
     if change is not None:
         change(data)

@@ -13,6 +13,7 @@ import yaml
 from tests.fault_injection.fault_matrix import cells
 from touchcell.cell.config.planning_scene import link_capsules
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.config.yaml_file import InvalidCell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
@@ -198,7 +199,7 @@ def test_slow_below_the_limit_is_refused():
 def following(tmp_path: Path, **changes: Any) -> Path:
     """Surface following with a finger along the sensor, and a post in the way that it slides."""
     data = cells()["surface_following"]
-    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(data)
     data["task"]["distance_mm"] = 60
     data["arms"]["arm"]["body"] = [{"from_mm": [0, 0, -100], "to_mm": [0, 0, -20], "radius_mm": 15}]
     data["interlocks"]["clear"] = {"kind": "clearance", "limit_mm": 20, "slow_mm": 30}

@@ -6,6 +6,7 @@ import yaml
 from pydantic import ValidationError
 
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.run_result import Outcome, Progress
@@ -152,7 +153,7 @@ def test_a_snapshot_brings_the_joints_back() -> None:
 def test_a_panda_tracks_a_moving_plate_in_a_dynamic_scene(tmp_path: Path) -> None:
     data = yaml.safe_load(Path("configs/object_track_panda_sim.yaml").read_text())
     data["task"]["duration_s"] = 3
-    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(data)
     path = tmp_path / "cell.yaml"
     path.write_text(yaml.safe_dump(data))
     depths_mm = []

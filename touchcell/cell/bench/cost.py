@@ -21,6 +21,7 @@ import yaml
 from touchcell.cell.bench.perception import write_simulated
 from touchcell.cell.bench.provenance import as_installed, provenance
 from touchcell.cell.config.find import find_cell
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.drivers.replay.dataset import IMAGE_FOLDER
 
 _REPLAYED = 120
@@ -35,7 +36,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
     far["arms"]["arm"]["start_pose_mm_deg"][2] = 120
     far["task"].update(approach_distance_mm=60)
     true = json.loads(json.dumps(base))
-    true["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(true)
     with tempfile.TemporaryDirectory() as folder:
         write_simulated(Path(folder), _REPLAYED)
         rows = {

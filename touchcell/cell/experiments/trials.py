@@ -21,6 +21,7 @@ import yaml
 
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.true_contact import answerable
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.compose import compose
@@ -50,7 +51,11 @@ class Trial:
     changes: Mapping[str, Any] = field(default_factory=dict)
 
     def cell_data(self) -> dict[str, Any]:
-        """The whole cell file with the changes. Raises ConfigError for a key that leads nowhere."""
+        """The whole cell file with the changes, without interlocks that ask what its estimators no longer report.
+
+        Raises:
+            ConfigError: a key leads nowhere.
+        """
         path = Path(self.cell)
         data: dict[str, Any] = yaml.safe_load((path if path.is_absolute() else CONFIGS / path).read_text())
         data = copy.deepcopy(data)
@@ -62,6 +67,8 @@ class Trial:
                     raise ConfigError("no such section", file=self.cell, key=key, hint=suggest(word, list(section)))
                 section = section[word]
             section[leaf] = copy.deepcopy(value)
+        if any(key.endswith(".estimator") for key in self.changes):
+            data["interlocks"] = answerable(data)
         return data
 
 
