@@ -26,7 +26,7 @@ from touchcell.geometry import se3
 from touchcell.tasks.interface import TaskContext
 
 if TYPE_CHECKING:
-    from touchcell.cell.config.schema import CellPlan, DevicePlan, NetworkEstimator
+    from touchcell.cell.config.schema import CellPlan, NetworkEstimator
 
 REQUIRED_OF_ARMS: Final = ("workspace", "tcp_speed", "arm_state_age")
 """Kinds that must guard every arm that a task moves."""
@@ -79,9 +79,10 @@ def cell_facts(plan: CellPlan, scene: PlanningScene | None = None) -> CellFacts:
     return CellFacts(
         1.0 / plan.cell.rate_hz,
         tuple(getattr(task, "states", ())),
-        {role: _arm_facts(plan.arms[name], moved=role in moved) for name, role in role_of.items()},
+        {role: _arm_facts(plan, name, moved=role in moved) for name, role in role_of.items()},
         sensors,
         planned_scene(plan, role_of) if scene is None else scene,
+        plan.cell.enabling_device is not None,
     )
 
 
@@ -165,10 +166,12 @@ def _required(plan: CellPlan, facts: CellFacts) -> Iterator[tuple[str, str, str]
                 yield kind, role, "sensor"
 
 
-def _arm_facts(device: DevicePlan, *, moved: bool) -> ArmFacts:
+def _arm_facts(plan: CellPlan, name: str, *, moved: bool) -> ArmFacts:
+    device = plan.arms[name]
     limits = getattr(device.config, "limits", None)
     chain = device.config.described_chain()
-    provides = device.spec.capabilities.provides
+    # Proxies of arms in other processes pass neither wrench nor torque on.
+    provides = device.spec.capabilities.provides if plan.cell.processes == "one" else frozenset()
     return ArmFacts(
         limits.build() if isinstance(limits, LimitsConfig) else None,
         _LONGEST_REACH_M if chain is None else chain.reach_m,

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
 import numpy as np
 import yaml
@@ -34,8 +34,13 @@ from touchcell.geometry.types import Array
 from touchcell.tasks.interface import TASKS, AnyTask, TaskConfig
 
 M = TypeVar("M", bound=BaseModel)
+C = TypeVar("C", bound=DriverConfig)
 Three = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]
+
+
+REDUCED_SPEED_M_S: Final = 0.25
+"""Largest speed of the tool centre point in reduced-speed mode (ISO 10218-1:2025, 5.5.6)."""
 
 
 class _Section(BaseModel):
@@ -230,7 +235,9 @@ class CellFile(_Section):
 
     ``on_trip: end`` ends a run that has tripped; ``wait_for_reset`` keeps it up, with the arms stopped and watched,
     until a person has reset it and lets the task start again. ``emulated_scene`` is what `touchcell emulate cell` puts
-    around the cell's arms and cameras; nothing else looks at it.
+    around the cell's arms and cameras; nothing else looks at it. ``reduced_speed`` caps every tool at 250 mm/s, in its
+    gate and by an interlock of its own. ``enabling_device`` is what ``hold_to_run`` reads: a simulated one, or one that
+    the program that runs the cell brings.
     """
 
     schema_: Literal[1] = Field(alias="schema")
@@ -248,6 +255,8 @@ class CellFile(_Section):
     pairs: tuple[PairSection, ...] = ()
     interlocks: InterlocksConfig = {}
     on_trip: Literal["end", "wait_for_reset"] = "end"
+    reduced_speed: bool = False
+    enabling_device: Literal["simulated", "external"] | None = None
     task: TaskSection
     recording: RecordingSection = RecordingSection()
     collect: CollectSection | None = None
@@ -476,6 +485,8 @@ class _Planner:
         fields = spec.config.model_fields
         settings = {key: value for key, value in {**shared, **self._overrides}.items() if key in fields}
         config = self._validated(spec.config, {**(section.model_extra or {}), **settings}, at)
+        if cell.reduced_speed and config is not None:
+            config = _at_reduced_speed(config)
         return DevicePlan(at[1], spec, config) if config is not None else None
 
     def _require_armed(self, plan: CellPlan) -> CellPlan:
@@ -627,6 +638,14 @@ class _Planner:
 
 def _a(word: str) -> str:
     return f"{'an' if word[0] in 'aeiou' else 'a'} {word}"
+
+
+def _at_reduced_speed(config: C) -> C:
+    """``config`` with the gate's speed capped; of what is no arm, as it is."""
+    limits = getattr(config, "limits", None)
+    if not isinstance(limits, LimitsConfig) or limits.tcp_speed_m_s <= REDUCED_SPEED_M_S:
+        return config
+    return config.model_copy(update={"limits": limits.model_copy(update={"tcp_speed_m_s": REDUCED_SPEED_M_S})})
 
 
 def _overshoot(arm: DevicePlan, lever_m: float, rate_hz: float) -> StoppingDistance | None:

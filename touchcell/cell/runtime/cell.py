@@ -15,6 +15,7 @@ from touchcell.cell.runtime.watchdog import NullWatchdog, Watchdog
 from touchcell.control.supervisor import Supervisor
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device, Lifecycle
+from touchcell.drivers.core.enabling import EnablingDevice
 from touchcell.drivers.core.protocols import StopCategory
 from touchcell.tasks.interface import Task
 
@@ -36,6 +37,8 @@ class Cell:
         stop_categories: by which each arm stops when something is wrong, by role.
         holding: roles of arms that keep their power when another's fault stops them.
         watched_joints: roles of arms whose joint angles an interlock looks at.
+        watched_wrenches, watched_torques: roles of arms whose wrench, or external torque, an interlock needs.
+        enabling_device: operator input of a cell whose file names one.
         scene: what is simulated around the arms, as far as it can be looked into; None in a cell of real devices.
         collection: where labelled frames go, None where the task labels none.
         watchdog: stops the arms when the loop falls silent.
@@ -54,6 +57,9 @@ class Cell:
     stop_categories: Mapping[str, StopCategory] = field(default_factory=dict)
     holding: frozenset[str] = frozenset()
     watched_joints: frozenset[str] = frozenset()
+    watched_wrenches: frozenset[str] = frozenset()
+    watched_torques: frozenset[str] = frozenset()
+    enabling_device: EnablingDevice | None = None
     scene: SceneTruth | None = None
     collection: Collection | None = None
     watchdog: Watchdog = field(default_factory=NullWatchdog)

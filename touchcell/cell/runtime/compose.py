@@ -2,35 +2,42 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import partial
 from typing import cast
 
 from touchcell.cell.config.armed import require_armed
 from touchcell.cell.config.planning_scene import build_planning_scene
-from touchcell.cell.config.schema import CellPlan
+from touchcell.cell.config.schema import REDUCED_SPEED_M_S, CellPlan
 from touchcell.cell.recording.dataset_writer import Collection
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.devices import build_devices, build_world
+from touchcell.cell.runtime.enabling import SimulatedEnablingDevice
 from touchcell.cell.runtime.sensor import build_sensor
+from touchcell.control.interlocks.basic import TcpSpeed
 from touchcell.control.interlocks.config import build_interlocks
+from touchcell.control.interlocks.violation import Severity
 from touchcell.control.latch import Latch
 from touchcell.control.supervisor import Supervisor
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.clock import Clock
-from touchcell.drivers.core.protocols import StopCategory
+from touchcell.drivers.core.enabling import EnablingDevice
+from touchcell.drivers.core.protocols import ExternalTorqueSource, StopCategory, WrenchSource
+from touchcell.errors import ConfigError
 from touchcell.tasks.interface import Task, TaskContext
 
 
-def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
+def compose(plan: CellPlan, *, clock: Clock | None = None, enabling_device: EnablingDevice | None = None) -> Cell:
     """Build everything that ``plan`` needs; nothing is connected yet.
 
     Args:
         plan: a checked cell file.
         clock: in place of the one that the file asks for.
+        enabling_device: for a cell with ``enabling_device: external``.
 
     Raises:
-        ConfigError: an interlock names what is not there.
+        ConfigError: an interlock names what is not there, or there is no enabling device.
         ModelError: a model file cannot be used.
         RecordingError: the folder for labelled frames cannot be written.
     """
@@ -57,7 +64,7 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
         arms=arms,
         cameras={name: devices[name] for name in plan.sensors},
         sensors=sensors,
-        supervisor=Supervisor(interlocks, Latch()),
+        supervisor=Supervisor((*interlocks, *_always_on(plan)), Latch()),
         task=new_task(),
         new_task=new_task,
         stop_categories={role: StopCategory(plan.cell.arms[name].stop_category) for name, role in role_of.items()},
@@ -65,11 +72,42 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
             role_of[pair.follower] for pair in plan.cell.pairs if pair.on_stop == "hold" and pair.follower in role_of
         ),
         watched_joints=frozenset(role for role, body in planning_scene.bodies.items() if body.link_count),
+        watched_wrenches=_watched(plan, role_of, "wrench", WrenchSource),
+        watched_torques=_watched(plan, role_of, "external_torque", ExternalTorqueSource),
+        enabling_device=_enabling_device(plan, world.clock, enabling_device),
         scene=world.truth,
         collection=collection,
         watchdog=world.watchdog,
         require_armed=partial(require_armed, plan, interlocks, planning_scene),
     )
+
+
+def _always_on(plan: CellPlan) -> tuple[TcpSpeed, ...]:
+    """Interlocks that the file switches on by other keys than ``interlocks:``."""
+    if not plan.cell.reduced_speed:
+        return ()
+    return (TcpSpeed("reduced_speed", Severity.TRIP, REDUCED_SPEED_M_S, math.inf),)
+
+
+def _watched(plan: CellPlan, role_of: Mapping[str, str], measure: str, source: type) -> frozenset[str]:
+    """Roles of arms of which an interlock needs a measurement that their drivers provide."""
+    if not any(measure in entry.measures for entry in plan.cell.interlocks.values()):
+        return frozenset()
+    return frozenset(role for name, role in role_of.items() if source in plan.arms[name].spec.capabilities.provides)
+
+
+def _enabling_device(plan: CellPlan, clock: Clock, given: EnablingDevice | None) -> EnablingDevice | None:
+    wanted = plan.cell.enabling_device
+    if wanted == "simulated":
+        return SimulatedEnablingDevice(clock)
+    if wanted == "external" and given is None:
+        raise ConfigError(
+            "the cell asks for an enabling device, and none is given",
+            file=str(plan.file),
+            key="enabling_device",
+            hint="compose(plan, enabling_device=...)",
+        )
+    return given
 
 
 def _arm_roles(plan: CellPlan) -> Mapping[str, str]:

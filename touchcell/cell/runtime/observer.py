@@ -18,6 +18,7 @@ from touchcell.drivers.core.errors import DeviceError, DeviceFault
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.geometry import se3
 from touchcell.geometry.finite import all_finite
+from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.tasks.interface import Action
 
@@ -87,16 +88,25 @@ class Observer:
             action: what the task asks for; None while no task is at work.
             sent: what was sent in the cycle before.
         """
+        cell = self._cell
         twists, sent = ({} if action is None else action.twists), sent or {}
         return CellView(
             reading.now_ns,
             {
-                role: ArmView(state, twists.get(role), sent.get(role), self._joints(role))
+                role: ArmView(
+                    state,
+                    twists.get(role),
+                    sent.get(role),
+                    self._joints(role),
+                    self._wrench(role),
+                    self._external_torque(role),
+                )
                 for role, state in reading.states.items()
             },
             {role: _sensor_view(estimate, self._cell.sensors[role]) for role, estimate in reading.contacts.items()},
             self._cell.task.state,
             at_work=action is not None,
+            enabling=None if cell.enabling_device is None else cell.enabling_device.position(),
         )
 
     def _perceive(self, sensor: Sensor, states: Mapping[str, Stamped[TcpState]]) -> ContactEstimate | None:
@@ -110,6 +120,14 @@ class Observer:
     def _joints(self, role: str) -> Stamped[JointState] | None:
         arm = self._cell.arms[role]
         return call_driver(arm.name, arm.joints) if role in self._cell.watched_joints else None
+
+    def _wrench(self, role: str) -> Stamped[Array] | None:
+        arm = self._cell.arms[role]
+        return call_driver(arm.name, arm.wrench) if role in self._cell.watched_wrenches else None
+
+    def _external_torque(self, role: str) -> Stamped[Array] | None:
+        arm = self._cell.arms[role]
+        return call_driver(arm.name, arm.external_torques) if role in self._cell.watched_torques else None
 
 
 def call_driver(device: str, call: Callable[[], _T]) -> _T:

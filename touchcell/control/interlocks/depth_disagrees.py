@@ -160,6 +160,11 @@ class DepthDisagreesConfig(GradedSettings):
     stiffness_n_mm: PositiveFloat | None = None
     states: tuple[str, ...] = Field(min_length=1)
 
+    @property
+    def measures(self) -> frozenset[str]:
+        """The wrench, where it is compared."""
+        return frozenset() if self.stiffness_n_mm is None else frozenset({"wrench"})
+
     def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
         """Return each sensor pressed in far beyond its range while its estimate stays healthy."""
         states, wrong = states_of(self.states, facts)

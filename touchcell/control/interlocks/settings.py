@@ -32,6 +32,11 @@ class InterlockSettings(BaseModel):
         return self
 
     @property
+    def measures(self) -> frozenset[str]:
+        """Optional measurements of arms that the interlock needs: names of attributes of ``ArmView``."""
+        return frozenset()
+
+    @property
     def level(self) -> Severity:
         """The severity as the interlocks use it."""
         return Severity[self.severity.upper()]

@@ -44,6 +44,7 @@ from touchcell.drivers.core.errors import (
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.protocols import (
     SERVO_ARM,
+    ExternalTorqueSource,
     HealthSource,
     JointGoal,
     JointSource,
@@ -61,7 +62,7 @@ from touchcell.geometry.types import Array
 
 CAPABILITIES = Capabilities(
     kind="arm",
-    provides=SERVO_ARM | {JointSource, WrenchSource, JointGoal, HealthSource, NativeWatchdog},
+    provides=SERVO_ARM | {JointSource, WrenchSource, ExternalTorqueSource, JointGoal, HealthSource, NativeWatchdog},
     state_rate_hz=1.0 / (2 * PERIOD_S),
     min_command_rate_hz=10.0,
     command_latency_s=0.001,
@@ -170,6 +171,11 @@ class FrankaArm(Arm):
         """Return the estimated external wrench (6,) at the tool centre point along base axes. Raises as ``tcp``."""
         reading = self._reading("read its wrench", max_age_s)
         return _stamped(reading.wrench, reading)
+
+    def external_torques(self, max_age_s: float | None = None) -> Stamped[Array]:
+        """Return the external torques (7,) of the joints, N m, as the controller estimates them. As ``tcp``."""
+        reading = self._reading("tell its external torques", max_age_s)
+        return _stamped(reading.external_torque, reading)
 
     def at_rest(self) -> bool:
         """Return whether the arm stands still and no motion runs. Raises the error that ended a motion."""

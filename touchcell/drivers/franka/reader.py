@@ -34,6 +34,7 @@ class Reading:
         twist: (6,) of the tool centre point, from measured joint velocities.
         q, dq, tau: joints (7,).
         wrench: (6,) external wrench on the tool centre point.
+        external_torque: (7,) external torques of the joints, the controller's filtered estimate.
         mode: franky's name of the robot mode.
         errors: names of the present errors.
         last_errors: names of the errors that ended the last motion.
@@ -48,6 +49,7 @@ class Reading:
     dq: Array
     tau: Array
     wrench: Array
+    external_torque: Array
     mode: str
     errors: tuple[str, ...]
     last_errors: tuple[str, ...]
@@ -55,7 +57,7 @@ class Reading:
 
     def is_finite(self) -> bool:
         """Return whether every number is finite."""
-        arrays = (self.T_base_tcp, self.twist, self.q, self.dq, self.tau, self.wrench)
+        arrays = (self.T_base_tcp, self.twist, self.q, self.dq, self.tau, self.wrench, self.external_torque)
         return all(bool(np.isfinite(array).all()) for array in arrays)
 
 
@@ -194,6 +196,7 @@ class StateReader:
             tau=np.asarray(state.tau_J),
             # Franka counts the wrench of the arm on the world as positive.
             wrench=-np.asarray(state.O_F_ext_hat_K),
+            external_torque=np.asarray(state.tau_ext_hat_filtered),
             mode=state.robot_mode.name,
             errors=_present(state.current_errors),
             last_errors=_present(state.last_motion_errors),

@@ -19,7 +19,15 @@ from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle, OperatorToken
 from touchcell.drivers.core.joint_arm import JointArm
 from touchcell.drivers.core.joint_setpoint import JointSetpoint
-from touchcell.drivers.core.protocols import SERVO_ARM, HealthSource, JointGoal, JointSource, StopCategory
+from touchcell.drivers.core.protocols import (
+    SERVO_ARM,
+    ExternalTorqueSource,
+    HealthSource,
+    JointGoal,
+    JointSource,
+    StopCategory,
+    WrenchSource,
+)
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain, Tool
@@ -35,7 +43,7 @@ if TYPE_CHECKING:
 
 CAPABILITIES = Capabilities(
     kind="arm",
-    provides=SERVO_ARM | {JointSource, JointGoal, HealthSource},
+    provides=SERVO_ARM | {JointSource, WrenchSource, ExternalTorqueSource, JointGoal, HealthSource},
     state_rate_hz=1.0 / DEFAULT_STEP_S,
     stop_categories=frozenset({1, 2}),
     has_brakes=True,
@@ -113,6 +121,7 @@ class SimJointArm(JointArm):
         self._ik = DifferentialIk(self._chain, config.joint_limits.settings())
         self._setpoint = JointSetpoint(self._chain, self._ik, self.limits)
         self._trouble = None
+        self._load = np.zeros(3), np.zeros(3)
         self.T_world_base = se3.from_euler_mm_deg(config.base_pose_mm_deg)
         self._timeline = timeline or Timeline(clock)
         step_s = self._timeline.step_ns * 1e-9
@@ -164,7 +173,21 @@ class SimJointArm(JointArm):
     def bear(self, force_world: Array, point_world: Array) -> None:
         """Apply ``force_world`` (3,) N at ``point_world`` (3,) m on the tool from now on: for scenes."""
         R, origin = self.T_world_base[:3, :3], self.T_world_base[:3, 3]
-        self._body.bear(force_world @ R, (point_world - origin) @ R)
+        force, point = force_world @ R, (point_world - origin) @ R
+        self._load = force, point
+        self._body.bear(force, point)
+
+    def wrench(self, max_age_s: float | None = None) -> Stamped[Array]:
+        """Return (6,) [force N, torque N m] on the tool centre point along base axes. Raises StaleData."""
+        sample = self.tcp(max_age_s)
+        force, point = self._load
+        torque = np.cross(point - sample.value.T_base_tcp[:3, 3], force)
+        return Stamped(np.concatenate([force, torque]), sample.t_ns, sample.seq)
+
+    def external_torques(self, max_age_s: float | None = None) -> Stamped[Array]:
+        """Return (n,) N m that the load on the tool puts on the joints. Raises StaleData."""
+        joints, wrench = self.joints(max_age_s), self.wrench(max_age_s)
+        return Stamped(self._chain.jacobian(joints.value.q).T @ wrench.value, joints.t_ns, joints.seq)
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
         self._timeline.advance()
