@@ -18,6 +18,7 @@ BENCHMARKS = {
     "filter": "benchmarks.filter",
     "fuzz-cells": "tests.fault_injection.fuzz_cells",
     "gdn-vs-cnn": "benchmarks.gdn_vs_cnn",
+    "mutation": "benchmarks.mutation",
     "kinematics": "benchmarks.kinematics",
     "safety": "tests.fault_injection.safety",
     "se3": "benchmarks.se3",

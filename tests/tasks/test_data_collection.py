@@ -45,7 +45,8 @@ def cell_file(folder: Path, **task: Any) -> Path:
     data = yaml.safe_load((CONFIGS / "collect_sim.yaml").read_text())
     data["task"] |= {"samples": 4, **FAST, **task}
     data["arms"]["arm"]["limits"]["tcp_accel_m_s2"] = 2.0
-    data["interlocks"]["tcp_speed"]["limit_rad_s"] = 3.0
+    # Above the 80 deg/s that are commanded, below three times the speed of the gate.
+    data["interlocks"]["tcp_speed"]["limit_rad_s"] = 1.45
     data["collect"]["data"] = str(folder / "data")
     path = folder / "cell.yaml"
     path.write_text(yaml.safe_dump(data))

@@ -291,6 +291,8 @@ def two_arms(folder: Path, **pair: Any) -> OperatedRun:
     cell["arms"]["other"] = {**cell["arms"]["arm"]}
     cell["sensors"]["sensor"]["mounted_on"] = "other"
     cell["interlocks"] = {name: entry for name, entry in cell["interlocks"].items() if name not in ("contact_lost",)}
+    for name in ("workspace", "tilt"):
+        cell["interlocks"][name] = {key: each for key, each in cell["interlocks"][name].items() if key != "sensor"}
     cell["pairs"] = [{"leader": "arm", "follower": "other", **pair}]
     return OperatedRun(folder, cell)
 
