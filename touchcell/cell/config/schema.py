@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
@@ -32,6 +32,7 @@ from touchcell.drivers.core.spec import DRIVERS, AnyDriver, DriverConfig
 from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.perception.runtime.estimator_spec import EstimatorSection
 from touchcell.tasks.interface import TASKS, AnyTask, TaskConfig
 
 M = TypeVar("M", bound=BaseModel)
@@ -47,83 +48,6 @@ class _OpenSection(BaseModel):
     """A section whose other keys belong to the driver or task that it names."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
-
-
-class StillSurfaceSection(_Section):
-    """The SE(3) Bayesian filter: how fast certainty is lost when no frame comes (slip, curvature)."""
-
-    model: Literal["still_surface"] = "still_surface"
-    drift_mm_per_sqrt_s: PositiveFloat
-    drift_deg_per_sqrt_s: PositiveFloat
-
-
-class MovingSurfaceSection(_Section):
-    """The filter that also estimates the surface's velocity, for surfaces that move steadily.
-
-    ``speed_*`` is how fast a surface may be when it is first touched (one standard deviation), ``accel_*`` how fast its
-    velocity stops being known.
-    """
-
-    model: Literal["moving_surface"]
-    drift_mm_per_sqrt_s: PositiveFloat
-    drift_deg_per_sqrt_s: PositiveFloat
-    speed_mm_s: PositiveFloat
-    speed_deg_s: PositiveFloat
-    accel_mm_s_per_sqrt_s: PositiveFloat
-    accel_deg_s_per_sqrt_s: PositiveFloat
-
-
-def _filter_model(value: Any) -> str | None:
-    """Which model a filter section means: a file that names none means a still surface."""
-    if isinstance(value, Mapping):
-        return str(value.get("model", "still_surface"))
-    return getattr(value, "model", None)
-
-
-FilterSection = Annotated[
-    Annotated[StillSurfaceSection, Tag("still_surface")] | Annotated[MovingSurfaceSection, Tag("moving_surface")],
-    Discriminator(
-        _filter_model,
-        custom_error_type="filter_model",
-        custom_error_message="must say `model: still_surface` or `model: moving_surface`",
-    ),
-]
-
-
-class GateSection(_Section):
-    """The contact gate: mean marker-image change, in per cent, that begins and ends a contact."""
-
-    touch_percent: PositiveFloat
-    release_percent: PositiveFloat
-
-
-class NetworkEstimator(_Section):
-    """Image -> network -> filter. ``calibration`` is a file of ``touchcell calibrate``."""
-
-    kind: Literal["network"]
-    model: str
-    calibration: str | None = None
-    gate: GateSection | None = None
-    filter: FilterSection | None = None
-
-
-class TrueContact(_Section):
-    """The simulator's own contact state, to see control error apart from estimation error."""
-
-    kind: Literal["true_contact"]
-
-
-class KnownSurface(_Section):
-    """The contact from the arm's pose over a surface that stands where the file says, for collecting labels.
-
-    ``surface_mm_deg`` is where the sensor frame is, in the arm's base, when it just touches the surface, upright.
-    """
-
-    kind: Literal["known_surface"]
-    surface_mm_deg: Six
-
-
-EstimatorSection = Annotated[NetworkEstimator | TrueContact | KnownSurface, Field(discriminator="kind")]
 
 
 class CapsuleSection(_Section):
@@ -474,8 +398,10 @@ class _Planner:
     def _sensor(self, cell: CellFile, name: str) -> DevicePlan | None:
         section = cell.sensors[name]
         self._require_mount(cell, ("sensors", name), section.mounted_on)
-        if section.estimator.kind == "true_contact" and cell.scene is None:
-            self._add(("sensors", name, "estimator"), "true_contact needs a `scene:`", hint="use kind: network")
+        if section.estimator.needs_truth and cell.scene is None:
+            self._add(
+                ("sensors", name, "estimator"), f"{section.estimator.kind} needs a `scene:`", hint="use kind: network"
+            )
         shared = {"mounted_on": section.mounted_on, "tcp_to_sensor_mm_deg": section.tcp_to_sensor_mm_deg}
         return self._device(cell, ("sensors", name), section, shared, "camera")
 
