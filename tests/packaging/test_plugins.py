@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from touchcell.cell.recording.mcap import read
+from touchcell.paths import CHECKOUT
 
 ACME = Path(__file__).parent / "acme"
 
@@ -269,3 +270,16 @@ def test_the_list_shows_them_and_names_what_is_broken(site: Path) -> None:
     for summary in ("arm of another package", "no force on a device exceeds a limit", "a plane that rises along x"):
         assert summary in done.stdout
     assert "of broken 0.1 cannot be imported" in done.stdout
+
+
+def test_the_page_shows_the_package_as_it_is() -> None:
+    page = (CHECKOUT / "docs" / "how-to" / "plugins.md").read_text()
+    blocks = re.findall(r"^```(\w+)\n(.*?)^```$", page, re.M | re.S)
+    assert {language for language, _ in blocks} == {"python", "toml", "yaml"}
+    for language, block in blocks:
+        if language == "python":
+            first, _, rest = block.partition("\n")
+            assert (ACME / first.removeprefix("# ")).read_text() == rest
+        else:
+            file = ACME / ("pyproject.toml" if language == "toml" else "cell.yaml")
+            assert block in file.read_text()
