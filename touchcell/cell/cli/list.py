@@ -7,6 +7,7 @@ from typing import Any
 
 from touchcell.cell.bench.catalog import benchmark_names
 from touchcell.cell.experiments.runner import EXPERIMENTS
+from touchcell.cell.experiments.trials import EXECUTORS
 from touchcell.control.interlocks.spec import INTERLOCKS
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.errors import ConfigError
@@ -31,6 +32,7 @@ def listing() -> dict[str, list[tuple[str, str]]]:
         "objects": _rows(OBJECTS),
         "emulators": [(name, "") for name in EMULATORS.names()],
         "experiments": _rows(EXPERIMENTS),
+        "executors": _rows(EXECUTORS),
         "benchmarks": [(name, "") for name in benchmark_names()],
         "cells that ship": [(f"configs/{path.name}", _first_comment(path)) for path in _shipped()],
     }

@@ -174,6 +174,7 @@ def _parser() -> argparse.ArgumentParser:
     experiment.add_argument("name", help="which, or `all`; `touchcell list` names them")
     experiment.add_argument("--out", type=Path, default=Path("runs/experiments"), help="folder with one for each")
     experiment.add_argument("--jobs", type=int, help="trials at a time (default: one for each core)")
+    experiment.add_argument("--executor", default="local", help="what runs the trials (default: local)")
     experiment.add_argument("--trials", type=int, help="repetitions of each row (default: the experiment's own number)")
     experiment.add_argument("--quick", action="store_true", help="the least that still shows every kind of row")
     experiment.set_defaults(run=_experiment)
@@ -415,7 +416,11 @@ def _experiment(options: argparse.Namespace) -> int:
     for experiment in experiments:
         folder = options.out / experiment.name
         try:
-            tables.append(run_experiment(experiment, folder, scale, jobs=jobs, live=sys.stdout.isatty()))
+            tables.append(
+                run_experiment(
+                    experiment, folder, scale, jobs=jobs, executor=options.executor, live=sys.stdout.isatty()
+                )
+            )
         except KeyboardInterrupt:
             print(f"touchcell: what has finished is kept in {folder}; the same command goes on", file=sys.stderr)
             raise

@@ -68,7 +68,15 @@ EXPERIMENTS: Final = Registry("touchcell.experiments", "experiment", ExperimentS
 """All installed experiments."""
 
 
-def run_experiment(experiment: ExperimentSpec, folder: Path, scale: Scale, *, jobs: int = 1, live: bool = False) -> str:
+def run_experiment(
+    experiment: ExperimentSpec,
+    folder: Path,
+    scale: Scale,
+    *,
+    jobs: int = 1,
+    executor: str = "local",
+    live: bool = False,
+) -> str:
     """Do what is missing, then write table and pictures into ``folder``; returns the table.
 
     Args:
@@ -76,6 +84,7 @@ def run_experiment(experiment: ExperimentSpec, folder: Path, scale: Scale, *, jo
         folder: for ``trials/``, ``summary.txt``, ``summary.json`` and the pictures.
         scale: how much of it.
         jobs: trials at a time, each in a process of its own; 1 stays in this one.
+        executor: name of what runs the trials.
         live: show progress.
 
     Raises:
@@ -84,7 +93,9 @@ def run_experiment(experiment: ExperimentSpec, folder: Path, scale: Scale, *, jo
     """
     folder.mkdir(parents=True, exist_ok=True)
     perform = Perform(experiment.measure, folder / "trials")
-    finished = perform_all(perform, experiment.trials(scale), jobs=jobs, live=live, title=experiment.name)
+    finished = perform_all(
+        perform, experiment.trials(scale), jobs=jobs, executor=executor, live=live, title=experiment.name
+    )
     rows = _rows(finished)
     text = table(f"{experiment.name}: {experiment.summary}", rows, experiment.columns, experiment.paper)
     pictures = experiment.draw(finished, folder)
