@@ -14,6 +14,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
+from touchcell.control.interlocks.always_on import OverrunConfig
 from touchcell.control.interlocks.basic import (
     ArmStateAgeConfig,
     DepthConfig,
@@ -66,7 +67,8 @@ InterlockConfig = Annotated[
     | OutOfStepConfig
     | ObjectLostConfig
     | TopplingConfig
-    | ClearanceConfig,
+    | ClearanceConfig
+    | OverrunConfig,
     Field(discriminator="kind"),
 ]
 """One entry of the ``interlocks:`` section; ``kind`` says which."""
@@ -100,6 +102,8 @@ INTERLOCKS: Final[Mapping[str, InterlockSpec]] = MappingProxyType(
         spec.kind: spec
         for spec in (
             InterlockSpec("finite", "every number is finite; always on, asked before all others", None),
+            InterlockSpec("missing", "every arm and sensor is in the view; always on", None),
+            InterlockSpec("overrun", "no control cycle comes late; always on, with a limit of its own", OverrunConfig),
             InterlockSpec("workspace", "sensor or tool stays inside a box in the arm's base frame", WorkspaceConfig),
             InterlockSpec("tcp_speed", "measured and commanded tool speed stay below limits", TcpSpeedConfig),
             InterlockSpec("depth", "no sensor is pressed in too deep", DepthConfig),
