@@ -58,6 +58,10 @@ class Cell:
     start_ns: int = 0
     _exit: ExitStack = field(default_factory=ExitStack, init=False)
 
+    def __repr__(self) -> str:
+        devices = ", ".join(repr(device) for device in self._devices())
+        return f"<Cell {self.plan.cell.name!r}: task {self.task_name} in {self.task.state!r}, {devices}>"
+
     @property
     def rate_hz(self) -> float:
         """Control cycles per second."""

@@ -48,7 +48,7 @@ class Watchdog(Protocol):
         ...
 
     def end(self) -> None:
-        """Guard no longer: the arms stand, as far as drivers can see to it. ``alarms`` then returns what is still wrong."""
+        """Guard no longer: the arms stand. ``alarms`` then returns what is still wrong."""
         ...
 
     def clear(self) -> None:

@@ -6,12 +6,13 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from pydantic import BaseModel, PositiveFloat
+from pydantic import PositiveFloat
 
 from touchcell.control.interlocks.basic import ArmStateAgeConfig, FrameAgeConfig
 from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.settings import InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
+from touchcell.control.interlocks.spec import InterlockSpec
 from touchcell.control.interlocks.timers import InterlockState, Judgement, TimedInterlock, TimerState
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.geometry.types import Array
@@ -83,11 +84,14 @@ class OverrunConfig(InterlockSettings):
     limit_ms: PositiveFloat
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
+        """Return the ``Overrun`` interlock."""
         return Overrun(name, self.level, 1e-3 * self.limit_ms)
 
 
-def default_overrun_s(rate_hz: float, settings: Collection[BaseModel]) -> float:
+OVERRUN = InterlockSpec("overrun", "no control cycle comes late; always on, with a limit of its own", OverrunConfig)
+
+
+def default_overrun_s(rate_hz: float, settings: Collection[InterlockSettings]) -> float:
     """Longest time between two cycles of a cell that does not set it.
 
     It is the smallest limit of a frame's or an arm state's age, at most ``LONGEST_GAP_S`` and at least
@@ -98,7 +102,12 @@ def default_overrun_s(rate_hz: float, settings: Collection[BaseModel]) -> float:
 
 
 def always_on(
-    rate_hz: float, settings: Collection[BaseModel], *, moved: bool, arms: Collection[str], sensors: Collection[str]
+    rate_hz: float,
+    settings: Collection[InterlockSettings],
+    *,
+    moved: bool,
+    arms: Collection[str],
+    sensors: Collection[str],
 ) -> Sequence[Interlock | TimedInterlock]:
     """The rules of a cell beyond those of its file.
 

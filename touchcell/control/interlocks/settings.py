@@ -1,32 +1,51 @@
-"""What the settings of all interlocks have in common."""
+"""Base classes of the interlocks' settings."""
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict
 
 from touchcell.control.interlocks.violation import Severity
+from touchcell.geometry.types import Array
+
+if TYPE_CHECKING:
+    from touchcell.control.interlocks.interlock import Interlock
+    from touchcell.control.interlocks.timers import TimedInterlock
 
 
 class InterlockSettings(BaseModel):
-    """Base of the settings: unknown keys refused, no limit has a default."""
+    """Base of the settings: unknown keys are refused, no limit has a default."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+    kind: str
     severity: Literal["trip", "fault"] = "trip"
 
     @property
     def level(self) -> Severity:
-        """The severity as the rules use it."""
+        """The severity as the interlocks use it."""
         return Severity[self.severity.upper()]
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock | TimedInterlock:
+        """Return the interlock.
+
+        Args:
+            name: of the entry in the cell file.
+            T_tcp_sensor: (4, 4) pose of each sensor in the tool frame, by role.
+
+        Raises:
+            ConfigError: the entry names a sensor that the cell does not have.
+        """
+        raise NotImplementedError(f"{type(self).__name__} builds no interlock")
 
 
 class GradedSettings(InterlockSettings):
-    """Settings of a rule that may also ask for slower motion first; a limit that lasts becomes a trip."""
+    """Settings of an interlock that may first slow the motion; a limit violation that lasts becomes a trip."""
 
     severity: Literal["limit", "trip", "fault"] = "trip"  # type: ignore[assignment]
 
 
 LEAVE = 0.8
-"""Once above its limit, a value counts as above until it has fallen to this share of it, unless the file says more."""
+"""Hysteresis: default fraction of the limit to which a value must fall before it counts as below again."""
