@@ -240,8 +240,8 @@ def test_an_unknown_sensor_is_a_config_error():
 
 
 def test_every_kind_is_listed_with_one_line():
-    # What a clearance does is in test_clearance.py.
-    assert set(INTERLOCKS.names()) == {"clearance"} | {entry["kind"] for entry in GOOD.values()}
+    # What these do is in test_clearance.py and test_always_on.py.
+    assert set(INTERLOCKS.names()) == {"clearance", "overrun"} | {entry["kind"] for entry in GOOD.values()}
     for kind in INTERLOCKS.names():
         spec = INTERLOCKS.load(kind)
         assert spec.config.model_fields["kind"].annotation == Literal[kind]
