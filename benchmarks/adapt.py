@@ -22,7 +22,6 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.perception.calibration.adaptation import (
     AdaptSettings,
-    FewShotDataset,
     about_z,
     adapt_to,
     align_to_sensor,
@@ -36,6 +35,7 @@ from touchcell.perception.markers.estimator import matcher_of
 from touchcell.perception.models.labels import contact_from_xi, xi_from_contact
 from touchcell.perception.models.marker_architecture import MarkerArchitecture, MarkerSize
 from touchcell.perception.models.model_file import Model, load_model
+from touchcell.perception.networks.marker_training import LabelledDiscs
 from touchcell.simulation.mount import MountModel
 from touchcell.simulation.samples import Variation, contacts
 from touchcell.simulation.tip import TipParameters
@@ -63,15 +63,15 @@ class Case:
 
     title: str
     model: Model
-    few: FewShotDataset
-    held_out: FewShotDataset
+    few: LabelledDiscs
+    held_out: LabelledDiscs
     size: MarkerSize
     best: tuple[str, Array] | None = None
 
-    def some(self, count: int) -> FewShotDataset:
+    def some(self, count: int) -> LabelledDiscs:
         """So many of the images to adapt with, evenly chosen."""
         chosen = evenly(len(self.few.frames), count)
-        return FewShotDataset([self.few.frames[i] for i in chosen], self.few.xi[chosen])
+        return LabelledDiscs([self.few.frames[i] for i in chosen], self.few.xi[chosen])
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
@@ -141,7 +141,7 @@ def _scratch(case: Case, adapted: Model, count: int) -> Model:
     return Model(adapted.header, tensors)
 
 
-def _errors(model: Model, contacts: FewShotDataset) -> tuple[Array, float]:
+def _errors(model: Model, contacts: LabelledDiscs) -> tuple[Array, float]:
     """MAE (6,) of x, y, z, alpha, beta, gamma, mm and deg; and the share of images whose markers were matched."""
     architecture = model.header.architecture
     assert isinstance(architecture, MarkerArchitecture)
@@ -171,9 +171,9 @@ def _real(data: Path, path: Path, held_out: int) -> Case:
         images = [model.header.preprocessing.reduce(read_image(split.images[i])) for i in chosen]
         xi = xi_from_contact(split.contact_mm_deg[chosen])
         if name == "val":
-            unchanged = FewShotDataset([detect_markers(image, architecture.size) for image in images], xi)
+            unchanged = LabelledDiscs([detect_markers(image, architecture.size) for image in images], xi)
         other = [changed(image, _ZOOM, _TURN_DEG, _SHIFT_PX) for image in images]
-        sets[name] = FewShotDataset(
+        sets[name] = LabelledDiscs(
             [detect_markers(image, architecture.size) for image in other], about_z(np.radians(_AXES_DEG), xi)
         )
     assert unchanged is not None
@@ -222,7 +222,7 @@ def second_sensor(tip: TipParameters, rig: MountModel) -> tuple[TipParameters, M
     return other, mounted
 
 
-def _drawn(tip: TipParameters, rig: MountModel, n: int, seed: int, model: Model) -> FewShotDataset:
+def _drawn(tip: TipParameters, rig: MountModel, n: int, seed: int, model: Model) -> LabelledDiscs:
     """Discs of simulated contacts, deepest last."""
     still = Variation(0.0, 0.0, 0.0, 0.15, 0.0, 0.003, field=0.01, slip=0.15)
     height, width = model.header.preprocessing.output_size
@@ -234,4 +234,4 @@ def _drawn(tip: TipParameters, rig: MountModel, n: int, seed: int, model: Model)
         labels.append(contact.T_f_s)
     order = np.argsort([T[2, 3] for T in labels])
     xi = se3.log(se3.inverse(np.stack(labels)))[order]
-    return FewShotDataset([frames[i] for i in order], xi)
+    return LabelledDiscs([frames[i] for i in order], xi)

@@ -117,7 +117,7 @@ def fit_tip(
     rings: int,
     *,
     start: Sensor | None = None,
-    told: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Sensor:
     """The simulated sensor whose markers are where the real one's were.
 
@@ -126,7 +126,7 @@ def fit_tip(
         reference: (m, 2) px lattice of the undeformed tip, markers in the order of ``markers.lattice``.
         rings: of the lattice.
         start: what is believed so far about tips of this kind; its camera is laid onto the lattice anew.
-        told: of turns done, and turns in all.
+        progress: of turns done, and turns in all.
 
     Raises:
         TrainingError: fewer than 8 contacts, or no orientation of the camera explains them.
@@ -148,7 +148,7 @@ def fit_tip(
             "no orientation of the camera makes the contacts move the markers as they were seen to",
             hint="check that labels and images belong together, and that the image is not mirrored",
         )
-    return _fitted(best, contacts, list(_FREE), _TURNS, _PRIOR_PX, told)
+    return _fitted(best, contacts, list(_FREE), _TURNS, _PRIOR_PX, progress)
 
 
 def _laid_onto(tip: TipParameters, reference: Array) -> TipParameters:
@@ -176,7 +176,7 @@ def _fitted(
     free: list[_Key],
     turns: int,
     prior_px: float,
-    told: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Sensor:
     seen = contacts.seen[:, ::_EVERY, None]
     measured = contacts.pixels[:, ::_EVERY]
@@ -188,7 +188,9 @@ def _fitted(
 
     scale, low, high = np.array([_FREE[key] for key in free]).T
     at = np.array([_value(start, key) for key in free])
-    x = robust_fit(residuals, at, scale, low=low, high=high, prior=prior_px, soft=_SOFT_PX, turns=turns, told=told)
+    x = robust_fit(
+        residuals, at, scale, low=low, high=high, prior=prior_px, soft=_SOFT_PX, turns=turns, progress=progress
+    )
     return _with(start, free, x)
 
 
