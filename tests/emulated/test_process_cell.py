@@ -431,5 +431,5 @@ def test_why_tells_what_the_watchdog_saw_of_a_run_whose_process_died(tmp_path: P
     (tmp_path / NOTES).write_text(json.dumps(note))
     assert explain(tmp_path).splitlines()[1:] == [
         "  the task's process has gone",
-        "  left: told to stop at 30.0 mm/s; at rest after 0.058 s and 1.00 mm",
+        "  left: commanded to stop at 30.0 mm/s; at rest after 0.058 s and 1.00 mm",
     ]

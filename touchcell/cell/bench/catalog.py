@@ -1,4 +1,4 @@
-"""Which benchmarks there are: those that ship, and in a checkout also those for developers."""
+"""Catalogue of benchmarks: those that ship, and in a checkout also those for developers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ GROUP = "touchcell.benchmarks"
 
 
 def benchmarks() -> dict[str, EntryPoint]:
-    """Entry points ``run(arguments, out)`` by name; nothing is imported but the list of the checkout's own."""
+    """Return entry points ``run(arguments, out)`` by name; only the checkout's own list is imported."""
     return {**_of_checkout(), **registry.installed(GROUP)}
 
 
