@@ -51,7 +51,7 @@ def test_twenty_contacts_determine_camera_mount_and_skin() -> None:
     assert calls[-1][0] >= 5
 
 
-def test_a_mirrored_image_is_told() -> None:
+def test_a_mirrored_image_is_reported() -> None:
     made = contacts(24, 3)
     mirrored = se3.to_euler_mm_deg(made.T_f_s) * np.array([-1.0, 1.0, 1.0, -1.0, 1.0, 1.0])
     wrong = MarkedContacts(se3.from_euler_mm_deg(mirrored), made.pixels, made.seen)

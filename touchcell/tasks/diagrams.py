@@ -1,4 +1,4 @@
-"""State diagrams of the tasks in ``docs/tasks.md``: ``python -m touchcell.tasks.diagrams [FILE]`` regenerates them."""
+"""State diagrams of the tasks: ``python -m touchcell.tasks.diagrams [FILE]`` redraws docs/explanation/tasks.md."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from touchcell.tasks.servoing import servo_table
 from touchcell.tasks.state_machine import Table, mermaid
 from touchcell.tasks.surface_following import SurfaceFollowingConfig
 
-PAGE: Final = Path(__file__).parents[2] / "docs" / "tasks.md"
+PAGE: Final = Path(__file__).parents[2] / "docs" / "explanation" / "tasks.md"
 
 _BLOCK: Final = re.compile(r"(<!-- diagram: (\w+) -->\n).*?(<!-- end of diagram -->)", re.DOTALL)
 
@@ -28,13 +28,12 @@ def tables() -> Mapping[str, Table]:
     }
 
 
-def redrawn(page: str) -> str:
-    """Return ``page`` with every diagram between its markers drawn from the code.
+def redraw(page: str, known: Mapping[str, Table]) -> str:
+    """Return ``page`` with every diagram between its markers drawn from ``known``.
 
     Raises:
-        KeyError: a marker names an unknown diagram.
+        KeyError: a diagram's name is not in ``known``.
     """
-    known = tables()
 
     def draw(block: re.Match[str]) -> str:
         return f"{block[1]}```mermaid\n{mermaid(known[block[2]])}\n```\n{block[3]}"
@@ -42,8 +41,13 @@ def redrawn(page: str) -> str:
     return _BLOCK.sub(draw, page)
 
 
+def redrawn(page: str) -> str:
+    """``page`` with every diagram between its markers drawn from the tasks. Raises KeyError for an unknown one."""
+    return redraw(page, tables())
+
+
 def main(arguments: Sequence[str]) -> None:
-    """Redraw the diagrams of the given page, or of ``docs/tasks.md``."""
+    """Redraw the diagrams of the given page, or of ``docs/explanation/tasks.md``."""
     page = Path(arguments[0]) if arguments else PAGE
     page.write_text(redrawn(page.read_text(encoding="utf-8")), encoding="utf-8")
 

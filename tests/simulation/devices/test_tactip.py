@@ -2,13 +2,12 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.errors import DeviceGone, LifecycleError, StaleData, TransportTimeout
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.drivers.core.samples import Stamped, TcpState
-from touchcell.drivers.core.spec import DriverContext
+from touchcell.drivers.core.spec import DRIVERS, DriverContext
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.simulation.devices.arm import SimArm
@@ -24,7 +23,7 @@ class Cell:
         self.clock = VirtualClock()
         self.scene: Scene = SceneConfig.model_validate({"surfaces": {"table": {"kind": "plane"}}}).build(self.clock)
         context = DriverContext(self.clock, {}, self.scene, seed)
-        arm_spec, tip_spec = registry.spec("sim_arm"), registry.spec("sim_tactip")
+        arm_spec, tip_spec = DRIVERS.load("sim_arm"), DRIVERS.load("sim_tactip")
         arm = arm_spec.build("arm", arm_spec.config(start_pose_mm_deg=(400, 0, 125, 180, 0, 0)), context)
         assert isinstance(arm, SimArm)
         self.arm = arm
@@ -47,9 +46,9 @@ class Cell:
             self.clock.advance_s(0.01)
 
 
-def test_the_spec_tells_the_truth() -> None:
+def test_the_spec_matches_the_device() -> None:
     cell = Cell()
-    assert registry.spec("sim_tactip").capabilities.abilities == {"FrameSource", "HealthSource"}
+    assert DRIVERS.load("sim_tactip").capabilities.provides == {FrameSource, HealthSource}
     assert isinstance(cell.tip, FrameSource)
     assert isinstance(cell.tip, HealthSource)
 
@@ -177,11 +176,11 @@ def test_a_late_camera_delivers_old_frames() -> None:
 
 def test_it_needs_a_scene_and_a_simulated_arm() -> None:
     cell = Cell()
-    spec = registry.spec("sim_tactip")
+    spec = DRIVERS.load("sim_tactip")
     config = SimTactipConfig(mounted_on="arm")
     with pytest.raises(ConfigError, match="needs a scene"):
         spec.build("tip2", config, DriverContext(cell.clock, {"arm": cell.arm}))
-    with pytest.raises(ConfigError, match="no arm of this cell") as caught:
+    with pytest.raises(ConfigError, match="not an arm of this cell") as caught:
         spec.build("tip2", config, DriverContext(cell.clock, {"tip": cell.tip}, cell.scene))
     assert caught.value.key == "tip2.mounted_on"
 
@@ -213,7 +212,7 @@ DOWN = se3.from_euler_mm_deg([400, 0, 0, 180, 0, 0])
 
 
 class Told:
-    """An arm that tells whatever it was given, or that it is gone."""
+    """An arm that returns a given state, or raises that it is lost."""
 
     def __init__(self) -> None:
         self.z_m: float | None = None
@@ -226,11 +225,11 @@ class Told:
         return Stamped(TcpState(T, np.zeros(6)), 0, 0)
 
 
-def test_a_simulated_sensor_sits_on_any_arm_that_tells_its_pose() -> None:
+def test_a_simulated_sensor_can_be_mounted_on_any_arm_with_a_pose() -> None:
     clock, arm = VirtualClock(), Told()
     scene: Scene = SceneConfig.model_validate({"surfaces": {"table": {"kind": "plane"}}}).build(clock)
     config = SimTactipConfig(mounted_on="arm", rate_hz=50, latency_ms=0)
-    tip = registry.spec("sim_tactip").build("tip", config, DriverContext(clock, {"arm": arm}, scene, 0))  # type: ignore[dict-item]
+    tip = DRIVERS.load("sim_tactip").build("tip", config, DriverContext(clock, {"arm": arm}, scene, 0))  # type: ignore[dict-item]
     assert isinstance(tip, SimTactip)
     with pytest.raises(DeviceGone):
         tip.connect()
@@ -247,7 +246,7 @@ def test_a_simulated_sensor_sits_on_any_arm_that_tells_its_pose() -> None:
         assert scene.contact("tip").value.depth_m == pytest.approx(depth_m)
 
 
-def test_dropped_frames_never_come_and_are_the_same_for_the_same_seed() -> None:
+def test_dropped_frames_never_arrive_and_are_the_same_for_the_same_seed() -> None:
     def arrived(seed: int) -> list[int]:
         cell = Cell(seed=seed, dropped=0.3, latency_ms=0)
         seqs = [cell.tip.next(-1, 1.0).seq]

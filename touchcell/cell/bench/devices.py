@@ -16,7 +16,6 @@ import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +23,10 @@ import numpy as np
 
 from touchcell.cell.bench.provenance import provenance
 from touchcell.drivers.core.errors import DeviceError
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.testing.conformance.client import MovingClient
 from touchcell.testing.conformance.context import Bench, DeviceUnderTest
-from touchcell.testing.emulation.rig import rig_of
+from touchcell.testing.emulation.rig import RIGS
 
 _RIGS = ("ur", "franka", "damiao_can", "feetech_serial", "v4l2")
 _TRIALS = 20
@@ -59,7 +59,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
         print(f"{name} ...", flush=True)
         with tempfile.TemporaryDirectory(prefix="touchcell-bench-") as folder:
             address = 1000 + (os.getpid() % 30_000) * 16 + number
-            seat = DeviceUnderTest(partial(rig_of, name), Path(folder), address)
+            seat = DeviceUnderTest(RIGS.load(name), Path(folder), address)
             try:
                 rows[name] = _measure(seat)
                 rows[f"{name}, vendor"] = _vendor(seat)
@@ -83,7 +83,7 @@ def _measure(seat: DeviceUnderTest) -> dict[str, Any]:
     row = _client("ours", seat, name)
     for part in (_wire, _ttl, _kill, _frozen):
         seat.clear()
-        if "TwistSink" in seat.rig.spec.capabilities.abilities or part is _frozen:
+        if TwistSink in seat.rig.spec.capabilities.provides or part is _frozen:
             try:
                 row |= part(seat)
             except BaseException as error:
@@ -198,7 +198,7 @@ def _frozen(seat: DeviceUnderTest) -> dict[str, Any]:
     bench.spoiled = True
     try:
         bench.active()
-        lease = bench.arm.acquire("bench") if "TwistSink" in seat.rig.spec.capabilities.abilities else None
+        lease = bench.arm.acquire("bench") if TwistSink in seat.rig.spec.capabilities.provides else None
         with suppress(DeviceError):
             bench.read()
         bench.sleep(0.2)

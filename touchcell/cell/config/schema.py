@@ -8,27 +8,31 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
+import yaml
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag, model_validator
 
-from touchcell.cell.config.stopping_distance import StoppingDistance, overshoot, together
-from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile, load
+from touchcell.cell.config.layers import load_layers
+from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
+from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile
 from touchcell.control.interlocks.basic import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
-from touchcell.control.interlocks.config import INTERLOCKS, REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
-from touchcell.drivers.core import spec as driver_registry
+from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
+from touchcell.control.interlocks.spec import INTERLOCKS
+from touchcell.control.interlocks.violation import Severity
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.device import DeactivatePolicy
+from touchcell.drivers.core.protocols import JointSource, TwistSink, protocol_names
 from touchcell.drivers.core.scene import scene_section
-from touchcell.drivers.core.spec import DriverConfig, DriverSpec
+from touchcell.drivers.core.spec import DRIVERS, AnyDriver, DriverConfig
 from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.tasks import registry as task_registry
-from touchcell.tasks.interface import TaskConfig, TaskSpec
+from touchcell.tasks.interface import TASKS, AnyTask, TaskConfig
 
 M = TypeVar("M", bound=BaseModel)
 Three = tuple[float, float, float]
@@ -183,11 +187,16 @@ class SensorSection(_OpenSection):
 
 
 class TaskSection(_OpenSection):
-    """The task, which arms and sensors play its roles, and the task's own keys."""
+    """The task, which arms and sensors play its roles, and the task's own keys; ``steps:`` alone names the task too."""
 
     name: str
     arms: dict[str, str] = {}
     sensors: dict[str, str] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named_by_its_steps(cls, section: Any) -> Any:
+        return {"name": "steps", **section} if isinstance(section, dict) and "steps" in section else section
 
 
 class RecordingSection(_Section):
@@ -250,7 +259,7 @@ class DevicePlan:
     """A device that will be built: its section, spec and validated configuration."""
 
     name: str
-    spec: DriverSpec
+    spec: AnyDriver
     config: DriverConfig
 
 
@@ -267,8 +276,9 @@ class CellPlan:
         task_config: its validated parameters.
         skipped: devices of the file that this task does not need and that are not built.
         devices: every device of the file, whether the task needs it or not.
-        overshoots: by the name of a workspace or clearance, how far its arm gets beyond it, or the two fastest arms
-            towards each other, before they stand.
+        stopping_distances: by the name of a workspace or clearance, how far its arm gets beyond it, or the two fastest
+            arms towards each other, before they stand.
+        settings: values that were set in place of the file's own, by dotted key.
     """
 
     file: Path
@@ -277,36 +287,57 @@ class CellPlan:
     sensors: Mapping[str, DevicePlan]
     arm_roles: Mapping[str, str]
     sensor_roles: Mapping[str, str]
-    task: TaskSpec
+    task: AnyTask
     task_config: TaskConfig
     skipped: tuple[str, ...]
     devices: Mapping[str, DevicePlan]
     stopping_distances: Mapping[str, StoppingDistance] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        devices = [f"{name} {device.spec.name}" for name, device in {**self.arms, **self.sensors}.items()]
+        return f"<CellPlan {self.cell.name!r}: task {self.task.name}, {', '.join(devices)}>"
+
+    def text(self) -> str:
+        """The cell file as it is planned: the file itself, or YAML of what comes of it and of what it extends."""
+        merged = load_layers(self.file, self.settings)
+        if not merged.sources:
+            return self.file.read_text()
+        return yaml.safe_dump(merged.data, sort_keys=False, allow_unicode=True)
 
 
-def plan_cell(path: Path, overrides: Mapping[str, Any] | None = None, *, model: str | None = None) -> CellPlan:
+def plan_cell(
+    path: str | PathLike[str],
+    overrides: Mapping[str, Any] | None = None,
+    *,
+    model: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> CellPlan:
     """Read and check a cell file without connecting anything.
 
     Args:
         path: the YAML file.
         overrides: driver keys set from the command line (``--data``), for every device whose driver has such a key.
         model: network model in place of the one that the file names.
+        settings: values in place of the file's own, by dotted key ("task.speed_mm_s", "arms.arm.limits").
 
     Raises:
         ConfigError: with file, line, key, value and remedy; InvalidCell for several at once.
     """
-    file = load(path)
-    if model is not None:
-        for sensor in file.data.get("sensors", {}).values():
-            if sensor.get("estimator", {}).get("kind") == "network":
-                sensor["estimator"]["model"] = model
-    return _Planner(file, overrides or {}).plan()
+    file = load_layers(Path(path), settings)
+    if model is not None and isinstance(sensors := file.data.get("sensors"), dict):
+        for sensor in sensors.values():
+            estimator = sensor.get("estimator") if isinstance(sensor, dict) else None
+            if isinstance(estimator, dict) and estimator.get("kind") == "network":
+                estimator["model"] = model
+    return _Planner(file, overrides or {}, settings or {}).plan()
 
 
 class _Planner:
-    def __init__(self, file: YamlFile, overrides: Mapping[str, Any]) -> None:
+    def __init__(self, file: YamlFile, overrides: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
         self._file = file
         self._overrides = overrides
+        self._settings = settings
         self._problems: list[ConfigError] = []
 
     def plan(self) -> CellPlan:
@@ -327,7 +358,7 @@ class _Planner:
         sensors = {name: plan for name, plan in devices.items() if name in needed_sensors}
         if task:
             self._require_collection(cell, task)
-            self._require_abilities(task, arm_roles, arms)
+            self._require_protocols(task, arm_roles, arms)
             self._require_interlocks(cell, task)
             self._require_processes(cell, task, arm_roles)
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
@@ -350,6 +381,7 @@ class _Planner:
             tuple(skipped),
             devices,
             stopping_distances,
+            self._settings,
         )
 
     def _require_scene_fits(self, cell: CellFile) -> None:
@@ -358,9 +390,9 @@ class _Planner:
         if cell.emulated_scene is not None:
             self._validated(scene_section(), cell.emulated_scene, ("emulated_scene",))
 
-    def _task(self, cell: CellFile) -> tuple[TaskSpec | None, TaskConfig | None]:
+    def _task(self, cell: CellFile) -> tuple[AnyTask | None, TaskConfig | None]:
         try:
-            spec = task_registry.spec(cell.task.name)
+            spec = TASKS.load(cell.task.name)
         except ConfigError as error:
             self._add(("task", "name"), error.reason, value=cell.task.name, hint=error.hint)
             return None, None
@@ -425,14 +457,14 @@ class _Planner:
         kind: str,
     ) -> DevicePlan | None:
         try:
-            spec = driver_registry.spec(section.driver)
+            spec = DRIVERS.load(section.driver)
         except ConfigError as error:
             self._add((*at, "driver"), error.reason, value=section.driver, hint=error.hint)
             return None
         if spec.capabilities.kind != kind:
             self._add(
                 (*at, "driver"),
-                f"{spec.name} drives a {spec.capabilities.kind}, not a {kind}",
+                f"{spec.name} drives {_a(spec.capabilities.kind)}, not {_a(kind)}",
                 value=section.driver,
                 hint="`touchcell list` tells which drivers there are",
             )
@@ -445,35 +477,35 @@ class _Planner:
         config = self._validated(spec.config, {**(section.model_extra or {}), **settings}, at)
         return DevicePlan(at[1], spec, config) if config is not None else None
 
-    def _require_interlocks(self, cell: CellFile, task: TaskSpec) -> None:
+    def _require_interlocks(self, cell: CellFile, task: AnyTask) -> None:
         """What moves must be bounded; limits have no defaults, so the file has to name them."""
-        moves = any("TwistSink" in abilities for abilities in task.arms.values())
+        moves = any(TwistSink in protocols for protocols in task.arms.values())
         required = REQUIRED_TO_MOVE if moves else frozenset()
         if moves and task.sensors:
             required |= REQUIRED_TO_TOUCH
-        stopping = {entry.kind for entry in cell.interlocks.values() if entry.severity != "limit"}
+        stopping = {entry.kind for entry in cell.interlocks.values() if entry.level is not Severity.LIMIT}
         for kind in sorted(required - stopping):
             self._add(
                 ("interlocks",),
                 f"no interlock of kind {kind!r} that stops, which a task that moves an arm must have",
-                hint=f"add one: {INTERLOCKS[kind].summary}",
+                hint=f"add one: {INTERLOCKS.load(kind).summary}",
             )
 
-    def _require_processes(self, cell: CellFile, task: TaskSpec, arm_roles: Mapping[str, str]) -> None:
+    def _require_processes(self, cell: CellFile, task: AnyTask, arm_roles: Mapping[str, str]) -> None:
         """What devices in other processes cannot do is not asked of them."""
         if cell.processes == "one":
             return
-        from touchcell.drivers.hosting.groups import REMOTE_ABILITIES
+        from touchcell.drivers.hosting.groups import REMOTE_PROTOCOLS
 
         if cell.time == "simulated":
             self._add(
                 ("processes",), "several processes share real time only", value=cell.processes, hint="`time: real`"
             )
-        for role, abilities in task.arms.items():
-            if missing := abilities - REMOTE_ABILITIES:
+        for role, protocols in task.arms.items():
+            if missing := protocols - REMOTE_PROTOCOLS:
                 self._add(
                     ("processes",),
-                    f"{task.name} needs {', '.join(sorted(missing))} of {role!r}, which no other process passes on",
+                    f"{task.name} needs {protocol_names(missing)} of {role!r}, which no other process passes on",
                     hint="leave out `processes:`",
                 )
 
@@ -531,7 +563,7 @@ class _Planner:
                 )
         return found
 
-    def _require_collection(self, cell: CellFile, task: TaskSpec) -> None:
+    def _require_collection(self, cell: CellFile, task: AnyTask) -> None:
         if task.labels_frames and cell.collect is None:
             self._add(("collect",), f"{task.name} labels frames, and nothing says where they go", hint="add `collect:`")
         if cell.collect is not None and not task.labels_frames:
@@ -544,7 +576,7 @@ class _Planner:
         ways = []
         for arm in arms.values():
             body = cell.arms[arm.name].body
-            if not body and "JointSource" not in arm.spec.capabilities.abilities:
+            if not body and JointSource not in arm.spec.capabilities.provides:
                 self._add(
                     ("arms", arm.name, "body"),
                     f"{arm.spec.name} tells only where its tool is; interlocks.{name} has to know its shape",
@@ -554,7 +586,7 @@ class _Planner:
             lever_m = 1e-3 * max((float(np.linalg.norm(end)) for end in ends), default=0.0)
             if (way := _overshoot(arm, lever_m, cell.rate_hz)) is not None:
                 ways.append(way)
-        both = together(sorted(ways, key=lambda way: way.total_m)[-2:])
+        both = combined(sorted(ways, key=lambda way: way.total_m)[-2:])
         if both.total_m > 1e-3 * entry.limit_mm:
             self._add(
                 ("interlocks", name, "limit_mm"),
@@ -565,18 +597,18 @@ class _Planner:
             )
         return both
 
-    def _require_abilities(self, task: TaskSpec, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]) -> None:
-        for role, abilities in task.arms.items():
+    def _require_protocols(self, task: AnyTask, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]) -> None:
+        for role, protocols in task.arms.items():
             name = arm_roles.get(role)
             if name is None or name not in arms:
                 continue
-            missing = abilities - arms[name].spec.capabilities.abilities
+            missing = protocols - arms[name].spec.capabilities.provides
             if missing:
                 self._add(
                     ("arms", name, "driver"),
-                    f"{arms[name].spec.name} lacks {', '.join(sorted(missing))}, which {task.name} needs",
+                    f"{arms[name].spec.name} does not provide {protocol_names(missing)}, which {task.name} needs",
                     value=arms[name].spec.name,
-                    hint="choose another driver; `touchcell list` shows abilities",
+                    hint="choose another driver; `touchcell list` names all",
                 )
 
     def _validated(self, model: type[M], data: Any, at: KeyPath) -> M | None:
@@ -588,6 +620,10 @@ class _Planner:
 
     def _add(self, path: tuple[str, ...], reason: str, *, value: Any = None, hint: str = "") -> None:
         self._problems.append(self._file.problem(path, reason, value=value, hint=hint))
+
+
+def _a(word: str) -> str:
+    return f"{'an' if word[0] in 'aeiou' else 'a'} {word}"
 
 
 def _overshoot(arm: DevicePlan, lever_m: float, rate_hz: float) -> StoppingDistance | None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from touchcell.cell.runtime.watchdog import NOTES
 from touchcell.control.interlocks.violation import Severity, Violation
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.drivers.hosting.groups import Group, HostedDevice
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def hosted_groups(plan: CellPlan) -> tuple[Group, ...]:
     alone = [
         device
         for device in plan.arms.values()
-        if device.name not in taken and "TwistSink" in device.spec.capabilities.abilities
+        if device.name not in taken and TwistSink in device.spec.capabilities.provides
     ]
     return (*groups, *(Group(each.name, (_hosted(plan, each),), "an arm by itself") for each in alone))
 
@@ -56,7 +57,7 @@ def process_lines(plan: CellPlan) -> list[str]:
     return lines
 
 
-class ProcessWatch:
+class ProcessWatchdog:
     """The chain, as the run loop sees it; see ``touchcell.cell.runtime.watchdog.Watch``.
 
     Args:
@@ -77,7 +78,7 @@ class ProcessWatch:
     ) -> None:
         self.chain.__exit__(kind, error, trace)
 
-    def prove(self) -> None:
+    def self_test(self) -> None:
         """The self-test: both links have to stop all arms in time. Raises SelfTestFailed."""
         from touchcell.drivers.hosting.self_test import self_test
 
@@ -127,7 +128,7 @@ class ProcessWatch:
         """Have the watchdog write ``watchdog.json`` there when it stops the arms."""
         self.chain.note_to(folder / NOTES)
 
-    def words(self) -> Sequence[str]:
+    def describe(self) -> Sequence[str]:
         """Each process and what scheduling and memory it got, and what the self-test measured."""
         lines = [f"host {link.name!r}: process {link.pid}, {link.realtime}" for link in self.chain.hosts]
         watchdog = self.chain.watchdog

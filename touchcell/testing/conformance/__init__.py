@@ -1,1 +1,1 @@
-"""One suite of checks for every driver, ours and other people's; ``docs/drivers.md`` says how to certify one."""
+"""Conformance suite for drivers, built-in and third-party; see ``docs/how-to/write-a-driver.md``."""
