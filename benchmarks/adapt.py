@@ -1,8 +1,8 @@
-"""``touchcell bench adapt``: how many labelled images of another sensor bring an estimator to it.
+"""``touchcell bench adapt``: accuracy over the number of labelled images of another sensor used for adaptation.
 
-No second real sensor is at hand. One table is of real images that were turned, zoomed and shifted, with labels about
-other axes; the other of a simulated sensor with another camera, mount, stiffness, skin and grip than the one that a
-model was trained on.
+A second real sensor is not available. One table is of real images that were rotated, zoomed and shifted, with labels
+about other axes; the other of a simulated sensor with another camera, mount, stiffness, skin and grip than the one that
+a model was trained on.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ class Case:
 
     Attributes:
         title: of the table.
-        model: that is adapted.
+        model: model to be adapted.
         few: images to adapt with.
         held_out: images to measure on.
         size: of its markers.
-        best: errors of a model that was trained on all images of this sensor, and what that was.
+        best: errors of a model that was trained on all images of this sensor, and its description.
     """
 
     title: str
@@ -69,7 +69,7 @@ class Case:
     best: tuple[str, Array] | None = None
 
     def some(self, count: int) -> LabelledDiscs:
-        """So many of the images to adapt with, evenly chosen."""
+        """Return that many of the images to adapt with, evenly chosen."""
         chosen = evenly(len(self.few.frames), count)
         return LabelledDiscs([self.few.frames[i] for i in chosen], self.few.xi[chosen])
 
@@ -124,13 +124,13 @@ def _adapted(case: Case, count: int) -> Model:
 
 
 def _scratch(case: Case, adapted: Model, count: int) -> Model:
-    """Networks that begin anew; camera and matching are given to them."""
+    """Return networks trained from scratch; camera and matching are given to them."""
     few = case.some(count)
     brought = align_to_sensor(case.model, few)
     rng = np.random.default_rng(0)
     layers = []
     for i, (weight, bias) in enumerate(layers_of(adapted)):
-        # First weights are per pixel: displacements are of eight.
+        # First weights are per pixel: displacements have a magnitude of eight.
         scale = 1.0 / np.sqrt(weight.shape[1]) / (8.0 if i == 0 else 1.0)
         layers.append((rng.uniform(-scale, scale, weight.shape), np.zeros_like(bias)))
     target = adapted.header.labels.targets(about_z(brought.turn_rad, few.xi[brought.matched]))
@@ -142,7 +142,10 @@ def _scratch(case: Case, adapted: Model, count: int) -> Model:
 
 
 def _errors(model: Model, contacts: LabelledDiscs) -> tuple[Array, float]:
-    """MAE (6,) of x, y, z, alpha, beta, gamma, mm and deg; and the share of images whose markers were matched."""
+    """Return the MAE (6,) of x, y, z, alpha, beta, gamma, mm and deg.
+
+    And the fraction of images with matched markers.
+    """
     architecture = model.header.architecture
     assert isinstance(architecture, MarkerArchitecture)
     matcher, camera = matcher_of(model, architecture), model.header.camera
@@ -177,7 +180,9 @@ def _real(data: Path, path: Path, held_out: int) -> Case:
             [detect_markers(image, architecture.size) for image in other], about_z(np.radians(_AXES_DEG), xi)
         )
     assert unchanged is not None
-    title = f"real images, turned by {_TURN_DEG:g} deg, zoomed {_ZOOM:g}, shifted {_SHIFT_PX:g} px; labels' axes turned"
+    title = (
+        f"real images, rotated by {_TURN_DEG:g} deg, zoomed {_ZOOM:g}, shifted {_SHIFT_PX:g} px; labels' axes turned"
+    )
     best = ("trained on all, unchanged images", _errors(model, unchanged)[0])
     return Case(title, model, sets["train"], sets["val"], architecture.size, best)
 
@@ -198,7 +203,7 @@ def _simulated(path: Path, tip: str, held_out: int) -> Case:
 
 
 def second_sensor(tip: TipParameters, rig: MountModel) -> tuple[TipParameters, MountModel]:
-    """Another sensor of the kind."""
+    """Return another sensor of the kind."""
     u, v = tip.centre_px
     other = replace(
         tip,
@@ -223,7 +228,7 @@ def second_sensor(tip: TipParameters, rig: MountModel) -> tuple[TipParameters, M
 
 
 def _drawn(tip: TipParameters, rig: MountModel, n: int, seed: int, model: Model) -> LabelledDiscs:
-    """Discs of simulated contacts, deepest last."""
+    """Return discs of simulated contacts, deepest last."""
     still = Variation(0.0, 0.0, 0.0, 0.15, 0.0, 0.003, field=0.01, slip=0.15)
     height, width = model.header.preprocessing.output_size
     frames, labels = [], []
