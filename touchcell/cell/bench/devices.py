@@ -1,6 +1,6 @@
 """``touchcell bench devices``: every driver on its emulator, and the vendor's client beside it.
 
-All figures are of this machine and of emulators, never of metal. It works with the conformance suite's bench, so it
+All figures are of this machine and of emulators, never of hardware. It uses the conformance suite's fixtures, so it
 needs pytest (extra ``dev``).
 """
 
@@ -50,7 +50,7 @@ _COLUMNS = (
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Print the table; writes ``devices.json`` into ``out``."""
+    """Print the table; write ``devices.json`` into ``out``."""
     parser = argparse.ArgumentParser(prog="touchcell bench devices", description=__doc__.partition("\n")[0])
     parser.add_argument("names", nargs="*", default=_RIGS, metavar="driver", help=f"of {', '.join(_RIGS)}")
     names = parser.parse_args(arguments).names
@@ -134,7 +134,7 @@ def _client(who: str, seat: DeviceUnderTest, name: str) -> dict[str, Any]:
 
 
 def _wire(seat: DeviceUnderTest) -> dict[str, Any]:
-    """From the call of ``send_twist`` to the emulator's own receive stamp, each time from rest."""
+    """Measure from the call of ``send_twist`` to the emulator's own receive stamp, each time from rest."""
     bench = Bench(seat)
     try:
         lease = bench.leased()
@@ -162,7 +162,7 @@ def _wire(seat: DeviceUnderTest) -> dict[str, Any]:
 
 
 def _ttl(seat: DeviceUnderTest) -> dict[str, Any]:
-    """From the expiry of the last command until the tool truly rests."""
+    """Measure from the expiry of the last command until the tool rests."""
     bench = Bench(seat)
     try:
         lease = bench.leased()
@@ -176,7 +176,7 @@ def _ttl(seat: DeviceUnderTest) -> dict[str, Any]:
 
 
 def _kill(seat: DeviceUnderTest) -> dict[str, Any]:
-    """From kill -9 of the client until the tool rests, or motors that carry an arm without brakes let go."""
+    """Measure from kill -9 of the client until the tool rests, or an arm without brakes de-energises its motors."""
     bench = Bench(seat)
     falls = seat.rig.spec.capabilities.falls_on_power_loss
     try:
@@ -193,7 +193,7 @@ def _kill(seat: DeviceUnderTest) -> dict[str, Any]:
 
 
 def _frozen(seat: DeviceUnderTest) -> dict[str, Any]:
-    """From SIGSTOP of the device until the driver is FAULTED."""
+    """Measure from SIGSTOP of the device until the driver is FAULTED."""
     bench = Bench(seat)
     bench.spoiled = True
     try:
