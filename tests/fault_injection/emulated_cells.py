@@ -16,7 +16,7 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.testing.emulation.rig import DeviceFixture
 
-HURT: Final = {
+FAULTED_ROLES: Final = {
     "surface_following": ("arm",),
     "object_tracking": ("arm",),
     "single_arm_pushing": ("arm",),
@@ -65,7 +65,7 @@ def arm_cell(task: str, role: str, rig: DeviceFixture, T_base_tcp: Array, collec
     """A cell in which the emulated arm of ``rig``, its tool at ``T_base_tcp`` (4, 4), plays ``role`` in ``task``.
 
     Args:
-        task: of ``HURT``.
+        task: of ``FAULTED_ROLES``.
         role: of the arm that is hurt; another one is simulated.
         rig: of the emulated arm.
         T_base_tcp: (4, 4) its tool in its base, which stands in the world's origin.
@@ -86,7 +86,7 @@ def arm_cell(task: str, role: str, rig: DeviceFixture, T_base_tcp: Array, collec
     sensors = {sensor_of(role): _simulated_sensor(role, _across(T_base_tcp, ahead), {"kind": "true_contact"})}
     tips = {role: tip}
     if task == "dual_arm_pushing":
-        other = next(name for name in HURT[task] if name != role)
+        other = next(name for name in FAULTED_ROLES[task] if name != role)
         T_other = se3.from_euler_mm_deg(np.array([*(1e3 * (2.0 * middle - tip)), *_DOWN]))
         arms[other] = _simulated_arm(T_other)
         sensors[sensor_of(other)] = _simulated_sensor(other, _across(T_other, -ahead), {"kind": "true_contact"})
@@ -112,7 +112,7 @@ def arm_cell(task: str, role: str, rig: DeviceFixture, T_base_tcp: Array, collec
 
 def camera_cell(task: str, cameras: Mapping[str, DeviceFixture], collected: str) -> dict[str, Any]:
     """A cell in which the emulated cameras, by role of their sensor, sit on simulated arms."""
-    roles = HURT.get(task, ())
+    roles = FAULTED_ROLES.get(task, ())
     arms, sensors, tips = {}, {}, {}
     settings: dict[str, Any] = {}
     for number, role in enumerate(roles):
@@ -247,4 +247,4 @@ def _collect(task: str, folder: str) -> dict[str, Any]:
 
 def sensors_of(task: str) -> Sequence[str]:
     """Roles of the sensors of a task."""
-    return [sensor_of(role) for role in HURT[task]] if task in HURT else ["sensor"]
+    return [sensor_of(role) for role in FAULTED_ROLES[task]] if task in FAULTED_ROLES else ["sensor"]

@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
-from tests.fault_injection.emulated_cells import HURT, arm_cell, camera_cell, sensor_of, sensors_of
+from tests.fault_injection.emulated_cells import FAULTED_ROLES, arm_cell, camera_cell, sensor_of, sensors_of
 from tests.fault_injection.sent_commands import SentCommands
 from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.cell.runtime.cell import Cell
@@ -186,7 +186,7 @@ def places(driver: str, folder: Path) -> Iterator[tuple[Place, str]]:
         driver: of ``ARMS`` or ``CAMERAS``.
         folder: for the rig, of which only the faults are looked at.
     """
-    tasks: list[str] = [*HURT]
+    tasks: list[str] = [*FAULTED_ROLES]
     if driver in CAMERAS:
         tasks.append("observe")
     elif driver in _COARSE:
@@ -194,13 +194,13 @@ def places(driver: str, folder: Path) -> Iterator[tuple[Place, str]]:
     faults = faults_of(driver, folder)
     for task in tasks:
         states, servoes = states_of(task)
-        for role in HURT.get(task, ("",)):
-            hurt = role if driver in ARMS else sensor_of(role or "arm")
+        for role in FAULTED_ROLES.get(task, ("",)):
+            affected = role if driver in ARMS else sensor_of(role or "arm")
             for state in states:
                 rule = _rule(task, state, servoes=servoes)
                 for fault, (_, lawful) in faults.items():
                     hidden = lawful in ("transient", "unseen") and task != "surface_following"
-                    yield Place(driver, fault, task, hurt, state), HIDDEN if hidden else rule
+                    yield Place(driver, fault, task, affected, state), HIDDEN if hidden else rule
 
 
 def _rule(task: str, state: str, *, servoes: bool) -> str:
@@ -312,8 +312,8 @@ def _run(case: EmulatedCase, rig: DeviceFixture, emulator: Emulated, plan: CellP
                 if wait <= 0:
                     stalls = watch.enter_context(closing(_Stalls()))
                     injected_s = time.monotonic()
-                    asked = _inject(emulator, place.fault, value)
-                    if asked and rig.pose is not None and not rig.spec.capabilities.falls_on_power_loss:
+                    requested = _inject(emulator, place.fault, value)
+                    if requested and rig.pose is not None and not rig.spec.capabilities.falls_on_power_loss:
                         witness = watch.enter_context(closing(_Witness(rig, emulator)))
             if injected_s is not None and given_up_ns is None:
                 for_s = _CALM_S if case.lawful in ("transient", "unseen") else _WATCHED_S

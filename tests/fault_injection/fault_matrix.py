@@ -111,9 +111,15 @@ FAULTS: Final = (
         obeys=False,
         extra_m_s=0.03,
     ),
-    Fault("arm: deaf", "arm", _and_stop(_arm(deaf=True)), frozenset(), {}),
+    Fault("arm: deaf", "arm", _and_stop(_arm(ignores_stops=True)), frozenset(), {}),
     Fault(
-        "arm: runs_on", "arm", _and_stop(_arm(runs_on=True)), frozenset({"stop"}), _STANDS, obeys=False, extra_m_s=0.02
+        "arm: runs_on",
+        "arm",
+        _and_stop(_arm(ignores_expiry=True)),
+        frozenset({"stop"}),
+        _STANDS,
+        obeys=False,
+        extra_m_s=0.02,
     ),
     Fault("camera: frozen", "camera", _camera(frozen=True), frozenset({"frame_frozen"}), {}),
     Fault("camera: last_seq", "camera", _camera(last_seq=0), frozenset({"frame_age"}), {}),
@@ -212,9 +218,9 @@ def matrix(
             path.write_text(yaml.safe_dump(on_true_contact(data) if kind == "arm" else data))
             probe = compose(plan_anew(path))
             assert isinstance(probe.task, MachineTask)
-            hurt = probe.plan.arm_roles if kind == "arm" else probe.cameras
+            affected = probe.plan.arm_roles if kind == "arm" else probe.cameras
             for fault in (fault for fault in FAULTS if fault.device == kind):
-                for device in hurt:
+                for device in affected:
                     for state in probe.task.states:
                         yield run_case(path, fault, device, state)
 
@@ -285,10 +291,10 @@ def _judged(
         problems.append("the arm does not stand")
     case = replace(case, ended_by=by, detection_s=None if first is None else (first.t_ns - injected_ns) * 1e-9)
     for role, report in result.stops.items():
-        hurt = role == case.device
-        times = 2 if hurt and not fault.obeys else 1
+        affected = role == case.device
+        times = 2 if affected and not fault.obeys else 1
         longest_s = times * report.declared_s + 1.0 / cell.rate_hz
-        farthest_m = times * report.declared_m + (fault.extra_m_s * longest_s if hurt else 0.0)
+        farthest_m = times * report.declared_m + (fault.extra_m_s * longest_s if affected else 0.0)
         if report.time_s is None or report.time_s > longest_s:
             problems.append(f"{role} at rest after {report.time_s} s, declared {report.declared_s:.3f} s")
         if report.distance_m is not None and report.distance_m > farthest_m:

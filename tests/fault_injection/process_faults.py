@@ -136,11 +136,11 @@ def run_fault(folder: Path, fault: ProcessFault, rate_hz: float, what: str = "sw
         await_motion(process, states)
         host = next(iter(who["hosts"]))
         victim = {"task": who["task"], "watchdog": who["watchdog"], "host": who["hosts"][host]}[fault.who]
-        hurt_arms = set(who["arms"][host]) if fault.who == "host" else set()
+        faulted_arms = set(who["arms"][host]) if fault.who == "host" else set()
         before = {name: state.read() for name, state in states.items()}
-        hurt_ns = time.monotonic_ns()
+        injected_ns = time.monotonic_ns()
         os.kill(victim, fault.signal)
-        survivors = {name: state for name, state in states.items() if name not in hurt_arms}
+        survivors = {name: state for name, state in states.items() if name not in faulted_arms}
         _await_rest(survivors)
         at_rest = {name: state.read() for name, state in survivors.items()}
         if fault.signal is signal.SIGSTOP:
@@ -153,17 +153,17 @@ def run_fault(folder: Path, fault: ProcessFault, rate_hz: float, what: str = "sw
         process.send_signal(signal.SIGTERM)
         outcome = last_line(process)
         problems = left_over([who["task"], who["watchdog"], *who["hosts"].values()])
-        arms = [_arm_case(name, before[name], record, hurt_ns) for name, record in at_rest.items()]
+        arms = [_arm_case(name, before[name], record, injected_ns) for name, record in at_rest.items()]
         longest_s = declared_s(rate_hz, max(speed_m_s(record) for record in before.values()), what)
         for case in arms:
             problems += _judged(case, fault, longest_s)
         for name, record in afterwards.items():
             # A killed host obeys nothing any more, and its record ends where it was killed.
-            if fault.signal is signal.SIGKILL and name in hurt_arms:
+            if fault.signal is signal.SIGKILL and name in faulted_arms:
                 continue
             if not record["at_rest"]:
                 problems.append(f"{name} moved afterwards")
-            if record["obeyed_ns"] > record["stop_ns"] > hurt_ns or (
+            if record["executed_ns"] > record["stop_ns"] > injected_ns or (
                 name in at_rest and record["obeyed"] != at_rest[name]["obeyed"]
             ):
                 problems.append(f"{name} obeyed a command after the stop")
@@ -179,15 +179,15 @@ def _judged(case: ArmCase, fault: ProcessFault, longest_s: float) -> list[str]:
     return [f"{case.arm} stood after {took_s:.3f} s, declared {longest_s:.3f} s"] if took_s > longest_s else []
 
 
-def _arm_case(name: str, before: Any, record: Any, hurt_ns: int) -> ArmCase:
-    told = [int(record[key]) for key in ("asked_ns", "stop_ns") if record[key] > hurt_ns]
+def _arm_case(name: str, before: Any, record: Any, injected_ns: int) -> ArmCase:
+    told = [int(record[key]) for key in ("requested_ns", "stop_ns") if record[key] > injected_ns]
     rested_ns = int(record["moved_ns"]) if record["at_rest"] else None
     detected_ns = min(told, default=None)
     return ArmCase(
         name,
-        None if detected_ns is None else (detected_ns - hurt_ns) * 1e-9,
-        None if rested_ns is None else max(0, rested_ns - (detected_ns or hurt_ns)) * 1e-9,
-        None if rested_ns is None else max(0, rested_ns - hurt_ns) * 1e-9,
+        None if detected_ns is None else (detected_ns - injected_ns) * 1e-9,
+        None if rested_ns is None else max(0, rested_ns - (detected_ns or injected_ns)) * 1e-9,
+        None if rested_ns is None else max(0, rested_ns - injected_ns) * 1e-9,
         math.dist(record["T_base_tcp"][:3, 3], before["T_base_tcp"][:3, 3]),
     )
 

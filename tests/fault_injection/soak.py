@@ -91,7 +91,7 @@ def lap(path: Path, folder: Path, rng: np.random.Generator, before_s: float = 0.
     """
     cell, stop, box = compose(plan_anew(path)), StopRequest(), BlackBox()
     sent = SentCommands(box)
-    places = [(fault, device) for fault in FAULTS for device in _hurt(fault, cell)]
+    places = [(fault, device) for fault in FAULTS for device in _affected(fault, cell)]
     fault, device = places[rng.integers(len(places))] if places and rng.random() < 0.75 else (None, "")
     after = int(rng.integers(1, 1500))
     with Recorder(folder / "run.mcap") as recorder, cell:
@@ -113,7 +113,7 @@ def lap(path: Path, folder: Path, rng: np.random.Generator, before_s: float = 0.
     return Lap(before_s + result.duration_s, result.outcome.value, injected, held(), problem or _unexpected(result))
 
 
-def _hurt(fault: Fault, cell: Cell) -> list[str]:
+def _affected(fault: Fault, cell: Cell) -> list[str]:
     """Devices that can have it: arms with joints are simulated without faults of their own."""
     if fault.device == "camera":
         return list(cell.cameras)
