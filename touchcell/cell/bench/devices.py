@@ -23,6 +23,7 @@ import numpy as np
 
 from touchcell.cell.bench.provenance import provenance
 from touchcell.drivers.core.errors import DeviceError
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.testing.conformance.client import MovingClient
 from touchcell.testing.conformance.context import ConformanceContext, DeviceUnderTest
 from touchcell.testing.emulation.rig import RIGS
@@ -82,7 +83,7 @@ def _measure(device: DeviceUnderTest) -> dict[str, Any]:
     row = _client("ours", device, name)
     for part in (_wire, _ttl, _kill, _frozen):
         device.clear()
-        if "TwistSink" in device.rig.spec.capabilities.abilities or part is _frozen:
+        if TwistSink in device.rig.spec.capabilities.provides or part is _frozen:
             try:
                 row |= part(device)
             except BaseException as error:
@@ -197,7 +198,7 @@ def _frozen(device: DeviceUnderTest) -> dict[str, Any]:
     context.spoiled = True
     try:
         context.active()
-        lease = context.arm.acquire("bench") if "TwistSink" in device.rig.spec.capabilities.abilities else None
+        lease = context.arm.acquire("bench") if TwistSink in device.rig.spec.capabilities.provides else None
         with suppress(DeviceError):
             context.read()
         context.sleep(0.2)

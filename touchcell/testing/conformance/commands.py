@@ -11,6 +11,7 @@ import pytest
 from touchcell.drivers.core.commands import TwistFrame
 from touchcell.drivers.core.errors import CommandRejected, Rejection
 from touchcell.drivers.core.lease import Lease
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import OWNER, ConformanceContext
 
@@ -25,7 +26,7 @@ def _refused(context: ConformanceContext, lease: Lease, reason: Rejection, **cha
     assert caught.value.reason is reason
 
 
-@check("TwistSink", on_hardware=True)
+@check(TwistSink, on_hardware=True)
 def non_finite_commands_are_refused(context: ConformanceContext) -> None:
     """NaN and both infinities in any component, and in the time-to-live, are rejected and move nothing."""
     lease = context.leased()
@@ -41,7 +42,7 @@ def non_finite_commands_are_refused(context: ConformanceContext) -> None:
     assert np.linalg.norm(context.position() - start) < _FORBIDDEN_TRAVEL_M
 
 
-@check("TwistSink", on_hardware=True)
+@check(TwistSink, on_hardware=True)
 def malformed_commands_are_refused(context: ConformanceContext) -> None:
     """Wrong shapes and unknown frames are rejected and move nothing."""
     lease = context.leased()
@@ -55,7 +56,7 @@ def malformed_commands_are_refused(context: ConformanceContext) -> None:
     assert np.linalg.norm(context.position() - start) < _FORBIDDEN_TRAVEL_M
 
 
-@check("TwistSink", on_hardware=True)
+@check(TwistSink, on_hardware=True)
 def commands_without_the_lease_are_refused(context: ConformanceContext) -> None:
     """A copied lease, another arm's, a released one: none of them moves the arm."""
     lease = context.leased()
@@ -69,7 +70,7 @@ def commands_without_the_lease_are_refused(context: ConformanceContext) -> None:
     assert np.linalg.norm(context.position() - start) < _FORBIDDEN_TRAVEL_M
 
 
-@check("TwistSink", on_hardware=True)
+@check(TwistSink, on_hardware=True)
 def second_owner_is_refused(context: ConformanceContext) -> None:
     """One owner at a time, by name; the next may acquire the lease after its release."""
     lease = context.leased()
@@ -81,7 +82,7 @@ def second_owner_is_refused(context: ConformanceContext) -> None:
     assert context.arm.acquire("another").owner == "another"
 
 
-@check("TwistSink", on_hardware=True)
+@check(TwistSink, on_hardware=True)
 def commands_out_of_their_time_are_refused(context: ConformanceContext) -> None:
     """Commands that are expired, from the future, or with a zero, negative or infinite time-to-live are rejected."""
     lease = context.leased()
@@ -95,7 +96,7 @@ def commands_out_of_their_time_are_refused(context: ConformanceContext) -> None:
         _refused(context, lease, Rejection.LIMIT, ttl_s=ttl_s)
 
 
-@check("TwistSink", on_hardware=True)
+@check(TwistSink, on_hardware=True)
 def commands_in_the_wrong_mode_are_refused(context: ConformanceContext) -> None:
     """Nothing moves an arm that is not ACTIVE, lease or not."""
     context.ready()
@@ -103,7 +104,7 @@ def commands_in_the_wrong_mode_are_refused(context: ConformanceContext) -> None:
     _refused(context, lease, Rejection.MODE)
 
 
-@check("TwistSink")
+@check(TwistSink)
 def commands_over_the_limits_are_scaled_and_reported(context: ConformanceContext) -> None:
     """A tenfold speed is sent within the limit, along the same direction, and reported as adjusted; the arm is no
     faster either."""
@@ -121,7 +122,7 @@ def commands_over_the_limits_are_scaled_and_reported(context: ConformanceContext
     context.settle()
 
 
-@check("TwistSink")
+@check(TwistSink)
 def acceleration_is_limited_and_reported(context: ConformanceContext) -> None:
     """From rest the first fast command is reduced by the acceleration limit."""
     lease = context.leased()

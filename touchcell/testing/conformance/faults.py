@@ -10,6 +10,7 @@ import pytest
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, DeviceError, LifecycleError, StaleData
 from touchcell.drivers.core.lease import Lease
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import OWNER, ConformanceContext
 
@@ -75,7 +76,7 @@ def vanished_device_is_a_fault_and_can_return(context: ConformanceContext) -> No
 def _begin(context: ConformanceContext) -> Lease | None:
     """Bring the device to ACTIVE and use it."""
     context.active()
-    if "TwistSink" not in context.rig.spec.capabilities.abilities:
+    if TwistSink not in context.rig.spec.capabilities.provides:
         context.until(lambda: _reads(context), 2.0, "first sample")
         return None
     lease = context.arm.acquire(OWNER)

@@ -7,13 +7,14 @@ from typing import Any
 import pytest
 
 from touchcell.drivers.core.errors import DeviceError, TransportTimeout
+from touchcell.drivers.core.protocols import FrameSource
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import ConformanceContext
 
 _UNREAD_PERIODS = 8
 
 
-@check("FrameSource", on_hardware=True)
+@check(FrameSource, on_hardware=True)
 def next_waits_and_times_out(context: ConformanceContext) -> None:
     """``next`` returns a frame beyond the known number, and raises TransportTimeout if none arrives in time."""
     context.active()
@@ -27,7 +28,7 @@ def next_waits_and_times_out(context: ConformanceContext) -> None:
     assert (context.clock.now_ns() - start_ns) * 1e-9 >= 0.099
 
 
-@check("FrameSource", on_hardware=True)
+@check(FrameSource, on_hardware=True)
 def latest_never_goes_back(context: ConformanceContext) -> None:
     """``latest`` repeats the newest frame until a newer one arrives, and skips unread ones."""
     rate_hz = context.rig.state_rate_hz or context.rig.spec.capabilities.state_rate_hz
@@ -39,7 +40,7 @@ def latest_never_goes_back(context: ConformanceContext) -> None:
     assert context.camera.latest().seq >= newest.seq
 
 
-@check("FrameSource")
+@check(FrameSource)
 def unread_frames_are_not_decoded(context: ConformanceContext) -> None:
     """While frames pass unread OpenCV decodes none of them; a read decodes one."""
     import cv2
@@ -66,7 +67,7 @@ def unread_frames_are_not_decoded(context: ConformanceContext) -> None:
     assert decoded <= 2
 
 
-@check("FrameSource", "truth")
+@check(FrameSource, "truth")
 def lost_frames_leave_a_gap(context: ConformanceContext) -> None:
     """Frames lost in transport leave gaps in the sequence numbers."""
     if "drop" not in context.rig.faults:

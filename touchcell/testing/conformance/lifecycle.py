@@ -8,19 +8,19 @@ import threading
 import numpy as np
 import pytest
 
-from touchcell.drivers.core import protocols as abilities
+from touchcell.drivers.core import protocols
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, DeviceError, LifecycleError, Rejection
-from touchcell.drivers.core.protocols import HealthSource, NativeWatchdog, StopCategory
+from touchcell.drivers.core.protocols import HealthSource, NativeWatchdog, StopCategory, Stoppable, TwistSink
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import ConformanceContext
 
-# Combined protocols, such as ServoArm, are not checked themselves.
-_PROTOCOLS = {
-    name: protocol
-    for name, protocol in vars(abilities).items()
+# ServoArm, which only combines others, is not declared by drivers.
+_PROTOCOLS = frozenset(
+    protocol
+    for protocol in vars(protocols).values()
     if getattr(protocol, "_is_runtime_protocol", False) and len(protocol.__bases__) == 1
-}
+)
 _WARM_UP_CYCLES = 2
 _CYCLES = 10
 
@@ -93,14 +93,13 @@ def disconnect_from_every_state(context: ConformanceContext) -> None:
 
 
 @check(on_hardware=True)
-def abilities_are_those_of_the_record(context: ConformanceContext) -> None:
-    """Every declared ability is implemented, and every implemented one is declared."""
-    named = context.rig.spec.capabilities.abilities
-    assert named <= _PROTOCOLS.keys()
-    assert {name for name, protocol in _PROTOCOLS.items() if isinstance(context.device, protocol)} == named
+def protocols_are_those_of_the_record(context: ConformanceContext) -> None:
+    """Every protocol that is declared is provided, and every one of ours that is provided is declared."""
+    declared = context.rig.spec.capabilities.provides
+    assert {protocol for protocol in declared | _PROTOCOLS if isinstance(context.device, protocol)} == declared
 
 
-@check("HealthSource", on_hardware=True)
+@check(HealthSource, on_hardware=True)
 def health_has_named_readings(context: ConformanceContext) -> None:
     """``health`` returns named numbers and texts while connected; no number is NaN."""
     device = context.ready()
@@ -112,7 +111,7 @@ def health_has_named_readings(context: ConformanceContext) -> None:
         assert reading == reading, name
 
 
-@check("NativeWatchdog", on_hardware=True)
+@check(NativeWatchdog, on_hardware=True)
 def watchdog_is_read_back(context: ConformanceContext) -> None:
     """An active device reports a watchdog no longer than declared."""
     device = context.active()
@@ -126,10 +125,10 @@ def watchdog_is_read_back(context: ConformanceContext) -> None:
 def record_of_the_watchdog_is_consistent(context: ConformanceContext) -> None:
     """``max_watchdog_s`` is declared exactly by devices that have a watchdog."""
     capabilities = context.rig.spec.capabilities
-    assert (capabilities.max_watchdog_s is not None) == ("NativeWatchdog" in capabilities.abilities)
+    assert (capabilities.max_watchdog_s is not None) == (NativeWatchdog in capabilities.provides)
 
 
-@check("Stoppable")
+@check(Stoppable)
 def stop_categories_are_those_of_the_record(context: ConformanceContext) -> None:
     """Supported categories stop a moving arm in the promised state; the others are refused."""
     offered = context.rig.spec.capabilities.stop_categories
@@ -165,7 +164,7 @@ def _activates(context: ConformanceContext) -> bool:
     return True
 
 
-@check("TwistSink")
+@check(TwistSink)
 def deactivation_stops_and_voids_the_lease(context: ConformanceContext) -> None:
     """``deactivate`` of a moving arm ends at rest in READY; the lease is invalid afterwards."""
     lease = context.leased()
@@ -181,7 +180,7 @@ def deactivation_stops_and_voids_the_lease(context: ConformanceContext) -> None:
     assert caught.value.reason is Rejection.LEASE
 
 
-@check("TwistSink")
+@check(TwistSink)
 def deactivation_policies_are_applied_or_refused(context: ConformanceContext) -> None:
     """Each policy ends in READY, or raises LifecycleError and keeps the arm held; power is really off."""
     context.ready()

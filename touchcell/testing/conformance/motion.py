@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from touchcell.drivers.core.commands import TwistFrame
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.client import MovingClient
 from touchcell.testing.conformance.context import ConformanceContext
@@ -19,13 +20,13 @@ _LATE_S = 0.01
 _AXES = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
-@check("TwistSink", on_hardware=True)
+@check(TwistSink, on_hardware=True)
 def twists_along_base_axes_are_followed(context: ConformanceContext) -> None:
     """Along every declared axis the tool moves with the right sign, within 20 % of the speed."""
     _follows_all_axes(context, TwistFrame.BASE)
 
 
-@check("TwistSink", on_hardware=True)
+@check(TwistSink, on_hardware=True)
 def twists_along_tool_axes_are_followed(context: ConformanceContext) -> None:
     """The same for twists along the tool's own axes."""
     _follows_all_axes(context, TwistFrame.TCP)
@@ -58,7 +59,7 @@ def _follows_all_axes(context: ConformanceContext, frame: TwistFrame) -> None:
     assert not wrong, "the tool moved otherwise:\n" + "\n".join(wrong)
 
 
-@check("TwistSink", "limited axes")
+@check(TwistSink, "limited axes")
 def infeasible_axes_are_reported(context: ConformanceContext) -> None:
     """A twist along an undeclared axis is sent without it and reported as adjusted."""
     lease = context.leased()
@@ -69,7 +70,7 @@ def infeasible_axes_are_reported(context: ConformanceContext) -> None:
     context.settle()
 
 
-@check("TwistSink", on_hardware=True)
+@check(TwistSink, on_hardware=True)
 def time_to_live_stops_the_motion(context: ConformanceContext) -> None:
     """After the last command has expired the tool brakes, within the distance from latency and limits."""
     lease = context.leased()
@@ -87,7 +88,7 @@ def time_to_live_stops_the_motion(context: ConformanceContext) -> None:
     assert travelled_m <= _braking_m(context, rest.late_s)
 
 
-@check("TwistSink", on_hardware=True)
+@check(TwistSink, on_hardware=True)
 def stop_stops_at_once(context: ConformanceContext) -> None:
     """``stop`` needs no lease and does not wait for the time-to-live."""
     lease = context.leased()
@@ -100,7 +101,7 @@ def stop_stops_at_once(context: ConformanceContext) -> None:
     context.until(context.arm.at_rest, 1.0, "at_rest")
 
 
-@check("TwistSink", on_hardware=True)
+@check(TwistSink, on_hardware=True)
 def release_stops_at_once(context: ConformanceContext) -> None:
     """Releasing the lease stops the arm too."""
     lease = context.leased()
@@ -112,7 +113,7 @@ def release_stops_at_once(context: ConformanceContext) -> None:
     assert np.linalg.norm(rest.poses[-1][:3, 3] - start) <= _braking_m(context, rest.late_s)
 
 
-@check("TwistSink", "truth", "process")
+@check(TwistSink, "truth", "process")
 def killed_client_leaves_the_arm_at_rest(context: ConformanceContext) -> None:
     """kill -9 of the client process: the device itself stops within its watchdog.
 

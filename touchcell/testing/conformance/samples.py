@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from touchcell.drivers.core.errors import DeviceError, StaleData
-from touchcell.drivers.core.protocols import JointSource, WrenchSource
+from touchcell.drivers.core.protocols import JointSource, TcpSource, WrenchSource
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import ConformanceContext
 
@@ -18,7 +18,7 @@ _WINDOW_S = 0.5
 _FROZEN_S = 0.3
 
 
-@check("TcpSource", on_hardware=True)
+@check(TcpSource, on_hardware=True)
 def states_are_stamped_and_numbered(context: ConformanceContext) -> None:
     """Timestamps are on the injected clock and advance; numbers rise; values are finite rigid poses."""
     before_ns = context.clock.now_ns()
@@ -86,7 +86,7 @@ def old_samples_are_stale(context: ConformanceContext) -> None:
     assert caught.value.age_s > -1.0
 
 
-@check("JointSource", on_hardware=True)
+@check(JointSource, on_hardware=True)
 def joints_are_finite_and_fresh(context: ConformanceContext) -> None:
     """Joint angles and velocities have one length, are finite, and no older than requested."""
     device = context.ready()
@@ -97,7 +97,7 @@ def joints_are_finite_and_fresh(context: ConformanceContext) -> None:
     assert np.isfinite(sample.value.dq).all()
 
 
-@check("WrenchSource", on_hardware=True)
+@check(WrenchSource, on_hardware=True)
 def wrench_is_finite_and_fresh(context: ConformanceContext) -> None:
     """The wrench is (6,) finite numbers, no older than requested."""
     device = context.ready()
