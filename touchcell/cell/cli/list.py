@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
+from touchcell import compiled
 from touchcell import registry as entry_points
 from touchcell.cell.bench.catalog import benchmarks
 from touchcell.control.interlocks.config import INTERLOCKS
@@ -25,7 +26,7 @@ def listing() -> dict[str, list[tuple[str, str]]]:
         ],
         "benchmarks": [(name, "") for name in sorted(benchmarks())],
         "cells that ship": [(f"configs/{path.name}", _first_comment(path)) for path in _shipped()],
-    }
+    } | ({"missing": [(line, "") for line in lines]} if (lines := compiled.missing()) else {})
 
 
 def _summary(point: EntryPoint) -> str:

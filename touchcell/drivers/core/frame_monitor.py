@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import zlib
 from collections import deque
 
 import numpy as np
 
 from touchcell.geometry.types import ImageArray
+from touchcell.logs import OncePerCause
+
+_logger = logging.getLogger(__name__)
 
 _BUDGET_FRAMES = 30
 _BUDGET_BAD = 10
@@ -23,9 +27,15 @@ class FrameMonitor:
     A frame is *lost* when the sequence number jumps, *unread* when it was lost because nobody emptied the queue,
     *frozen* when its bytes equal those of the frame before (sensor noise makes that next to impossible on a live
     sensor), and *bad* when it was refused. Brightness is compared with that of the first 60 frames that were read.
+    The first loss of each kind in a stream is logged.
+
+    Args:
+        camera: name of the camera, for the log.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, camera: str = "camera") -> None:
+        self._camera = camera
+        self._losses = OncePerCause(_logger)
         self.good = 0
         self.lost = 0
         self.unread = 0
@@ -44,10 +54,14 @@ class FrameMonitor:
 
     def miss(self, frames: int, *, overrun: bool) -> None:
         """Count ``frames`` that never came; with ``overrun`` the queue was full, so that it was the reader's fault."""
+        if not frames:
+            return
         if overrun:
             self.unread += frames
+            self._losses.warning("unread", "%s: dropped %d frames that were not read in time", self._camera, frames)
         else:
             self.lost += frames
+            self._losses.warning("lost", "%s: %d frames were lost on their way", self._camera, frames)
 
     def admit(self, data: bytes) -> None:
         """Count a good frame; ``data`` are its bytes as they came."""
@@ -66,6 +80,7 @@ class FrameMonitor:
         """Count a frame that was refused for ``reason``, a word such as "short"."""
         self.bad[reason] = self.bad.get(reason, 0) + 1
         self._recent_bad.append(True)
+        self._losses.warning(reason, "%s: dropped a bad frame (%s)", self._camera, reason.replace("_", " "))
 
     def look(self, image: ImageArray) -> None:
         """Note the brightness of a frame that somebody read."""
@@ -79,6 +94,7 @@ class FrameMonitor:
     def reset_errors(self) -> None:
         """Begin a new stream: its first frame follows nothing, and its budget is whole. Counters go on."""
         self._recent_bad.clear()
+        self._losses.forget()
         self._fingerprint = None
         self.frozen_run = 0
 

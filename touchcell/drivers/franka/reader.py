@@ -6,6 +6,7 @@ controls a second arm can wait for that. And a motion that dies while nobody ask
 
 from __future__ import annotations
 
+import logging
 import threading
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,9 @@ from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import CorruptMessage, DeviceError, DeviceGone
 from touchcell.drivers.franka.errors import BY_NAME
 from touchcell.geometry.types import Array
+from touchcell.logs import OncePerCause
+
+_logger = logging.getLogger(__name__)
 
 PERIOD_S = 0.002
 _BAD_IN_A_ROW = 50
@@ -80,6 +84,7 @@ class StateReader:
         self._looked_ns = 0
         self._bad = 0
         self._bad_in_a_row = 0
+        self._losses = OncePerCause(_logger)
         self._states = 0
         self._device_ms = -1
         self._read_ns = clock.now_ns()
@@ -177,7 +182,9 @@ class StateReader:
         if not reading.is_finite():
             self._count_bad("state with numbers that are not finite")
             return
-        self._bad_in_a_row = 0
+        if self._bad_in_a_row:
+            self._bad_in_a_row = 0
+            self._losses.forget()
         self._newest = reading
 
     def _convert(self, state: Any, t_ns: int, device_ms: int) -> Reading:
@@ -202,6 +209,7 @@ class StateReader:
     def _count_bad(self, what: str) -> None:
         self._bad += 1
         self._bad_in_a_row += 1
+        self._losses.warning("bad", "%s: dropped a bad state: %s", self._device, what)
         if self._bad_in_a_row >= _BAD_IN_A_ROW:
             raise CorruptMessage(self._device, f"{_BAD_IN_A_ROW} bad states in a row, the last: {what}")
 
