@@ -13,10 +13,9 @@ import numpy as np
 
 from touchcell.api.cells import load_cell
 from touchcell.cell.config.schema import CellPlan
-from touchcell.cell.config.yaml_file import YamlFile
-from touchcell.cell.runtime.compose import build_devices
+from touchcell.cell.config.yaml_file import KeyPath, YamlFile
+from touchcell.cell.runtime.devices import build_devices
 from touchcell.control.reach import Reach, is_there
-from touchcell.drivers.core import spec as drivers
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.clock import Clock, MonotonicClock, VirtualClock
 from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
@@ -25,7 +24,7 @@ from touchcell.drivers.core.errors import DeviceError, EndOfStream
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.protocols import FrameSource, HealthSource, JointSource, TcpSource
 from touchcell.drivers.core.samples import Frame, Stamped
-from touchcell.drivers.core.spec import DriverContext
+from touchcell.drivers.core.spec import DRIVERS, DriverContext
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array, ArrayLike, ImageArray
@@ -388,9 +387,10 @@ def connect_cell(cell: str | PathLike[str] | CellPlan) -> ConnectedCell:
 
 
 def _build(driver: str, name: str, settings: Mapping[str, Any]) -> tuple[Device, Clock]:
-    spec = drivers.spec(driver)
+    spec = DRIVERS.load(driver)
     # No file and no line: a mistake is reported by its key.
-    config = YamlFile(Path(driver), dict(settings), {(): 0}).validate(spec.config, _plain(settings))
+    lines: dict[KeyPath, int] = dict.fromkeys([(), *((key,) for key in settings)], 0)
+    config = YamlFile(Path(driver), dict(settings), lines).validate(spec.config, _plain(settings))
     clock: Clock = VirtualClock() if spec.capabilities.virtual_time else MonotonicClock()
     return spec.build(name, config, DriverContext(clock)), clock
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
-from touchcell.cell.runtime.compose import model_path
+from touchcell.cell.runtime.sensor import model_path
 from touchcell.perception.models.prediction import ContactEstimator
 from touchcell.perception.runtime import estimators
 

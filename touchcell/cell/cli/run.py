@@ -19,7 +19,8 @@ from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import RECORDING, Recorder
 from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, stop_record
-from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.heap import trim_heap
 from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
 from touchcell.cell.runtime.operator_channel import OperatorChannel
@@ -125,9 +126,9 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
         stop_on_keys(stop, desk=desk) as look_at_keys,
         _live_line(cell.plan, live) as show,
     ):
-        cell.watch.note_to(folder)
+        cell.watchdog.note_to(folder)
         if live:
-            print("\n".join(cell.watch.words()))
+            print("\n".join(cell.watchdog.describe()))
 
         def after_cycle(progress: Progress) -> None:
             look_at_keys()

@@ -17,21 +17,19 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag, model_validator
 
 from touchcell.cell.config.settings import with_settings
-from touchcell.cell.config.stopping_distance import StoppingDistance, overshoot, together
+from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
 from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile, load
 from touchcell.control.interlocks.basic import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.control.interlocks.config import INTERLOCKS, REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
-from touchcell.drivers.core import spec as driver_registry
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.device import DeactivatePolicy
 from touchcell.drivers.core.scene import scene_section
-from touchcell.drivers.core.spec import DriverConfig, DriverSpec
+from touchcell.drivers.core.spec import DRIVERS, DriverConfig, DriverSpec
 from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.tasks import registry as task_registry
-from touchcell.tasks.interface import TaskConfig, TaskSpec
+from touchcell.tasks.interface import TASKS, TaskConfig, TaskSpec
 
 M = TypeVar("M", bound=BaseModel)
 Three = tuple[float, float, float]
@@ -186,11 +184,16 @@ class SensorSection(_OpenSection):
 
 
 class TaskSection(_OpenSection):
-    """The task, which arms and sensors play its roles, and the task's own keys."""
+    """The task, which arms and sensors play its roles, and the task's own keys; ``steps:`` alone names the task too."""
 
     name: str
     arms: dict[str, str] = {}
     sensors: dict[str, str] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named_by_its_steps(cls, section: Any) -> Any:
+        return {"name": "steps", **section} if isinstance(section, dict) and "steps" in section else section
 
 
 class RecordingSection(_Section):
@@ -320,12 +323,23 @@ def plan_cell(
     """
     file = load(Path(path))
     if settings:
-        file = replace(file, data=with_settings(file.data, settings))
-    if model is not None:
-        for sensor in file.data.get("sensors", {}).values():
-            if sensor.get("estimator", {}).get("kind") == "network":
-                sensor["estimator"]["model"] = model
+        file = _with_settings(file, settings)
+    if model is not None and isinstance(sensors := file.data.get("sensors"), dict):
+        for sensor in sensors.values():
+            estimator = sensor.get("estimator") if isinstance(sensor, dict) else None
+            if isinstance(estimator, dict) and estimator.get("kind") == "network":
+                estimator["model"] = model
     return _Planner(file, overrides or {}, settings or {}).plan()
+
+
+def _with_settings(file: YamlFile, settings: Mapping[str, Any]) -> YamlFile:
+    """The file with settings in place; a mistake in one is reported at the line where its key would be."""
+    lines = dict(file.lines)
+    for key in settings:
+        path: KeyPath = tuple(int(part) if part.isdigit() else part for part in key.split("."))
+        for end in range(1, len(path) + 1):
+            lines.setdefault(path[:end], file.line(path[:end]))
+    return replace(file, data=with_settings(file.data, settings), lines=lines)
 
 
 class _Planner:
@@ -387,7 +401,7 @@ class _Planner:
 
     def _task(self, cell: CellFile) -> tuple[TaskSpec | None, TaskConfig | None]:
         try:
-            spec = task_registry.spec(cell.task.name)
+            spec = TASKS.load(cell.task.name)
         except ConfigError as error:
             self._add(("task", "name"), error.reason, value=cell.task.name, hint=error.hint)
             return None, None
@@ -452,14 +466,14 @@ class _Planner:
         kind: str,
     ) -> DevicePlan | None:
         try:
-            spec = driver_registry.spec(section.driver)
+            spec = DRIVERS.load(section.driver)
         except ConfigError as error:
             self._add((*at, "driver"), error.reason, value=section.driver, hint=error.hint)
             return None
         if spec.capabilities.kind != kind:
             self._add(
                 (*at, "driver"),
-                f"{spec.name} drives a {spec.capabilities.kind}, not a {kind}",
+                f"{spec.name} drives {_a(spec.capabilities.kind)}, not {_a(kind)}",
                 value=section.driver,
                 hint="`touchcell list` tells which drivers there are",
             )
@@ -581,7 +595,7 @@ class _Planner:
             lever_m = 1e-3 * max((float(np.linalg.norm(end)) for end in ends), default=0.0)
             if (way := _overshoot(arm, lever_m, cell.rate_hz)) is not None:
                 ways.append(way)
-        both = together(sorted(ways, key=lambda way: way.total_m)[-2:])
+        both = combined(sorted(ways, key=lambda way: way.total_m)[-2:])
         if both.total_m > 1e-3 * entry.limit_mm:
             self._add(
                 ("interlocks", name, "limit_mm"),
@@ -615,6 +629,10 @@ class _Planner:
 
     def _add(self, path: tuple[str, ...], reason: str, *, value: Any = None, hint: str = "") -> None:
         self._problems.append(self._file.problem(path, reason, value=value, hint=hint))
+
+
+def _a(word: str) -> str:
+    return f"{'an' if word[0] in 'aeiou' else 'a'} {word}"
 
 
 def _overshoot(arm: DevicePlan, lever_m: float, rate_hz: float) -> StoppingDistance | None:

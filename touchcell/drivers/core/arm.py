@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.command_checks import finite_array, finite_number
 from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
 from touchcell.drivers.core.device import DeactivatePolicy, Device, Lifecycle
 from touchcell.drivers.core.errors import (
@@ -99,6 +100,7 @@ class Arm(Device):
         self._desk = LeaseManager(name)
         self._refusals = OncePerCause(_logger)
         self._gate = TwistGate(name, limits, self._desk, clock, max_ttl_s=max_ttl_s)
+        self._stop_count = 0
 
     @property
     def limits(self) -> TwistLimits:
@@ -138,6 +140,7 @@ class Arm(Device):
             CommandRejected: nothing was sent; ``reason`` tells why.
             StaleData: the pose is too old to turn a twist along tool axes, or the joints to be kept within limits.
         """
+        stop_count = self._stop_count
         try:
             sent = self._gate.admit(
                 command, lease, self.state, self._tool_pose(command), self._project_to_feasible, self._local_ik
@@ -146,8 +149,16 @@ class Arm(Device):
             self._refusals.warning(error.reason, "%s", error)
             raise
         self._refusals.forget()
-        left_s = command.ttl_s - (sent.t_ns - command.t_ns) * 1e-9
-        self._stream_twist(sent.command.twist, max(left_s, _SHORTEST_TTL_S), sent.t_ns)
+        admitted = sent.command
+        left_s = admitted.ttl_s - (sent.t_ns - admitted.t_ns) * 1e-9
+        self._stream_twist(admitted.twist, max(left_s, _SHORTEST_TTL_S), sent.t_ns)
+        if self._stop_count != stop_count:
+            # Another thread has stopped or faulted the arm since; the twist may have reached it after that stop.
+            self._gate.reset()
+            if self.state in (Lifecycle.ACTIVE, Lifecycle.FAULTED):
+                with suppress(DeviceError):
+                    self._begin_stop(StopCategory.STOP_AND_HOLD)
+            raise CommandRejected(self.name, Rejection.MODE, "stopped while the command was on its way")
         return sent
 
     @final
@@ -166,6 +177,7 @@ class Arm(Device):
             )
         if self.state not in (Lifecycle.ACTIVE, Lifecycle.FAULTED):
             return
+        self._stop_count += 1
         self._gate.reset()
         removes_power = category is not StopCategory.STOP_AND_HOLD
         if removes_power:
@@ -239,6 +251,7 @@ class Arm(Device):
         return latched
 
     def _give_up_command(self) -> None:
+        self._stop_count += 1
         self._desk.revoke()
         self._gate.reset()
 
@@ -268,13 +281,8 @@ class Arm(Device):
 
         The order is the twist gate's. Raises CommandRejected with the first reason that applies.
         """
-        target = np.asarray(q, dtype=np.float64)
-        if not (np.isfinite(target).all() and np.isfinite(speed_fraction)):
-            raise CommandRejected(self.name, Rejection.NON_FINITE, "joint goal is not finite", value=q)
-        if target.shape != (joints,):
-            raise CommandRejected(
-                self.name, Rejection.SHAPE, f"joint goal has shape {target.shape}, not ({joints},)", value=target.shape
-            )
+        speed_fraction = finite_number(self.name, "speed fraction", speed_fraction)
+        target = finite_array(self.name, "joint goal", q, (joints,))
         self._desk.check(lease)
         if self.state is not Lifecycle.ACTIVE:
             raise CommandRejected(self.name, Rejection.MODE, f"device is {self.state.value}, not active")
