@@ -67,9 +67,9 @@ class _Version(argparse.Action):
     """Reads the version only when it is asked for: the metadata of all packages take 15 ms."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        import touchcell
+        from importlib.metadata import version
 
-        print(f"touchcell {touchcell.__version__}")
+        print(f"touchcell {version('touchcell')}")
         parser.exit(EXIT_OK)
 
 
