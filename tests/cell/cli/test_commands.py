@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 import touchcell as tc
-from touchcell.cell.cli.commands.runs import latest_run
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_DEVICE_LOST, EXIT_OK, MEANING
 from touchcell.cell.cli.main import build_parser, main
+from touchcell.cell.cli.run_commands import latest_run
 
 
 def parsers() -> Iterator[tuple[str, argparse.ArgumentParser]]:

@@ -8,14 +8,32 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from touchcell.cell.cli.commands import cells, completion, devices, emulate, learning, measuring, plugins, runs
-from touchcell.cell.cli.commands.arguments import Subparsers
+from touchcell.cell.cli import (
+    cell_commands,
+    completion_command,
+    device_commands,
+    emulate_command,
+    learning_commands,
+    measuring_commands,
+    plugin_commands,
+    run_commands,
+)
+from touchcell.cell.cli.arguments import Subparsers
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_DEVICE_LOST, EXIT_INTERRUPTED, EXIT_OK, MEANING
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.errors import TouchcellError, suggest
 from touchcell.logs import log_to_terminal
 
-_GROUPS: Final = (cells, runs, devices, plugins, learning, measuring, emulate, completion)
+_GROUPS: Final = (
+    cell_commands,
+    run_commands,
+    device_commands,
+    plugin_commands,
+    learning_commands,
+    measuring_commands,
+    emulate_command,
+    completion_command,
+)
 
 _EXTRAS: Final = {
     "torch": "touchcell[train]",
@@ -39,6 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(f"unknown command {command!r} ({suggest(command, commands.choices)})", EXIT_BAD_INPUT)
     options = parser.parse_args(words)
     options.passed_on = passed_on
+    options.parser = parser
     with log_to_terminal(options.verbose):
         return _run(options)
 

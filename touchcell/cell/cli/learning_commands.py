@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from touchcell.cell.cli.commands.arguments import Subparsers, add_command, positive, whole
+from touchcell.cell.cli.arguments import Subparsers, add_command, positive, whole
 from touchcell.cell.cli.exit_codes import EXIT_OK
 from touchcell.cell.config.find import find_cell
 

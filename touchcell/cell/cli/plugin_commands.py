@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from touchcell.cell.cli.commands.arguments import Subparsers, add_command
+from touchcell.cell.cli.arguments import Subparsers, add_command
 from touchcell.cell.cli.exit_codes import EXIT_OK
 
 

@@ -7,7 +7,7 @@ import os
 import sys
 from pathlib import Path
 
-from touchcell.cell.cli.commands.arguments import RUNS, Subparsers, add_command, positive
+from touchcell.cell.cli.arguments import RUNS, Subparsers, add_command, positive
 from touchcell.cell.cli.exit_codes import EXIT_OK
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from touchcell.cell.cli.commands.arguments import Subparsers, add_cell, add_command
+from touchcell.cell.cli.arguments import Subparsers, add_cell, add_command
 from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_OK
 from touchcell.cell.config.find import find_cell
 

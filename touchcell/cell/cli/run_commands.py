@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from touchcell.cell.cli.commands.arguments import RUNS, Subparsers, add_command, add_run_folder, port
+from touchcell.cell.cli.arguments import RUNS, Subparsers, add_command, add_run_folder, port
 from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED
 from touchcell.errors import ConfigError
 

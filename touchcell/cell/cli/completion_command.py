@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from touchcell.cell.cli.commands.arguments import Subparsers, add_command
+from touchcell.cell.cli.arguments import Subparsers, add_command
 from touchcell.cell.cli.exit_codes import EXIT_OK
 
 
@@ -17,7 +17,5 @@ def add_parser(commands: Subparsers) -> None:
 def _completion(options: argparse.Namespace) -> int:
     import shtab
 
-    from touchcell.cell.cli.main import build_parser
-
-    print(shtab.complete(build_parser(), shell=options.shell))
+    print(shtab.complete(options.parser, shell=options.shell))
     return EXIT_OK
