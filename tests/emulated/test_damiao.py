@@ -492,7 +492,7 @@ def test_configurations_that_cannot_be_right_are_refused(tmp_path: Path, changes
 
 def test_gains_that_would_push_too_hard_are_refused(channel: Path, emulator: EmulatorProcess) -> None:
     arm = DamiaoCanArm("arm", config(channel, tracking_error_deg=40.0), CLOCK)
-    with arm, pytest.raises(ConfigError, match="pushes with"):
+    with arm, pytest.raises(ConfigError, match="N m before tracking_error_deg trips"):
         arm.configure()
 
 

@@ -461,7 +461,7 @@ def test_nothing_there_and_nobody_answering_are_told_apart(port: Path, servos: E
 
 def test_one_line_has_one_owner(arm: FeetechSerialArm, port: Path) -> None:
     arm.connect()
-    with pytest.raises(ConnectError, match="nobody else"):
+    with pytest.raises(ConnectError, match="in use elsewhere"):
         FeetechSerialArm("other", config(port), CLOCK).connect()
     assert arm.joints(0.5).seq > 0
 

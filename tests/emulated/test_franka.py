@@ -405,7 +405,7 @@ def test_the_contact_backstop_stops_the_arm_and_stays(bench: Bench) -> None:
     assert truth["reflexes"] == 0
     assert truth["position_m"][0] - before[0] < 0.005
     np.testing.assert_allclose(bench.arm.wrench(1.0).value, [12, 0, 17, 0, 0, 0], atol=1e-5)
-    with pytest.raises(DeviceFault, match="still pushed"):
+    with pytest.raises(DeviceFault, match="still in contact"):
         bench.arm.recover(OPERATOR)
     bench.emulator.clear("external_wrench")
     eventually(lambda: bench.arm.health()["external_force_n"] == 0.0)

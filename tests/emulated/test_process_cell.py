@@ -294,7 +294,7 @@ def test_a_stop_by_the_chain_is_reset_when_its_cause_has_gone_and_the_run_goes_o
             assert run.loop.step()
         np.testing.assert_array_equal(run.positions(), stood)
         lease = cell.arms["left"].acquire("somebody")
-        with pytest.raises(CommandRejected, match="no watchdog guards it"):
+        with pytest.raises(CommandRejected, match="not guarded by a watchdog"):
             cell.arms["left"].send_twist(twist(cell), lease)
         cell.arms["left"].release(lease)
         assert "starts again" in run.ask(OperatorRequest.RESUME)
@@ -427,9 +427,9 @@ def test_a_cell_in_one_process_starts_none(tmp_path: Path) -> None:
 
 def test_why_tells_what_the_watchdog_saw_of_a_run_whose_process_died(tmp_path: Path) -> None:
     stop = {"speed_m_s": 0.03, "time_s": 0.058, "distance_m": 0.001, "escalated": False}
-    note = {"words": "the task's process has gone", "value_s": 0.0, "limit_s": 0.0, "arms": {"left": stop}}
+    note = {"words": "the task's process has ended", "value_s": 0.0, "limit_s": 0.0, "arms": {"left": stop}}
     (tmp_path / NOTES).write_text(json.dumps(note))
     assert explain(tmp_path).splitlines()[1:] == [
-        "  the task's process has gone",
+        "  the task's process has ended",
         "  left: told to stop at 30.0 mm/s; at rest after 0.058 s and 1.00 mm",
     ]

@@ -1,4 +1,4 @@
-"""Tasks are found by name, their specs are sound, and the page about them is true."""
+"""Tasks are found by name, their specs are consistent, and their documentation page is up to date."""
 
 from __future__ import annotations
 

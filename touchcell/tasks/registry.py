@@ -1,4 +1,4 @@
-"""Which tasks exist, known without importing any of them."""
+"""Registry of the installed tasks, without importing any of them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ GROUP = "touchcell.tasks"
 
 
 def installed() -> dict[str, EntryPoint]:
-    """Entry points of all installed tasks by name; nothing is imported."""
+    """Return the entry points of all installed tasks by name; nothing is imported."""
     return entry_points.installed(GROUP)
 
 
 def spec(name: str) -> TaskSpec:
-    """The spec of task ``name``. Raises ConfigError with a suggestion for an unknown one."""
+    """Return the spec of task ``name``. Raises ConfigError with a suggestion for an unknown one."""
     return entry_points.load(GROUP, "task", name, TaskSpec)

@@ -71,7 +71,7 @@ def test_nothing_impossible_is_encoded(field: str, value: float) -> None:
 
 def test_no_command_reads_as_enable() -> None:
     tau = 10.0 - 3 * 20 / 4095
-    with pytest.raises(CodecError, match="would read as enable"):
+    with pytest.raises(CodecError, match="would be interpreted as enable"):
         codec.encode_mit(MitCommand(12.5, 30.0, 500.0, 5.0, tau), R4310)
 
 

@@ -170,7 +170,7 @@ def test_a_panda_tracks_a_moving_plate_in_a_dynamic_scene(tmp_path: Path) -> Non
 
 
 def test_what_it_cannot_reach_is_told() -> None:
-    with pytest.raises(ConfigError, match="found no joint angles"):
+    with pytest.raises(ConfigError, match="no inverse kinematics solution"):
         make(VirtualClock(), start_pose_mm_deg=(1500, 0, 300, 180, 0, 0))
     with pytest.raises(ConfigError, match="is not 7 angles"):
         make(VirtualClock(), near_joints_deg=(0, 0, 0, 0, 0, 0))

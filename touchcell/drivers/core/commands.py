@@ -1,4 +1,4 @@
-"""Commands that say in which frame they hold and for how long."""
+"""Motion commands, each with its reference frame and time-to-live."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ C = TypeVar("C")
 
 
 class TwistFrame(Enum):
-    """Along whose axes a twist's two vectors are given. Its reference point is always the tool centre point."""
+    """Axes in which both vectors of a twist are expressed. Its reference point is always the tool centre point."""
 
     TCP = "tcp"
     BASE = "base"
@@ -23,14 +23,14 @@ class TwistFrame(Enum):
 
 @dataclass(frozen=True, slots=True)
 class TwistCommand:
-    """Move the tool centre point with a velocity, for at most ``ttl_s``, then stop.
+    """Move the tool centre point at a velocity for at most ``ttl_s``, then stop.
 
     Attributes:
         twist: (6,) [vx vy vz wx wy wz], m/s and rad/s: linear velocity of the tool centre point, angular velocity.
-        frame: whose axes.
-        t_ns: when the command was computed; it has expired at ``t_ns + ttl_s``.
-        ttl_s: how long the arm may move on it without another.
-        t_cause_ns: capture stamp of the sample that caused it, so that sensor-to-command age is measurable.
+        frame: axes in which ``twist`` is expressed.
+        t_ns: time at which the command was computed; it expires at ``t_ns + ttl_s``.
+        ttl_s: time-to-live: how long the arm may follow it without a newer command.
+        t_cause_ns: capture time of the sample that caused it, so that the sensor-to-command latency is measurable.
     """
 
     twist: Array
@@ -42,7 +42,7 @@ class TwistCommand:
 
 @dataclass(frozen=True, slots=True)
 class Sent(Generic[C]):
-    """What really went to the device, and why it differs from what was asked for."""
+    """The command actually sent to the device, and the adjustments that made it differ from the request."""
 
     command: C
     t_ns: int
@@ -50,12 +50,12 @@ class Sent(Generic[C]):
 
     @property
     def limited(self) -> bool:
-        """Whether any limit changed the command."""
+        """True if a limit changed the command."""
         return bool(self.adjustments)
 
 
 def in_base_axes(command: TwistCommand, T_base_tcp: Array) -> Array:
-    """The command's twist along base axes, (6,): both vectors turned by the tool's orientation where needed."""
+    """Return the command's twist along base axes, (6,), rotated by the orientation of the tool where needed."""
     if command.frame is TwistFrame.BASE:
         return command.twist
     R = T_base_tcp[:3, :3]
