@@ -16,6 +16,7 @@ BENCHMARKS = {
     "emulated-push": "benchmarks.emulated_push",
     "faults": "tests.fault_injection.faults",
     "filter": "benchmarks.filter",
+    "fuzz-cells": "tests.fault_injection.fuzz_cells",
     "gdn-vs-cnn": "benchmarks.gdn_vs_cnn",
     "kinematics": "benchmarks.kinematics",
     "safety": "tests.fault_injection.safety",

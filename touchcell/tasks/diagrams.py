@@ -1,4 +1,4 @@
-"""State diagrams of the tasks: ``python -m touchcell.tasks.diagrams [FILE]`` regenerates docs/explanation/tasks.md."""
+"""State diagrams of the tasks: ``python -m touchcell.tasks.diagrams [FILE]`` redraws docs/explanation/tasks.md."""
 
 from __future__ import annotations
 

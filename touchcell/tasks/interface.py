@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from pydantic import BaseModel, ConfigDict
 
@@ -16,6 +16,7 @@ from touchcell.drivers.core.commands import TwistCommand
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.registry import Registry
 
 
 class TaskConfig(BaseModel):
@@ -138,3 +139,7 @@ class TaskSpec:
     sensors: frozenset[str]
     build: Callable[[Any, TaskContext], Task]
     labels_frames: bool = False
+
+
+TASKS: Final = Registry("touchcell.tasks", "task", TaskSpec)
+"""All installed tasks."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import shutil
 import sys
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import RECORDING, Recorder
 from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, stop_record
-from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.heap import trim_heap
 from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
 from touchcell.cell.runtime.operator_channel import OperatorChannel
@@ -32,6 +33,21 @@ _EXIT = {
     Outcome.ERROR: EXIT_TASK_FAILED,
     Outcome.TRIPPED: EXIT_TRIPPED,
 }
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A run that has ended.
+
+    Attributes:
+        result: how it ended.
+        folder: its run folder.
+        summary: the text of its report.
+    """
+
+    result: RunResult
+    folder: Path
+    summary: str
 
 
 def run_cell(
@@ -56,22 +72,36 @@ def run_cell(
     Raises:
         ConfigError, ModelError, ConnectError: before anything moves.
     """
-    plan = plan_cell(path, {} if data is None else {"data": data}, model=model)
+    run = run_plan(plan_cell(path, {} if data is None else {"data": data}, model=model), out=out, live=live)
+    print(run.summary)
+    if moving:
+        from touchcell.cell.experiments.animation import animate
+
+        print(f"  {animate(run.folder).name}")
+    if run.result.outcome in (Outcome.TRIPPED, Outcome.ERROR):
+        print(f"`touchcell why {run.folder}` explains")
+    return _EXIT[run.result.outcome]
+
+
+def run_plan(plan: CellPlan, *, out: Path | None = None, live: bool = False) -> FinishedRun:
+    """Compose and run a planned cell to its end, and write its run folder.
+
+    Args:
+        plan: the cell.
+        out: run folder; None for ``runs/NAME-TIME``.
+        live: show a progress line.
+
+    Raises:
+        ConfigError, ModelError, ConnectError: before anything moves.
+    """
     cell = compose(plan)
     trim_heap()
     folder = out or Path("runs") / f"{plan.cell.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(path, folder / "cell.yaml")
+    (folder / "cell.yaml").write_text(plan.text())
     result = _run(cell, folder, live)
     (folder / "result.json").write_text(json.dumps(_result_json(plan, result), indent=1) + "\n")
-    print(write_report(folder))
-    if moving:
-        from touchcell.cell.experiments.animation import animate
-
-        print(f"  {animate(folder).name}")
-    if result.outcome in (Outcome.TRIPPED, Outcome.ERROR):
-        print(f"`touchcell why {folder}` explains")
-    return _EXIT[result.outcome]
+    return FinishedRun(result, folder, write_report(folder))
 
 
 def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
@@ -85,9 +115,9 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
         stop_on_keys(stop, desk=desk) as look_at_keys,
         _live_line(cell.plan, live) as show,
     ):
-        cell.watch.note_to(folder)
+        cell.watchdog.note_to(folder)
         if live:
-            print("\n".join(cell.watch.words()))
+            print("\n".join(cell.watchdog.describe()))
 
         def after_cycle(progress: Progress) -> None:
             look_at_keys()

@@ -1,11 +1,19 @@
-"""YAML with a memory of lines, so that every complaint names file, line, key, value and remedy."""
+"""YAML with a memory of lines, so that every problem names file, line, key, value and remedy.
+
+Files come from people and from scripts: encodings, aliases, nesting, tags and sizes that none needs are refused.
+"""
 
 from __future__ import annotations
 
+import json
+import os
+import re
+import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, ClassVar, Final, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -50,33 +58,97 @@ class YamlFile:
         return ConfigError(reason, file=str(self.path), line=self.line(path), key=key, value=value, hint=hint)
 
     def validate(self, model: type[M], data: Any, at: KeyPath = ()) -> M:
-        """Build ``model`` from ``data``, which stands at ``at``. Raises InvalidCell with every mistake."""
+        """Build ``model`` from ``data``, which stands at ``at``. Raises InvalidCell with every mistake.
+
+        Types are strict: text is no number, and true is no number.
+        """
         try:
-            return model.model_validate(data)
+            # Strict rules for JSON let a list be a tuple and text be a path, which those for Python values do not.
+            return model.model_validate_json(json.dumps(data, default=_plain), strict=True)
         except ValidationError as error:
-            raise InvalidCell([self._explain(model, at, dict(detail)) for detail in error.errors()]) from None
+            details = [dict(detail) for detail in error.errors()]
+            raise InvalidCell([self._explain(model, at, detail) for detail in _merged(details)]) from None
 
     def _explain(self, model: type[BaseModel], at: KeyPath, detail: dict[str, Any]) -> ConfigError:
         location: KeyPath = detail["loc"]
         path = self._written(at, location)
         value = detail.get("input")
         kind = detail["type"]
+        context = detail.get("ctx", {})
         if kind == "extra_forbidden":
             known = _fields_at(model, location[:-1])
             return self.problem(path, "unknown key", value=value, hint=suggest(str(location[-1]), known))
         if kind == "missing":
-            return self.problem(path, "is missing", hint=f"add `{location[-1]}:`")
+            written = "schema: 1" if location == ("schema",) else f"{location[-1]}:"
+            return self.problem((*path, location[-1]), "is missing", hint=f"add `{written}`")
+        if kind == "count":
+            wanted = _NUMBERS.get(context["wanted"], str(context["wanted"]))
+            meaning = next((words for ending, words in _MEANINGS if str(path[-1]).endswith(ending)), "")
+            return self.problem(path, f"needs {wanted} numbers{meaning}, found {context['found']}", value=value)
+        if kind == "union_tag_invalid":
+            tag = str(context["discriminator"]).strip("'")
+            names = re.findall(r"'([^']*)'", str(context["expected_tags"]))
+            unknown = str(context["tag"])
+            return self.problem((*path, tag), f"unknown {tag} {unknown!r}", value=unknown, hint=suggest(unknown, names))
+        if kind == "union_tag_not_found":
+            tag = str(context["discriminator"]).strip("'")
+            return self.problem((*path, tag), "is missing", hint=f"add `{tag}:`")
+        if value is None and kind != "value_error":
+            return self.problem(path, "has no value", hint="write one behind the colon, or leave the key out")
         reason = detail["msg"].removeprefix("Value error, ")
-        shown = "" if isinstance(value, dict | list) else f", not {value!r}"
-        return self.problem(path, reason[:1].lower() + reason[1:] + shown, value=value)
+        reason = reason.replace("Input should be", "must be").replace("valid dictionary", "mapping")
+        reason = reason.replace("an object", "a mapping").replace("a valid array", "a list")
+        shown = "" if isinstance(value, dict | list) else f", not {_short(value)}"
+        hint = "write it in quotes" if kind == "string_type" and isinstance(value, int | float | bool) else ""
+        return self.problem(path, reason[:1].lower() + reason[1:] + shown, value=value, hint=hint)
 
     def _written(self, at: KeyPath, location: KeyPath) -> KeyPath:
-        """``location`` without the union tags that pydantic puts in and nobody wrote."""
+        """``location`` as far as it stands in the file: without the union tags that pydantic puts in."""
         path = at
-        for part in location[:-1]:
+        for part in location:
             if (*path, part) in self.lines:
                 path = (*path, part)
-        return path + location[-1:]
+        return path
+
+
+_NUMBERS: Final = {2: "two", 3: "three", 4: "four", 6: "six", 7: "seven"}
+_MEANINGS: Final = (("_mm_deg", " [x y z mm, rx ry rz deg]"), ("_mm", " [x y z]"))
+
+
+def _short(value: Any) -> str:
+    shown = repr(value)
+    return shown if len(shown) <= 60 else f"{shown[:57]}..."
+
+
+def _plain(value: Any) -> Any:
+    """What the command line and the planner put between a file's own values."""
+    return value.value if isinstance(value, Enum) else str(value)
+
+
+def _merged(details: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Mistakes with those about one list's length as one, of the type "count"."""
+    found: dict[KeyPath, dict[str, Any]] = {}
+    for detail in details:
+        at: KeyPath = detail["loc"]
+        kind = detail["type"]
+        if kind == "missing" and at and isinstance(at[-1], int):
+            have = detail["input"]
+            known = found.get(at[:-1])
+            wanted = at[-1] + 1
+            if known is None or known["type"] != "count":
+                count = {"wanted": wanted, "found": len(have)}
+                found[at[:-1]] = detail | {"loc": at[:-1], "type": "count", "ctx": count}
+            else:
+                known["ctx"]["wanted"] = wanted
+        elif kind == "too_long" and isinstance(detail["input"], list):
+            limits = detail["ctx"]
+            found[at] = detail | {
+                "type": "count",
+                "ctx": {"wanted": limits["max_length"], "found": limits["actual_length"]},
+            }
+        else:
+            found.setdefault((*at, kind), detail)
+    return list(found.values())
 
 
 def _fields_at(model: type[BaseModel], location: KeyPath) -> list[str]:
@@ -89,7 +161,7 @@ def _fields_at(model: type[BaseModel], location: KeyPath) -> list[str]:
             candidates = [m for field in fields for m in _models_in(field.annotation)] or candidates
         elif tagged:
             candidates = tagged
-    return sorted({name for candidate in candidates for name in candidate.model_fields})
+    return sorted({field.alias or name for each in candidates for name, field in each.model_fields.items()})
 
 
 def _has_tag(model: type[BaseModel], tag: str | int) -> bool:
@@ -103,41 +175,205 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def load(path: Path) -> YamlFile:
-    """Read ``path``. Raises ConfigError for what cannot be read, is no YAML, or repeats a key."""
+    """Read a cell file.
+
+    YAML 1.2's core scalars only: ``yes``, ``on``, ``1:30``, ``012``, ``1_000`` and dates are text.
+
+    Raises:
+        ConfigError: for what cannot be read, is no text in UTF-8, no YAML, repeats a key, or grows beyond bounds.
+    """
+    text = _read_text(path)
+    loader = _Loader(text)
     try:
-        text = path.read_text()
-    except OSError as error:
-        raise ConfigError(
-            f"cannot be read: {error.strerror}", file=str(path), hint="`touchcell list` names the cells that ship"
-        ) from None
-    try:
-        # The loader in C, where it was built, is ten times as fast: 40 ms of a cell's start.
-        node = yaml.compose(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-        loader = yaml.SafeLoader("")
-        lines: dict[KeyPath, int] = {(): 1}
+        node = loader.get_single_node()
         if not isinstance(node, yaml.MappingNode):
             raise ConfigError("is no mapping", file=str(path), line=1, hint="a cell file starts with `schema: 1`")
-        _walk(node, (), lines, str(path))
+        walk = _Walk(str(path), loader)
+        walk.visit(node, (), ())
         data: dict[str, Any] = loader.construct_document(node)
     except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = mark.line + 1 if mark else 0
-        raise ConfigError(f"is no YAML: {getattr(error, 'problem', error)}", file=str(path), line=line) from None
-    return YamlFile(path, data, lines)
+        raise _syntax_error(path, text, error) from None
+    except RecursionError:
+        # Only the loader in Python, which has no bound of its own.
+        raise ConfigError(_TOO_DEEP, file=str(path), hint=_TOO_DEEP_HINT) from None
+    finally:
+        loader.dispose()
+    return YamlFile(path, data, walk.lines)
 
 
-def _walk(node: yaml.Node, path: KeyPath, lines: dict[KeyPath, int], file: str) -> None:
-    if isinstance(node, yaml.MappingNode):
-        for key_node, value_node in node.value:
-            key = (*path, key_node.value)
-            line = key_node.start_mark.line + 1
-            if key in lines:
-                raise ConfigError(
-                    f"stands twice, first on line {lines[key]}", file=file, line=line, key=".".join(map(str, key))
-                )
-            lines[key] = line
-            _walk(value_node, key, lines, file)
-    elif isinstance(node, yaml.SequenceNode):
-        for index, item in enumerate(node.value):
-            lines[*path, index] = item.start_mark.line + 1
-            _walk(item, (*path, index), lines, file)
+_MOST_BYTES: Final = 256 * 1024
+_MOST_NODES: Final = 20_000
+_MOST_CHARACTERS: Final = 1_000_000
+_DEEPEST: Final = 40
+_TOO_DEEP: Final = f"is nested more than {_DEEPEST} levels deep"
+_TOO_DEEP_HINT: Final = "no section of a cell file needs that"
+# What people save by mistake, by its first bytes.
+_FOREIGN: Final = {
+    b"\x1f\x8b": ("is compressed by gzip", "unpack it with `gunzip`"),
+    b"PK\x03\x04": ("is a ZIP archive", "unpack it with `unzip`"),
+    b"\x89MCAP0": ("is an MCAP recording", "name the cell file, not the recording"),
+    b"\xff\xfe": ("is text in UTF-16", "save it as UTF-8"),
+    b"\xfe\xff": ("is text in UTF-16", "save it as UTF-8"),
+}
+
+
+def _read_text(path: Path) -> str:
+    hint = "`touchcell list` names the cells that ship"
+    if "\x00" in str(path):
+        raise ConfigError("cannot be the name of a file", file=repr(str(path)), hint=hint)
+    try:
+        # A pipe without a writer must not block.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        with open(descriptor, "rb") as stream:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise ConfigError("is no regular file", file=str(path), hint=hint)
+            content = stream.read(_MOST_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(f"cannot be read: {error.strerror}", file=str(path), hint=hint) from None
+    for start, (reason, remedy) in _FOREIGN.items():
+        if content.startswith(start):
+            raise ConfigError(reason, file=str(path), line=1, hint=remedy)
+    if len(content) > _MOST_BYTES:
+        raise ConfigError(
+            f"is longer than {_MOST_BYTES // 1024} KiB", file=str(path), line=1, hint="a cell file has a few kilobytes"
+        )
+    if b"\x00" in content:
+        raise ConfigError(
+            "is binary, or text in UTF-16 or UTF-32", file=str(path), line=1, hint="a cell file is YAML text in UTF-8"
+        )
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        byte = content[error.start]
+        raise ConfigError(
+            f"is no text in UTF-8: byte 0x{byte:02x}, {bytes([byte]).decode('latin-1')!r} in Latin-1",
+            file=str(path),
+            line=line,
+            hint="save it as UTF-8, as by `iconv -f latin1 -t utf8`",
+        ) from None
+
+
+def _syntax_error(path: Path, text: str, error: yaml.YAMLError) -> ConfigError:
+    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+    if isinstance(error, yaml.reader.ReaderError):
+        # Its position is in bytes or characters, by loader.
+        bad = next((i for i, each in enumerate(text) if yaml.reader.Reader.NON_PRINTABLE.match(each)), 0)
+        line = text.count("\n", 0, bad) + 1
+        return ConfigError(f"holds the control character {text[bad]!r}", file=str(path), line=line, hint="delete it")
+    line = mark.line + 1 if mark else 0
+    lines = text.splitlines()
+    blamed = lines[line - 1] if 0 < line <= len(lines) else ""
+    if "\t" in blamed[: len(blamed) - len(blamed.lstrip())]:
+        return ConfigError("is indented by a tab", file=str(path), line=line, hint="use spaces")
+    problem = str(getattr(error, "problem", None) or "cannot be parsed")
+    if "nesting depth" in problem:
+        return ConfigError(_TOO_DEEP, file=str(path), line=line, hint=_TOO_DEEP_HINT)
+    hint = "use spaces in place of tabs" if "\t" in blamed else _SYNTAX_HINTS.get(problem, "")
+    return ConfigError(f"is no YAML: {problem}", file=str(path), line=line, hint=hint)
+
+
+_SYNTAX_HINTS: Final = {
+    "mapping values are not allowed in this context": "check the indentation, or quote text that has `: ` in it",
+    "could not find expected ':'": "a key is followed by `: ` and its value",
+    "did not find expected key": "check the indentation, and that each `{`, `[` and quote is closed",
+    "did not find expected ',' or '}'": "close the `{`",
+    "did not find expected ',' or ']'": "close the `[`",
+    "expected a single document in the stream": "leave out the second `---`",
+}
+
+_TAG: Final = "tag:yaml.org,2002:"
+_STRING: Final = f"{_TAG}str"
+_MERGE: Final = f"{_TAG}merge"
+
+
+# The loader in C, where it was built, is ten times as fast: 40 ms of a cell's start.
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """PyYAML's safe loader with the scalars of YAML 1.2: nothing else than a number, true, false or null is no text."""
+
+    yaml_implicit_resolvers: ClassVar[dict[str | None, list[Any]]] = {}
+
+
+for _name, _pattern, _first in (
+    ("null", r"^(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
+    ("bool", r"^(?:true|True|TRUE|false|False|FALSE)$", list("tTfF")),
+    # More than 18 digits are no number that a cell needs, and thousands take minutes to convert.
+    ("int", r"^(?:[-+]?(?:0|[1-9][0-9]{0,17})|0x[0-9a-fA-F]{1,15})$", list("-+0123456789")),
+    (
+        "float",
+        r"^(?:[-+]?(?:(?:0|[1-9][0-9]{0,39})?\.[0-9]{1,40}|(?:0|[1-9][0-9]{0,39})\.?)(?:[eE][-+]?[0-9]{1,4})?"
+        r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$",
+        list("-+.0123456789"),
+    ),
+    ("merge", r"^<<$", ["<"]),
+):
+    _Loader.add_implicit_resolver(f"{_TAG}{_name}", re.compile(_pattern), _first)
+
+
+class _Walk:
+    """Walks a parsed document with its aliases expanded: finds lines, and refuses what no cell file needs.
+
+    Args:
+        file: for errors.
+        loader: resolves plain scalars.
+    """
+
+    def __init__(self, file: str, loader: Any) -> None:
+        self._file = file
+        self._loader = loader
+        self._nodes = 0
+        self._characters = 0
+        self.lines: dict[KeyPath, int] = {(): 1}
+
+    def visit(self, node: yaml.Node, path: KeyPath, above: tuple[int, ...]) -> None:
+        """Walk ``node``, which stands at ``path`` below the nodes ``above``. Raises ConfigError."""
+        if id(node) in above:
+            raise self._error(node, path, "refers to itself", "write out what is meant in place of the alias")
+        if len(above) >= _DEEPEST:
+            raise self._error(node, path, _TOO_DEEP, _TOO_DEEP_HINT)
+        self._count(node, path)
+        if isinstance(node, yaml.MappingNode):
+            self._tagged(node, path, "map")
+            for key_node, value_node in node.value:
+                key = (*path, self._key(key_node, path))
+                line = key_node.start_mark.line + 1
+                if key in self.lines:
+                    raise self._error(key_node, key, f"stands twice, first on line {self.lines[key]}", "remove one")
+                self.lines[key] = line
+                self.visit(value_node, key, (*above, id(node)))
+        elif isinstance(node, yaml.SequenceNode):
+            self._tagged(node, path, "seq")
+            for index, item in enumerate(node.value):
+                self.lines[*path, index] = item.start_mark.line + 1
+                self.visit(item, (*path, index), (*above, id(node)))
+        elif node.tag not in (_STRING, self._loader.resolve(yaml.ScalarNode, node.value, (True, False))):
+            raise self._error(node, path, f"has the tag {node.tag.replace(_TAG, '!!')!r}", "leave it out")
+
+    def _key(self, node: yaml.Node, path: KeyPath) -> str:
+        self._count(node, path)
+        if isinstance(node, yaml.ScalarNode) and node.tag in (_STRING, _MERGE):
+            return str(node.value)
+        if isinstance(node, yaml.ScalarNode):
+            shown = str(node.value)[:40]
+            raise self._error(node, path, f"the key {shown!r} is no text", f"write it in quotes: '{shown}':")
+        raise self._error(node, path, "a key is a list or a mapping", "a key is a word")
+
+    def _tagged(self, node: yaml.Node, path: KeyPath, kind: str) -> None:
+        if node.tag != f"{_TAG}{kind}":
+            raise self._error(node, path, f"has the tag {node.tag.replace(_TAG, '!!')!r}", "leave it out")
+
+    def _count(self, node: yaml.Node, path: KeyPath) -> None:
+        self._nodes += 1
+        if isinstance(node, yaml.ScalarNode):
+            self._characters += len(node.value)
+        if self._nodes > _MOST_NODES or self._characters > _MOST_CHARACTERS:
+            raise self._error(
+                node,
+                path[:1],
+                f"holds more than {_MOST_NODES} values or {_MOST_CHARACTERS} characters, its aliases expanded",
+                "leave out aliases of aliases",
+            )
+
+    def _error(self, node: yaml.Node, path: KeyPath, reason: str, hint: str) -> ConfigError:
+        key = ".".join(map(str, path))
+        return ConfigError(reason, file=self._file, line=node.start_mark.line + 1, key=key, hint=hint)

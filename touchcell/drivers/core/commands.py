@@ -21,9 +21,18 @@ class TwistFrame(Enum):
     BASE = "base"
 
 
+def read_only(array: Array) -> Array:
+    """A copy of ``array`` that cannot be written to, nor be made writeable."""
+    copy: Array = np.frombuffer(array.tobytes(), array.dtype).reshape(array.shape)
+    return copy
+
+
 @dataclass(frozen=True, slots=True)
 class TwistCommand:
     """Move the tool centre point at a velocity for at most ``ttl_s``, then stop.
+
+    A command is a value: it keeps a read-only copy of an array of numbers, so that nothing that sees it on its way to
+    the arm can change it. What is no such array is left as it is, for the gate to judge.
 
     Attributes:
         twist: (6,) [vx vy vz wx wy wz], m/s and rad/s: linear velocity of the tool centre point, angular velocity.
@@ -39,10 +48,15 @@ class TwistCommand:
     ttl_s: float
     t_cause_ns: int | None = None
 
+    def __post_init__(self) -> None:
+        twist = self.twist
+        if type(twist) is np.ndarray and twist.flags.writeable and twist.dtype == np.float64:
+            object.__setattr__(self, "twist", read_only(twist))
+
 
 @dataclass(frozen=True, slots=True)
 class Sent(Generic[C]):
-    """The command actually sent to the device, and the adjustments that made it differ from the request."""
+    """The command actually sent, and why it differs from the request. Read-only like the command."""
 
     command: C
     t_ns: int

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from pydantic import BaseModel
 
-from touchcell import registry
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.samples import Stamped
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.registry import Registry
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +97,10 @@ class SceneSpec:
     section: type[SceneSection]
 
 
-GROUP = "touchcell.scenes"
+SCENES: Final = Registry("touchcell.scenes", "scene", SceneSpec)
+"""All installed simulators."""
 
 
 def scene_section() -> type[SceneSection]:
     """Return the pydantic model of ``scene:`` sections. Raises ConfigError if no simulator is installed."""
-    return registry.load(GROUP, "scene", "simulated", SceneSpec).section
+    return SCENES.load("simulated").section

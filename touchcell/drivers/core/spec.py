@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import EntryPoint
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from touchcell import registry as entry_points
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.scene import SceneTruth
 from touchcell.geometry.types import Array
-
-GROUP = "touchcell.drivers"
+from touchcell.registry import Registry
 
 
 class DriverConfig(BaseModel):
@@ -98,11 +95,5 @@ class DriverSpec:
     extra: str | None = None
 
 
-def installed() -> dict[str, EntryPoint]:
-    """Return the entry points of all installed drivers by name; imports none of them."""
-    return entry_points.installed(GROUP)
-
-
-def spec(name: str) -> DriverSpec:
-    """Return the spec of driver ``name``. Raises ConfigError with a suggestion for an unknown one."""
-    return entry_points.load(GROUP, "driver", name, DriverSpec)
+DRIVERS: Final = Registry("touchcell.drivers", "driver", DriverSpec)
+"""All installed drivers."""

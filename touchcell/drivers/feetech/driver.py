@@ -150,8 +150,8 @@ class FeetechSerialConfig(BusArmConfig):
             lower, upper = max(joint.lower_deg, float(ends[0])), min(joint.upper_deg, float(ends[1]))
             if upper - lower < np.rad2deg(_SHORTEST_RANGE_RAD):
                 raise ConfigError(
-                    f"joint {joint.name} has a range of {joint.lower_deg:g} to {joint.upper_deg:g} deg, its calibration "
-                    f"{ends[0]:.0f} to {ends[1]:.0f} deg: they hardly overlap",
+                    f"joint {joint.name} has a range of {joint.lower_deg:g} to {joint.upper_deg:g} deg, "
+                    f"its calibration {ends[0]:.0f} to {ends[1]:.0f} deg: they hardly overlap",
                     key=f"servos[{index}]",
                     hint="correct zero_ticks, direction, min_ticks and max_ticks",
                 )

@@ -25,6 +25,7 @@ from pydantic import Field
 from touchcell.drivers.core.arm import Arm, JointLimitsConfig, LimitsConfig
 from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.command_checks import finite_array
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
     CommandRejected,
@@ -442,11 +443,7 @@ class FrankaArm(Arm):
             self._robot.move(motion, asynchronous=True, cutoff_frequency=_NO_FILTER_HZ)
 
     def _checked_goal(self, what: str, goal: Array, shape: tuple[int, ...], lease: Lease) -> Array:
-        target = np.asarray(goal, dtype=np.float64)
-        if not np.isfinite(target).all():
-            raise CommandRejected(self.name, Rejection.NON_FINITE, f"{what} is not finite", value=goal)
-        if target.shape != shape:
-            raise CommandRejected(self.name, Rejection.SHAPE, f"{what} has shape {target.shape}", limit=shape)
+        target = finite_array(self.name, what, goal, shape)
         self._desk.check(lease)
         if self.state is not Lifecycle.ACTIVE:
             raise CommandRejected(self.name, Rejection.MODE, f"device is {self.state.value}, not active")

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.clock import Clock, MonotonicClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
@@ -30,7 +29,7 @@ from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.protocols import FrameSource, HealthSource, JointSource, StopCategory
 from touchcell.drivers.core.samples import Frame, JointState, Quality, Stamped
 from touchcell.drivers.core.scene import scene_section
-from touchcell.drivers.core.spec import DriverContext
+from touchcell.drivers.core.spec import DRIVERS, DriverContext
 from touchcell.drivers.hosting.layouts import (
     ANSWER,
     ARM,
@@ -441,7 +440,7 @@ def _build(spec: Mapping[str, Any], clock: Clock) -> tuple[dict[str, Device], Sc
     devices: dict[str, Device] = {}
     context = DriverContext(clock, devices, scene, spec["seed"])
     for each in spec["devices"]:
-        driver = registry.spec(each["driver"])
+        driver = DRIVERS.load(each["driver"])
         devices[each["name"]] = driver.build(each["name"], driver.config.model_validate(each["config"]), context)
     return devices, scene
 

@@ -9,7 +9,8 @@ from typing import Any, Final
 import numpy as np
 
 from touchcell.drivers.core.clock import Clock
-from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
+from touchcell.drivers.core.command_checks import checked_twist_command
+from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame, read_only
 from touchcell.drivers.core.device import DeactivatePolicy, Device, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
     CommandRejected,
@@ -207,24 +208,21 @@ class RemoteArm(RemoteDevice):
             DeviceFault: the host has died or is silent; the arm is FAULTED.
         """
         link = self._check_host()
-        twist = np.asarray(command.twist, dtype=np.float64)
-        # Same check as in the gate, because the block has no room for another shape.
-        if twist.shape != (6,):
-            reason = f"twist has shape {twist.shape}, not (6,)"
-            raise CommandRejected(self.name, Rejection.SHAPE, reason, value=twist.shape, limit=(6,))
-        if not isinstance(command.frame, TwistFrame):
-            raise CommandRejected(self.name, Rejection.FRAME, f"unknown frame {command.frame!r}", value=command.frame)
+        # The gate would say the same, but the block has no room for anything else.
+        command = checked_twist_command(self.name, command)
+        if abs(command.t_ns) >= 2**62:
+            raise CommandRejected(self.name, Rejection.EXPIRED, "its time stamp is no time", value=command.t_ns)
         value = self._commands.value
         value["number"] = self._next()
-        value["lease"] = lease.epoch if lease is self._lease else 0
-        value["twist"], value["tcp_frame"] = twist, command.frame is TwistFrame.TCP
+        value["lease"] = lease.epoch if self._lease is not None and lease is self._lease else 0
+        value["twist"], value["tcp_frame"] = command.twist, command.frame is TwistFrame.TCP
         value["t_ns"], value["ttl_s"] = command.t_ns, command.ttl_s
         value["has_cause"], value["t_cause_ns"] = command.t_cause_ns is not None, command.t_cause_ns or 0
         self._write(link)
         answer, note = self._await_answer(link, command.ttl_s)
         if answer["refused"]:
             raise decode_note(note, self.name)
-        sent = replace(command, twist=answer["twist"].copy(), frame=TwistFrame.BASE)
+        sent = replace(command, twist=read_only(answer["twist"]), frame=TwistFrame.BASE)
         return Sent(sent, int(answer["t_ns"]), decode_adjustments(note))
 
     def stop(self, category: StopCategory = StopCategory.STOP_AND_HOLD) -> None:
