@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from tests.helpers.franka_bench import OPERATOR, Bench, eventually
-from touchcell.drivers.core import protocols as abilities
 from touchcell.drivers.core.clock import MonotonicClock
 from touchcell.drivers.core.commands import TwistFrame
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle
@@ -87,7 +86,8 @@ def faulted(bench: Bench) -> DeviceFault:
 
 
 def test_its_spec_needs_no_sdk() -> None:
-    code = "import sys, touchcell.drivers.core.spec as r; r.spec('franka'); assert 'franky' not in sys.modules"
+    code = "from touchcell.drivers.core.spec import DRIVERS; DRIVERS.load('franka')"
+    code += "; import sys; assert 'franky' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
     assert DRIVERS.load("franka").extra == "franka"
 
@@ -133,8 +133,8 @@ def test_connecting_configuring_and_activating_energise_nothing(bench: Bench) ->
 
 
 def test_it_can_do_what_it_declares(bench: Bench) -> None:
-    for name in CAPABILITIES.abilities:
-        assert isinstance(bench.arm, getattr(abilities, name)), name
+    for protocol in CAPABILITIES.provides:
+        assert isinstance(bench.arm, protocol), protocol
     assert bench.arm.watchdog_s() == bench.truth()["watchdog_s"] == CAPABILITIES.max_watchdog_s
 
 

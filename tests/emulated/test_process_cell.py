@@ -25,9 +25,11 @@ from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, RunLoop, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest
 from touchcell.cell.runtime.process_watchdog import ProcessWatchdog, hosted_groups
+from touchcell.cell.runtime.run_result import Outcome
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.cell.runtime.watchdog import NOTES
 from touchcell.control.latch import LatchState
 from touchcell.drivers.core.clock import MonotonicClock
@@ -249,7 +251,7 @@ class ResetProcedure:
         watch = cell.watchdog
         assert isinstance(watch, ProcessWatchdog)
         self.cell, self.chain, self.desk, self.stop = cell, watch.chain, OperatorChannel(), StopRequest()
-        self.loop = RunLoop(cell, None, stop=self.stop, desk=self.desk)
+        self.loop = RunLoop(cell, None, stop=self.stop, channel=self.desk)
         self.loop.begin()
 
     def until(self, done: Callable[[], bool]) -> None:

@@ -168,8 +168,8 @@ def test_importing_the_driver_imports_no_sdk() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_abilities_are_those_of_the_record() -> None:
-    protocols = (
+def test_protocols_are_those_of_the_record() -> None:
+    protocols = {
         TcpSource,
         JointSource,
         WrenchSource,
@@ -178,9 +178,9 @@ def test_abilities_are_those_of_the_record() -> None:
         JointGoal,
         HealthSource,
         NativeWatchdog,
-    )
+    }
     arm = UrArm("ur", UrConfig(host="127.0.0.1", flange_to_tcp_mm_deg=TOOL_MM_DEG), VirtualClock())
-    assert {protocol.__name__ for protocol in protocols} == SPEC.capabilities.abilities
+    assert protocols == SPEC.capabilities.provides
     assert all(isinstance(arm, protocol) for protocol in protocols)
 
 

@@ -27,7 +27,7 @@ from touchcell.drivers.core.errors import (
 )
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.drivers.core.samples import Frame, Quality, Stamped
-from touchcell.drivers.core.spec import spec
+from touchcell.drivers.core.spec import DRIVERS
 from touchcell.drivers.v4l2.codec import Arrival
 from touchcell.drivers.v4l2.driver import SPEC, V4l2Camera, V4l2Config
 from touchcell.drivers.v4l2.emulator import picture
@@ -106,8 +106,8 @@ def read_until(camera: V4l2Camera, reading: str, at_least: float) -> None:
 
 
 def test_the_driver_is_found_by_name_and_offers_what_it_says(camera: V4l2Camera) -> None:
-    assert spec("v4l2") is SPEC
-    assert SPEC.capabilities.abilities == {"FrameSource", "HealthSource"}
+    assert DRIVERS.load("v4l2") is SPEC
+    assert SPEC.capabilities.provides == {FrameSource, HealthSource}
     assert isinstance(camera, FrameSource)
     assert isinstance(camera, HealthSource)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from touchcell.cell.runtime.loop import Box
+from touchcell.cell.runtime.run_record import Box
 
 
 class SentCommands:

@@ -16,7 +16,9 @@ import yaml
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import RunLoop, RunResult, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import RunResult
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.paths import CONFIGS
 
 

@@ -11,7 +11,8 @@ import yaml
 
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, RunLoop, RunResult
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import Outcome, RunResult
 from touchcell.paths import CONFIGS
 
 SHIPPED = CONFIGS / "single_push_sim.yaml"

@@ -88,7 +88,7 @@ def command(
     return TwistCommand(np.array([vx, 0, 0, 0, 0, 0.0]), frame, clock.now_ns(), ttl_s)
 
 
-def test_it_has_the_abilities_of_an_arm(arm: NotedArm) -> None:
+def test_it_provides_the_protocols_of_an_arm(arm: NotedArm) -> None:
     assert isinstance(arm, TcpSource)
     assert isinstance(arm, TwistSink)
     assert isinstance(arm, Stoppable)

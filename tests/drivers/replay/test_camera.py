@@ -48,7 +48,7 @@ def test_it_is_a_frame_source(folder: Path) -> None:
     camera = play(folder, VirtualClock())
     assert isinstance(camera, FrameSource)
     assert isinstance(camera, HealthSource)
-    assert DRIVERS.load("replay_camera").capabilities.abilities == {"FrameSource", "HealthSource"}
+    assert DRIVERS.load("replay_camera").capabilities.provides == {FrameSource, HealthSource}
     with pytest.raises(LifecycleError):
         camera.latest()
 

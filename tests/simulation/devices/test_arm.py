@@ -54,10 +54,10 @@ def get_going(arm: SimArm, lease: Lease, clock: VirtualClock, twist: list[float]
 def test_the_spec_tells_the_truth() -> None:
     spec = DRIVERS.load("sim_arm")
     arm = make(VirtualClock())
-    for ability in (TcpSource, TwistSink, Stoppable, HealthSource):
-        assert isinstance(arm, ability)
-        assert ability.__name__ in spec.capabilities.abilities
-    assert len(spec.capabilities.abilities) == 4
+    for protocol in (TcpSource, TwistSink, Stoppable, HealthSource):
+        assert isinstance(arm, protocol)
+        assert protocol in spec.capabilities.provides
+    assert len(spec.capabilities.provides) == 4
 
 
 def test_it_starts_where_the_configuration_says_and_can_be_read_while_passive() -> None:

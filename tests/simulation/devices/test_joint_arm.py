@@ -7,7 +7,8 @@ from pydantic import ValidationError
 
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import Outcome, Progress
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.errors import LifecycleError

@@ -48,7 +48,7 @@ class Cell:
 
 def test_the_spec_tells_the_truth() -> None:
     cell = Cell()
-    assert DRIVERS.load("sim_tactip").capabilities.abilities == {"FrameSource", "HealthSource"}
+    assert DRIVERS.load("sim_tactip").capabilities.provides == {FrameSource, HealthSource}
     assert isinstance(cell.tip, FrameSource)
     assert isinstance(cell.tip, HealthSource)
 

@@ -21,9 +21,11 @@ from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlie
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.heap import trim_heap
-from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.operator_channel import OperatorChannel
 from touchcell.cell.runtime.operator_input import reachable, stop_on_keys, stop_on_signals
+from touchcell.cell.runtime.run_result import Outcome, Progress, RunResult
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.drivers.core.clock import VirtualClock
 
 _EXIT = {
@@ -105,14 +107,14 @@ def run_plan(plan: CellPlan, *, out: Path | None = None, live: bool = False) -> 
 
 
 def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
-    stop, desk = StopRequest(), OperatorChannel(folder)
+    stop, channel = StopRequest(), OperatorChannel(folder)
     box = BlackBox()
     with (
         reachable(folder),
         Recorder(folder / RECORDING) as recorder,
         cell,
         stop_on_signals(stop),
-        stop_on_keys(stop, desk=desk) as look_at_keys,
+        stop_on_keys(stop, channel=channel) as look_at_keys,
         _live_line(cell.plan, live) as show,
     ):
         cell.watchdog.note_to(folder)
@@ -133,7 +135,7 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
             print(f"tripped: {so_far.reason}\n`touchcell why {folder}` explains; `touchcell reset {folder}` or r, when")
             print("it is safe, then `touchcell resume` or g; `touchcell stop` or q ends the run")
 
-        loop = RunLoop(cell, recorder, box=box, stop=stop, on_cycle=after_cycle, desk=desk, on_trip=tripped)
+        loop = RunLoop(cell, recorder, box=box, stop=stop, on_cycle=after_cycle, channel=channel, on_trip=tripped)
         result = loop.run()
         # Before the devices are given back, which an arm that obeys nothing may not survive.
         if result.outcome in (Outcome.TRIPPED, Outcome.ERROR) and not loop.has_waited:

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import Recorder
-from touchcell.cell.runtime.loop import RunResult
+from touchcell.cell.runtime.run_result import RunResult
 from touchcell.cell.runtime.stopping import StopReport
 from touchcell.control.interlocks.violation import Violation
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -17,7 +16,7 @@ from touchcell.drivers.core.arm import Arm, LimitsConfig
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import StaleData
-from touchcell.drivers.core.protocols import StopCategory
+from touchcell.drivers.core.protocols import SERVO_ARM, HealthSource, StopCategory
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.geometry import se3
@@ -29,7 +28,7 @@ from touchcell.simulation.timeline import DEFAULT_STEP_S, Phase, Timeline
 
 CAPABILITIES = Capabilities(
     kind="arm",
-    abilities=frozenset({"TcpSource", "TwistSink", "Stoppable", "HealthSource"}),
+    provides=SERVO_ARM | {HealthSource},
     state_rate_hz=1.0 / DEFAULT_STEP_S,
     stop_categories=frozenset({1, 2}),
     has_brakes=True,
@@ -194,7 +193,7 @@ class SimArm(Arm):
         self._body.freeze()
 
 
-def _build(name: str, config: Any, context: DriverContext) -> SimArm:
+def _build(name: str, config: SimArmConfig, context: DriverContext) -> SimArm:
     scene = context.scene
     return SimArm(name, config, context.clock, scene.timeline if isinstance(scene, Scene) else None)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import Field
@@ -19,7 +19,7 @@ from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle, OperatorToken
 from touchcell.drivers.core.joint_arm import JointArm
 from touchcell.drivers.core.joint_setpoint import JointSetpoint
-from touchcell.drivers.core.protocols import StopCategory
+from touchcell.drivers.core.protocols import SERVO_ARM, HealthSource, JointGoal, JointSource, StopCategory
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain, Tool
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 CAPABILITIES = Capabilities(
     kind="arm",
-    abilities=frozenset({"TcpSource", "JointSource", "TwistSink", "Stoppable", "JointGoal", "HealthSource"}),
+    provides=SERVO_ARM | {JointSource, JointGoal, HealthSource},
     state_rate_hz=1.0 / DEFAULT_STEP_S,
     stop_categories=frozenset({1, 2}),
     has_brakes=True,
@@ -216,7 +216,7 @@ def _dynamics(
     return ArmDynamics(description, tool, q, step_s, links)
 
 
-def _build(name: str, config: Any, context: DriverContext) -> SimJointArm:
+def _build(name: str, config: SimJointArmConfig, context: DriverContext) -> SimJointArm:
     scene = context.scene
     return SimJointArm(name, config, context.clock, scene.timeline if isinstance(scene, Scene) else None)
 

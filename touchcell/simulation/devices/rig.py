@@ -5,14 +5,14 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import numpy as np
 
 from touchcell.drivers.core.clock import Clock, VirtualClock
 from touchcell.drivers.core.device import Device
-from touchcell.drivers.core.spec import DriverConfig, DriverContext, DriverSpec
+from touchcell.drivers.core.spec import ConfigT, DriverContext, DriverSpec
 from touchcell.drivers.replay import camera as replay_camera
 from touchcell.simulation.devices import arm as sim_arm
 from touchcell.simulation.devices import joint_arm as sim_joint_arm
@@ -80,11 +80,11 @@ def sim_joint_arm_rig(folder: Path, address: int) -> DeviceFixture:
     return _arm_rig(sim_joint_arm.SPEC, sim_joint_arm.SimJointArmConfig(model="panda", start_pose_mm_deg=_START))
 
 
-def _arm_rig(spec: DriverSpec, config: DriverConfig) -> DeviceFixture:
+def _arm_rig(spec: DriverSpec[ConfigT, SimArm | SimJointArm], config: ConfigT) -> DeviceFixture:
     arms: list[SimArm | SimJointArm] = []
 
     def build(clock: Clock) -> Device:
-        arm = cast(SimArm | SimJointArm, spec.build("arm", config, DriverContext(clock)))
+        arm = spec.build("arm", config, DriverContext(clock))
         arms.append(arm)
         return arm
 
@@ -116,7 +116,7 @@ def sim_tactip_rig(folder: Path, address: int) -> DeviceFixture:
         arm = sim_arm.SPEC.build("arm", sim_arm.SimArmConfig(start_pose_mm_deg=_START), context)
         config = sim_tactip.SimTactipConfig(mounted_on="arm")
         context = DriverContext(clock, {"arm": arm}, scene)
-        cameras.append(cast(sim_tactip.SimTactip, sim_tactip.SPEC.build("tip", config, context)))
+        cameras.append(sim_tactip.SPEC.build("tip", config, context))
         clocks.append(clock)
         return cameras[-1]
 

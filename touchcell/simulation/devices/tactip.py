@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -12,7 +12,7 @@ from pydantic import Field
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device, Lifecycle
 from touchcell.drivers.core.errors import StaleData, TransportTimeout
-from touchcell.drivers.core.protocols import TcpSource
+from touchcell.drivers.core.protocols import FrameSource, HealthSource, TcpSource
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.errors import ConfigError
@@ -25,7 +25,7 @@ from touchcell.simulation.tip_file import load_tip
 
 CAPABILITIES = Capabilities(
     kind="camera",
-    abilities=frozenset({"FrameSource", "HealthSource"}),
+    provides=frozenset({FrameSource, HealthSource}),
     state_rate_hz=30.0,
     virtual_time=True,
 )
@@ -190,7 +190,7 @@ class SimTactip(Device):
         self._newest = None
 
 
-def _build(name: str, config: Any, context: DriverContext) -> SimTactip:
+def _build(name: str, config: SimTactipConfig, context: DriverContext) -> SimTactip:
     scene: object = context.scene
     arm: object = context.devices.get(config.mounted_on)
     mount: object = arm

@@ -11,6 +11,7 @@ import pytest
 from touchcell.drivers.core.commands import TwistFrame
 from touchcell.drivers.core.errors import CommandRejected, Rejection
 from touchcell.drivers.core.lease import Lease
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import OWNER, Bench
 
@@ -25,7 +26,7 @@ def _refused(bench: Bench, lease: Lease, reason: Rejection, **changes: Any) -> N
     assert caught.value.reason is reason
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def non_finite_commands_are_refused(bench: Bench) -> None:
     """NaN and both infinities in any component, and in the time-to-live, are refused and move nothing."""
     lease = bench.leased()
@@ -41,7 +42,7 @@ def non_finite_commands_are_refused(bench: Bench) -> None:
     assert np.linalg.norm(bench.position() - start) < _FORBIDDEN_TRAVEL_M
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def malformed_commands_are_refused(bench: Bench) -> None:
     """Wrong shapes and frames that are none are refused and move nothing."""
     lease = bench.leased()
@@ -55,7 +56,7 @@ def malformed_commands_are_refused(bench: Bench) -> None:
     assert np.linalg.norm(bench.position() - start) < _FORBIDDEN_TRAVEL_M
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def commands_without_the_lease_are_refused(bench: Bench) -> None:
     """A copied lease, another arm's, a released one: none of them moves the arm."""
     lease = bench.leased()
@@ -69,7 +70,7 @@ def commands_without_the_lease_are_refused(bench: Bench) -> None:
     assert np.linalg.norm(bench.position() - start) < _FORBIDDEN_TRAVEL_M
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def second_owner_is_refused(bench: Bench) -> None:
     """One owner at a time, named; the next may come when the first has gone."""
     lease = bench.leased()
@@ -81,7 +82,7 @@ def second_owner_is_refused(bench: Bench) -> None:
     assert bench.arm.acquire("another").owner == "another"
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def commands_out_of_their_time_are_refused(bench: Bench) -> None:
     """Expired ones, ones from the future, and times-to-live that are zero, negative or endless."""
     lease = bench.leased()
@@ -95,7 +96,7 @@ def commands_out_of_their_time_are_refused(bench: Bench) -> None:
         _refused(bench, lease, Rejection.LIMIT, ttl_s=ttl_s)
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def commands_in_the_wrong_mode_are_refused(bench: Bench) -> None:
     """Nothing moves an arm that is not ACTIVE, lease or not."""
     bench.ready()
@@ -103,7 +104,7 @@ def commands_in_the_wrong_mode_are_refused(bench: Bench) -> None:
     _refused(bench, lease, Rejection.MODE)
 
 
-@check("TwistSink")
+@check(TwistSink)
 def commands_over_the_limits_are_scaled_and_reported(bench: Bench) -> None:
     """Ten times too fast is sent within the limit, along the same direction, and the answer says so; nor is it truly
     faster."""
@@ -121,7 +122,7 @@ def commands_over_the_limits_are_scaled_and_reported(bench: Bench) -> None:
     bench.settle()
 
 
-@check("TwistSink")
+@check(TwistSink)
 def acceleration_is_limited_and_reported(bench: Bench) -> None:
     """From rest the very first command is held back by the acceleration limit where the speed asked for is high."""
     lease = bench.leased()

@@ -10,6 +10,7 @@ import pytest
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, DeviceError, LifecycleError, StaleData
 from touchcell.drivers.core.lease import Lease
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import OWNER, Bench
 
@@ -75,7 +76,7 @@ def vanished_device_is_a_fault_and_can_return(bench: Bench) -> None:
 def _begin(bench: Bench) -> Lease | None:
     """ACTIVE and in use."""
     bench.active()
-    if "TwistSink" not in bench.rig.spec.capabilities.abilities:
+    if TwistSink not in bench.rig.spec.capabilities.provides:
         bench.until(lambda: _reads(bench), 2.0, "first sample")
         return None
     lease = bench.arm.acquire(OWNER)

@@ -7,13 +7,14 @@ from typing import Any
 import pytest
 
 from touchcell.drivers.core.errors import DeviceError, TransportTimeout
+from touchcell.drivers.core.protocols import FrameSource
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import Bench
 
 _UNREAD_PERIODS = 8
 
 
-@check("FrameSource", on_bench=True)
+@check(FrameSource, on_bench=True)
 def next_waits_and_gives_up(bench: Bench) -> None:
     """``next`` gives a frame beyond the number that is known, and TransportTimeout when none comes in time."""
     bench.active()
@@ -27,7 +28,7 @@ def next_waits_and_gives_up(bench: Bench) -> None:
     assert (bench.clock.now_ns() - start_ns) * 1e-9 >= 0.099
 
 
-@check("FrameSource", on_bench=True)
+@check(FrameSource, on_bench=True)
 def latest_never_goes_back(bench: Bench) -> None:
     """``latest`` repeats the newest frame until a newer one is there, and skips those that nobody read."""
     rate_hz = bench.rig.state_rate_hz or bench.rig.spec.capabilities.state_rate_hz
@@ -39,7 +40,7 @@ def latest_never_goes_back(bench: Bench) -> None:
     assert bench.camera.latest().seq >= newest.seq
 
 
-@check("FrameSource")
+@check(FrameSource)
 def frames_that_nobody_reads_are_not_decoded(bench: Bench) -> None:
     """While frames pass unread OpenCV decodes none of them; reading decodes one."""
     import cv2
@@ -66,7 +67,7 @@ def frames_that_nobody_reads_are_not_decoded(bench: Bench) -> None:
     assert decoded <= 2
 
 
-@check("FrameSource", "truth")
+@check(FrameSource, "truth")
 def lost_frames_leave_a_gap(bench: Bench) -> None:
     """Frames that are lost on the way are missing in the numbers."""
     if "drop" not in bench.rig.faults:

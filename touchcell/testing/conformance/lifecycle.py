@@ -8,19 +8,19 @@ import threading
 import numpy as np
 import pytest
 
-from touchcell.drivers.core import protocols as abilities
+from touchcell.drivers.core import protocols
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, DeviceError, LifecycleError, Rejection
-from touchcell.drivers.core.protocols import HealthSource, NativeWatchdog, StopCategory
+from touchcell.drivers.core.protocols import HealthSource, NativeWatchdog, StopCategory, Stoppable, TwistSink
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import Bench
 
-# What combines abilities, as ServoArm does, is none itself.
-_PROTOCOLS = {
-    name: protocol
-    for name, protocol in vars(abilities).items()
+# ServoArm, which only combines others, is not declared by drivers.
+_PROTOCOLS = frozenset(
+    protocol
+    for protocol in vars(protocols).values()
     if getattr(protocol, "_is_runtime_protocol", False) and len(protocol.__bases__) == 1
-}
+)
 _WARM_UP_CYCLES = 2
 _CYCLES = 10
 
@@ -93,14 +93,13 @@ def disconnect_from_every_state(bench: Bench) -> None:
 
 
 @check(on_bench=True)
-def abilities_are_those_of_the_record(bench: Bench) -> None:
-    """Every ability that is named is there, and every one that is there is named."""
-    named = bench.rig.spec.capabilities.abilities
-    assert named <= _PROTOCOLS.keys()
-    assert {name for name, protocol in _PROTOCOLS.items() if isinstance(bench.device, protocol)} == named
+def protocols_are_those_of_the_record(bench: Bench) -> None:
+    """Every protocol that is declared is provided, and every one of ours that is provided is declared."""
+    declared = bench.rig.spec.capabilities.provides
+    assert {protocol for protocol in declared | _PROTOCOLS if isinstance(bench.device, protocol)} == declared
 
 
-@check("HealthSource", on_bench=True)
+@check(HealthSource, on_bench=True)
 def health_is_told_by_name(bench: Bench) -> None:
     """``health`` gives named numbers and words while connected; no number is NaN."""
     device = bench.ready()
@@ -112,7 +111,7 @@ def health_is_told_by_name(bench: Bench) -> None:
         assert reading == reading, name
 
 
-@check("NativeWatchdog", on_bench=True)
+@check(NativeWatchdog, on_bench=True)
 def watchdog_is_read_back(bench: Bench) -> None:
     """An active device tells a watchdog no longer than its record says."""
     device = bench.active()
@@ -126,10 +125,10 @@ def watchdog_is_read_back(bench: Bench) -> None:
 def record_of_the_watchdog_is_consistent(bench: Bench) -> None:
     """``max_watchdog_s`` is given exactly by devices that have a watchdog."""
     capabilities = bench.rig.spec.capabilities
-    assert (capabilities.max_watchdog_s is not None) == ("NativeWatchdog" in capabilities.abilities)
+    assert (capabilities.max_watchdog_s is not None) == (NativeWatchdog in capabilities.provides)
 
 
-@check("Stoppable")
+@check(Stoppable)
 def stop_categories_are_those_of_the_record(bench: Bench) -> None:
     """Offered categories stop a moving arm in the state that they promise; the others are refused."""
     offered = bench.rig.spec.capabilities.stop_categories
@@ -165,7 +164,7 @@ def _activates(bench: Bench) -> bool:
     return True
 
 
-@check("TwistSink")
+@check(TwistSink)
 def deactivation_rests_and_voids_the_lease(bench: Bench) -> None:
     """``deactivate`` of a moving arm ends at rest in READY; the lease is worth nothing afterwards."""
     lease = bench.leased()
@@ -181,7 +180,7 @@ def deactivation_rests_and_voids_the_lease(bench: Bench) -> None:
     assert caught.value.reason is Rejection.LEASE
 
 
-@check("TwistSink")
+@check(TwistSink)
 def deactivation_policies_are_obeyed_or_refused(bench: Bench) -> None:
     """Each policy ends in READY, or is refused by LifecycleError and leaves the arm held; power off is true."""
     bench.ready()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from touchcell.drivers.core.commands import TwistFrame
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.client import MovingClient
 from touchcell.testing.conformance.context import Bench
@@ -19,13 +20,13 @@ _LATE_S = 0.01
 _AXES = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def twists_along_base_axes_are_followed(bench: Bench) -> None:
     """Along every axis of the record the tool truly moves with the right sign, within 20 % of the speed."""
     _follows_all_axes(bench, TwistFrame.BASE)
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def twists_along_tool_axes_are_followed(bench: Bench) -> None:
     """The same for twists along the tool's own axes."""
     _follows_all_axes(bench, TwistFrame.TCP)
@@ -58,7 +59,7 @@ def _follows_all_axes(bench: Bench, frame: TwistFrame) -> None:
     assert not wrong, "the tool truly moved otherwise:\n" + "\n".join(wrong)
 
 
-@check("TwistSink", "limited axes")
+@check(TwistSink, "limited axes")
 def axes_that_it_cannot_follow_are_reported(bench: Bench) -> None:
     """A twist along an axis that the record excludes is sent without it, and the answer says so."""
     lease = bench.leased()
@@ -69,7 +70,7 @@ def axes_that_it_cannot_follow_are_reported(bench: Bench) -> None:
     bench.settle()
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def time_to_live_stops_the_motion(bench: Bench) -> None:
     """After the last command has expired the tool brakes: it goes no farther than latency and limits allow."""
     lease = bench.leased()
@@ -87,7 +88,7 @@ def time_to_live_stops_the_motion(bench: Bench) -> None:
     assert travelled_m <= _braking_m(bench, rest.late_s)
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def stop_stops_at_once(bench: Bench) -> None:
     """``stop`` needs no lease and does not wait for the time-to-live."""
     lease = bench.leased()
@@ -100,7 +101,7 @@ def stop_stops_at_once(bench: Bench) -> None:
     bench.until(bench.arm.at_rest, 1.0, "at_rest")
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def release_stops_at_once(bench: Bench) -> None:
     """Giving the lease back stops the arm too."""
     lease = bench.leased()
@@ -112,7 +113,7 @@ def release_stops_at_once(bench: Bench) -> None:
     assert np.linalg.norm(rest.poses[-1][:3, 3] - start) <= _braking_m(bench, rest.late_s)
 
 
-@check("TwistSink", "truth", "process")
+@check(TwistSink, "truth", "process")
 def killed_client_leaves_the_arm_at_rest(bench: Bench) -> None:
     """kill -9 of the process that moves the arm: the device itself stops within its watchdog.
 

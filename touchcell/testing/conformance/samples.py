@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from touchcell.drivers.core.errors import DeviceError, StaleData
-from touchcell.drivers.core.protocols import JointSource, WrenchSource
+from touchcell.drivers.core.protocols import JointSource, TcpSource, WrenchSource
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import Bench
 
@@ -18,7 +18,7 @@ _WINDOW_S = 0.5
 _FROZEN_S = 0.3
 
 
-@check("TcpSource", on_bench=True)
+@check(TcpSource, on_bench=True)
 def states_are_stamped_and_numbered(bench: Bench) -> None:
     """Stamps lie on the injected clock and advance; numbers rise; values are finite rigid poses."""
     before_ns = bench.clock.now_ns()
@@ -86,7 +86,7 @@ def too_old_is_stale(bench: Bench) -> None:
     assert caught.value.age_s > -1.0
 
 
-@check("JointSource", on_bench=True)
+@check(JointSource, on_bench=True)
 def joints_are_finite_and_fresh(bench: Bench) -> None:
     """Joint angles and velocities of one length, finite, no older than asked for."""
     device = bench.ready()
@@ -97,7 +97,7 @@ def joints_are_finite_and_fresh(bench: Bench) -> None:
     assert np.isfinite(sample.value.dq).all()
 
 
-@check("WrenchSource", on_bench=True)
+@check(WrenchSource, on_bench=True)
 def wrench_is_finite_and_fresh(bench: Bench) -> None:
     """(6,) finite numbers, no older than asked for."""
     device = bench.ready()

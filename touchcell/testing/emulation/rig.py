@@ -9,7 +9,7 @@ from typing import Any, Final, Protocol, runtime_checkable
 
 from touchcell.drivers.core.clock import Clock, MonotonicClock
 from touchcell.drivers.core.device import Device
-from touchcell.drivers.core.spec import DriverConfig, DriverSpec
+from touchcell.drivers.core.spec import AnyDriver, DriverConfig
 from touchcell.registry import Registry
 
 
@@ -70,7 +70,7 @@ class DeviceFixture:
         notes: behaviours known only from public documents.
     """
 
-    spec: DriverSpec
+    spec: AnyDriver
     start: Callable[[], Emulated] | None
     build: Callable[[Clock], Device]
     config: DriverConfig | None = None
