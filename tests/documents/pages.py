@@ -13,6 +13,14 @@ DOCS = CHECKOUT / "docs"
 PAGES: tuple[Path, ...] = tuple(sorted([*CHECKOUT.glob("*.md"), *DOCS.rglob("*.md")]))
 """Pages at their place in the site: the pages of devices below docs/devices, where links lead to their folders."""
 
+FOLLOWED: tuple[Path, ...] = (
+    DOCS / "tutorials" / "first-run.md",
+    DOCS / "how-to" / "write-a-task.md",
+    DOCS / "how-to" / "write-a-driver.md",
+    DOCS / "how-to" / "write-an-interlock.md",
+)
+"""Pages that a test follows from top to bottom."""
+
 _FENCE = re.compile(r"^(?P<indent> *)```(?P<info>[^\n`]*)\n(?P<text>.*?)^(?P=indent)```", re.MULTILINE | re.DOTALL)
 _COMMENT = re.compile(r"<!--\s*(.*?)\s*-->\s*\Z", re.DOTALL)
 _TITLE = re.compile(r'title="([^"]*)"')

@@ -1,7 +1,7 @@
 """Pages that are followed literally, from top to bottom, in an empty folder.
 
-A block with ``title="FILE"`` is written there. ``sh`` blocks run in a shell that stops at the first failure; ``<!-- exits
-with N -->`` above one says which exit code is right, ``<!-- not run: REASON -->`` leaves one out. ``python`` blocks without
+A block with ``title="FILE"`` is written there. ``sh`` blocks run in a shell that stops at the first failure; a comment
+``exits with N`` above one says which exit code is right, ``not run: REASON`` leaves one out. ``python`` blocks without
 a title run in the folder. A ``pyproject.toml`` counts as installed: its entry points are found, nothing is downloaded.
 """
 
@@ -16,15 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.documents.pages import DOCS, Block, blocks
+from tests.documents.pages import DOCS, FOLLOWED, Block, blocks
 from touchcell.paths import CHECKOUT
 
-FOLLOWED = (
-    DOCS / "tutorials" / "first-run.md",
-    DOCS / "how-to" / "write-a-task.md",
-    DOCS / "how-to" / "write-a-driver.md",
-    DOCS / "how-to" / "write-an-interlock.md",
-)
 _TIMEOUT_S = 300
 
 
@@ -102,8 +96,6 @@ def test_every_python_block_compiles() -> None:
         compile(block.text, str(block), "exec")
 
 
-@pytest.mark.parametrize(
-    "page", [page for page in sorted(DOCS.rglob("*.md")) if page not in FOLLOWED], ids=_names
-)
+@pytest.mark.parametrize("page", [page for page in sorted(DOCS.rglob("*.md")) if page not in FOLLOWED], ids=_names)
 def test_pages_that_are_not_followed_have_no_python_that_nobody_runs(page: Path) -> None:
     assert [str(block) for block in blocks(page) if block.language == "python"] == []

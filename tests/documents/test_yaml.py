@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.documents.pages import Block, all_blocks
+from tests.documents.pages import FOLLOWED, Block, all_blocks
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.schema import ArmSection, SensorSection, plan_cell
 from touchcell.paths import CONFIGS
 
-BLOCKS = all_blocks("yaml", "yml")
+BLOCKS = [block for block in all_blocks("yaml", "yml") if block.page not in FOLLOWED]
 _MERGED = re.compile(r"merged into configs/(\S+\.yaml)(, run)?")
 
 
