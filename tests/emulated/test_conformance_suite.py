@@ -110,7 +110,7 @@ def broken(rig):
     } == found
 
 
-def test_a_failure_that_is_known_by_name_is_told_apart(pytester: pytest.Pytester) -> None:
+def test_a_failure_known_by_name_is_reported_separately(pytester: pytest.Pytester) -> None:
     change = """
 def broken(rig):
     capabilities = dataclasses.replace(rig.spec.capabilities, max_watchdog_s=0.1)

@@ -7,7 +7,7 @@ task fit, and says which devices the task does not need, so that they are not ev
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -16,9 +16,9 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag, model_validator
 
-from touchcell.cell.config.settings import with_settings
+from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
-from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile, load
+from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile
 from touchcell.control.interlocks.basic import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
@@ -299,11 +299,11 @@ class CellPlan:
         return f"<CellPlan {self.cell.name!r}: task {self.task.name}, {', '.join(devices)}>"
 
     def text(self) -> str:
-        """The cell file as it is planned: the file itself, or YAML of its content with ``settings`` in place."""
-        if not self.settings:
+        """The cell file as it is planned: the file itself, or YAML of what comes of it and of what it extends."""
+        merged = load_layers(self.file, self.settings)
+        if not merged.sources:
             return self.file.read_text()
-        data = with_settings(load(self.file).data, self.settings)
-        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
+        return yaml.safe_dump(merged.data, sort_keys=False, allow_unicode=True)
 
 
 def plan_cell(
@@ -324,9 +324,7 @@ def plan_cell(
     Raises:
         ConfigError: with file, line, key, value and remedy; InvalidCell for several at once.
     """
-    file = load(Path(path))
-    if settings:
-        file = replace(file, data=with_settings(file.data, settings))
+    file = load_layers(Path(path), settings)
     if model is not None and isinstance(sensors := file.data.get("sensors"), dict):
         for sensor in sensors.values():
             estimator = sensor.get("estimator") if isinstance(sensor, dict) else None

@@ -10,7 +10,7 @@ import os
 import re
 import stat
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 from typing import Any, ClassVar, Final, TypeVar, get_args
@@ -42,11 +42,25 @@ class InvalidCell(ConfigError):
 
 @dataclass(frozen=True, slots=True)
 class YamlFile:
-    """A parsed file: its data, and the line on which each key stands."""
+    """A parsed file: its data, and the line on which each key stands.
+
+    Attributes:
+        path: the file.
+        data: its content.
+        lines: line of each key.
+        sources: file or option that each key comes from, where it is not ``path`` (see ``layers``).
+    """
 
     path: Path
     data: dict[str, Any]
     lines: Mapping[KeyPath, int]
+    sources: Mapping[KeyPath, Path] = field(default_factory=dict)
+
+    def source(self, path: KeyPath) -> Path:
+        """Return the file or option that the key comes from."""
+        while path and path not in self.lines:
+            path = path[:-1]
+        return self.sources.get(path, self.path)
 
     def line(self, path: KeyPath) -> int:
         """Line of the key, or of the nearest thing around it that stands in the file."""
@@ -57,7 +71,7 @@ class YamlFile:
     def problem(self, path: KeyPath, reason: str, *, value: Any = None, hint: str = "") -> ConfigError:
         """A ConfigError about the key at ``path``."""
         key = ".".join(str(part) for part in path)
-        return ConfigError(reason, file=str(self.path), line=self.line(path), key=key, value=value, hint=hint)
+        return ConfigError(reason, file=str(self.source(path)), line=self.line(path), key=key, value=value, hint=hint)
 
     def validate(self, model: type[M], data: Any, at: KeyPath = ()) -> M:
         """Build ``model`` from ``data``, which stands at ``at``. Raises InvalidCell with every mistake.
@@ -238,6 +252,24 @@ def load(path: Path) -> YamlFile:
     finally:
         loader.dispose()
     return YamlFile(path, data, walk.lines)
+
+
+def parse_value(text: str) -> Any:
+    """Return the value that ``text`` has in a cell file. Raises ConfigError if it is no YAML."""
+    loader = _Loader(text)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        _Walk("", loader).visit(node, (), ())
+        return loader.construct_document(node)
+    except yaml.YAMLError as error:
+        reason = getattr(error, "problem", None) or "is no YAML"
+        raise ConfigError(str(reason), value=text, hint="quote what is not a number, list or mapping") from None
+    except RecursionError:
+        raise ConfigError(_TOO_DEEP, value=text, hint=_TOO_DEEP_HINT) from None
+    finally:
+        loader.dispose()
 
 
 _MOST_BYTES: Final = 256 * 1024

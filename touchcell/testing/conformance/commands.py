@@ -1,4 +1,4 @@
-"""Checks of the command gate as the driver's users meet it: what is refused, what is limited, what is reported."""
+"""Checks of the command gate: rejected commands, limited commands, reported adjustments."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import OWNER, Bench
 
 _FORBIDDEN_TRAVEL_M = 1e-3
-"""Much less than any command that got through would make it; a soft arm may still creep to its setpoint."""
+"""Much less than the motion caused by any accepted command; a compliant arm may still creep to its setpoint."""
 
 
 def _refused(bench: Bench, lease: Lease, reason: Rejection, **changes: Any) -> None:
@@ -28,7 +28,7 @@ def _refused(bench: Bench, lease: Lease, reason: Rejection, **changes: Any) -> N
 
 @check(TwistSink, on_bench=True)
 def non_finite_commands_are_refused(bench: Bench) -> None:
-    """NaN and both infinities in any component, and in the time-to-live, are refused and move nothing."""
+    """NaN and both infinities in any component, and in the time-to-live, are rejected and move nothing."""
     lease = bench.leased()
     bench.settle()
     start = bench.position()
@@ -44,7 +44,7 @@ def non_finite_commands_are_refused(bench: Bench) -> None:
 
 @check(TwistSink, on_bench=True)
 def malformed_commands_are_refused(bench: Bench) -> None:
-    """Wrong shapes and frames that are none are refused and move nothing."""
+    """Wrong shapes and unknown frames are rejected and move nothing."""
     lease = bench.leased()
     bench.settle()
     start = bench.position()
@@ -72,7 +72,7 @@ def commands_without_the_lease_are_refused(bench: Bench) -> None:
 
 @check(TwistSink, on_bench=True)
 def second_owner_is_refused(bench: Bench) -> None:
-    """One owner at a time, named; the next may come when the first has gone."""
+    """One owner at a time, by name; the next may acquire the lease after its release."""
     lease = bench.leased()
     with pytest.raises(CommandRejected) as caught:
         bench.arm.acquire("another")
@@ -84,7 +84,7 @@ def second_owner_is_refused(bench: Bench) -> None:
 
 @check(TwistSink, on_bench=True)
 def commands_out_of_their_time_are_refused(bench: Bench) -> None:
-    """Expired ones, ones from the future, and times-to-live that are zero, negative or endless."""
+    """Commands that are expired, from the future, or with a zero, negative or infinite time-to-live are rejected."""
     lease = bench.leased()
     with pytest.raises(CommandRejected) as caught:
         bench.arm.send_twist(bench.command(bench.twist(bench.axis()), ttl_s=0.1, age_s=0.2), lease)
@@ -106,8 +106,8 @@ def commands_in_the_wrong_mode_are_refused(bench: Bench) -> None:
 
 @check(TwistSink)
 def commands_over_the_limits_are_scaled_and_reported(bench: Bench) -> None:
-    """Ten times too fast is sent within the limit, along the same direction, and the answer says so; nor is it truly
-    faster."""
+    """A tenfold speed is sent within the limit, along the same direction, and reported as adjusted; the arm is no
+    faster either."""
     lease = bench.leased()
     limit = bench.arm.limits.speed_m_s
     track, sent = bench.stream(lease, bench.twist(bench.axis(), speed=10.0 * limit), 0.5)
@@ -124,7 +124,7 @@ def commands_over_the_limits_are_scaled_and_reported(bench: Bench) -> None:
 
 @check(TwistSink)
 def acceleration_is_limited_and_reported(bench: Bench) -> None:
-    """From rest the very first command is held back by the acceleration limit where the speed asked for is high."""
+    """From rest the first fast command is reduced by the acceleration limit."""
     lease = bench.leased()
     limits = bench.arm.limits
     ttl_s = min(0.02, 0.5 * limits.speed_m_s / limits.accel_m_s2)
