@@ -38,6 +38,7 @@ GOOD = {
     "depth": {"kind": "depth", "limit_mm": 6.0},
     "frames": {"kind": "frame_age", "limit_ms": 100},
     "states": {"kind": "arm_state_age", "limit_ms": 50, "severity": "fault"},
+    "readings": {"kind": "reading_age", "limit_ms": 50},
     "tilt": {"kind": "tilt", "arm": "arm", "sensor": "sensor", "direction": [0, 0, 2], "limit_deg": 20},
     "frozen": {"kind": "frame_frozen", "limit_ms": 200},
     "exposure": {"kind": "exposure", "limit_percent": 20},

@@ -163,7 +163,7 @@ def _cell(frames: Path, sensors: int, rate_hz: float, model: str) -> Cell:
     )
 
 
-class _Worker(threading.Thread):
+class _Worker(threading.Thread, ContactSource):
     """Perceives in a thread of its own, as soon as there is a frame; the loop takes what is there."""
 
     def __init__(self, source: ContactSource, clock: Clock) -> None:
