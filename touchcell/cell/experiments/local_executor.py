@@ -18,7 +18,7 @@ def run(perform: Perform, trials: Sequence[Trial], jobs: int) -> Iterator[Finish
         for trial in trials:
             yield perform(trial)
         return
-    # Fresh processes: a fork would inherit the threads of libraries that do not outlive it.
+    # Spawned processes: a fork would inherit locks of library threads that do not survive it.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(trials)), context, initializer=_belong_to_parent) as executor:
         running = [executor.submit(perform, trial) for trial in trials]
