@@ -8,38 +8,51 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_TASK_FAILED
+from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_TASK_FAILED
+from touchcell.cell.cli.output import flush_output, warn
 from touchcell.cell.config.find import find_cell
+from touchcell.drivers.core.errors import DeviceError
 from touchcell.errors import TouchcellError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0 done, 1 task or device failed, 2 bad input, 3 an interlock tripped."""
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    """Run one command; returns the exit code.
+
+    It is 0 when done, 1 when the task or the command failed, 2 for bad input, 3 when an interlock tripped and 4 when a
+    device or a process was lost, whatever becomes of the output.
+    """
+    try:
+        return _command(list(sys.argv[1:] if arguments is None else arguments))
+    except DeviceError as error:
+        warn(str(error))
+        return EXIT_LOST
+    except TouchcellError as error:
+        warn(str(error))
+        return EXIT_BAD_INPUT
+    except BrokenPipeError:
+        # The reader of the output, `head` perhaps, has seen enough.
+        return EXIT_OK
+    except KeyboardInterrupt:
+        warn("interrupted")
+        return 130
+    finally:
+        flush_output()
+
+
+def _command(words: list[str]) -> int:
     passed_on: list[str] = []
     if words[:1] == ["bench"] and "--" in words:
         # argparse hands the dashes on to the subcommand's parser, which then claims the words behind them.
         at = words.index("--")
         words, passed_on = words[:at], words[at + 1 :]
-    try:
-        if words[:1] == ["emulate"]:
-            from touchcell.testing.emulation.launcher import main as emulate
+    if words[:1] == ["emulate"]:
+        from touchcell.testing.emulation.launcher import main as emulate
 
-            return emulate(words[1:])
-        options = _parser().parse_args(words)
-        options.passed_on = passed_on
-        code: int = options.run(options)
-        return code
-    except TouchcellError as error:
-        print(f"touchcell: {error}", file=sys.stderr)
-        return EXIT_BAD_INPUT
-    except BrokenPipeError:
-        # Whoever read us, `head` perhaps, has seen enough; Python would complain again when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_OK
-    except KeyboardInterrupt:
-        print("touchcell: interrupted", file=sys.stderr)
-        return 130
+        return emulate(words[1:])
+    options = _parser().parse_args(words)
+    options.passed_on = passed_on
+    code: int = options.run(options)
+    return code
 
 
 def _parser() -> argparse.ArgumentParser:
