@@ -152,7 +152,7 @@ class Arm(Device):
         admitted = sent.command
         left_s = admitted.ttl_s - (sent.t_ns - admitted.t_ns) * 1e-9
         self._stream_twist(admitted.twist, max(left_s, _SHORTEST_TTL_S), sent.t_ns)
-        if self._stop_count != stop_count:
+        if self._stop_count != stop_count or self.state is not Lifecycle.ACTIVE:
             # Another thread has stopped or faulted the arm since; the twist may have reached it after that stop.
             self._gate.reset()
             if self.state in (Lifecycle.ACTIVE, Lifecycle.FAULTED):
@@ -177,14 +177,15 @@ class Arm(Device):
             )
         if self.state not in (Lifecycle.ACTIVE, Lifecycle.FAULTED):
             return
-        self._stop_count += 1
+        self._count_stop()
         self._gate.reset()
         removes_power = category is not StopCategory.STOP_AND_HOLD
         if removes_power:
             self._desk.revoke()
         self._begin_stop(category)
-        if removes_power and self.state is Lifecycle.ACTIVE:
-            self._state = Lifecycle.READY
+        if removes_power:
+            # Not over a fault that a thread of the driver has latched since.
+            self._change_state(Lifecycle.ACTIVE, Lifecycle.READY)
 
     @abstractmethod
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
@@ -241,8 +242,9 @@ class Arm(Device):
 
     @final
     def _to_faulted(self, error: DeviceError) -> DeviceError:
-        was_active = self.state is Lifecycle.ACTIVE
-        latched = super()._to_faulted(error)
+        with self._state_lock:
+            was_active = self.state is Lifecycle.ACTIVE
+            latched = super()._to_faulted(error)
         if was_active:
             self._give_up_command()
             # The device may be gone; the first fault is the one to report.
@@ -250,8 +252,12 @@ class Arm(Device):
                 self._begin_stop(StopCategory.STOP_AND_HOLD)
         return latched
 
+    def _count_stop(self) -> None:
+        with self._state_lock:
+            self._stop_count += 1
+
     def _give_up_command(self) -> None:
-        self._stop_count += 1
+        self._count_stop()
         self._desk.revoke()
         self._gate.reset()
 
