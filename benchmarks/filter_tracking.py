@@ -14,17 +14,17 @@ from pydantic import TypeAdapter
 from touchcell.cell.analysis.report import summarise
 from touchcell.cell.analysis.run_data import load_run
 from touchcell.cell.config.find import find_cell
-from touchcell.cell.config.schema import FilterSection, plan_cell
+from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
-from touchcell.cell.runtime.sensor import build_filter
 from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.types import Array
 from touchcell.perception.models.labels import XI_UNITS
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.perception.runtime.filter import ContactFilter
+from touchcell.perception.runtime.filter_spec import FilterSection
 from touchcell.perception.runtime.motion import PoseHistory
 from touchcell.perception.runtime.pipeline import ContactSource
 
@@ -49,7 +49,7 @@ FILTERS: dict[str, Mapping[str, Any] | None] = {
 }
 
 
-class GaussianContact:
+class GaussianContact(ContactSource):
     """A ``ContactSource`` in place of camera and network: the true contact with Gaussian errors, a cycle late.
 
     Args:
@@ -57,8 +57,6 @@ class GaussianContact:
         pose_filter: None treats each frame independently.
         seed: of the errors.
     """
-
-    ended = False
 
     def __init__(self, truth: ContactSource, pose_filter: ContactFilter | None, seed: int) -> None:
         self._truth = truth
@@ -126,7 +124,7 @@ def track(name: str, *, moving: bool, duration_s: float, seed: int, network: Pat
         estimator |= {"model": str(network), "filter": None if settings is None else dict(settings)}
     else:
         cell_file["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
-    pose_filter = None if settings is None else build_filter(TypeAdapter(FilterSection).validate_python(settings))
+    pose_filter = None if settings is None else TypeAdapter(FilterSection).validate_python(settings).build()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cell.yaml"
         path.write_text(yaml.safe_dump(cell_file))

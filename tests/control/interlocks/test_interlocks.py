@@ -38,6 +38,7 @@ GOOD = {
     "depth": {"kind": "depth", "limit_mm": 6.0},
     "frames": {"kind": "frame_age", "limit_ms": 100},
     "states": {"kind": "arm_state_age", "limit_ms": 50, "severity": "fault"},
+    "readings": {"kind": "reading_age", "limit_ms": 50},
     "tilt": {"kind": "tilt", "arm": "arm", "sensor": "sensor", "direction": [0, 0, 2], "limit_deg": 20},
     "frozen": {"kind": "frame_frozen", "limit_ms": 200},
     "exposure": {"kind": "exposure", "limit_percent": 20},
@@ -239,8 +240,8 @@ def test_an_unknown_sensor_is_a_config_error():
 
 
 def test_every_kind_is_listed_with_one_line():
-    # Clearance is tested in test_clearance.py.
-    assert set(INTERLOCKS.names()) == {"clearance"} | {entry["kind"] for entry in GOOD.values()}
+    # What these do is in test_clearance.py and test_always_on.py.
+    assert set(INTERLOCKS.names()) == {"clearance", "overrun"} | {entry["kind"] for entry in GOOD.values()}
     for kind in INTERLOCKS.names():
         spec = INTERLOCKS.load(kind)
         assert spec.config.model_fields["kind"].annotation == Literal[kind]

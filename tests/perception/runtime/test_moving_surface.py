@@ -7,14 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from touchcell.cell.config.schema import NetworkEstimator
-from touchcell.cell.runtime.sensor import build_filter
 from touchcell.geometry import se3
 from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.gaussian import NotPositiveDefinite, PoseGaussian
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.filter import PoseFilter, isotropic_noise
 from touchcell.perception.runtime.moving_surface import MovingSurfaceFilter
+from touchcell.perception.runtime.network_estimator import NetworkEstimator
 
 STEP_NS = 33_000_000
 CONTACT = se3.inverse(se3.from_euler_mm_deg([1.0, -0.5, 3.0, 5.0, -8.0, 2.0]))
@@ -242,4 +241,4 @@ def test_a_cell_file_chooses_the_model() -> None:
     ):
         estimator = NetworkEstimator.model_validate({"kind": "network", "model": "m", "filter": section})
         assert estimator.filter is not None
-        assert type(build_filter(estimator.filter)) is kind
+        assert type(estimator.filter.build()) is kind

@@ -163,7 +163,7 @@ def _cell(frames: Path, sensors: int, rate_hz: float, model: str) -> Cell:
     )
 
 
-class _Worker(threading.Thread):
+class _Worker(threading.Thread, ContactSource):
     """Perceives in its own thread, as soon as there is a frame; the loop reads the latest result."""
 
     def __init__(self, source: ContactSource, clock: Clock) -> None:

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
+from pydantic import PositiveFloat
 
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array
+from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,3 +116,18 @@ def require_noise_density(noise_density: Array) -> None:
 def require_pose(T_base_sensor: Array) -> Array:
     """Return the pose. Raises GeometryError unless it is one: a first frame is stored before anything is computed."""
     return PoseGaussian(T_base_sensor, np.eye(6)).mean
+
+
+class StillSurfaceConfig(FilterConfig):
+    """The SE(3) Bayesian filter: growth of the uncertainty while no frame comes (slip, curvature)."""
+
+    model: Literal["still_surface"] = "still_surface"
+    drift_mm_per_sqrt_s: PositiveFloat
+    drift_deg_per_sqrt_s: PositiveFloat
+
+    def build(self) -> PoseFilter:
+        """Return the ``PoseFilter``."""
+        return PoseFilter(isotropic_noise(1e-3 * self.drift_mm_per_sqrt_s, np.deg2rad(self.drift_deg_per_sqrt_s)))
+
+
+STILL_SURFACE = FilterSpec("still_surface", "SE(3) Bayesian filter of a surface that stands still", StillSurfaceConfig)

@@ -29,13 +29,16 @@ Applications to Tracking and Navigation, 2001, section 6.2 (white-noise accelera
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from pydantic import PositiveFloat
 
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.gaussian import NotPositiveDefinite, PoseGaussian
 from touchcell.geometry.types import Array
-from touchcell.perception.runtime.filter import FilterState, require_noise_density, require_pose
+from touchcell.perception.runtime.filter import FilterState, isotropic_noise, require_noise_density, require_pose
+from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,3 +186,30 @@ def _corrected(motion: SurfaceMotion, prior: PoseGaussian, fused: PoseGaussian) 
     covariance[:6, :6], covariance[:6, 6:], covariance[6:, :6] = S, KS.T, KS
     covariance[6:, 6:] = 0.5 * (rest + rest.T)
     return SurfaceMotion(motion.twist + G @ e, covariance)
+
+
+class MovingSurfaceConfig(FilterConfig):
+    """The filter that also estimates the surface's velocity, for surfaces that move steadily.
+
+    ``speed_*`` is the standard deviation of the surface's velocity when it is first touched, ``accel_*`` the growth of
+    the velocity's uncertainty.
+    """
+
+    model: Literal["moving_surface"]
+    drift_mm_per_sqrt_s: PositiveFloat
+    drift_deg_per_sqrt_s: PositiveFloat
+    speed_mm_s: PositiveFloat
+    speed_deg_s: PositiveFloat
+    accel_mm_s_per_sqrt_s: PositiveFloat
+    accel_deg_s_per_sqrt_s: PositiveFloat
+
+    def build(self) -> MovingSurfaceFilter:
+        """Return the ``MovingSurfaceFilter``."""
+        return MovingSurfaceFilter(
+            isotropic_noise(1e-3 * self.drift_mm_per_sqrt_s, np.deg2rad(self.drift_deg_per_sqrt_s)),
+            isotropic_noise(1e-3 * self.accel_mm_s_per_sqrt_s, np.deg2rad(self.accel_deg_s_per_sqrt_s)),
+            isotropic_noise(1e-3 * self.speed_mm_s, np.deg2rad(self.speed_deg_s)),
+        )
+
+
+MOVING_SURFACE = FilterSpec("moving_surface", "filter that also estimates the surface's velocity", MovingSurfaceConfig)

@@ -35,8 +35,17 @@ class ContactSource(Protocol):
 
     @property
     def ended(self) -> bool:
-        """True if no further estimate will come (the end of a recording)."""
-        ...
+        """Whether no further estimate will come (a recording has been played)."""
+        return False
+
+    @property
+    def frame(self) -> Stamped[Frame] | None:
+        """Newest frame that was processed; None for a source that reads no camera."""
+        return None
+
+    def await_frame(self) -> None:
+        """Wait for the first frame, so that no control cycle has to. Raises DeviceError."""
+        return
 
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
         """Record the sensor's pose at ``t_ns``; called before ``update``."""
