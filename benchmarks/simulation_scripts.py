@@ -167,7 +167,7 @@ class _TipArm:
             config |= {"physics_step_ms": self.physics_step_ms}
         arm: Device = spec.build(self.tip, spec.config(**config), DriverContext(self.clock, {}, self.scene))
         assert isinstance(arm, SimArm | SimJointArm)
-        self.scene.mount(self.tip, arm.T_world_tcp, arm.bear if isinstance(arm, SimJointArm) else None)
+        self.scene.mount(self.tip, arm.T_world_tcp, arm.apply_force if isinstance(arm, SimJointArm) else None)
         arm.connect()
         arm.configure()
         arm.activate()

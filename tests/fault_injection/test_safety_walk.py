@@ -113,9 +113,9 @@ class SafetyWalk(RuleBasedStateMachine):
                 {"nan_state": True},
                 {"stale": True},
                 {"stale": False},
-                {"deaf": True},
-                {"runs_on": True},
-                {"runs_on": False, "deaf": False},
+                {"ignores_stops": True},
+                {"ignores_expiry": True},
+                {"ignores_expiry": False, "ignores_stops": False},
                 {"drift_m_s": 0.03},
                 {"drift_m_s": 0.0},
             ]
@@ -124,7 +124,7 @@ class SafetyWalk(RuleBasedStateMachine):
     def fault(self, which: int, change: dict[str, Any]) -> None:
         role = sorted(self.arms)[which % len(self.arms)]
         self.arms[role].faults = replace(self.arms[role].faults, **change)
-        if any(change.get(name) for name in ("runs_on", "drift_m_s")):
+        if any(change.get(name) for name in ("ignores_expiry", "drift_m_s")):
             self.disobeyed.add(role)
 
     @precondition(running)
@@ -153,10 +153,10 @@ class SafetyWalk(RuleBasedStateMachine):
         assert (self.result.outcome is Outcome.TRIPPED) == (trip is not None)
         for role, arm in self.arms.items():
             report = self.result.stops[role]
-            if not (faults[role].deaf or faults[role].runs_on or faults[role].drift_m_s):
+            if not (faults[role].ignores_stops or faults[role].ignores_expiry or faults[role].drift_m_s):
                 assert report.kept or report.time_s <= report.declared_s + 1.0 / self.cell.rate_hz
                 assert not report.escalated
-            if not faults[role].deaf:
+            if not faults[role].ignores_stops:
                 assert arm.at_rest()
                 assert report.time_s is not None
             assert arm.owner is None
@@ -184,7 +184,7 @@ class SafetyWalk(RuleBasedStateMachine):
             if self.result is None:
                 self.end()
             for arm in self.arms.values():
-                arm.faults = replace(arm.faults, deaf=False, runs_on=False, drift_m_s=0.0)
+                arm.faults = replace(arm.faults, ignores_stops=False, ignores_expiry=False, drift_m_s=0.0)
             self.cell.__exit__(None, None, None)
         self.folder.cleanup()
 

@@ -99,7 +99,7 @@ def test_an_arm_that_ignores_every_command_still_leaves_a_black_box(
 
     def broken(arm: SimArm, *arguments: Any, **more: Any) -> None:
         honest(arm, *arguments, **more)
-        arm.faults = ArmFaults(deaf=True, drift_m_s=0.004)
+        arm.faults = ArmFaults(ignores_stops=True, drift_m_s=0.004)
 
     monkeypatch.setattr(SimArm, "__init__", broken)
     data = yaml.safe_load(SHIPPED.read_text())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from touchcell import compiled
 from touchcell.cell.bench.catalog import benchmark_names
 from touchcell.cell.experiments.runner import EXPERIMENTS
 from touchcell.control.interlocks.spec import INTERLOCKS
@@ -37,7 +38,7 @@ def listing() -> dict[str, list[tuple[str, str]]]:
         "experiments": _rows(EXPERIMENTS),
         "benchmarks": [(name, "") for name in benchmark_names()],
         "cells that ship": [(f"configs/{path.name}", _first_comment(path)) for path in _shipped()],
-    }
+    } | ({"missing": [(line, "") for line in lines]} if (lines := compiled.missing()) else {})
 
 
 def _rows(registry: Registry[Any]) -> list[tuple[str, str]]:

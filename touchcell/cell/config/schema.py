@@ -320,6 +320,7 @@ class _Planner:
             self._require_protocols(task, "devices", task.devices, auxiliary_roles, others)
             self._require_interlocks(cell, task)
             self._require_processes(cell, task, arm_roles)
+            self._require_data_is_used(cell, {**arms, **sensors})
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
         self._require_pairs(cell)
         stopping_distances = self._require_margins(cell, arm_roles, sensor_roles, arms)
@@ -472,6 +473,20 @@ class _Planner:
                 f"no interlock of kind {kind!r} that stops, which a task that moves an arm must have",
                 hint=f"add one: {INTERLOCKS.load(kind).summary}",
             )
+
+    def _require_data_is_used(self, cell: CellFile, devices: Mapping[str, DevicePlan]) -> None:
+        """A data set that is given is there, and something reads it or writes it."""
+        data = self._overrides.get("data")
+        if data is None or cell.collect is not None:
+            return
+        readers = [name for name, device in devices.items() if "data" in type(device.config).model_fields]
+        if not readers:
+            reason, hint = "no driver of this cell replays a data set", "leave out --data"
+        elif not Path(data).is_dir():
+            reason, hint = f"{data}: there is no such folder", f"{', '.join(readers)} would replay it"
+        else:
+            return
+        self._problems.append(ConfigError(reason, key="--data", value=data, hint=hint))
 
     def _require_processes(self, cell: CellFile, task: AnyTask, arm_roles: Mapping[str, str]) -> None:
         """What devices in other processes cannot do is not asked of them."""

@@ -41,7 +41,7 @@ def command_message(sent: Sent[TwistCommand]) -> dict[str, Any]:
         "frame": command.frame.value,
         "ttl_s": command.ttl_s,
         "limited_by": [adjustment.limit for adjustment in sent.adjustments],
-        "asked": [adjustment.asked for adjustment in sent.adjustments],
+        "asked": [adjustment.requested for adjustment in sent.adjustments],
         "allowed": [adjustment.allowed for adjustment in sent.adjustments],
         "speed_mm_s": 1e3 * float(np.linalg.norm(command.twist[:3])),
     }

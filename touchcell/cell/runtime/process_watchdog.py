@@ -117,7 +117,7 @@ class ProcessWatchdog:
                 "watchdog",
                 severity,
                 subject,
-                cause.reason.words,
+                cause.reason.description,
                 cause.t_ns,
                 value=cause.value_s if timed else None,
                 limit=cause.limit_s if timed else None,
