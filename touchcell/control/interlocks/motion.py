@@ -49,7 +49,7 @@ class Standstill:
             if not mark.values and view.now_ns - mark.since_ns >= round(1e9 * self.settle_s):
                 mark = TimerState(mark.since_ns, values=tuple(position.tolist()))
             drift_m = math.dist(position, mark.values) if mark.values else 0.0
-            # The position is taken anew after a violation, or the latch could never be reset.
+            # The reference is reset after a violation, or the latch could never be reset.
             marks[role] = TimerState(view.now_ns) if drift_m > self.limit_m else mark
             if found is None and drift_m > self.limit_m:
                 reason = f"drifted by {1e3 * drift_m:.2f} mm while commanded to stop, limit {1e3 * self.limit_m:g} mm"

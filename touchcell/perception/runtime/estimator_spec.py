@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class EstimatorContext:
-    """What an estimator may need besides its own section.
+    """Inputs of an estimator besides its own section.
 
     Attributes:
         sensor: name of the sensor in the cell file.

@@ -52,7 +52,7 @@ class Until(TaskConfig):
         return self
 
     @property
-    def feels(self) -> bool:
+    def needs_touch(self) -> bool:
         """True if a condition needs the tactile sensor."""
         return self.contact is not None or self.depth_mm is not None
 
