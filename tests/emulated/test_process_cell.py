@@ -212,7 +212,7 @@ def test_activation_is_refused_when_the_chain_does_not_stop_in_time(
     assert caught.value.declared_s < 2.5 / RATE_HZ
 
 
-def run_with_fault(tmp_path: Path, fault: ProcessFault) -> ProcessCase:
+def inject(tmp_path: Path, fault: ProcessFault) -> ProcessCase:
     """The fault in a cell that ran until then; where this machine starves it, the watchdog has done its work before."""
     for k in range(TRIES - 1):
         with contextlib.suppress(TooBusy):
@@ -231,7 +231,7 @@ def run_with_fault(tmp_path: Path, fault: ProcessFault) -> ProcessCase:
 def test_both_arms_stop_in_time_whichever_process_dies(tmp_path: Path, name: str, reported_as: str | None) -> None:
     """The others of ``FAULTS`` are in ``touchcell bench safety -- --processes``."""
     fault = next(fault for fault in FAULTS if fault.name == name)
-    case = run_with_fault(tmp_path, fault)
+    case = inject(tmp_path, fault)
     assert list(case.problems) == []
     assert len(case.arms) == 2
     assert case.notes.get("reason") == reported_as
@@ -434,5 +434,5 @@ def test_why_reports_the_watchdogs_record_of_a_run_whose_process_died(tmp_path: 
     (tmp_path / NOTES).write_text(json.dumps(note))
     assert explain(tmp_path).splitlines()[1:] == [
         "  the task's process has ended",
-        "  left: told to stop at 30.0 mm/s; at rest after 0.058 s and 1.00 mm",
+        "  left: commanded to stop at 30.0 mm/s; at rest after 0.058 s and 1.00 mm",
     ]

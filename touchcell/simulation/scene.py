@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Annotated, Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import DeviceError
@@ -16,12 +16,12 @@ from touchcell.drivers.core.protocols import TcpSource
 from touchcell.drivers.core.samples import Stamped
 from touchcell.drivers.core.scene import ContactState, SceneSection, SceneSpec
 from touchcell.errors import ConfigError, TouchcellError
-from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.plugin_section import Section
 from touchcell.simulation.contact import ContactLaw
-from touchcell.simulation.motions import Glide, Motion, Periodic, Still
-from touchcell.simulation.objects import ObjectConfig, PoseMmDeg, TableConfig
+from touchcell.simulation.objects import ObjectConfig, TableConfig
 from touchcell.simulation.quasi_static import QuasiStaticWorld
+from touchcell.simulation.shape_spec import SurfaceConfig, SurfaceSection, SurfaceSpec
 from touchcell.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
 from touchcell.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeline
 from touchcell.simulation.world import DeferredContact, KinematicWorld, World, computed
@@ -215,73 +215,17 @@ def physics_engine(key: str, value: str) -> Iterator[None]:
         ) from None
 
 
-_HERE: PoseMmDeg = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-_SI = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class GlideConfig(_Part):
-    """One smooth move: translations along and at most one rotation about the start frame's axes."""
-
-    kind: Literal["glide"]
-    displacement_mm_deg: PoseMmDeg
-    start_s: float = Field(ge=0.0)
-    duration_s: float = Field(gt=0.0)
-
-    @model_validator(mode="after")
-    def _one_rotation(self) -> GlideConfig:
-        if sum(angle != 0.0 for angle in self.displacement_mm_deg[3:]) > 1:
-            raise ValueError("displacement_mm_deg may rotate about one axis only; use kind: periodic for more")
-        return self
-
-    def build(self, T_start: Array) -> Motion:
-        return Glide(T_start, np.array(self.displacement_mm_deg) * _SI, self.start_s, self.duration_s)
-
-
-class PeriodicConfig(_Part):
-    """Sines in all pose components of the start frame, with a gentle start; see ``motions.Periodic``."""
-
-    kind: Literal["periodic"]
-    amplitude_mm_deg: PoseMmDeg
-    shift_deg: PoseMmDeg = (0.0, 90.0, 0.0, 0.0, 90.0, 45.0)
-    period_s: float = Field(gt=0.0)
-    ramp_s: float = Field(default=1.0, gt=0.0)
-
-    def build(self, T_start: Array) -> Motion:
-        return Periodic(
-            T_start,
-            np.array(self.amplitude_mm_deg) * _SI,
-            np.radians(self.shift_deg),
-            self.period_s,
-            self.ramp_s,
-        )
-
-
-class _SurfaceConfig(_Part):
-    pose_mm_deg: PoseMmDeg = _HERE
-    motion: Annotated[GlideConfig | PeriodicConfig, Field(discriminator="kind")] | None = None
-
-    def shape(self) -> Shape:
-        raise NotImplementedError
-
-    def build(self) -> Surface:
-        T_world_body = se3.from_euler_mm_deg(self.pose_mm_deg)
-        return Surface(self.shape(), self.motion.build(T_world_body) if self.motion else Still(T_world_body))
-
-
-class PlaneConfig(_SurfaceConfig):
+class PlaneConfig(SurfaceConfig):
     """A flat plate: the plane z = 0 of its pose, outside towards +z."""
 
     kind: Literal["plane"]
 
     def shape(self) -> Shape:
+        """Return the shape in its own frame."""
         return Plane()
 
 
-class RampConfig(_SurfaceConfig):
+class RampConfig(SurfaceConfig):
     """Flat, then bent over an arc to an incline along the pose's +x; see ``surfaces.Ramp``."""
 
     kind: Literal["ramp"]
@@ -289,30 +233,33 @@ class RampConfig(_SurfaceConfig):
     incline_deg: float = Field(gt=-90.0, lt=90.0)
 
     def shape(self) -> Shape:
+        """Return the shape in its own frame."""
         return Ramp(self.bend_radius_mm * 1e-3, float(np.radians(self.incline_deg)))
 
 
-class DomeConfig(_SurfaceConfig):
+class DomeConfig(SurfaceConfig):
     """A hemisphere on a plane, its centre at the pose's origin, rising towards +z."""
 
     kind: Literal["dome"]
     radius_mm: float = Field(gt=0.0)
 
     def shape(self) -> Shape:
+        """Return the shape in its own frame."""
         return Dome(self.radius_mm * 1e-3)
 
 
-class SphereConfig(_SurfaceConfig):
+class SphereConfig(SurfaceConfig):
     """A ball about the pose's origin."""
 
     kind: Literal["sphere"]
     radius_mm: float = Field(gt=0.0)
 
     def shape(self) -> Shape:
+        """Return the shape in its own frame."""
         return Sphere(self.radius_mm * 1e-3)
 
 
-class TipLawConfig(_Part):
+class TipLawConfig(Section):
     """Contact law of every simulated tip of the scene; see ``contact.ContactLaw``."""
 
     radius_mm: float = Field(default=20.0, gt=0.0)
@@ -323,7 +270,7 @@ class TipLawConfig(_Part):
         return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3, self.friction)
 
 
-class SceneConfig(_Part, SceneSection):
+class SceneConfig(Section, SceneSection):
     """The ``scene:`` section of a cell file. Poses are in the world frame.
 
     ``physics`` is the fidelity (docs/explanation/simulation.md). ``kinematic``: surfaces with prescribed motion,
@@ -333,11 +280,8 @@ class SceneConfig(_Part, SceneSection):
     """
 
     physics: Literal["kinematic", "quasi_static", "dynamic"] = "kinematic"
-    surfaces: dict[
-        str,
-        Annotated[PlaneConfig | RampConfig | DomeConfig | SphereConfig, Field(discriminator="kind")],
-    ] = {}
-    objects: dict[str, ObjectConfig] = {}
+    surfaces: dict[str, SurfaceSection] = Field(default={})
+    objects: dict[str, ObjectConfig] = Field(default={})
     table: TableConfig = TableConfig()
     tip: TipLawConfig = TipLawConfig()
     step_ms: float = Field(default=2.0, ge=0.1, le=10.0)
@@ -377,3 +321,8 @@ class SceneConfig(_Part, SceneSection):
 
 
 SPEC = SceneSpec("simulated", "surfaces and free objects, kinematic, quasi-static or dynamic", SceneConfig)
+
+PLANE = SurfaceSpec("plane", "a flat plate", PlaneConfig)
+RAMP = SurfaceSpec("ramp", "a flat that bends over an arc to an incline", RampConfig)
+DOME = SurfaceSpec("dome", "a hemisphere on a plane", DomeConfig)
+SPHERE = SurfaceSpec("sphere", "a ball", SphereConfig)

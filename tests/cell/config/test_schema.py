@@ -40,7 +40,7 @@ def line_of(path: Path, words: str) -> int:
 
 @pytest.mark.parametrize("path", sorted(SHIPPED.parent.glob("*.yaml")), ids=lambda path: path.name)
 def test_every_cell_that_ships_is_valid(path: Path) -> None:
-    plan = plan_cell(path, {"data": path.parent})
+    plan = plan_cell(path, {"data": path.parent} if "replay" in path.name else {})
     assert plan.task.name == plan.cell.task.name
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 import sys
 import time
 from collections.abc import Iterable, Iterator
@@ -27,6 +28,12 @@ from touchcell.cell.runtime.operator_input import reachable, stop_on_keys, stop_
 from touchcell.cell.runtime.run_result import Outcome, Progress, RunResult
 from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.drivers.core.clock import VirtualClock
+from touchcell.logs import log_to_file
+
+_logger = logging.getLogger(__name__)
+
+LOG = "run.log"
+"""Name of the log file in a run folder."""
 
 _EXIT = {
     Outcome.DONE: EXIT_OK,
@@ -101,7 +108,11 @@ def run_plan(plan: CellPlan, *, out: Path | None = None, live: bool = False) -> 
     folder = out or Path("runs") / f"{plan.cell.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "cell.yaml").write_text(plan.text())
-    result = _run(cell, folder, live)
+    with log_to_file(folder / LOG):
+        _logger.info("%s: task %s of %s, in %s", plan.cell.name, plan.task.name, plan.file, folder)
+        result = _run(cell, folder, live)
+        ended = f"{result.outcome.value} after {result.duration_s:.2f} s"
+        _logger.info("%s: %s%s", plan.cell.name, ended, f" ({result.reason})" if result.reason else "")
     (folder / "result.json").write_text(json.dumps(_result_json(plan, result), indent=1) + "\n")
     return FinishedRun(result, folder, write_report(folder))
 

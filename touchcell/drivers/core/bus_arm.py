@@ -5,6 +5,7 @@ A control loop in a thread of the driver sends setpoints, collects replies, and 
 
 from __future__ import annotations
 
+import logging
 import threading
 from abc import abstractmethod
 from collections import deque
@@ -36,6 +37,9 @@ from touchcell.drivers.core.spec import DriverConfig
 from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain, Tool
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
+from touchcell.logs import OncePerCause
+
+_logger = logging.getLogger(__name__)
 
 Positive = Annotated[float, Field(gt=0.0)]
 
@@ -131,6 +135,7 @@ class BusArm(JointArm):
         self._seq = 0
         self._implausible = 0
         self._overruns = 0
+        self._delays = OncePerCause(_logger)
         self._latest_s = 0.0
         self._missed: deque[bool] = deque(maxlen=_MISS_WINDOW)
         self._follows_until_ns = 0
@@ -271,6 +276,7 @@ class BusArm(JointArm):
             self._latest_s = max(self._latest_s, late_ns * 1e-9)
             if late_ns > 0:
                 self._overruns += 1
+                self._delays.warning("overrun", "%s: bus cycle %.1f ms late", self.name, late_ns * 1e-6)
                 next_ns += late_ns
             self._clock.sleep_until_ns(next_ns)
 

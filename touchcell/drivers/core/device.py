@@ -8,6 +8,7 @@ PASSIVE only reads: nothing that changes power, mode or zero has been sent. ``ac
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,6 +19,8 @@ from typing import Self, final
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import CommandRejected, DeviceError, LifecycleError, TransportError
+
+_logger = logging.getLogger(__name__)
 
 
 class Lifecycle(Enum):
@@ -87,6 +90,7 @@ class Device(ABC):
             self._close()
             raise
         self._state = Lifecycle.PASSIVE
+        _logger.info("%s: connected", self.name)
 
     @final
     def configure(self) -> None:
@@ -118,6 +122,7 @@ class Device(ABC):
         self._recover(token)
         self._fault_error = None
         self._state = Lifecycle.READY
+        _logger.info("%s: recovered on request of %s", self.name, token.operator)
 
     @final
     def disconnect(self) -> None:
@@ -133,6 +138,7 @@ class Device(ABC):
             self._state = Lifecycle.DISCONNECTED
             self._fault_error = None
             self._close()
+            _logger.info("%s: disconnected", self.name)
 
     def __enter__(self) -> Self:
         if self._state is Lifecycle.DISCONNECTED:
@@ -154,6 +160,7 @@ class Device(ABC):
         if self._fault_error is not None:
             raise self._fault_error
         self._state = state
+        _logger.info("%s: %s", self.name, state.value)
 
     def _to_faulted(self, error: DeviceError) -> DeviceError:
         """Latch the first fault; returns it so that callers can raise it."""
@@ -161,6 +168,7 @@ class Device(ABC):
             # The error first: who reads the state from another thread finds it.
             self._fault_error = error
             self._state = Lifecycle.FAULTED
+            _logger.error("faulted: %s", error)
         return error
 
     def _attempt(self, step: Callable[[], None]) -> None:
