@@ -107,7 +107,7 @@ def test_a_twist_moves_the_tool_and_its_expiry_stops_it(arm: DamiaoCanArm, emula
     lease = activate(arm)
     start = position(emulator.state())
     measured = stream(arm, lease, UP, 0.8)
-    # A starved loop moves the setpoint more slowly than asked for, never faster.
+    # A starved loop moves the setpoint more slowly than commanded, never faster.
     speed = np.median(measured, axis=0)
     assert 0.01 < speed[2] < 0.06
     np.testing.assert_allclose(speed[:2], 0.0, atol=0.01)
