@@ -1,13 +1,15 @@
-"""``list``, ``describe``, ``schema``: what is installed, and what a cell file may say about it."""
+"""``list``, ``describe``, ``schema``: what is installed; ``new``: a package of one's own."""
 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from touchcell.cell.cli.arguments import Subparsers, add_command
 from touchcell.cell.cli.exit_codes import EXIT_OK
 
 _INDENT = " " * 6
+_KINDS = ("driver", "camera", "task", "interlock", "estimator")
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -21,6 +23,11 @@ def add_parser(commands: Subparsers) -> None:
     describe.add_argument("name", nargs="?", metavar="NAME", help="which of that kind; without it they are listed")
 
     add_command(commands, "schema", _schema, "print a JSON Schema of cell files, for editors")
+
+    new = add_command(commands, "new", _new, "write a package for a plug-in, whose tests are red until it is filled in")
+    new.add_argument("kind", choices=_KINDS, help="what to make; a driver is that of an arm")
+    new.add_argument("name", metavar="NAME", help="of the package and of the plug-in, such as my_arm")
+    new.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder to put it in (default: this one)")
 
 
 def _list(options: argparse.Namespace) -> int:
@@ -51,6 +58,17 @@ def _describe(options: argparse.Namespace) -> int:
             facts = [key.type, key.unit, "required" if key.default is None else f"default {key.default}", key.limits]
             print(f"\n  {key.name}: {'; '.join(fact for fact in facts if fact)}")
             print(f"{_INDENT}{key.meaning}")
+    return EXIT_OK
+
+
+def _new(options: argparse.Namespace) -> int:
+    from touchcell.cell.cli.scaffold import new
+
+    files = new(options.kind, options.name, options.out)
+    for file in files:
+        print(file)
+    package = files[0].parent
+    print(f"next: pip install -e {package}, then pytest {package}, and fill in {options.name}.py until it is green")
     return EXIT_OK
 
 
