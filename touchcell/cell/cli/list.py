@@ -25,7 +25,11 @@ def listing() -> dict[str, list[tuple[str, str]]]:
     return {
         "drivers": _rows(DRIVERS),
         "tasks": _rows(TASKS),
-        "interlocks": [("finite", "every number is finite; always on, checked first"), *_rows(INTERLOCKS)],
+        "interlocks": [
+            ("finite", "every number is finite; always on, checked first"),
+            ("missing", "every arm and sensor is in the view; always on"),
+            *_rows(INTERLOCKS),
+        ],
         "estimators": _rows(ESTIMATORS),
         "filters": _rows(FILTERS),
         "surfaces": _rows(SURFACES),
