@@ -75,7 +75,12 @@ def _limited(view: CellView) -> Mapping[str, str]:
 
 
 class StandstillConfig(InterlockSettings):
-    """Largest drift of an arm that is commanded to stop, and the time that it may take to come to rest."""
+    """Largest drift of an arm that is commanded to stop, and the time that it may take to come to rest.
+
+    Attributes:
+        limit_mm: largest drift.
+        settle_ms: time to come to rest after a stop.
+    """
 
     kind: Literal["standstill"]
     limit_mm: PositiveFloat
@@ -87,7 +92,13 @@ class StandstillConfig(InterlockSettings):
 
 
 class TrackingConfig(InterlockSettings):
-    """Largest difference between commanded and measured velocity, and how long it may be exceeded."""
+    """Largest difference between commanded and measured velocity, and how long it may be exceeded.
+
+    Attributes:
+        limit_mm_s: largest difference of the velocities.
+        leave_mm_s: difference below which the time starts anew; none for a share of the limit.
+        hold_ms: how long it may be exceeded.
+    """
 
     kind: Literal["tracking"]
     limit_mm_s: PositiveFloat
@@ -103,7 +114,11 @@ class TrackingConfig(InterlockSettings):
 
 
 class LimitedConfig(InterlockSettings):
-    """Longest time for which an arm's gate may limit the task's commands."""
+    """Longest time for which an arm's gate may limit the task's commands.
+
+    Attributes:
+        limit_ms: longest time.
+    """
 
     kind: Literal["limited"]
     limit_ms: PositiveFloat

@@ -33,6 +33,7 @@ class EstimatorConfig(Section):
 
     Attributes:
         needs_truth: True if it can only be built where the true contact is known, as in a simulated scene.
+        kind: which estimator.
     """
 
     needs_truth: ClassVar[bool] = False

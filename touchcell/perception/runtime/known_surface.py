@@ -60,6 +60,9 @@ class KnownSurface(EstimatorConfig):
     """The contact from the arm's pose above a surface at a given pose, for collecting labels.
 
     ``surface_mm_deg`` is the pose of the sensor frame in the arm's base when it just touches the surface, upright.
+
+    Attributes:
+        surface_mm_deg: pose of the sensor frame in the arm's base when it just touches the surface, upright.
     """
 
     kind: Literal["known_surface"]
