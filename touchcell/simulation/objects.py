@@ -1,18 +1,19 @@
-"""Free rigid objects on a table: shape, mass and sliding friction."""
+"""Free rigid objects on a table: shape (group ``touchcell.objects``), mass and sliding friction."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field, PositiveFloat
 
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.plugin_section import Section
-from touchcell.simulation.shape_spec import ObjectShapeConfig, ObjectShapeSection, ObjectSpec, PoseMmDeg
+from touchcell.plugin_section import PluginSection, Section
+from touchcell.registry import Registry
+from touchcell.simulation.surface_spec import PoseMmDeg
 
 TABLES: dict[str, float] = {"mdf": 0.3, "foam": 0.6}
 """Coefficients of sliding friction of the paper's two tables, chosen within literature values."""
@@ -77,6 +78,38 @@ class FreeObject:
     mass_kg: float
     friction: float
     T_world_object: Array
+
+
+class ObjectShapeConfig(Section):
+    """Base of the ``shape:`` section of a free object."""
+
+    kind: str
+
+    def build(self) -> Solid:
+        """Build the solid."""
+        raise NotImplementedError(f"{type(self).__name__} builds no solid")
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectSpec:
+    """Entry point of one shape of free objects.
+
+    Attributes:
+        name: value of ``kind`` in the object's ``shape:``.
+        summary: one line for ``touchcell list``.
+        config: pydantic model of that section, which builds the solid.
+    """
+
+    name: str
+    summary: str
+    config: type[ObjectShapeConfig]
+
+
+OBJECTS: Final = Registry("touchcell.objects", "object", ObjectSpec)
+"""All installed shapes of free objects."""
+
+ObjectShapeSection: TypeAlias = Annotated[ObjectShapeConfig, PluginSection(OBJECTS)]
+"""The ``shape:`` of a free object."""
 
 
 class BoxShape(ObjectShapeConfig):

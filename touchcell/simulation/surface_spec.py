@@ -1,9 +1,9 @@
-"""Entry points of the shapes in a simulated scene (groups ``touchcell.surfaces`` and ``touchcell.objects``)."""
+"""Entry points of the surfaces in a simulated scene (group ``touchcell.surfaces``)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
+from typing import Annotated, Final, Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -14,9 +14,6 @@ from touchcell.plugin_section import PluginSection, Section
 from touchcell.registry import Registry
 from touchcell.simulation.motions import Glide, Motion, Periodic, Still
 from touchcell.simulation.surfaces import Shape, Surface
-
-if TYPE_CHECKING:
-    from touchcell.simulation.objects import Solid
 
 PoseMmDeg = tuple[float, float, float, float, float, float]
 
@@ -83,16 +80,6 @@ class SurfaceConfig(Section):
         return Surface(self.shape(), self.motion.build(T_world_body) if self.motion else Still(T_world_body))
 
 
-class ObjectShapeConfig(Section):
-    """Base of the ``shape:`` section of a free object."""
-
-    kind: str
-
-    def build(self) -> Solid:
-        """Build the solid."""
-        raise NotImplementedError(f"{type(self).__name__} builds no solid")
-
-
 @dataclass(frozen=True, slots=True)
 class SurfaceSpec:
     """Entry point of one kind of surface.
@@ -108,29 +95,8 @@ class SurfaceSpec:
     config: type[SurfaceConfig]
 
 
-@dataclass(frozen=True, slots=True)
-class ObjectSpec:
-    """Entry point of one shape of free objects.
-
-    Attributes:
-        name: value of ``kind`` in the object's ``shape:``.
-        summary: one line for ``touchcell list``.
-        config: pydantic model of that section, which builds the solid.
-    """
-
-    name: str
-    summary: str
-    config: type[ObjectShapeConfig]
-
-
 SURFACES: Final = Registry("touchcell.surfaces", "surface", SurfaceSpec)
 """All installed kinds of surface."""
 
-OBJECTS: Final = Registry("touchcell.objects", "object", ObjectSpec)
-"""All installed shapes of free objects."""
-
 SurfaceSection: TypeAlias = Annotated[SurfaceConfig, PluginSection(SURFACES)]
 """A surface of the scene."""
-
-ObjectShapeSection: TypeAlias = Annotated[ObjectShapeConfig, PluginSection(OBJECTS)]
-"""The ``shape:`` of a free object."""
