@@ -24,7 +24,7 @@ from touchcell.simulation.quasi_static import QuasiStaticWorld
 from touchcell.simulation.shape_spec import SurfaceConfig, SurfaceSection, SurfaceSpec
 from touchcell.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
 from touchcell.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeline
-from touchcell.simulation.world import Feeling, KinematicWorld, World, known
+from touchcell.simulation.world import DeferredContact, KinematicWorld, World, computed
 
 HISTORY_S = 5.0
 
@@ -54,10 +54,10 @@ class Carrier(Protocol):
 
 
 @runtime_checkable
-class LoadBearer(Protocol):
+class LoadReceiver(Protocol):
     """A simulated arm that yields to contact forces on its sensors."""
 
-    def bear(self, force_world: Array, point_world: Array) -> None:
+    def apply_force(self, force_world: Array, point_world: Array) -> None:
         """Apply ``force_world`` (3,) N at ``point_world`` (3,) m from now on."""
         ...
 
@@ -108,30 +108,32 @@ class Scene:
         self.timeline = Timeline(clock, step_s)
         self._start_ns = self.timeline.t_ns
         self._poses: dict[str, Callable[[], Array]] = {}
-        self._bearers: dict[str, Callable[[Array, Array], None]] = {}
+        self._load_receivers: dict[str, Callable[[Array, Array], None]] = {}
         # The last entry is of the timeline's present step, the one before it of the previous step.
-        self._felt: dict[str, deque[Feeling]] = {}
+        self._contacts: dict[str, deque[DeferredContact]] = {}
         self._kept = round(HISTORY_S * 1e9 / self.timeline.step_ns)
         self.timeline.add(Phase.CONTACT, self._step)
         self.timeline.keep(self._snapshot)
 
-    def mount(self, sensor: str, pose: Callable[[], Array], bear: Callable[[Array, Array], None] | None = None) -> None:
+    def mount(
+        self, sensor: str, pose: Callable[[], Array], apply_force: Callable[[Array, Array], None] | None = None
+    ) -> None:
         """Mount ``sensor``.
 
         Args:
             sensor: name of the sensor.
             pose: returns T_world_s (4, 4) at the present step and must not advance time.
-            bear: called after every step with the contact force (3,) N on the sensor and its point of application (3,)
-                m, both in the world frame.
+            apply_force: called after every step with the contact force (3,) N on the sensor and its point of
+                application (3,) m, both in the world frame.
         """
         if sensor in self._poses:
             raise ConfigError(f"sensor {sensor!r} is mounted already", key="scene", value=sensor)
         t_ns = self.timeline.t_ns
         state = self.world.mount(sensor, pose(), self.seconds(t_ns))
         self._poses[sensor] = pose
-        if bear is not None:
-            self._bearers[sensor] = bear
-        self._felt[sensor] = deque([known(state)], maxlen=self._kept)
+        if apply_force is not None:
+            self._load_receivers[sensor] = apply_force
+        self._contacts[sensor] = deque([computed(state)], maxlen=self._kept)
 
     def has(self, sensor: str) -> bool:
         """Return whether ``sensor`` is mounted."""
@@ -144,17 +146,17 @@ class Scene:
             ConfigError: no such sensor.
             ContactNotKept: ``t_ns`` is in the future or older than the history.
         """
-        if sensor not in self._felt:
+        if sensor not in self._contacts:
             raise ConfigError(f"no sensor {sensor!r} is mounted", key="scene", value=sensor)
         now_ns = self.timeline.advance()
-        felt, step_ns = self._felt[sensor], self.timeline.step_ns
+        contacts, step_ns = self._contacts[sensor], self.timeline.step_ns
         newest = now_ns // step_ns
         seq = newest if t_ns is None else t_ns // step_ns
-        if not 0 <= newest - seq < len(felt):
-            raise ContactNotKept(seq * step_ns, (newest - len(felt) + 1) * step_ns, now_ns)
+        if not 0 <= newest - seq < len(contacts):
+            raise ContactNotKept(seq * step_ns, (newest - len(contacts) + 1) * step_ns, now_ns)
         at = seq - newest - 1
-        state = felt[at]()
-        felt[at] = known(state)
+        state = contacts[at]()
+        contacts[at] = computed(state)
         return Stamped(state, seq * step_ns, seq)
 
     def objects(self) -> Stamped[Mapping[str, Array]]:
@@ -180,20 +182,20 @@ class Scene:
 
     def _step(self, t_ns: int) -> None:
         poses = {sensor: pose() for sensor, pose in self._poses.items()}
-        for sensor, felt in self.world.step(poses, self.seconds(t_ns)).items():
-            self._felt[sensor].append(felt)
-            if sensor in self._bearers:
-                self._bearers[sensor](felt().force_world_n, poses[sensor][:3, 3])
+        for sensor, contacts in self.world.step(poses, self.seconds(t_ns)).items():
+            self._contacts[sensor].append(contacts)
+            if sensor in self._load_receivers:
+                self._load_receivers[sensor](contacts().force_world_n, poses[sensor][:3, 3])
 
     def _snapshot(self) -> Callable[[int], None]:
         start_ns, world = self._start_ns, self.world.snapshot()
-        felt = {sensor: kept.copy() for sensor, kept in self._felt.items()}
+        contacts = {sensor: kept.copy() for sensor, kept in self._contacts.items()}
 
         def restore(later_ns: int) -> None:
-            if felt.keys() != self._felt.keys():
+            if contacts.keys() != self._contacts.keys():
                 raise ConfigError("a sensor was mounted after the snapshot was taken", key="scene")
             self._start_ns = start_ns + later_ns
-            self._felt = {sensor: kept.copy() for sensor, kept in felt.items()}
+            self._contacts = {sensor: kept.copy() for sensor, kept in contacts.items()}
             world()
 
         return restore
@@ -224,7 +226,12 @@ class PlaneConfig(SurfaceConfig):
 
 
 class RampConfig(SurfaceConfig):
-    """Flat, then bent over an arc to an incline along the pose's +x; see ``surfaces.Ramp``."""
+    """Flat, then bent over an arc to an incline along the pose's +x; see ``surfaces.Ramp``.
+
+    Attributes:
+        bend_radius_mm: radius of the arc.
+        incline_deg: slope at its end, negative downwards.
+    """
 
     kind: Literal["ramp"]
     bend_radius_mm: float = Field(gt=0.0)
@@ -236,7 +243,11 @@ class RampConfig(SurfaceConfig):
 
 
 class DomeConfig(SurfaceConfig):
-    """A hemisphere on a plane, its centre at the pose's origin, rising towards +z."""
+    """A hemisphere on a plane, its centre at the pose's origin, rising towards +z.
+
+    Attributes:
+        radius_mm: radius of the hemisphere.
+    """
 
     kind: Literal["dome"]
     radius_mm: float = Field(gt=0.0)
@@ -247,7 +258,11 @@ class DomeConfig(SurfaceConfig):
 
 
 class SphereConfig(SurfaceConfig):
-    """A ball about the pose's origin."""
+    """A ball about the pose's origin.
+
+    Attributes:
+        radius_mm: radius of the ball.
+    """
 
     kind: Literal["sphere"]
     radius_mm: float = Field(gt=0.0)
@@ -258,7 +273,12 @@ class SphereConfig(SurfaceConfig):
 
 
 class TipLawConfig(Section):
-    """Contact law of every simulated tip of the scene; see ``contact.ContactLaw``."""
+    """Contact law of every simulated tip of the scene; see ``contact.ContactLaw``.
+
+    Attributes:
+        radius_mm: radius of the tip.
+        stiffness_n_mm: normal stiffness, N/mm.
+    """
 
     radius_mm: float = Field(default=20.0, gt=0.0)
     stiffness_n_mm: float = Field(default=1.5, gt=0.0)
@@ -275,6 +295,15 @@ class SceneConfig(Section, SceneSection):
     unaffected by contact. ``quasi_static``: in addition, objects slide on the table where tips push them, without
     inertia and always upright. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms``
     within ``step_ms``, the grid on which arms move and contacts are stored.
+
+    Attributes:
+        physics: fidelity, see above.
+        surfaces: surfaces, by a name of one's own.
+        objects: free objects, by a name of one's own.
+        table: the table under the objects.
+        tip: contact law of the simulated tips.
+        step_ms: grid on which arms move and contacts are stored.
+        physics_step_ms: step of the dynamics, a divisor of ``step_ms``.
     """
 
     physics: Literal["kinematic", "quasi_static", "dynamic"] = "kinematic"

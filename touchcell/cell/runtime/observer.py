@@ -14,9 +14,10 @@ from touchcell.cell.runtime.sensor import Sensor
 from touchcell.cell.runtime.timing import CycleTimes
 from touchcell.control.interlocks.snapshot import ArmView, CellView, DeviceView, SensorView
 from touchcell.drivers.core.commands import Sent, TwistCommand
-from touchcell.drivers.core.errors import DeviceError, DeviceFault
+from touchcell.drivers.core.errors import DeviceFault
 from touchcell.drivers.core.protocols import ReadingSource
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
+from touchcell.errors import TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.finite import all_finite
 from touchcell.perception.runtime.estimate import ContactEstimate
@@ -45,7 +46,7 @@ class Reading:
 class Observer:
     """Reads a cell's arms and sensors.
 
-    Whatever a driver raises comes out as a DeviceError that names the device.
+    What a driver raises that is no TouchcellError comes out as a DeviceFault that names the device.
 
     Args:
         cell: activated.
@@ -62,8 +63,13 @@ class Observer:
         sensors = self._cell.sensors
         return bool(sensors) and all(sensor.source.ended for sensor in sensors.values())
 
+    def await_frames(self) -> None:
+        """Wait for each camera's first frame, so that no control cycle has to. Raises DeviceError."""
+        for role, sensor in self._cell.sensors.items():
+            call_driver(self._device(role), sensor.await_frame)
+
     def read(self) -> Reading:
-        """Read the arms and perceive. Raises DeviceError."""
+        """Read the arms and perceive. Raises DeviceError, ImageError."""
         cell = self._cell
         self._times.begin()
         started = time.perf_counter_ns()
@@ -71,7 +77,7 @@ class Observer:
         self._times.add("read arms", time.perf_counter_ns() - started)
         contacts = {}
         for role, sensor in cell.sensors.items():
-            estimate = call_driver(cell.plan.sensor_roles[role], partial(self._perceive, sensor, states))
+            estimate = call_driver(self._device(role), partial(self._perceive, sensor, states))
             if estimate is not None:
                 contacts[role] = estimate
         devices = {}
@@ -111,6 +117,9 @@ class Observer:
             },
         )
 
+    def _device(self, sensor_role: str) -> str:
+        return self._cell.plan.sensor_roles.get(sensor_role, sensor_role)
+
     def _perceive(self, sensor: Sensor, states: Mapping[str, Stamped[TcpState]]) -> ContactEstimate | None:
         if sensor.arm_role is not None:
             state = states[sensor.arm_role]
@@ -125,10 +134,10 @@ class Observer:
 
 
 def call_driver(device: str, call: Callable[[], _T]) -> _T:
-    """Call a driver; whatever it raises that is no DeviceError comes out as a DeviceFault of ``device``."""
+    """Call a driver; whatever it raises that is no TouchcellError comes out as a DeviceFault of ``device``."""
     try:
         return call()
-    except DeviceError:
+    except TouchcellError:
         raise
     except Exception as error:
         raise DeviceFault(device, f"its driver raised {error!r}") from error

@@ -40,6 +40,7 @@ class StopProcedure:
         distrusted = {c.subject for c in self._cell.supervisor.latch.causes if c.severity is Severity.FAULT}
         failed = self._stopper.stop(tripped=tripped, distrusted=distrusted)
         for role, error in failed.items():
+            logger.error("%s could not be told to stop", role, exc_info=error)
             self._record.event("stop failed", f"{role}: {error}")
         for role, device in self._cell.auxiliaries.items():
             if isinstance(device, Stoppable):
@@ -57,8 +58,11 @@ class StopProcedure:
         return stops
 
     def _on_state(self, role: str, state: Stamped[TcpState]) -> None:
-        # Arms on their way to rest are still guarded.
-        self._cell.watchdog.beat()
+        try:
+            # Arms on their way to rest are still guarded.
+            self._cell.watchdog.beat()
+        except Exception:
+            logger.exception("the watchdog was not told that the loop lives")
         self._record.state(role, state)
 
     def _on_escalation(self, role: str, report: StopReport, waited_s: float) -> None:

@@ -13,7 +13,11 @@ if TYPE_CHECKING:
 
 
 class FilterConfig(Section):
-    """Base of a ``filter:`` section."""
+    """Base of a ``filter:`` section.
+
+    Attributes:
+        model: which filter.
+    """
 
     model: str
 
