@@ -89,12 +89,7 @@ class Mutant:
 def mutants(source: str) -> Iterator[Mutant]:
     """Return every mutant of a module."""
     tree = ast.parse(source)
-    spared = {
-        id(inner)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.FunctionDef) and node.name in _SPARED
-        for inner in ast.walk(node)
-    }
+    spared = {id(inner) for node in ast.walk(tree) for root in _roots(node) for inner in ast.walk(root)}
     for number, node in enumerate(ast.walk(tree)):
         if id(node) in spared or not hasattr(node, "lineno"):
             continue
@@ -104,6 +99,18 @@ def mutants(source: str) -> Iterator[Mutant]:
             change(target)
             ast.fix_missing_locations(changed)
             yield Mutant(node.lineno, what, ast.unparse(changed))
+
+
+def _roots(node: ast.AST) -> Iterator[ast.AST]:
+    """Return what below ``node`` is not to be changed: annotations, which nothing evaluates, and spared functions."""
+    if isinstance(node, ast.FunctionDef):
+        if node.name in _SPARED:
+            yield node
+        if node.returns is not None:
+            yield node.returns
+    annotation = node.annotation if isinstance(node, ast.arg | ast.AnnAssign) else None
+    if annotation is not None:
+        yield annotation
 
 
 def _changes(node: ast.AST) -> Iterator[tuple[str, Change]]:
@@ -127,7 +134,8 @@ def _changes(node: ast.AST) -> Iterator[tuple[str, Change]]:
         yield "x if c else y -> c = True", _constant("test", True)
         yield "x if c else y -> c = False", _constant("test", False)
     elif isinstance(node, ast.Constant) and type(node.value) in (int, float) and node.value not in (0, 1):
-        yield f"{node.value} -> {2 * node.value}", _set_value(2 * node.value)
+        doubled = 2 * cast(float, node.value)
+        yield f"{0.5 * doubled:g} -> {doubled:g}", _set_value(doubled)
     elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in _CALLS:
         yield f"{node.func.id} -> {_CALLS[node.func.id]}", _rename(_CALLS[node.func.id])
     elif isinstance(node, ast.Raise):
@@ -158,7 +166,7 @@ def _rename(name: str) -> Change:
 
 def _blank(node: ast.AST) -> None:
     """Turn a statement into one that does nothing."""
-    node.__class__ = ast.Pass  # type: ignore[assignment]
+    node.__class__ = ast.Pass
 
 
 def survives(module: Path, mutant: Mutant, tests: Sequence[str], timeout_s: float) -> bool:

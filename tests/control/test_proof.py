@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -72,7 +73,11 @@ class ProvableConfig(BrightConfig):
     def faults(self, facts: CellFacts) -> Iterable[Fault | CannotTrip]:
         level = just_beyond(self.limit, 255.0)
         for role in facts.sensors:
-            yield Fault(role, "glare", "200", lambda view, t_s: with_sensor(view, role, brightness=level), key="limit")
+            yield Fault(role, "glare", "200", partial(_glare, role, level), key="limit")
+
+
+def _glare(role: str, level: float, view: CellView, t_s: float) -> CellView:
+    return with_sensor(view, role, brightness=level)
 
 
 def proven(settings: InterlockSettings, interlock: Any = None, facts: CellFacts = FACTS) -> Proof:

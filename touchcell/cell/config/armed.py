@@ -20,13 +20,14 @@ from touchcell.control.interlocks.timers import TimedInterlock
 from touchcell.control.interlocks.violation import Severity
 from touchcell.control.proof import Proof, prove
 from touchcell.drivers.core.arm import LimitsConfig
-from touchcell.drivers.core.protocols import ExternalTorqueSource, TwistSink, WrenchSource
+from touchcell.drivers.core.protocols import ExternalTorqueSource, ReadingSource, TwistSink, WrenchSource
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.tasks.interface import TaskContext
 
 if TYPE_CHECKING:
-    from touchcell.cell.config.schema import CellPlan, NetworkEstimator
+    from touchcell.cell.config.schema import CellPlan
+    from touchcell.perception.runtime.network_estimator import NetworkEstimator
 
 REQUIRED_OF_ARMS: Final = ("workspace", "tcp_speed", "arm_state_age")
 """Kinds that must guard every arm that a task moves."""
@@ -34,6 +35,8 @@ REQUIRED_OF_SENSORS: Final = ("depth", "frame_age")
 """Kinds that must guard every sensor of such a task."""
 REQUIRED_OF_NETWORKS: Final = ("out_of_range",)
 """Kinds that must guard every sensor of such a task whose estimator is a network."""
+REQUIRED_OF_READINGS: Final = frozenset({"reading_age"})
+"""Kinds that a task which moves an arm must have if it uses the readings of another device."""
 
 _COLUMNS = ("interlock", "subject", "limit", "trips at", "after", "stops within", "margin left")
 _TIP_M = 0.02
@@ -131,6 +134,12 @@ def not_armed(plan: CellPlan, facts: CellFacts, proofs: Sequence[Proof]) -> Iter
         for role in proof.covers
     }
     refused = {(proof.kind, proof.subject) for proof in proofs if proof.problem and proof.fatal}
+    reads = any(ReadingSource in protocols for protocols in plan.task.devices.values())
+    if reads and any(arm.moved for arm in facts.arms.values()):
+        kinds = {plan.cell.interlocks[name].kind for name in stopping}
+        for kind in sorted(REQUIRED_OF_READINGS - kinds):
+            reason = f"no interlock of kind {kind!r} that stops, which a task that moves an arm by readings must have"
+            yield NotArmed(("interlocks",), reason, "add one")
     for kind, role, whose in _required(plan, facts):
         # What has a rule of that kind that cannot trip has been reported.
         if (kind, role) in covered | refused or (kind, "") in refused:
@@ -186,8 +195,10 @@ def _sensor_facts(plan: CellPlan, name: str, role_of: Mapping[str, str]) -> Sens
     arm = None if section.mounted_on is None else role_of[section.mounted_on]
     device = plan.sensors[name]
     rate_hz = getattr(device.config, "rate_hz", None) or device.spec.capabilities.state_rate_hz or 30.0
+    from touchcell.perception.runtime.network_estimator import NetworkEstimator
+
     estimator = section.estimator
-    if estimator.kind == "network":
+    if isinstance(estimator, NetworkEstimator):
         return _network_facts(estimator, arm, section.T_tcp_sensor, float(rate_hz))
     images = estimator.kind == "known_surface"
     kind = estimator.kind.replace("_", " ")
@@ -199,10 +210,10 @@ def _sensor_facts(plan: CellPlan, name: str, role_of: Mapping[str, str]) -> Sens
 def _network_facts(
     estimator: NetworkEstimator, arm: str | None, T_tcp_sensor: np.ndarray, rate_hz: float
 ) -> SensorFacts:
-    from touchcell.cell.config.model_path import model_path
     from touchcell.perception.errors import ModelError
     from touchcell.perception.models.architecture import LOG_PRECISION_BOUNDS
     from touchcell.perception.models.model_file import load_header
+    from touchcell.perception.runtime.network_estimator import model_path
 
     try:
         header = load_header(model_path(estimator.model))
@@ -225,8 +236,8 @@ def _network_facts(
         unit_m = 1.0
     widest = math.exp(-LOG_PRECISION_BOUNDS[0]) if header.architecture.kind == "gdn" else 1.0
     sigma_m = unit_m * float(header.calibrated(np.full(6, widest))[2] * labels.sigma_unit[2])
-    if estimator.filter is not None:
-        sigma_m = max(sigma_m, 1e-3 * estimator.filter.drift_mm_per_sqrt_s * math.sqrt(_DRIFTS_S))
+    drift_mm = getattr(estimator.filter, "drift_mm_per_sqrt_s", 0.0)
+    sigma_m = max(sigma_m, 1e-3 * drift_mm * math.sqrt(_DRIFTS_S))
     return SensorFacts(
         f"network {estimator.model}",
         arm,

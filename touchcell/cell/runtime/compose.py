@@ -15,6 +15,7 @@ from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.devices import build_devices, build_world
 from touchcell.cell.runtime.enabling import SimulatedEnablingDevice
 from touchcell.cell.runtime.sensor import build_sensor
+from touchcell.control.interlocks.always_on import always_on
 from touchcell.control.interlocks.basic import TcpSpeed
 from touchcell.control.interlocks.config import build_interlocks
 from touchcell.control.interlocks.violation import Severity
@@ -23,7 +24,7 @@ from touchcell.control.supervisor import Supervisor
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.enabling import EnablingDevice
-from touchcell.drivers.core.protocols import ExternalTorqueSource, StopCategory, WrenchSource
+from touchcell.drivers.core.protocols import ExternalTorqueSource, StopCategory, TwistSink, WrenchSource
 from touchcell.errors import ConfigError
 from touchcell.tasks.interface import Task, TaskContext
 
@@ -43,7 +44,7 @@ def compose(plan: CellPlan, *, clock: Clock | None = None, enabling_device: Enab
     """
     role_of = _arm_roles(plan)
     world = build_world(plan, role_of, clock)
-    wanted = {name: device for name, device in {**plan.arms, **plan.sensors}.items() if name not in world.hosted}
+    wanted = {name: device for name, device in plan.built.items() if name not in world.hosted}
     devices = build_devices(plan, wanted, world.clock, world.scene, world.hosted)
     arms = {role: cast(Arm, devices[name]) for name, role in role_of.items()}
     sensors = {
@@ -51,7 +52,18 @@ def compose(plan: CellPlan, *, clock: Clock | None = None, enabling_device: Enab
     }
     sensor_poses = {role: sensor.T_tcp_sensor for role, sensor in sensors.items()}
     planning_scene = build_planning_scene(plan, arms, {role: name for name, role in role_of.items()})
-    interlocks = build_interlocks(plan.cell.interlocks, sensor_poses, planning_scene)
+    configured = build_interlocks(plan.cell.interlocks, sensor_poses, planning_scene)
+    interlocks = [
+        *always_on(
+            plan.cell.rate_hz,
+            plan.cell.interlocks.values(),
+            moved=any(isinstance(arm, TwistSink) for arm in arms.values()),
+            arms=arms.keys(),
+            sensors=sensors.keys(),
+        ),
+        *configured,
+        *_by_switch(plan),
+    ]
     collection = _collection(plan)
     context = TaskContext(plan.cell.rate_hz, sensor_poses, 0 if collection is None else collection.kept)
 
@@ -64,9 +76,10 @@ def compose(plan: CellPlan, *, clock: Clock | None = None, enabling_device: Enab
         arms=arms,
         cameras={name: devices[name] for name in plan.sensors},
         sensors=sensors,
-        supervisor=Supervisor((*interlocks, *_always_on(plan)), Latch()),
+        supervisor=Supervisor(interlocks, Latch()),
         task=new_task(),
         new_task=new_task,
+        auxiliaries={role: devices[name] for role, name in plan.auxiliary_roles.items()},
         stop_categories={role: StopCategory(plan.cell.arms[name].stop_category) for name, role in role_of.items()},
         holding=frozenset(
             role_of[pair.follower] for pair in plan.cell.pairs if pair.on_stop == "hold" and pair.follower in role_of
@@ -78,11 +91,11 @@ def compose(plan: CellPlan, *, clock: Clock | None = None, enabling_device: Enab
         scene=world.truth,
         collection=collection,
         watchdog=world.watchdog,
-        require_armed=partial(require_armed, plan, interlocks, planning_scene),
+        require_armed=partial(require_armed, plan, configured, planning_scene),
     )
 
 
-def _always_on(plan: CellPlan) -> tuple[TcpSpeed, ...]:
+def _by_switch(plan: CellPlan) -> tuple[TcpSpeed, ...]:
     """Interlocks that the file switches on by other keys than ``interlocks:``."""
     if not plan.cell.reduced_speed:
         return ()

@@ -76,6 +76,11 @@ class Finite:
             ):
                 if value is not None:
                     yield role, sensor.seq, what, value
+        for role, device in view.devices.items():
+            for name, number in ({} if device.reading is None else device.reading.value).items():
+                yield role, None, name, float(number)
+            for name, number in (device.setting or {}).items():
+                yield role, None, f"set {name}", float(number)
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +213,12 @@ def _check_ages(
 
 
 class TcpSpeedConfig(InterlockSettings):
-    """Largest speeds of any tool centre point."""
+    """Largest speeds of any tool centre point.
+
+    Attributes:
+        limit_m_s: largest linear speed, commanded and measured.
+        limit_rad_s: largest angular speed, likewise.
+    """
 
     kind: Literal["tcp_speed"]
     limit_m_s: PositiveFloat
@@ -251,7 +261,11 @@ def _runs_away(role: str, twist: Array, source: str) -> Change:
 
 
 class DepthConfig(GradedSettings):
-    """Largest indentation of any sensor."""
+    """Largest indentation of any sensor.
+
+    Attributes:
+        limit_mm: largest indentation.
+    """
 
     kind: Literal["depth"]
     limit_mm: PositiveFloat
@@ -278,7 +292,11 @@ class DepthConfig(GradedSettings):
 
 
 class FrameAgeConfig(InterlockSettings):
-    """Largest age of a tactile frame."""
+    """Largest age of a tactile frame.
+
+    Attributes:
+        limit_ms: oldest tactile frame that is accepted.
+    """
 
     kind: Literal["frame_age"]
     limit_ms: PositiveFloat
