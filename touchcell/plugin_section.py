@@ -5,14 +5,23 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
-from pydantic import BaseModel, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError, PydanticKnownError, core_schema
 
 from touchcell.errors import ConfigError
 from touchcell.registry import Registry
+
+PLUGIN: Final = "x-plugin"
+"""Keyword of a JSON Schema that says which kind of plug-in a section belongs to."""
+
+
+class Section(BaseModel):
+    """Base of a plug-in's section: unknown keys are refused, values are frozen and finite."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class HasConfig(Protocol):
@@ -72,4 +81,5 @@ class PluginSection:
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         models = [self.registry.load(name).config for name in self.registry.names()]
-        return handler(core_schema.union_schema([model.__pydantic_core_schema__ for model in models]))
+        union = handler(core_schema.union_schema([model.__pydantic_core_schema__ for model in models]))
+        return union | {PLUGIN: self.registry.noun}

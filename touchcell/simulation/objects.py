@@ -7,59 +7,16 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+from pydantic import Field, PositiveFloat
 
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-
-PoseMmDeg = tuple[float, float, float, float, float, float]
+from touchcell.plugin_section import Section
+from touchcell.simulation.shape_spec import ObjectShapeConfig, ObjectShapeSection, ObjectSpec, PoseMmDeg
+from touchcell.simulation.shapes import Ball, Prism, Solid, Turned
 
 TABLES: dict[str, float] = {"mdf": 0.3, "foam": 0.6}
 """Coefficients of sliding friction of the paper's two tables, chosen within literature values."""
-
-
-@dataclass(frozen=True, slots=True)
-class Prism:
-    """A convex outline extruded along z; the origin is in the middle of its bottom.
-
-    Attributes:
-        outline_m: (n, 2) corners, anticlockwise.
-        height_m: along z.
-    """
-
-    outline_m: Array
-    height_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class Turned:
-    """A solid of revolution about z, made of stacked cylinders; the origin is in the middle of its bottom.
-
-    Attributes:
-        sections_m: (height, radius) of each, from the bottom up. One section is a plain cylinder.
-    """
-
-    sections_m: tuple[tuple[float, float], ...]
-
-    @property
-    def height_m(self) -> float:
-        """Height along z."""
-        return sum(height for height, _ in self.sections_m)
-
-
-@dataclass(frozen=True, slots=True)
-class Ball:
-    """A ball about its origin."""
-
-    radius_m: float
-
-    @property
-    def height_m(self) -> float:
-        """Diameter of the ball."""
-        return 2.0 * self.radius_m
-
-
-Solid = Prism | Turned | Ball
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,12 +36,12 @@ class FreeObject:
     T_world_object: Array
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+class BoxShape(ObjectShapeConfig):
+    """A box, its sides along the object's axes.
 
-
-class BoxShape(_Part):
-    """A box, its sides along the object's axes."""
+    Attributes:
+        size_mm: lengths of its sides.
+    """
 
     kind: Literal["box"]
     size_mm: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
@@ -95,8 +52,12 @@ class BoxShape(_Part):
         return Prism(np.array([[-x, -y], [x, -y], [x, y], [-x, y]]), 2.0 * z)
 
 
-class HexagonShape(_Part):
-    """A hexagonal prism, two of its faces across the object's x axis."""
+class HexagonShape(ObjectShapeConfig):
+    """A hexagonal prism, two of its faces across the object's x axis.
+
+    Attributes:
+        height_mm: height.
+    """
 
     kind: Literal["hexagon"]
     width_mm: PositiveFloat = Field(description="across flats")
@@ -109,8 +70,13 @@ class HexagonShape(_Part):
         return Prism(corner_m * np.column_stack([np.cos(angles), np.sin(angles)]), 1e-3 * self.height_mm)
 
 
-class CylinderShape(_Part):
-    """An upright cylinder."""
+class CylinderShape(ObjectShapeConfig):
+    """An upright cylinder.
+
+    Attributes:
+        diameter_mm: diameter.
+        height_mm: height.
+    """
 
     kind: Literal["cylinder"]
     diameter_mm: PositiveFloat
@@ -121,8 +87,12 @@ class CylinderShape(_Part):
         return Turned(((1e-3 * self.height_mm, 0.5e-3 * self.diameter_mm),))
 
 
-class BottleShape(_Part):
-    """Stacked cylinders: [height, diameter] of each, from the bottom up."""
+class BottleShape(ObjectShapeConfig):
+    """Stacked cylinders: [height, diameter] of each, from the bottom up.
+
+    Attributes:
+        sections_mm: height and diameter of each cylinder, from the bottom up.
+    """
 
     kind: Literal["bottle"]
     sections_mm: tuple[tuple[PositiveFloat, PositiveFloat], ...] = Field(min_length=1)
@@ -132,8 +102,12 @@ class BottleShape(_Part):
         return Turned(tuple((1e-3 * height, 0.5e-3 * diameter) for height, diameter in self.sections_mm))
 
 
-class BallShape(_Part):
-    """A ball; its frame is at its centre."""
+class BallShape(ObjectShapeConfig):
+    """A ball; its frame is at its centre.
+
+    Attributes:
+        diameter_mm: diameter.
+    """
 
     kind: Literal["ball"]
     diameter_mm: PositiveFloat
@@ -143,13 +117,16 @@ class BallShape(_Part):
         return Ball(0.5e-3 * self.diameter_mm)
 
 
-class ObjectConfig(_Part):
-    """One free object of the ``scene:`` section. ``pose_mm_deg`` is in the world frame, its z above the table's top."""
+class ObjectConfig(Section):
+    """One free object of the ``scene:`` section. ``pose_mm_deg`` is in the world frame, its z above the table's top.
 
-    shape: Annotated[
-        BoxShape | HexagonShape | CylinderShape | BottleShape | BallShape,
-        Field(discriminator="kind"),
-    ]
+    Attributes:
+        shape: its shape.
+        mass_g: its mass.
+        pose_mm_deg: initial pose in the world frame, z above the table's top.
+    """
+
+    shape: ObjectShapeSection
     mass_g: PositiveFloat
     pose_mm_deg: PoseMmDeg = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -160,8 +137,13 @@ class ObjectConfig(_Part):
         return FreeObject(self.shape.build(), 1e-3 * self.mass_g, table.coefficient, T_world_object)
 
 
-class TableConfig(_Part):
-    """The table under the objects: a level plane."""
+class TableConfig(Section):
+    """The table under the objects: a level plane.
+
+    Attributes:
+        height_mm: height of its top in the world.
+        friction: coefficient of sliding friction, or the name of one of the paper's tables.
+    """
 
     height_mm: float = 0.0
     friction: Literal["mdf", "foam"] | Annotated[float, Field(gt=0.0, le=2.0)] = "mdf"
@@ -170,3 +152,10 @@ class TableConfig(_Part):
     def coefficient(self) -> float:
         """Coefficient of sliding friction."""
         return TABLES[self.friction] if isinstance(self.friction, str) else self.friction
+
+
+BOX = ObjectSpec("box", "a box", BoxShape)
+HEXAGON = ObjectSpec("hexagon", "a hexagonal prism", HexagonShape)
+CYLINDER = ObjectSpec("cylinder", "an upright cylinder", CylinderShape)
+BOTTLE = ObjectSpec("bottle", "stacked cylinders", BottleShape)
+BALL = ObjectSpec("ball", "a ball", BallShape)

@@ -1,4 +1,4 @@
-"""The paper's figures 14 and 15: poses of leader and follower; and error against frame rate and latency."""
+"""The paper's figures 14 and 15: poses of leader and follower; and error over frame rate and latency."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 
 
 def plot_components(trials: Mapping[str, RunFolder], path: Path) -> Path:
-    """The moved component of plate and sensor over time, each trial in its panel, with the error below."""
+    """Plot the moved component of plate and sensor over time, each trial in a panel, with the error below."""
     figure, axes = plt.subplots(
         2, 6, figsize=(18, 6), sharex=True, height_ratios=(3, 2), layout="constrained", squeeze=False
     )
     for i, (row, trial) in enumerate(trials.items()):
         poses, T_world_plate, error = tracking(trial)
         moved = np.asarray(se3.to_euler_mm_deg(se3.inverse(T_world_plate[0]) @ T_world_plate))
-        # Signs differ, as the sensor looks against the plate's z axis.
+        # Signs differ, as the sensor's axis is opposite to the plate's z axis.
         sign = np.array([1, -1, -1, 1, -1, -1])[i]
         axes[0, i].plot(poses.t_s, moved[:, i], color="black", lw=1.4, label="plate")
         axes[0, i].plot(poses.t_s, moved[:, i] + sign * error[:, i], color=ORANGE, lw=1.2, ls="--", label="sensor")
@@ -41,12 +41,12 @@ def plot_components(trials: Mapping[str, RunFolder], path: Path) -> Path:
 
 
 def plot_all_six(trial: RunFolder, path: Path) -> Path:
-    """Ways of plate and sensor with their frames, from above and from the side, and all errors over time."""
+    """Plot the paths of plate and sensor with their frames, in top and side view, and all errors over time."""
     figure, axes = plt.subplots(1, 3, figsize=(18, 6), layout="constrained")
     poses, T_world_plate, error = tracking(trial)
-    felt = np.isfinite(error[:, 0])
-    sensor = Poses(poses.t_s[felt], poses.T_world[felt])
-    plate = Poses(poses.t_s[felt], T_world_plate[felt])
+    in_contact = np.isfinite(error[:, 0])
+    sensor = Poses(poses.t_s[in_contact], poses.T_world[in_contact])
+    plate = Poses(poses.t_s[in_contact], T_world_plate[in_contact])
     for axis, view, title in ((axes[0], (0, 1), "from above"), (axes[1], (0, 2), "from the side")):
         path_2d(axis, plate, view, color="black", lw=1.2, label="plate")
         path_2d(axis, sensor, view, color=ORANGE, lw=1.2, ls="--", label="sensor")
@@ -64,7 +64,7 @@ def plot_all_six(trial: RunFolder, path: Path) -> Path:
 
 
 def plot_sweep(finished: Sequence[Finished], path: Path) -> Path:
-    """RMS of each component over latency, one line for each frame rate."""
+    """Plot the RMS of each component over latency, one line for each frame rate."""
     figure, axes = plt.subplots(2, 3, figsize=(13, 6.5), sharex=True, layout="constrained")
     points: dict[tuple[float, float], list[Mapping[str, float]]] = {}
     for each in finished:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from enum import IntEnum
 from typing import Final, Protocol, runtime_checkable
 
@@ -139,6 +139,32 @@ class NativeWatchdog(Protocol):
         ...
 
 
+@runtime_checkable
+class ReadingSource(Protocol):
+    """Delivers named numbers: a force-torque sensor, a gripper, a scale."""
+
+    def read(self, max_age_s: float | None = None) -> Stamped[Mapping[str, float]]:
+        """Return the newest reading, with units in the names ("force_z_n").
+
+        Raises:
+            StaleData: the newest reading is older than ``max_age_s``.
+        """
+        ...
+
+
+@runtime_checkable
+class SettingSink(Protocol):
+    """Follows named set values: a gripper, a conveyor."""
+
+    def apply(self, setting: Mapping[str, float]) -> None:
+        """Begin to follow ``setting``, with units in the names ("width_mm"). Never blocks for longer than a cycle.
+
+        Raises:
+            CommandRejected: a name is unknown, or a value is not finite or out of range.
+        """
+        ...
+
+
 SERVO_ARM: Final[frozenset[type]] = frozenset({TcpSource, TwistSink, Stoppable})
 """What a task needs of an arm that it moves; see ``ServoArm``."""
 
@@ -152,4 +178,4 @@ def require_protocols(protocols: Iterable[object]) -> None:
     """Check a declaration. Raises TypeError for anything that ``isinstance`` cannot hold against a device."""
     for each in protocols:
         if not (isinstance(each, type) and getattr(each, "_is_runtime_protocol", False)):
-            raise TypeError(f"{each!r} is no runtime-checkable Protocol class")
+            raise TypeError(f"{each!r} is not a runtime-checkable Protocol class")

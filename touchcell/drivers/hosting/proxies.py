@@ -104,7 +104,7 @@ class RemoteDevice(Device):
 
     def _close(self) -> None:
         # A host that has ended has disconnected; the chain kills one that hangs.
-        if self._link is not None and not self._link.end_words() and not self._link.hangs():
+        if self._link is not None and not self._link.describe_end() and not self._link.hangs():
             try:
                 self._link.call("disconnect", device=self.name)
             except DeviceError:
@@ -172,7 +172,7 @@ class RemoteArm(RemoteDevice):
             DeviceFault: the host has died or is silent; the arm is FAULTED.
             DeviceError: error raised by the driver in the host.
         """
-        record, note = self._look()
+        record, note = self._poll()
         if record["failed"]:
             raise decode_note(note, self.name)
         state = TcpState(record["T_base_tcp"].copy(), record["twist"].copy())
@@ -185,12 +185,12 @@ class RemoteArm(RemoteDevice):
 
     def at_rest(self) -> bool:
         """Return whether the host saw it at rest after the last command or stop."""
-        record, _ = self._look()
-        return bool(record["at_rest"]) and int(record["told_ns"]) > self._written_ns
+        record, _ = self._poll()
+        return bool(record["at_rest"]) and int(record["read_ns"]) > self._written_ns
 
     def rested_ns(self) -> int | None:
         """Time at which its host saw it at rest after the latest stop by the chain; None before."""
-        record, _ = self._look()
+        record, _ = self._poll()
         return int(record["rest_ns"]) or None
 
     def kinematics(self) -> DifferentialIk | None:
@@ -208,10 +208,12 @@ class RemoteArm(RemoteDevice):
             DeviceFault: the host has died or is silent; the arm is FAULTED.
         """
         link = self._check_host()
-        # The gate would say the same, but the block has no room for anything else.
+        # Same check as in the gate, because the block has no room for anything else.
         command = checked_twist_command(self.name, command)
         if abs(command.t_ns) >= 2**62:
-            raise CommandRejected(self.name, Rejection.EXPIRED, "its time stamp is no time", value=command.t_ns)
+            raise CommandRejected(
+                self.name, Rejection.EXPIRED, "its timestamp is not an integer in nanoseconds", value=command.t_ns
+            )
         value = self._commands.value
         value["number"] = self._next()
         value["lease"] = lease.epoch if self._lease is not None and lease is self._lease else 0
@@ -262,17 +264,18 @@ class RemoteArm(RemoteDevice):
                 raise TransportTimeout(self.name, "reply of its host", seconds)
             link.await_answer(left_s)
 
-    def _look(self) -> tuple[Any, bytes]:
+    def _poll(self) -> tuple[Any, bytes]:
         self._check_host()
         _, record, note = self._arm.read_all()
         if self._state is Lifecycle.DISCONNECTED:
             raise LifecycleError(self.name, "read its pose", self._state.value, ["passive"])
         # A stop that removes power ends in READY, and a driver may fault on its own.
         found = LIFECYCLES[int(record["lifecycle"])]
-        if found is Lifecycle.FAULTED and self._state is not Lifecycle.FAULTED and note:
-            self._fault_error = _device_error(note, self.name)
-        if found in (Lifecycle.READY, Lifecycle.FAULTED) and self._state is Lifecycle.ACTIVE:
-            self._state = found
+        with self._state_lock:
+            if found is Lifecycle.FAULTED and self._state is not Lifecycle.FAULTED and note:
+                self._fault_error = _device_error(note, self.name)
+            if found in (Lifecycle.READY, Lifecycle.FAULTED):
+                self._change_state(Lifecycle.ACTIVE, found)
         return record, note
 
     def _open(self) -> None:
@@ -300,7 +303,7 @@ class RemoteJointArm(RemoteArm):
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
         """Return the newest joint state published by the host. Raises as ``tcp``."""
-        record, note = self._look()
+        record, note = self._poll()
         if record["failed"]:
             raise decode_note(note, self.name)
         count = int(record["joint_count"])
@@ -313,10 +316,12 @@ class RemoteJointArm(RemoteArm):
         return sample
 
     def _configure(self) -> None:
-        told = self._call("configure").get("kinematics")
-        if told is not None:
-            chain = SerialChain(ChainDescription.model_validate(told["chain"]), Tool.model_validate(told["tool"]))
-            self._ik = DifferentialIk(chain, IkSettings(**told["settings"]))
+        reported = self._call("configure").get("kinematics")
+        if reported is not None:
+            chain = SerialChain(
+                ChainDescription.model_validate(reported["chain"]), Tool.model_validate(reported["tool"])
+            )
+            self._ik = DifferentialIk(chain, IkSettings(**reported["settings"]))
 
 
 class RemoteCamera(RemoteDevice):

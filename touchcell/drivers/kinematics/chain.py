@@ -90,7 +90,14 @@ class Joint(Placement):
 
 
 class Tool(Placement):
-    """Tool on the flange: pose of the tool centre point, and mass and centre of mass in the flange frame."""
+    """Tool on the flange: pose of the tool centre point, and mass and centre of mass in the flange frame.
+
+    Attributes:
+        origin_mm: position of the tool centre point in the flange frame.
+        rotation_deg: its orientation there, extrinsic xyz.
+        mass_kg: mass of the tool.
+        com_mm: centre of mass in the flange frame.
+    """
 
     mass_kg: NotNegative = 0.0
     com_mm: Vector3 = (0.0, 0.0, 0.0)
@@ -320,7 +327,7 @@ class LocalIk:
         chain, settings = self._chain, self._settings
         lowest, highest = self._bounds
         dq = self._inverse @ (self._weights * twist)
-        if settings.goes_round and len(dq) > 6:
+        if settings.uses_null_space and len(dq) > 6:
             dq = self._saturated(dq, self._weights * twist, lowest, highest)
         scale, adjustments = within_bounds(dq, lowest, highest, chain.joint_names)
         # Rounding must not exceed a limit either.

@@ -58,7 +58,18 @@ _REST_SPEED_RAD_S = 1e-3
 
 
 class SimJointArmConfig(DriverConfig):
-    """Model, base pose, start pose, tool and limits of the arm."""
+    """Model, base pose, start pose, tool and limits of the arm.
+
+    Attributes:
+        model: which arm.
+        start_pose_mm_deg: initial pose of the tool centre point in the base frame.
+        base_pose_mm_deg: pose of the base in the world frame.
+        tool: tool on the flange, by name or by its pose and mass.
+        limits: limits of the tool centre point.
+        joint_limits: how joints are kept within their ranges.
+        max_ttl_s: longest time-to-live of a command that is accepted.
+        physics_step_ms: step of the dynamics.
+    """
 
     model: Literal["panda", "ur5e"]
     start_pose_mm_deg: tuple[float, float, float, float, float, float]
@@ -105,7 +116,7 @@ class SimJointArm(JointArm):
         self._chain = SerialChain(description, tool)
         self._ik = DifferentialIk(self._chain, config.joint_limits.settings())
         self._setpoint = JointSetpoint(self._chain, self._ik, self.limits)
-        self._trouble = None
+        self._latched_fault = None
         self.T_world_base = se3.from_euler_mm_deg(config.base_pose_mm_deg)
         self._timeline = timeline or Timeline(clock)
         step_s = self._timeline.step_ns * 1e-9
@@ -154,10 +165,10 @@ class SimJointArm(JointArm):
         """Return the present pose (4, 4), in any lifecycle state, without advancing time: for scenes."""
         return self.T_world_base @ self._body.T_base_tcp()
 
-    def bear(self, force_world: Array, point_world: Array) -> None:
+    def apply_force(self, force_world: Array, point_world: Array) -> None:
         """Apply ``force_world`` (3,) N at ``point_world`` (3,) m on the tool from now on: for scenes."""
         R, origin = self.T_world_base[:3, :3], self.T_world_base[:3, 3]
-        self._body.bear(force_world @ R, (point_world - origin) @ R)
+        self._body.apply_force(force_world @ R, (point_world - origin) @ R)
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
         self._timeline.advance()

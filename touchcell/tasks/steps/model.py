@@ -1,4 +1,4 @@
-"""The steps that a task can be written in, as validated data.
+"""The steps of a task as validated data.
 
 In a cell file each step is a mapping with one key, its kind:
 ``- move: {by_mm_deg: [0, 0, 30], until: {contact: true}}``.
@@ -14,11 +14,14 @@ from pydantic import (
     BeforeValidator,
     Discriminator,
     Field,
+    GetJsonSchemaHandler,
     NonNegativeFloat,
     PositiveFloat,
     PositiveInt,
     model_validator,
 )
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 from touchcell.errors import suggest
 from touchcell.tasks.contact_servo import ContactServoConfig, Six, SixGains
@@ -52,8 +55,8 @@ class Until(TaskConfig):
         return self
 
     @property
-    def feels(self) -> bool:
-        """Whether a condition needs the tactile sensor."""
+    def needs_touch(self) -> bool:
+        """True if a condition needs the tactile sensor."""
         return self.contact is not None or self.depth_mm is not None
 
 
@@ -139,15 +142,15 @@ class Servo(_Step):
 
     @property
     def reference(self) -> Six:
-        """The contact to hold, mm and degrees."""
+        """Contact to hold, mm and degrees."""
         return self.reference_mm_deg or (0.0, 0.0, self.depth_mm or 0.0, 0.0, 0.0, 0.0)
 
 
 class Hold(_Step):
-    """Stand still.
+    """Hold the position.
 
     Attributes:
-        time_s: for how long.
+        time_s: duration.
     """
 
     kind: Literal["hold"] = "hold"
@@ -170,7 +173,7 @@ class Retract(_Step):
 
 
 class Record(_Step):
-    """Write tool pose and contact of this moment into the recording, as telemetry ``LABEL_x_mm`` and so on.
+    """Write the current tool pose and contact into the recording, as telemetry ``LABEL_x_mm`` and so on.
 
     Attributes:
         label: prefix of the numbers.
@@ -215,8 +218,24 @@ def _numbers(value: Any) -> bool:
     return isinstance(value, list) and all(isinstance(each, int | float) for each in value)
 
 
+class _OneKey:
+    """Describes a step to editors as ``_by_kind`` reads it: a mapping with one key."""
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        steps = dict(zip(KINDS, handler(schema)["oneOf"], strict=True))
+        return {
+            "type": "object",
+            "properties": steps,
+            "minProperties": 1,
+            "maxProperties": 1,
+            "additionalProperties": False,
+        }
+
+
 Step = Annotated[
-    Annotated[Move | Servo | Hold | Retract | Record | Repeat, Discriminator("kind")], BeforeValidator(_by_kind)
+    Annotated[Move | Servo | Hold | Retract | Record | Repeat, Discriminator("kind")],
+    BeforeValidator(_by_kind),
+    _OneKey(),
 ]
 Repeat.model_rebuild()
 
