@@ -171,7 +171,7 @@ class CellUnderTest:
             self.step()
 
     def run_until(self, state: str, limit_s: float = _LIMIT_S) -> None:
-        """Run until the task is in ``state``. Fails the test if the run ends or ``limit_s`` of cell time passes first."""
+        """Run until the task is in ``state``; fail the test if the run ends or ``limit_s`` of cell time passes."""
         end_s = self.t_s + limit_s
         while self.state != state:
             if not self._going or self.waits_for_reset:
