@@ -17,6 +17,7 @@ BENCHMARKS = {
     "faults": "tests.fault_injection.faults",
     "filter": "benchmarks.filter",
     "fuzz-cells": "tests.fault_injection.fuzz_cells",
+    "fuzz-recordings": "tests.fault_injection.fuzz_recordings",
     "gdn-vs-cnn": "benchmarks.gdn_vs_cnn",
     "kinematics": "benchmarks.kinematics",
     "safety": "tests.fault_injection.safety",

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from touchcell.cell.runtime.loop import Box
 
 
@@ -19,7 +16,7 @@ class SentCommands:
         self._box = box
         self._last_ns: int | None = None
 
-    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
+    def add(self, topic: str, t_ns: int, data: bytes) -> None:
         """Take in one message."""
         if topic.endswith("/command"):
             self._last_ns = t_ns

@@ -181,6 +181,7 @@ class SafetyWalk(RuleBasedStateMachine):
             for arm in self.arms.values():
                 arm.faults = replace(arm.faults, deaf=False, runs_on=False, drift_m_s=0.0)
             self.cell.__exit__(None, None, None)
+            self.box.close()
         self.folder.cleanup()
 
 

@@ -12,7 +12,7 @@ import yaml
 
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_TRIPPED
 from touchcell.cell.cli.main import main
-from touchcell.cell.recording.mcap import read
+from touchcell.cell.recording.mcap import encode, read
 from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.paths import CONFIGS
 from touchcell.simulation.devices.arm import SimArm
@@ -34,11 +34,11 @@ def run_into_the_wall(folder: Path, **arm: Any) -> Path:
 
 
 def test_the_ring_keeps_ten_seconds() -> None:
-    box = BlackBox()
-    for k in range(3000):
-        box.add("/task", k * 10_000_000, {"k": k})
-    # Both ends included.
-    assert len(box) == 1001
+    with BlackBox() as box:
+        for k in range(3000):
+            box.add("/task", k * 10_000_000, encode({"k": k}))
+        # Both ends included.
+        assert [message.data["k"] for message in box.messages()] == list(range(1999, 3000))
 
 
 def test_a_trip_is_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -87,9 +87,9 @@ def test_the_stop_category_of_the_cell_file_is_used(tmp_path: Path) -> None:
     assert json.loads((folder / "blackbox.json").read_text())["stops"]["arm"]["category"] == 1
 
 
-def test_a_run_without_a_black_box(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_without_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["why", str(tmp_path)]) == EXIT_BAD_INPUT
-    assert "holds no black box" in capsys.readouterr().err
+    assert "holds nothing of a run" in capsys.readouterr().err
 
 
 def test_an_arm_that_obeys_nothing_still_leaves_a_black_box(

@@ -26,6 +26,7 @@ _TITLES = dict(
 _PANELS = ("z_mm", "alpha_deg", "beta_deg", "x_mm", "y_mm", "gamma_deg")
 # A TacTip's (SPEC part 2): ticks of this length from the tip's centre trace the surface that it is pressed on.
 _TIP_RADIUS_MM = 20.0
+_LEAST_SPAN_MM = 1.0
 _STATE_COLOURS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52", "#8172b3", "#937860", "#da8bc3", "#8c8c8c")
 
 
@@ -54,7 +55,7 @@ def plot_contact(run: Run, sensor: str, path: Path, *, last_s: float | None = No
     axes.flat[0].legend(loc="best", fontsize=9)
     for axis in axes[-1]:
         axis.set_xlabel("time (s)")
-        if last_s is not None:
+        if last_s is not None and len(contact.t_s):
             axis.set_xlim(contact.t_s[-1] - last_s, contact.t_s[-1])
     figure.suptitle(f"{sensor}: contact pose and shear of the sensor in the surface frame")
     figure.savefig(path, dpi=100)
@@ -77,7 +78,9 @@ def plot_agreement(run: Run, sensor: str, path: Path) -> Path:
         index = np.clip(np.searchsorted(truth.t_s, series.t_s + 1e-6, side="right") - 1, 0, len(truth.t_s) - 1)
         for axis, name in zip(axes.flat, _PANELS, strict=True):
             true, value = truth.column(name)[index], series.column(name)
-            error = np.nanmean(np.abs(value - true))
+            errors = np.abs(value - true)
+            errors = errors[np.isfinite(errors)]
+            error = float(np.mean(errors)) if len(errors) else float("nan")
             axis.plot(true, value, ".", ms=size, alpha=0.35, color=colour, mew=0, label=f"{label}: {error:.3f}")
     for axis, name in zip(axes.flat, _PANELS, strict=True):
         low, high = axis.get_xlim()
@@ -118,6 +121,12 @@ def plot_trajectory(run: Run, path: Path, mounts: Mapping[str, tuple[Array, Arra
             _draw_axes(axis, T, points, (i, j))
             axis.set_xlabel("xyz"[i] + " (mm)")
             axis.set_ylabel("xyz"[j] + " (mm)")
+            # A path that stays in one point, or is along one axis, has no width of its own.
+            axis.margins(0.05)
+            for limits, set_limits in ((axis.get_xlim(), axis.set_xlim), (axis.get_ylim(), axis.set_ylim)):
+                if limits[1] - limits[0] < _LEAST_SPAN_MM:
+                    middle = 0.5 * (limits[0] + limits[1])
+                    set_limits(middle - 0.5 * _LEAST_SPAN_MM, middle + 0.5 * _LEAST_SPAN_MM)
             axis.set_aspect("equal", adjustable="datalim")
             axis.grid(alpha=0.3)
     axes[0].set_title("from the side; ticks show the sensor's axis as far as its tip")

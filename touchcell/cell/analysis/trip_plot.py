@@ -15,8 +15,8 @@ from touchcell.cell.analysis.run_data import Run
 _BEFORE_S, _AFTER_S = 1.0, 0.5
 
 
-def plot_trip(run: Run, trip_s: float, cause: dict[str, Any] | None, path: Path) -> Path:
-    """Speed sent and measured, depth, and the age of the frames, from a second before the trip until after the stop."""
+def plot_trip(run: Run, trip_s: float, cause: dict[str, Any] | None, path: Path, moment: str = "trip") -> Path:
+    """Speed sent and measured, depth, and the age of frames, from a second before the moment until after the stop."""
     figure, axes = plt.subplots(3, 1, figsize=(11, 8), sharex=True, layout="constrained")
     speed, depth, age = axes
     axes[-1].set_xlim(-_BEFORE_S, _AFTER_S)
@@ -50,7 +50,7 @@ def plot_trip(run: Run, trip_s: float, cause: dict[str, Any] | None, path: Path)
         axis.grid(alpha=0.3)
         if axis.get_legend_handles_labels()[0]:
             axis.legend(fontsize=9, loc="upper left")
-    axes[-1].set_xlabel("time from the trip (s)")
+    axes[-1].set_xlabel(f"time from the {moment} (s)")
     if cause is not None:
         figure.suptitle(f"{cause['interlock']}: {cause['subject']}: {cause['reason']}")
     figure.savefig(path, dpi=110)

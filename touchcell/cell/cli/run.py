@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import shutil
@@ -17,12 +18,13 @@ from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPE
 from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import RECORDING, Recorder
-from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, stop_record
+from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, note_crashes, stop_record
 from touchcell.cell.runtime.compose import Cell, compose
 from touchcell.cell.runtime.heap import trim_heap
 from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
 from touchcell.cell.runtime.operator_channel import OperatorChannel
-from touchcell.cell.runtime.operator_input import reachable, stop_on_keys, stop_on_signals
+from touchcell.cell.runtime.operator_input import stop_on_keys, stop_on_signals
+from touchcell.cell.runtime.run_directory import RunFolderError, run_directory
 from touchcell.drivers.core.clock import VirtualClock
 
 _EXIT = {
@@ -49,37 +51,52 @@ def run_cell(
         path: the cell file.
         data: for drivers that replay a data set.
         model: estimator model in place of the file's own.
-        out: run folder.
+        out: run folder, made for this run or empty.
         live: show a progress line.
         moving: also make the animation of a simulated run.
 
     Raises:
-        ConfigError, ModelError, ConnectError: before anything moves.
+        ConfigError, ModelError, RunFolderError, ConnectError: before anything moves.
     """
     plan = plan_cell(path, {} if data is None else {"data": data}, model=model)
     cell = compose(plan)
     trim_heap()
-    folder = out or Path("runs") / f"{plan.cell.name}-{time.strftime('%Y%m%d-%H%M%S')}"
-    folder.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(path, folder / "cell.yaml")
-    result = _run(cell, folder, live)
-    (folder / "result.json").write_text(json.dumps(_result_json(plan, result), indent=1) + "\n")
-    print(write_report(folder))
-    if moving:
-        from touchcell.cell.experiments.animation import animate
-
-        print(f"  {animate(folder).name}")
-    if result.outcome in (Outcome.TRIPPED, Outcome.ERROR):
+    with run_directory(plan.cell.name, out) as folder:
+        try:
+            shutil.copyfile(path, folder / "cell.yaml")
+        except OSError as error:
+            raise RunFolderError(folder, f"cannot be written: {error.strerror}") from None
+        result = _run(cell, folder, live)
+        try:
+            (folder / "result.json").write_text(json.dumps(_result_json(plan, result), indent=1) + "\n")
+        except OSError as error:
+            print(f"touchcell: no result.json: {error.strerror}", file=sys.stderr)
+    _report(folder, moving=moving)
+    if result.outcome not in (Outcome.DONE, Outcome.STOPPED):
         print(f"`touchcell why {folder}` explains")
     return _EXIT[result.outcome]
 
 
+def _report(folder: Path, *, moving: bool) -> None:
+    """Write and print the report; a disk without room for it keeps the recording, which the report is made from."""
+    try:
+        print(write_report(folder))
+        if moving:
+            from touchcell.cell.experiments.animation import animate
+
+            print(f"  {animate(folder).name}")
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+            raise
+        print(f"touchcell: no report: {error.strerror}; `touchcell report {folder}` makes it later", file=sys.stderr)
+
+
 def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
     stop, desk = StopRequest(), OperatorChannel(folder)
-    box = BlackBox()
     with (
-        reachable(folder),
-        Recorder(folder / RECORDING) as recorder,
+        note_crashes(folder),
+        BlackBox(folder, _about(cell, folder)) as box,
+        _recording(folder) as recorder,
         cell,
         stop_on_signals(stop),
         stop_on_keys(stop, desk=desk) as look_at_keys,
@@ -99,6 +116,7 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
 
         def tripped(so_far: RunResult) -> None:
             keep_earlier(folder)
+            recorder.sync()
             _dump(box, folder, cell, so_far)
             print(f"tripped: {so_far.reason}\n`touchcell why {folder}` explains; `touchcell reset {folder}` or r, when")
             print("it is safe, then `touchcell resume` or g; `touchcell stop` or q ends the run")
@@ -106,23 +124,46 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
         loop = RunLoop(cell, recorder, box=box, stop=stop, on_cycle=after_cycle, desk=desk, on_trip=tripped)
         result = loop.run()
         # Before the devices are given back, which an arm that obeys nothing may not survive.
-        if result.outcome in (Outcome.TRIPPED, Outcome.ERROR) and not loop.has_waited:
-            _dump(box, folder, cell, result)
+        dumped = result.outcome is Outcome.DONE or loop.has_waited or _dump(box, folder, cell, result)
+        if result.outcome is Outcome.TRIPPED:
+            with contextlib.suppress(RecordingError):
+                recorder.sync()
+    if dumped:
+        box.discard()
     return result
 
 
-def _dump(box: BlackBox, folder: Path, cell: Cell, result: RunResult) -> None:
-    about = {
+@contextlib.contextmanager
+def _recording(folder: Path) -> Iterator[Recorder]:
+    """The run's recording; one that cannot be finished changes nothing about how the run ended."""
+    recorder = Recorder(folder / RECORDING)
+    try:
+        yield recorder
+    finally:
+        try:
+            recorder.close()
+        except RecordingError as error:
+            print(f"touchcell: {error}", file=sys.stderr)
+
+
+def _about(cell: Cell, folder: Path) -> dict[str, Any]:
+    content = (folder / "cell.yaml").read_bytes()
+    return {
         "cell": cell.plan.cell.name,
         "cell_file": "cell.yaml",
-        "cell_sha256": hashlib.sha256((folder / "cell.yaml").read_bytes()).hexdigest(),
-        "start_ns": cell.start_ns,
+        "cell_sha256": hashlib.sha256(content).hexdigest(),
+        "start_ns": cell.clock.now_ns(),
     }
+
+
+def _dump(box: BlackBox, folder: Path, cell: Cell, result: RunResult) -> bool:
+    """Write the black box; returns whether that succeeded. Its ring has everything where it did not."""
     try:
-        box.dump(folder, result, about)
+        box.dump(folder, result, cell.start_ns)
     except RecordingError as error:
-        # What happened is told all the same.
-        print(f"touchcell: no black box: {error}", file=sys.stderr)
+        print(f"touchcell: {error}", file=sys.stderr)
+        return False
+    return True
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ from typing import Any, Protocol, cast
 
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.dataset_writer import Collection
-from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.recording.mcap import Recorder, encode
 from touchcell.cell.recording.messages import (
     command_message,
     contact_message,
@@ -115,8 +115,8 @@ class StopRequest:
 class Box(Protocol):
     """Something that keeps messages and never fails; see ``touchcell.cell.runtime.black_box``."""
 
-    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
-        """Keep one message."""
+    def add(self, topic: str, t_ns: int, data: bytes) -> None:
+        """Keep one message, encoded as for the recording."""
         ...
 
 
@@ -531,12 +531,17 @@ class RunLoop:
             self._transitions_written += 1
 
     def _write(self, topic: str, t_ns: int, message: Mapping[str, Any], *, boxed: bool = True) -> None:
+        boxed = boxed and self._box is not None
+        recorded = self._recorder is not None and not self._recorder.failed
+        if not boxed and not recorded:
+            return
+        data = encode(message)
         if boxed and self._box is not None:
-            self._box.add(topic, t_ns, message)
-        if self._recorder is None or self._recorder.failed:
+            self._box.add(topic, t_ns, data)
+        if self._recorder is None or not recorded:
             return
         try:
-            self._recorder.write(topic, t_ns, message)
+            self._recorder.write_encoded(topic, t_ns, data)
         except RecordingError as error:
             # Nothing keeps the arms from being watched until they stand.
             if not self._ending:
