@@ -29,10 +29,12 @@ check: .venv/dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# Metadata that a build leaves in the tree would shadow the entry points of what is installed: gone before and after.
 .venv/core: $(SOURCES)
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	rm -rf *.egg-info
 	$(BIN)/python -m pip install --quiet --editable .
+	rm -rf *.egg-info
 	touch $@
 
 .venv/dev: .venv/core
@@ -40,6 +42,7 @@ check: .venv/dev
 	$(BIN)/python -m pip install --quiet --editable ".[train,dev]"
 	$(BIN)/python -m pip install --quiet --editable ".[ur,franka,peers]" \
 		|| echo "the vendors' clients cannot be installed here: tests that need them are skipped"
+	rm -rf *.egg-info
 	touch $@
 
 clean:

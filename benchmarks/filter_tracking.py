@@ -17,8 +17,9 @@ from touchcell.cell.analysis.run_data import load_run
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import FilterSection, plan_cell
 from touchcell.cell.recording.mcap import Recorder
-from touchcell.cell.runtime.compose import build_filter, compose
+from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.sensor import build_filter
 from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.types import Array

@@ -14,7 +14,7 @@ import numpy as np
 from touchcell.testing.conformance.suite import suite
 from touchcell.simulation.devices.rig import sim_arm_rig
 from touchcell.simulation.devices.arm import SimArm
-from touchcell.testing.emulation.rig import Rig
+from touchcell.testing.emulation.rig import DeviceFixture
 
 {change}
 

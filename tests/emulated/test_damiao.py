@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.clock import MonotonicClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
@@ -30,6 +29,7 @@ from touchcell.drivers.core.errors import (
     TransportTimeout,
 )
 from touchcell.drivers.core.lease import Lease
+from touchcell.drivers.core.spec import DRIVERS
 from touchcell.drivers.damiao.driver import DamiaoCanArm
 from touchcell.drivers.damiao.rig import config, rig
 from touchcell.errors import ConfigError
@@ -99,7 +99,7 @@ def faulted(arm: DamiaoCanArm) -> bool:
 
 
 def test_it_is_registered_and_says_that_it_falls() -> None:
-    spec = registry.spec("damiao_can")
+    spec = DRIVERS.load("damiao_can")
     assert spec.capabilities.falls_on_power_loss
     assert not spec.capabilities.has_brakes
     assert not spec.capabilities.hardware_validated
@@ -492,7 +492,7 @@ def test_configurations_that_cannot_be_right_are_refused(tmp_path: Path, changes
 
 def test_gains_that_would_push_too_hard_are_refused(channel: Path, emulator: EmulatorProcess) -> None:
     arm = DamiaoCanArm("arm", config(channel, tracking_error_deg=40.0), CLOCK)
-    with arm, pytest.raises(ConfigError, match="pushes with"):
+    with arm, pytest.raises(ConfigError, match="N m before tracking_error_deg trips"):
         arm.configure()
 
 

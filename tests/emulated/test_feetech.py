@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.clock import MonotonicClock
 from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
@@ -32,6 +31,7 @@ from touchcell.drivers.core.errors import (
 )
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.samples import Quality
+from touchcell.drivers.core.spec import DRIVERS
 from touchcell.drivers.feetech.driver import FeetechSerialArm
 from touchcell.drivers.feetech.rig import DIRECTION, PARK_DEG, ZERO_TICKS, config, emulator, rig
 from touchcell.errors import ConfigError
@@ -102,7 +102,7 @@ def faulted(arm: FeetechSerialArm) -> bool:
 
 
 def test_it_is_registered_and_says_what_it_cannot() -> None:
-    capabilities = registry.spec("feetech_serial").capabilities
+    capabilities = DRIVERS.load("feetech_serial").capabilities
     assert capabilities.falls_on_power_loss
     assert not capabilities.has_brakes
     assert capabilities.max_watchdog_s is None
@@ -461,7 +461,7 @@ def test_nothing_there_and_nobody_answering_are_told_apart(port: Path, servos: E
 
 def test_one_line_has_one_owner(arm: FeetechSerialArm, port: Path) -> None:
     arm.connect()
-    with pytest.raises(ConnectError, match="nobody else"):
+    with pytest.raises(ConnectError, match="in use elsewhere"):
         FeetechSerialArm("other", config(port), CLOCK).connect()
     assert arm.joints(0.5).seq > 0
 

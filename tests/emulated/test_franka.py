@@ -16,7 +16,6 @@ import pytest
 
 from tests.helpers.franka_bench import OPERATOR, Bench, eventually
 from touchcell.drivers.core import protocols as abilities
-from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.clock import MonotonicClock
 from touchcell.drivers.core.commands import TwistFrame
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle
@@ -32,6 +31,7 @@ from touchcell.drivers.core.errors import (
     StaleData,
     TransportError,
 )
+from touchcell.drivers.core.spec import DRIVERS, DriverContext
 from touchcell.drivers.franka.driver import CAPABILITIES, FrankaConfig
 from touchcell.drivers.franka.errors import ERRORS
 from touchcell.geometry import se3
@@ -89,13 +89,13 @@ def faulted(bench: Bench) -> DeviceFault:
 def test_its_spec_needs_no_sdk() -> None:
     code = "import sys, touchcell.drivers.core.spec as r; r.spec('franka'); assert 'franky' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
-    assert registry.spec("franka").extra == "franka"
+    assert DRIVERS.load("franka").extra == "franka"
 
 
 def test_a_missing_sdk_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "franky", None)
-    arm = registry.spec("franka").build(
-        "arm", FrankaConfig(host="127.0.0.1", enforce_realtime=False), registry.DriverContext(MonotonicClock())
+    arm = DRIVERS.load("franka").build(
+        "arm", FrankaConfig(host="127.0.0.1", enforce_realtime=False), DriverContext(MonotonicClock())
     )
     with pytest.raises(ConnectError, match=r"touchcell\[franka\]"):
         arm.connect()
@@ -405,7 +405,7 @@ def test_the_contact_backstop_stops_the_arm_and_stays(bench: Bench) -> None:
     assert truth["reflexes"] == 0
     assert truth["position_m"][0] - before[0] < 0.005
     np.testing.assert_allclose(bench.arm.wrench(1.0).value, [12, 0, 17, 0, 0, 0], atol=1e-5)
-    with pytest.raises(DeviceFault, match="still pushed"):
+    with pytest.raises(DeviceFault, match="still in contact"):
         bench.arm.recover(OPERATOR)
     bench.emulator.clear("external_wrench")
     eventually(lambda: bench.arm.health()["external_force_n"] == 0.0)

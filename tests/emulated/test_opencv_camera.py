@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from touchcell.drivers.core.spec import spec
+from touchcell.drivers.core.spec import DRIVERS
 from touchcell.drivers.v4l2.shim import environment
 from touchcell.testing.emulation.process import EmulatorProcess
 
@@ -114,7 +114,7 @@ def run(folder: Path, emulator: EmulatorProcess) -> Iterator[Callable[[str], Pro
 
 
 def test_the_driver_is_found_by_name() -> None:
-    assert spec("opencv_camera").capabilities.kind == "camera"
+    assert DRIVERS.load("opencv_camera").capabilities.kind == "camera"
 
 
 def test_connecting_changes_no_control(run: Callable[[str], Program], emulator: EmulatorProcess) -> None:

@@ -23,10 +23,11 @@ from touchcell.cell.analysis.trip_report import explain
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
-from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import Outcome, RunLoop, StopRequest
 from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest
-from touchcell.cell.runtime.process_watchdog import ProcessWatch, hosted_groups
+from touchcell.cell.runtime.process_watchdog import ProcessWatchdog, hosted_groups
 from touchcell.cell.runtime.watchdog import NOTES
 from touchcell.control.latch import LatchState
 from touchcell.drivers.core.clock import MonotonicClock
@@ -90,8 +91,8 @@ def twist(
 def test_a_remote_arm_is_as_an_arm_is(tmp_path: Path) -> None:
     local = compose(two_arm_plan(tmp_path, RATE_HZ, processes="one")).arms["left"]
     with compose(two_arm_plan(tmp_path, RATE_HZ, categories={"right": 1})) as cell:
-        watch = cell.watch
-        assert isinstance(watch, ProcessWatch)
+        watch = cell.watchdog
+        assert isinstance(watch, ProcessWatchdog)
         assert [proof.link for proof in watch.proofs] == ["the task's heartbeat", "the watchdog"]
         for proof in watch.proofs:
             # The watchdog's last beat may have come a quarter of a period before it was stopped.
@@ -245,8 +246,8 @@ class ResetProcedure:
     """A run with two swaying arms that waits for its operator after a trip; the operator is the test."""
 
     def __init__(self, cell: Cell) -> None:
-        watch = cell.watch
-        assert isinstance(watch, ProcessWatch)
+        watch = cell.watchdog
+        assert isinstance(watch, ProcessWatchdog)
         self.cell, self.chain, self.desk, self.stop = cell, watch.chain, OperatorChannel(), StopRequest()
         self.loop = RunLoop(cell, None, stop=self.stop, desk=self.desk)
         self.loop.begin()
@@ -294,7 +295,7 @@ def test_a_stop_by_the_chain_is_reset_when_its_cause_has_gone_and_the_run_goes_o
             assert run.loop.step()
         np.testing.assert_array_equal(run.positions(), stood)
         lease = cell.arms["left"].acquire("somebody")
-        with pytest.raises(CommandRejected, match="no watchdog guards it"):
+        with pytest.raises(CommandRejected, match="not guarded by a watchdog"):
             cell.arms["left"].send_twist(twist(cell), lease)
         cell.arms["left"].release(lease)
         assert "starts again" in run.ask(OperatorRequest.RESUME)
@@ -328,8 +329,8 @@ def test_a_reset_is_refused_for_good_when_a_host_has_died(tmp_path: Path) -> Non
 def test_a_dead_host_is_a_fault_of_its_devices(tmp_path: Path) -> None:
     cell = compose(two_arm_plan(tmp_path, RATE_HZ))
     with cell:
-        watch = cell.watch
-        assert isinstance(watch, ProcessWatch)
+        watch = cell.watchdog
+        assert isinstance(watch, ProcessWatchdog)
         host = watch.chain.hosts[0]
         host.process.kill()
         host.process.wait()
@@ -343,8 +344,8 @@ def test_a_dead_host_is_a_fault_of_its_devices(tmp_path: Path) -> None:
 def test_a_host_that_hangs_delays_nobody_for_long(tmp_path: Path) -> None:
     started_s = time.monotonic()
     with compose(two_arm_plan(tmp_path, RATE_HZ)) as cell:
-        watch = cell.watch
-        assert isinstance(watch, ProcessWatch)
+        watch = cell.watchdog
+        assert isinstance(watch, ProcessWatchdog)
         os.kill(watch.chain.hosts[0].pid, signal.SIGSTOP)
         while not watch.chain.hosts[0].hangs():
             time.sleep(0.05)
@@ -427,9 +428,9 @@ def test_a_cell_in_one_process_starts_none(tmp_path: Path) -> None:
 
 def test_why_tells_what_the_watchdog_saw_of_a_run_whose_process_died(tmp_path: Path) -> None:
     stop = {"speed_m_s": 0.03, "time_s": 0.058, "distance_m": 0.001, "escalated": False}
-    note = {"words": "the task's process has gone", "value_s": 0.0, "limit_s": 0.0, "arms": {"left": stop}}
+    note = {"words": "the task's process has ended", "value_s": 0.0, "limit_s": 0.0, "arms": {"left": stop}}
     (tmp_path / NOTES).write_text(json.dumps(note))
     assert explain(tmp_path).splitlines()[1:] == [
-        "  the task's process has gone",
+        "  the task's process has ended",
         "  left: told to stop at 30.0 mm/s; at rest after 0.058 s and 1.00 mm",
     ]

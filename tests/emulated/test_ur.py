@@ -138,7 +138,7 @@ def test_an_arm_of_another_model_than_its_chain_is_not_activated(emulator: Emula
     other.connect()
     try:
         other.configure()
-        with pytest.raises(DeviceFault, match="from where the chain puts it") as caught:
+        with pytest.raises(DeviceFault, match="from the one its chain gives") as caught:
             other.activate()
         assert caught.value.fault_class is FaultClass.CONFIGURATION
     finally:

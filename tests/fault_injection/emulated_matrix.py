@@ -21,7 +21,8 @@ import yaml
 from tests.fault_injection.emulated_cells import HURT, arm_cell, camera_cell, sensor_of, sensors_of
 from tests.fault_injection.sent_commands import SentCommands
 from touchcell.cell.config.schema import CellPlan, plan_cell
-from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import Outcome, RunLoop, RunResult, StopRequest
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.clock import MonotonicClock
@@ -30,11 +31,10 @@ from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.spec import DriverContext
 from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
-from touchcell.tasks import registry as tasks_registry
-from touchcell.tasks.interface import TaskContext
+from touchcell.tasks.interface import TASKS, TaskContext
 from touchcell.tasks.servoing import ServoTask
 from touchcell.tasks.state_machine_task import MachineTask
-from touchcell.testing.emulation.rig import DeviceFixture, Emulated, rig_of
+from touchcell.testing.emulation.rig import RIGS, DeviceFixture, Emulated
 
 ARMS: Final = ("ur", "franka", "damiao_can", "feetech_serial")
 CAMERAS: Final = ("v4l2",)
@@ -147,7 +147,7 @@ class EmulatedCase:
 
 def states_of(task: str) -> tuple[tuple[str, ...], bool]:
     """The states of a task by its own table, and whether it is one of those that share ``ServoTask``."""
-    spec = tasks_registry.spec(task)
+    spec = TASKS.load(task)
     required = {"target_mm": (0.0, 0.0)} if "target_mm" in spec.config.model_fields else {}
     poses = {sensor: np.eye(4) for sensor in sensors_of(task)}
     made = spec.build(spec.config.model_validate(required), TaskContext(_RATE_HZ, poses, 0))
@@ -158,7 +158,7 @@ def states_of(task: str) -> tuple[tuple[str, ...], bool]:
 def faults_of(driver: str, folder: Path) -> dict[str, tuple[Any, str]]:
     """Every fault of the driver's emulator with its value and the lawful answer, and what befalls its process."""
     ends = {HANG: (True, "fault"), VANISH: (True, "fault")}
-    return {**rig_of(driver, folder, 0).faults, **MORE_FAULTS[driver], **ends}
+    return {**RIGS.load(driver)(folder, 0).faults, **MORE_FAULTS[driver], **ends}
 
 
 SERVO: Final = (
@@ -236,7 +236,7 @@ class Bench:
             lawful = "unseen"
         case = EmulatedCase(place, lawful)
         self.address += 10
-        rig = rig_of(place.driver, self.folder, self.address)
+        rig = RIGS.load(place.driver)(self.folder, self.address)
         with ExitStack() as exits:
             try:
                 emulator = _started(rig, exits)
@@ -255,9 +255,11 @@ class Bench:
     def _camera_plan(self, place: Place, rig: DeviceFixture, exits: ExitStack) -> CellPlan:
         rigs = {}
         for number, sensor in enumerate(sensors_of(place.task), start=1):
-            rigs[sensor] = rig if sensor == place.role else rig_of(place.driver, self.folder, self.address + number)
-            if rigs[sensor] is not rig:
-                _started(rigs[sensor], exits)
+            if sensor == place.role:
+                rigs[sensor] = rig
+                continue
+            rigs[sensor] = RIGS.load(place.driver)(self.folder, self.address + number)
+            _started(rigs[sensor], exits)
         plan = self._planned(camera_cell(place.task, rigs, str(self._collected())))
         # No kernel module is needed: this process asks the emulator in place of the kernel.
         sensors = {

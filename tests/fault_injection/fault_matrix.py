@@ -17,7 +17,8 @@ import yaml
 from tests.fault_injection.sent_commands import SentCommands
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import CellPlan, plan_cell
-from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop, RunResult, StopRequest
 from touchcell.simulation.devices.arm import SimArm
 from touchcell.simulation.devices.tactip import SimTactip
@@ -28,7 +29,7 @@ _SETTLED_CYCLES = 3
 # By then the camera has shown enough for its brightness to be known.
 _NOT_BEFORE_S = 0.4
 # Some tasks withdraw only when they are asked to end.
-_AFTER_STOP = "retract"
+_AFTER_STOP = ("retract", "withdraw")
 _ASKED_AFTER_S = 0.8
 
 Inject = Callable[[Cell, StopRequest, str], None]
@@ -89,7 +90,12 @@ def _and_stop(inject: Inject) -> Inject:
     return both
 
 
-_STANDS = {"prepare": "nothing moves yet", "grab": "it stands while a frame is taken"}
+_STANDS = {
+    "prepare": "nothing moves yet",
+    "grab": "it stands while a frame is taken",
+    "keep": "the arm stands still",
+    "note": "the arm stands still",
+}
 _NO_BASELINE = {"prepare": "the first frames are the measure", "wait": "the first frames are the measure"}
 
 FAULTS: Final = (
@@ -151,6 +157,16 @@ class Case:
     problem: str = ""
 
 
+_STEPS: Final = (
+    {"move": {"name": "touch", "by_mm_deg": [0, 0, 20], "speed_mm_s": 8, "until": {"contact": True}}},
+    {"servo": {"name": "press", "depth_mm": 2, "until": {"time_s": 0.8}}},
+    {"hold": {"name": "keep", "time_s": 0.6}},
+    {"move": {"name": "aside", "frame": "base", "by_mm_deg": [3, 0, 0], "speed_mm_s": 6}},
+    {"retract": {"name": "lift", "distance_mm": 8, "speed_mm_s": 10}},
+)
+"""A step of each kind that lasts: ``record`` takes one cycle, in which nothing moves."""
+
+
 def cells() -> dict[str, dict[str, Any]]:
     """A short cell file for every task, by the task's name."""
     following, tracking = _shipped("surface_follow_sim.yaml"), _shipped("object_track_sim.yaml")
@@ -170,7 +186,11 @@ def cells() -> dict[str, dict[str, Any]]:
     collecting["interlocks"]["stale_frame"]["limit_ms"] = 150
     watching = ("frame_frozen", "exposure", "standstill")
     collecting["interlocks"] |= {n: e for n, e in following["interlocks"].items() if e["kind"] in watching}
-    tasks = (following, tracking, observing, single, dual, collecting)
+    stepping = _shipped("steps_sim.yaml")
+    stepping["scene"]["surfaces"]["plate"]["pose_mm_deg"] = [0, 0, 13, 0, 0, 0]
+    stepping["interlocks"] |= {n: e for n, e in following["interlocks"].items() if e["kind"] in watching}
+    stepping["task"] = {"name": "steps", "withdraw_mm": 10, "steps": list(_STEPS)}
+    tasks = (following, tracking, observing, single, dual, collecting, stepping)
     return {data["task"]["name"]: data for data in tasks}
 
 
@@ -237,7 +257,7 @@ def run_case(path: Path, fault: Fault, device: str, state: str) -> Case:
                     fault.inject(cell, stop, device)
             if injected_ns is not None and cell.clock.now_ns() > injected_ns + _WATCHED_S * 1e9:
                 break
-            if state == _AFTER_STOP and cell.clock.now_ns() > cell.start_ns + _ASKED_AFTER_S * 1e9 and not stop.count:
+            if state in _AFTER_STOP and cell.clock.now_ns() > cell.start_ns + _ASKED_AFTER_S * 1e9 and not stop.count:
                 stop.ask()
             going = loop.step()
         result = loop.end()

@@ -11,7 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from tests.fault_injection.two_arms import two_arm_plan
-from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.compose import compose
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 
 _CYCLES: Final = 500
@@ -39,16 +40,16 @@ def measure(folder: Path, processes: str, cycles: int = _CYCLES) -> ProcessCost:
     cycle_ns: list[int] = []
     with compose(two_arm_plan(folder, _GUARDED_HZ, processes=processes)) as cell:
         leases = {name: arm.acquire("bench") for name, arm in cell.arms.items()}
-        cell.watch.begin()
+        cell.watchdog.begin()
         start_ns = cell.clock.now_ns()
         for k in range(cycles):
-            cell.watch.beat()
+            cell.watchdog.beat()
             started_ns = time.monotonic_ns()
             for name, lease in leases.items():
                 one_way_ns.append(_drive(cell, name, lease))
             cycle_ns.append(time.monotonic_ns() - started_ns)
             cell.clock.sleep_until_ns(start_ns + round((k + 1) * 1e9 / _RATE_HZ))
-        cell.watch.end()
+        cell.watchdog.end()
         for name, lease in leases.items():
             cell.arms[name].release(lease)
     return ProcessCost(_quantiles_us(one_way_ns), _quantiles_us(cycle_ns))

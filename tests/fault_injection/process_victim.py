@@ -20,9 +20,10 @@ from typing import Any, Final
 from tests.fault_injection.two_arms import pushing_plan, two_arm_plan
 from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.black_box import BlackBox
-from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import Progress, RunLoop, StopRequest
-from touchcell.cell.runtime.process_watchdog import ProcessWatch
+from touchcell.cell.runtime.process_watchdog import ProcessWatchdog
 
 PLANS: Final = {"sway": two_arm_plan, "push": pushing_plan}
 _MOVING_STATES: Final = ("sway", "run")
@@ -31,8 +32,8 @@ _MOVING_S: Final = 0.5
 
 def _participants(cell: Cell) -> dict[str, Any]:
     """Processes and descriptors, by which somebody outside can hurt them and read the hosts' records."""
-    watch = cell.watch
-    assert isinstance(watch, ProcessWatch)
+    watch = cell.watchdog
+    assert isinstance(watch, ProcessWatchdog)
     return {
         "task": os.getpid(),
         "watchdog": watch.chain.watchdog.pid,
@@ -92,7 +93,7 @@ def main() -> None:
     box = BlackBox()
     wall_s = time.time() - time.monotonic()
     with Recorder(folder / "run.mcap") as recorder, compose(PLANS[what](folder, rate_hz)) as cell:
-        cell.watch.note_to(folder)
+        cell.watchdog.note_to(folder)
         print(json.dumps(_participants(cell)), flush=True)
         result = RunLoop(cell, recorder, box=box, stop=stop, on_cycle=_Announce()).run()
         causes = [[cause.interlock, cause.subject, cause.reason] for cause in result.causes]

@@ -25,7 +25,8 @@ from tests.fault_injection.sent_commands import SentCommands
 from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.black_box import BlackBox
-from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import Outcome, RunLoop, RunResult, StopRequest
 from touchcell.errors import TouchcellError
 from touchcell.paths import CONFIGS

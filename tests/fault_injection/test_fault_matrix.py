@@ -13,17 +13,24 @@ import yaml
 from tests.fault_injection.fault_matrix import FAULTS, Case, cells, matrix, run_case
 from touchcell.paths import MODELS
 from touchcell.simulation.faults import ArmFaults, FrameFaults
-from touchcell.tasks import registry
+from touchcell.tasks.interface import TASKS
 
 
 def test_every_fault_and_every_task_is_in_the_matrix() -> None:
     names = {fault.name for fault in FAULTS}
     assert {f"arm: {field.name}" for field in fields(ArmFaults)} <= names
     assert {f"camera: {field.name}" for field in fields(FrameFaults)} <= names
-    assert set(cells()) == set(registry.installed())
+    assert set(cells()) == set(TASKS.names())
 
 
-MOVING = ("surface_following", "object_tracking", "single_arm_pushing", "dual_arm_pushing", "data_collection")
+MOVING = (
+    "surface_following",
+    "object_tracking",
+    "single_arm_pushing",
+    "dual_arm_pushing",
+    "data_collection",
+    "steps",
+)
 
 
 def run_all(folder: Path, kind: Literal["arm", "camera"], task: str) -> list[Case]:
@@ -47,7 +54,7 @@ def test_faults_of_arms_in_every_state(task: str, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not (MODELS / "sim_gdn.safetensors").exists(), reason="needs the model that ships")
-@pytest.mark.parametrize("task", ["surface_following", "object_tracking", "observe", "data_collection"])
+@pytest.mark.parametrize("task", ["surface_following", "object_tracking", "observe", "data_collection", "steps"])
 def test_faults_of_cameras_in_every_state(task: str, tmp_path: Path) -> None:
     """Those of the pushing tasks take minutes; ``touchcell bench safety`` has them."""
     run_all(tmp_path, "camera", task)

@@ -14,8 +14,8 @@ import yaml
 
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import CellFile, CellPlan, DevicePlan, plan_cell
-from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
+from touchcell.drivers.core.spec import DRIVERS
 from touchcell.tasks.interface import Action, Observation, TaskConfig, TaskContext, TaskSpec, TransitionRecord
 from touchcell.testing.emulation.process import EmulatorProcess
 
@@ -75,7 +75,7 @@ def two_arm_plan(
     on_trip: str = "end",
 ) -> CellPlan:
     """The plan of the cell: no scene, so that each arm is a group by itself."""
-    driver = registry.spec("sim_arm")
+    driver = DRIVERS.load("sim_arm")
     places = {"left": -300.0, "right": 300.0}
     arms = {
         name: {

@@ -189,7 +189,7 @@ def test_fusing_equal_means_adds_information(backend: str) -> None:
 
 
 def test_fusion_matches_importance_sampling(backend: str) -> None:
-    # Noise of the estimate: 3e-3 standard deviations; leaving J^-1 out would miss by 5e-2 (NUMERICS part 5).
+    # Noise of the estimate: 3e-3 standard deviations; leaving J^-1 out would miss by 5e-2.
     rng = np.random.default_rng(6)
     g1 = random_gaussian(rng, 0.04)
     g2 = random_gaussian(rng, 0.04, near=g1.mean)

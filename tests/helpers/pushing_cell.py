@@ -14,7 +14,8 @@ import numpy as np
 import yaml
 
 from touchcell.cell.config.schema import plan_cell
-from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop, RunResult, StopRequest
 from touchcell.paths import CONFIGS
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from touchcell.cell.cli.main import main
-from touchcell.cell.runtime.compose import MODELS
 from touchcell.geometry import se3
+from touchcell.paths import MODELS
 from touchcell.perception.runtime.contact_gate import ContactGate
 from touchcell.perception.runtime.inference import ContactModel
 from touchcell.simulation.render import FrameRenderer

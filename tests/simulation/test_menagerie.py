@@ -8,10 +8,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
-from touchcell.drivers.core.spec import DriverContext
+from touchcell.drivers.core.spec import DRIVERS, DriverContext
 from touchcell.drivers.kinematics.chain import ChainDescription
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
@@ -70,7 +69,7 @@ def text(values: object) -> str:
 
 
 def build(model: str, **changes: object) -> SimJointArm:
-    spec = registry.spec("sim_joint_arm")
+    spec = DRIVERS.load("sim_joint_arm")
     config = spec.config.model_validate({"model": model, "start_pose_mm_deg": START[model], **changes})
     arm = spec.build("arm", config, DriverContext(VirtualClock()))
     assert isinstance(arm, SimJointArm)

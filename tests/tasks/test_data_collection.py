@@ -1,4 +1,4 @@
-"""Data collection: contacts as drawn, frames that show them, and a data set that grows over broken runs."""
+"""Data collection: contacts as drawn, frames that match their labels, data sets continued after interrupted runs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FAST = {"settle_ms": 0, "speed_mm_s": 80, "press_speed_mm_s": 40, "turn_deg_s": 
 
 
 class KnownPlane(KinematicPlant):
-    """The plant with a sensor that knows its surface, in contact or not."""
+    """A kinematic plant with a sensor that knows its surface, in contact or not."""
 
     def _estimate(self) -> ContactEstimate:
         found = super()._estimate()
@@ -65,7 +65,7 @@ def tables(folder: Path) -> list[str]:
     return [(folder / "data" / split / "targets_images.csv").read_text() for split in ("train", "val")]
 
 
-def test_a_collection_that_was_stopped_goes_on_to_the_same_data(tmp_path):
+def test_a_stopped_collection_continues_to_the_same_data(tmp_path):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     whole.mkdir()
     broken.mkdir()
@@ -82,7 +82,7 @@ def test_a_collection_that_was_stopped_goes_on_to_the_same_data(tmp_path):
     assert len(read_split(whole / "data", "train").images) == 3
 
 
-def test_frames_show_what_their_labels_say(tmp_path):
+def test_frames_match_their_labels(tmp_path):
     run(cell_file(tmp_path))
     split = read_split(tmp_path / "data", "train")
     z = split.contact_mm_deg[:, 2]
@@ -91,7 +91,7 @@ def test_frames_show_what_their_labels_say(tmp_path):
     assert images[0].shape == (440, 445)
     deepest, shallowest = images[int(z.argmax())], images[int(z.argmin())]
     assert np.mean(deepest != shallowest) > 0.02
-    # Out of contact the tip looks more like in the slightest contact than in the deepest.
+    # Out of contact the tip resembles the lightest contact more than the deepest.
     rest = read_rest(tmp_path / "data")
     assert rest is not None
     assert np.mean(rest != shallowest) < np.mean(rest != deepest)
@@ -107,7 +107,7 @@ def test_a_folder_with_other_samples_is_refused(tmp_path):
         Collection(tmp_path / "more", {"train": 1}, {})
 
 
-def test_a_task_and_a_place_for_its_frames_belong_together(tmp_path):
+def test_a_labelling_task_requires_storage_for_its_frames_and_vice_versa(tmp_path):
     path = cell_file(tmp_path)
     data = yaml.safe_load(path.read_text())
     del data["collect"]

@@ -1,4 +1,4 @@
-"""Dual-arm pushing: whole cells in quasi-static physics, and how the two hands wait for each other."""
+"""Dual-arm pushing: whole cells in quasi-static physics, and how the two arms wait for each other."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SHORT = {"task__target_mm": [50, 3], "task__retract_mm": 12, "scene__step_ms": 1
 
 
 def test_both_arms_bring_the_object_to_the_target(tmp_path):
-    """The follower goes ahead of it."""
+    """The follower moves ahead of it."""
     depths, apart = [], []
 
     def look(cell):
@@ -33,11 +33,11 @@ def test_both_arms_bring_the_object_to_the_target(tmp_path):
     assert abs(pushed.error_mm) < 3.0
     late = np.array(depths[len(depths) // 2 :])
     assert np.abs(late[:, 1] - 2.0).max() < 1.0
-    # What the follower presses with and friction, 0.6 N/mm and 0.3 x 479 g.
+    # The follower's contact force and friction, 0.6 N/mm and 0.3 x 479 g.
     assert (late[:, 0] - late[:, 1]).mean() == pytest.approx(0.3 * 0.479 * 9.81 / 0.6, abs=0.2)
 
 
-def test_the_leader_waits_while_the_follower_looks_for_what_it_lost(tmp_path):
+def test_the_leader_waits_while_the_follower_searches_for_its_lost_contact(tmp_path):
     lost, leader_x = [], []
 
     def look(cell):
@@ -54,7 +54,7 @@ def test_the_leader_waits_while_the_follower_looks_for_what_it_lost(tmp_path):
     assert 1e3 * (leader_x[-1] - leader_x[0]) < 1.0
 
 
-def test_both_stop_when_one_sees_nothing(tmp_path):
+def test_both_stop_when_one_has_no_fresh_frame(tmp_path):
     moving = []
 
     def look(cell):

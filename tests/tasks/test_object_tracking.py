@@ -18,7 +18,7 @@ def build(config: ObjectTrackingConfig = QUICK) -> Task:
     return SPEC.build(config, CONTEXT)
 
 
-def test_holds_a_plate_that_stands_still_for_the_given_time():
+def test_holds_a_resting_plate_for_the_given_time():
     plant, task = KinematicPlant(), build()
     plant.run(task, until="run")
     actions = plant.run(task, until="retract")
@@ -69,7 +69,7 @@ GLIDES = [np.diag([200.0, 200.0, 100.0, 30.0, 30.0, 60.0])[i] for i in range(6)]
 
 @pytest.mark.parametrize("axis", range(6))
 def test_tracks_one_component_at_a_time_in_the_simulator(axis):
-    """A plate glides 200 mm at up to 47 mm/s (100 mm along the normal) or turns by 30 or 60 deg."""
+    """A plate moves 200 mm at up to 47 mm/s (100 mm along the normal) or turns by 30 or 60 deg."""
     glide = {"kind": "glide", "displacement_mm_deg": tuple(GLIDES[axis]), "start_s": 5.0, "duration_s": 8.0}
     loop = SimulatedLoop({"kind": "plane", "motion": glide}, (0.0, 0.0, 40.0, 180.0, 0.0, 0.0))
     task = SPEC.build(ObjectTrackingConfig(duration_s=11.0), loop.context)

@@ -27,7 +27,7 @@ def look(task, t_s, seq=None, belief=BELIEF, stop=False):
     return task.tick(Observation(now_ns, {}, contacts, stop))
 
 
-def test_reports_what_the_sensor_feels_and_commands_nothing():
+def test_reports_contacts_and_commands_nothing():
     task = build()
     action = look(task, 0.0, 1)
     assert task.state == "observe"
@@ -41,7 +41,7 @@ def test_without_contact_there_are_no_components():
     assert look(build(), 0.0, 1, belief=None).telemetry == {"frames": 1.0, "frame_age_ms": 20.0, "in_contact": 0.0}
 
 
-def test_ends_well_when_the_source_has_ended():
+def test_succeeds_when_the_source_has_ended():
     task = build(idle_timeout_s=1.0)
     for k in range(10):
         look(task, 0.1 * k, k)
@@ -53,7 +53,7 @@ def test_ends_well_when_the_source_has_ended():
     assert task.transitions[-1].event == "ended"
 
 
-def test_fails_when_nothing_ever_comes():
+def test_fails_when_no_frame_arrives():
     task = build(first_frame_timeout_s=2.0)
     look(task, 0.0)
     look(task, 1.9)
@@ -64,7 +64,7 @@ def test_fails_when_nothing_ever_comes():
 
 
 @pytest.mark.parametrize("seq", [None, 1])
-def test_a_person_ends_it(seq):
+def test_an_operators_stop_ends_it(seq):
     task = build()
     look(task, 0.0, seq)
     look(task, 0.1, seq, stop=True)
@@ -72,7 +72,7 @@ def test_a_person_ends_it(seq):
     assert look(task, 0.2, 2).telemetry == {}
 
 
-def test_looks_no_longer_than_it_was_told():
+def test_ends_after_its_duration():
     task = build(duration_s=0.5)
     for k in range(6):
         look(task, 0.1 * k, k)

@@ -1,4 +1,4 @@
-"""Planned ways: as short as Dubins' are, no narrower than asked, clear of obstacles, and ending as they should."""
+"""Planned paths: as short as Dubins paths, of the given turning radius, clear of obstacles, and ending at the goal."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_quarter_turn_is_one_arc():
 
 
 def test_turning_round_on_the_spot_takes_three_arcs():
-    """The known length of the way back to where it began, the other way round: 7 pi / 3 radii."""
+    """The known length of the path back to the start with opposite heading: 7 pi / 3 radii."""
     way = plan(START, (0.0, 0.0, math.pi), TURN_M)
     assert length_m([START[:2], *way]) == pytest.approx(7.0 * math.pi / 3.0 * TURN_M, rel=2e-3)
 
@@ -48,7 +48,7 @@ POSES = st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-math.pi
 
 @settings(max_examples=60)
 @given(goal=POSES)
-def test_ways_are_smooth_and_end_at_the_goal(goal):
+def test_paths_are_smooth_and_end_at_the_goal(goal):
     if math.hypot(goal[0], goal[1]) < 0.02:
         return
     way = [START[:2], *plan(START, goal, TURN_M)]
@@ -56,7 +56,7 @@ def test_ways_are_smooth_and_end_at_the_goal(goal):
     assert length_m(way) >= math.hypot(goal[0], goal[1]) - 1e-9
     steps = [math.hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(way)]
     assert max(steps) <= STEP_M + 1e-9
-    # Chords of an arc turn by half of what their lengths make.
+    # A chord is turned by half of its arc's angle.
     for (before, after), (a, b) in zip(pairwise(headings(way)), pairwise(steps), strict=True):
         assert turned(before, after) <= 0.5 * (a + b) / TURN_M * 1.01 + 1e-6
     assert turned(headings(way)[0], 0.0) <= steps[0] / TURN_M
@@ -75,16 +75,16 @@ def test_an_obstacle_is_passed_on_the_nearer_side(beside_m):
         assert math.copysign(1.0, middle[1]) == -math.copysign(1.0, beside_m)
 
 
-def test_without_a_clear_way_it_says_so():
+def test_without_a_clear_path_it_raises():
     with pytest.raises(NoPathFound, match="400"):
         plan(START, (0.4, 0.0, 0.0), TURN_M, [Obstacle(0.4, 0.0, 0.05)])
 
 
-def test_the_narrowest_turn_leans_on_the_friction_cone():
+def test_the_smallest_turning_radius_puts_the_force_on_the_friction_cone():
     square = Prism(0.04 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]), 0.06)
     c = friction_radius_m(square)
     turn_m = min_turning_radius_m(0.04, c, 0.9)
-    # The force that leans to the edge of the cone, and the motion that the limit surface gives it.
+    # A force on the edge of the friction cone, and its motion by the limit surface.
     fx, fy = math.cos(math.atan(0.9)), math.sin(math.atan(0.9))
     assert turn_m == pytest.approx(abs(fx / (-0.04 * fy / c**2)))
     assert 1e3 * turn_m == pytest.approx(26.0, abs=0.1)

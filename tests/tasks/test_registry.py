@@ -1,4 +1,4 @@
-"""Tasks are found by name, their specs are sound, and the page about them is true."""
+"""Tasks are found by name, their specs are consistent, and their documentation page is up to date."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import pytest
 
 from touchcell.drivers.core import protocols as abilities
 from touchcell.errors import ConfigError
-from touchcell.tasks import diagrams, registry
-from touchcell.tasks.interface import TaskContext, TaskSpec
+from touchcell.tasks import diagrams
+from touchcell.tasks.interface import TASKS, TaskContext, TaskSpec
 
 
 @pytest.mark.parametrize("name", ["data_collection", "object_tracking", "observe", "surface_following"])
 def test_specs(name):
-    assert name in registry.installed()
-    spec = registry.spec(name)
+    assert name in TASKS.names()
+    spec = TASKS.load(name)
     assert isinstance(spec, TaskSpec)
     assert spec.name == name
     assert spec.summary
@@ -30,13 +30,13 @@ def test_specs(name):
 
 def test_an_unknown_task_is_answered_with_a_suggestion():
     with pytest.raises(ConfigError) as caught:
-        registry.spec("surface_folowing")
+        TASKS.load("surface_folowing")
     assert caught.value.key == "task"
     assert "surface_following" in caught.value.hint
 
 
 def test_listing_imports_no_task():
-    code = "import sys, touchcell.tasks.registry as r; r.installed(); print('transitions' in sys.modules)"
+    code = "import sys; from touchcell.tasks.interface import TASKS; TASKS.names(); print('transitions' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 

@@ -29,12 +29,12 @@ def test_the_object_is_brought_to_the_target(tmp_path, shape, mass_g, friction):
     pushed = push(data, tmp_path)
     assert pushed.path == WHOLE
     assert abs(pushed.error_mm) < 2.5
-    # The contact is not known to lie beside the middle by the 3 mm that it does.
+    # The controller does not know that the contact is 3 mm beside the centre.
     assert pushed.object_mm_deg[:2] == pytest.approx(data["task"]["target_mm"], abs=6.0)
 
 
-def test_a_lost_object_is_looked_for_again_and_pushed_on(tmp_path):
-    """Somebody moves the object 15 mm ahead while it is pushed."""
+def test_a_lost_object_is_searched_for_and_pushed_again(tmp_path):
+    """The object is displaced 15 mm ahead while it is pushed."""
     moved = []
 
     def snatch(cell):
@@ -49,7 +49,7 @@ def test_a_lost_object_is_looked_for_again_and_pushed_on(tmp_path):
     assert pushed.object_mm_deg[0] == pytest.approx(80.0, abs=5.0)
 
 
-def test_without_an_object_it_gives_up(tmp_path):
+def test_without_an_object_it_fails(tmp_path):
     data = cell_file(CELL, task__approach_distance_mm=10.0)
     data["scene"]["objects"]["prism"]["pose_mm_deg"] = [200, 0, 0, 0, 0, 0]
     pushed = push(data, tmp_path)
@@ -64,8 +64,8 @@ def test_the_object_is_brought_to_a_full_pose(tmp_path):
     assert pushed.object_mm_deg[2] == pytest.approx(20.0, abs=10.0)
 
 
-def test_without_a_way_past_the_obstacle_it_faults_before_it_pushes(tmp_path):
+def test_without_a_path_past_the_obstacle_it_faults_before_it_pushes(tmp_path):
     pushed = push(cell_file(CELL, task__obstacles_mm=[[90, 0, 20]]), tmp_path)
     assert pushed.cell.task.state == "faulted"
-    assert "no way" in pushed.cell.task.transitions[-1].reason
+    assert "no path" in pushed.cell.task.transitions[-1].reason
     assert pushed.object_mm_deg[:2] == pytest.approx((0.0, 3.0), abs=0.1)

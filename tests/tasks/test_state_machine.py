@@ -1,4 +1,4 @@
-"""The state machine: the table's linter, time, order of events, and the faults E6 and E7 of PEERS."""
+"""The state machine: the table's linter, time, order of events, and guards that are never bypassed."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ TABLE = Table("example", STATES, ROWS)
 
 
 class Model:
-    """Counts its starts; can be made to refuse or to break."""
+    """Counts its starts; can be made to refuse or to raise."""
 
     def __init__(self, ready=True, start_error=None, guard_error=None):
         self.is_ready = ready
@@ -85,7 +85,7 @@ def test_events_take_effect_in_order_at_the_tick():
     assert model.starts == [task.records[0]]
 
 
-def test_fire_says_what_happened():
+def test_fire_returns_the_result():
     task, _ = machine()
     task.tick(0)
     outcome = task.fire("go")
@@ -95,16 +95,16 @@ def test_fire_says_what_happened():
     assert [r.event for r in task.refusals] == ["go", "fly"]
 
 
-def test_a_guard_that_says_no_is_named():
+def test_a_guard_that_returns_false_is_named():
     task, model = machine(ready=False)
-    assert task.fire("go") == Refused("go", "guard ready said no")
+    assert task.fire("go") == Refused("go", "guard ready returned False")
     assert task.state is S.IDLE
     assert task.records == ()
     model.is_ready = True
     assert isinstance(task.fire("go"), Accepted)
 
 
-def test_e7_no_trigger_passes_by_the_guard():
+def test_no_trigger_bypasses_the_guard():
     task, _ = machine(ready=False)
     for way in ("to_moving", "to_MOVING", "MOVING"):
         assert task.fire(way) == Refused(way, "no such event")
@@ -127,7 +127,7 @@ def test_timeout_is_counted_from_entry():
     assert "2.000 s in moving" in task.records[-1].reason
 
 
-def test_e6_a_late_timeout_of_a_state_that_was_left_is_dropped():
+def test_a_late_timeout_of_a_state_that_was_left_is_dropped():
     task, _ = machine()
     task.tick(0)
     task.fire("go")
@@ -135,7 +135,7 @@ def test_e6_a_late_timeout_of_a_state_that_was_left_is_dropped():
     task.tick(s_to_ns(60.0))
     assert task.state is S.DONE
     assert [r.event for r in task.records] == ["go", "arrive"]
-    assert task.refusals == (Refused("late", "the state that it belongs to has been left"),)
+    assert task.refusals == (Refused("late", "the state it was bound to has been left"),)
 
 
 def test_a_fired_event_is_recorded_at_its_own_time():
@@ -153,7 +153,7 @@ def test_an_event_bound_to_an_old_stay_is_dropped():
     assert task.state is S.MOVING
 
 
-def test_e7_an_exception_on_entry_ends_in_the_fault_state_before_anything_else():
+def test_an_exception_on_entry_ends_in_the_fault_state_before_anything_else():
     task, _ = machine(start_error=RuntimeError("no power"))
     task.post("go")
     task.post("arrive")
@@ -237,7 +237,7 @@ def test_the_linter_finds(states, rows, problem):
     assert any(problem in found for found in lint(Table("bad", states, rows), Model()))
 
 
-def test_building_a_bad_table_lists_everything_that_is_wrong():
+def test_building_a_bad_table_lists_all_problems():
     rows = (replace(GO, guard="redy"), ARRIVE, LATE, STOP, TRIP)
     with pytest.raises(TaskDefinitionError) as caught:
         TaskMachine(Table("bad", STATES, rows), Model())

@@ -1,4 +1,4 @@
-"""Surface following, and the machine that it shares with object tracking, on exact kinematics and on the simulator."""
+"""Surface following, and the state machine that it shares with object tracking, on exact kinematics and simulated."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_follows_a_plane_from_start_to_end():
     np.testing.assert_allclose(back, [0, 0, -0.005], atol=0.0006)
 
 
-def test_pressing_in_hardly_overshoots():
+def test_pressing_in_overshoots_little():
     plant, task = KinematicPlant(tilt_deg=(0.0, 0.0)), build()
     deepest = 0.0
     while not task.finished:
@@ -74,7 +74,7 @@ def test_direction_is_counted_from_the_sensors_x_axis(direction_deg):
     assert np.degrees(np.arctan2(moved[1], moved[0])) == pytest.approx(direction_deg, abs=0.1)
 
 
-def test_commands_say_when_why_and_for_how_long():
+def test_commands_carry_time_cause_and_time_to_live():
     plant, task = KinematicPlant(), build()
     for action in plant.run(task):
         for command in action.twists.values():
@@ -106,7 +106,7 @@ def test_stale_data_stops_the_arm_and_then_trips(state, loss):
 
 
 @pytest.mark.parametrize("state", ["settle", "run"])
-def test_a_belief_out_of_range_moves_nothing_and_is_forgiven_if_short(state):
+def test_an_estimate_out_of_range_moves_nothing_and_is_tolerated_if_short(state):
     plant, task = KinematicPlant(), build()
     plant.run(task, until=state)
     plant.cycle(task)
@@ -132,7 +132,7 @@ def test_a_lost_contact_is_searched_for_a_limited_number_of_times():
 
 
 def reached(state: str) -> tuple[KinematicPlant, Task]:
-    """A plant and a task that has just entered ``state``."""
+    """Return a plant and a task that has just entered ``state``."""
     config = QUICK.model_copy(update={"settle_timeout_s": 0.5, "max_reapproach": 1})
     plant, task = KinematicPlant(), build(config)
     plant.run(task, until=state)
@@ -211,7 +211,7 @@ def test_nothing_moves_after_a_trip(state):
         assert plant.cycle(task).twists == {}
 
 
-def test_a_fault_is_told_with_its_reason():
+def test_a_fault_is_reported_with_its_reason():
     plant, task = reached("run")
     plant.broken = True
     assert plant.cycle(task).twists == {}
@@ -229,7 +229,7 @@ SWITCHES = ("frames", "states", "touching", "in_range", "frozen", "broken", "ope
     )
 )
 def test_walks(walk):
-    """Whatever happens in whatever order: no motion on old data, none after a trip, and a stop ends it all at rest."""
+    """In any order of events: no motion on stale data, none after a trip, and a stop ends at rest."""
     plant, task = KinematicPlant(), build()
     tripped = False
     stale = {"frames": 0, "states": 0}
@@ -259,7 +259,7 @@ def test_walks(walk):
         assert task.state == "tripped"
 
 
-def test_the_way_is_counted_along_the_sensors_direction_only():
+def test_distance_is_counted_along_the_direction_of_travel_only():
     follow = Follow(QUICK.model_copy(update={"direction_deg": 90.0}))
     T = se3.from_euler_mm_deg(np.array([10.0, 20.0, 30.0, 0.0, 0.0, 90.0]))
 
@@ -299,7 +299,7 @@ DOMES = [({"kind": "dome", "radius_mm": 70.0}, direction) for direction in (0.0,
 
 @pytest.mark.parametrize(("surface", "direction_deg"), RAMPS + DOMES)
 def test_follows_ramp_and_dome_in_the_simulator(surface, direction_deg):
-    """The bars: depth within 0.1 mm and tilt within 1 deg RMS at 20 mm/s with 30 Hz frames and 100 Hz control."""
+    """Limits: depth within 0.1 mm and tilt within 1 deg RMS at 20 mm/s with 30 Hz frames and 100 Hz control."""
     on_ramp = surface["kind"] == "ramp"
     start = (-30.0, 0.0, 40.0, 180.0, 0.0, 0.0) if on_ramp else (0.0, 0.0, 110.0, 180.0, 0.0, 0.0)
     loop = SimulatedLoop(surface, start)
@@ -317,7 +317,7 @@ def test_follows_ramp_and_dome_in_the_simulator(surface, direction_deg):
     assert turned == pytest.approx(30.0 if on_ramp else np.degrees(60.0 / 87.0), abs=1.5)
 
 
-def test_holds_the_bars_under_single_frame_noise():
+def test_meets_the_limits_under_single_frame_noise():
     noise = np.array([0.25e-3, 0.25e-3, 0.06e-3, *np.radians([0.35, 0.35, 0.8])])
     loop = SimulatedLoop(RAMPS[0][0], (-30.0, 0.0, 40.0, 180.0, 0.0, 0.0), noise=noise, latency_s=0.04, seed=1)
     task = SPEC.build(SurfaceFollowingConfig(), loop.context)

@@ -1,4 +1,4 @@
-"""The tall objects' push heights and the moment that two tips put against toppling, by statics."""
+"""The tall objects' push heights and the moment of two tips against toppling, by statics."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SHEAR_N_MM = 0.4
 
 
 def moments_n_mm(pushed: Pushed) -> tuple[float, float, float]:
-    """Of the push, of the weight about an edge, and of the two tips."""
+    """Return the moments of the push, of the weight about an edge, and of the two tips."""
     weight_n = 9.81e-3 * pushed.mass_g
     tips = _SHEAR_N_MM * sum(held_with_mm(pushed)) * pushed.reach_mm
     return _MDF * weight_n * pushed_at_mm(pushed), weight_n * pushed.reach_mm, tips
@@ -24,11 +24,11 @@ def test_a_push_topples_all_but_the_tin_and_two_tips_hold_them(pushed: Pushed) -
     push, weight, tips = moments_n_mm(pushed)
     assert (push > weight) == (pushed.name != "coffee tin")
     assert push - tips < weight
-    # Nor do the tips tip it backwards before it is pushed.
+    # Nor do the tips topple it backwards before it is pushed.
     assert tips < weight
 
 
-def test_the_follower_goes_along_light_round_objects_and_gives_way_to_flat_sides_slowly() -> None:
+def test_the_follower_moves_with_light_round_objects_and_yields_slowly_to_flat_sides() -> None:
     gains = {
         trial.row.partition(",")[0]: (follower["kp_per_s"][1], follower["ki_per_s2"][1], follower.get("active", False))
         for trial in SPEC.trials(Scale(trials=1))

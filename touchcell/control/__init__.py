@@ -1,1 +1,1 @@
-"""Tactile servoing by velocity in SE(3), and the interlocks that stop it."""
+"""Tactile servoing by velocity in SE(3), and the interlocks that supervise it."""

@@ -14,22 +14,22 @@ from touchcell.control.pid import Pid, PidGains
 from touchcell.geometry.types import Array
 
 MAX_CRAB_RAD: Final = math.radians(25.0)
-"""Furthest that an object is headed aside to go straight: it is pushed this far beside its middle."""
+"""Largest crab angle, at which the object travels straight although it is pushed beside its centre."""
 MAX_INTEGRATED_M: Final = 0.015
-"""Larger distances from the path are not integrated: on the way back to it the integral would only gather overshoot."""
+"""Anti-windup zone: larger cross-track errors are not integrated, they would only cause overshoot."""
 
 
 @dataclass(frozen=True, slots=True)
 class AlignmentGains:
-    """How a pushed object is steered.
+    """Gains and limits of target alignment.
 
     Attributes:
-        kp: sideways speed per bearing of the point aimed at, m/s per rad.
-        ki: how fast the object is headed aside per distance from the path, rad per m and s.
-        kd: sideways speed per rate of the bearing, m per rad.
-        limit_m_s: largest sideways speed.
-        look_ahead_m: how far ahead on the path it aims.
-        lead_m: where the object turns, ahead of the middle of the tip.
+        kp: lateral speed per bearing of the look-ahead point, m/s per rad.
+        ki: crab angle rate per cross-track error, rad per m and s.
+        kd: lateral speed per rate of the bearing, m per rad.
+        limit_m_s: largest lateral speed.
+        look_ahead_m: look-ahead distance along the path.
+        lead_m: distance from the centre of the tip forward to the object's turning centre.
     """
 
     kp: float
@@ -42,14 +42,14 @@ class AlignmentGains:
 
 @dataclass(frozen=True, slots=True)
 class Aim:
-    """How the object stands to its target.
+    """Pose of the pushed object relative to its path and target.
 
     Attributes:
-        theta_rad: bearing of the point aimed at, from the contact normal, positive to its left.
-        remaining_m: way that is left.
+        theta_rad: bearing of the look-ahead point, from the contact normal, positive to its left.
+        remaining_m: remaining path length.
         cross_track_error_m: distance of the object from its path, positive to its left.
         target_lateral_error_m: distance of the target from the contact normal, positive to its left.
-        heading_rad: of the contact normal in the base frame.
+        heading_rad: heading of the contact normal in the base frame.
     """
 
     theta_rad: float
@@ -60,22 +60,23 @@ class Aim:
 
 
 class TargetAlignment:
-    """A PID on a bearing that moves the contact to the other side, which turns the object towards where it shall go.
+    """PID on a bearing: moves the contact to the opposite side, which turns the object towards its path.
 
-    Pushed at its near side, an object turns about a point ahead of the contact, near its middle: to head left, the
-    contact has to go right. Seen from that point, ``lead_m`` ahead, the object is steered like a unicycle.
+    Pushed at its near side, an object turns about a point ahead of the contact, near its centre: to head left, the
+    contact has to move right. Seen from that point, ``lead_m`` ahead, the object steers like a unicycle.
 
-    The paper takes the bearing of the target from the sensor. From there the sideways motion itself turns the bearing
-    the wrong way, as much as the object's turn rights it when the target is at ``lead_m``; so it has to be switched off
-    before the end, and an object that is not pushed through its middle then goes astray. Here the bearing is taken from
-    where the object turns, of a point ``look_ahead_m`` further on the straight path to the target (pure pursuit), and
-    it is the distance from that path that is integrated: the object may head a little aside to go straight. That works
-    until the end, and along bent paths.
+    The paper (section 3.3.3) measures the bearing of the target from the sensor. There the lateral motion itself turns
+    the bearing the wrong way, as much as the object's turn corrects it when the target is at ``lead_m``; so it has to
+    be switched off before the end, and an object that is not pushed through its centre then drifts off. Here the
+    bearing is measured from the turning centre, to a point ``look_ahead_m`` further on the straight path to the target
+    (pure pursuit), and the integrated quantity is the cross-track error: the object may crab a little to travel
+    straight. That works to the end, and along curved paths.
 
     Args:
-        route: from where the object's middle is (x, y, m, in the base frame) and heads (rad) when pushing begins to the
-            points of the way, without the first one; the last one is the target.
-        gains: see there.
+        route: (x, y, m, base frame) waypoints from the object's centre and heading (rad) at the start of the push,
+            without
+            the start itself; the last one is the target.
+        gains: gains and limits.
 
     Raises:
         ControlError: a number is not finite or a limit negative.
@@ -94,18 +95,18 @@ class TargetAlignment:
         self._along_m = 0.0
 
     def pause(self) -> None:
-        """The motion was interrupted: forget the past, but not the path."""
+        """Reset the PID after the motion was interrupted, but keep the path."""
         self._pid.reset()
 
     def aim(self, T_base_sensor: Array, T_s_f: Array) -> Aim:
-        """How the object stands now. The first time it also lays the path from there.
+        """Return the object's pose relative to its path. The first call also lays the path from there.
 
         Args:
             T_base_sensor: (4, 4) pose of the sensor, its x axis upright.
             T_s_f: (4, 4) contact: z of the surface frame is the inward normal.
 
         Raises:
-            ControlError: the path is none.
+            ControlError: the path is degenerate.
         """
         normal = T_base_sensor[:2, :3] @ T_s_f[:3, 2]
         length = math.hypot(normal[0], normal[1])
@@ -126,6 +127,6 @@ class TargetAlignment:
         return Aim(theta, remaining_m, place.cross_track_error_m, target_aside, heading)
 
     def step(self, aim: Aim, dt_s: float) -> float:
-        """Speed of the contact to the left of the contact normal, m/s."""
+        """Return the speed of the contact to the left of the contact normal, m/s."""
         e = np.array([-aim.cross_track_error_m, aim.theta_rad, 0.0, 0.0, 0.0, 0.0])
         return -float(self._pid.step(e, np.zeros(6), dt_s)[1])

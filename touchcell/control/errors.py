@@ -1,4 +1,4 @@
-"""What can go wrong in control, as types with attributes."""
+"""Errors of the controllers."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from touchcell.errors import TouchcellError
 
 
 class ControlError(TouchcellError, ValueError):
-    """A controller was given something that it must not work with; nothing was changed in it.
+    """A controller was given an invalid argument; its state is unchanged.
 
     Attributes:
         argument: name of the offending argument.
-        value: what it was.
+        value: its value.
     """
 
     def __init__(self, argument: str, reason: str, value: Any, *, hint: str = "") -> None:

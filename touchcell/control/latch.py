@@ -1,4 +1,4 @@
-"""The latch: what has tripped stays tripped until a person resets it, and a reset never moves anything.
+"""The latch: a trip persists until an operator resets it, and a reset never moves anything.
 
     CLEAR -trip-> TRIPPED -fault-> FAULTED      TRIPPED | FAULTED <-> CAUSE_GONE -reset (at rest, idle)-> CLEAR
 
@@ -17,17 +17,17 @@ from touchcell.drivers.core.device import OperatorToken
 
 
 class LatchState(Enum):
-    """Whether motion is allowed, and if not, what it takes."""
+    """State of the latch. Only CLEAR allows motion."""
 
     CLEAR = "clear"
     TRIPPED = "tripped"
     FAULTED = "faulted"
     CAUSE_GONE = "cause gone"
-    """Still latched: a person may reset it now."""
+    """Still latched: an operator may reset it now."""
 
 
 class Refusal(Enum):
-    """Why a reset was refused."""
+    """Reason why a reset was refused."""
 
     NOT_LATCHED = "nothing is latched"
     OLD_TOKEN = "the token was made before the latest violation or has been used"
@@ -38,11 +38,11 @@ class Refusal(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ResetDone:
-    """The latch is clear. Nothing moves until somebody starts something.
+    """The latch is clear. Nothing moves until a start is commanded.
 
     Attributes:
-        operator: who asked.
-        causes: what had latched, the first cause first.
+        operator: name of the operator who requested the reset.
+        causes: violations that had latched, the first cause first.
     """
 
     operator: str
@@ -51,7 +51,7 @@ class ResetDone:
 
 @dataclass(frozen=True, slots=True)
 class ResetRefused:
-    """Nothing has changed.
+    """The reset was refused; the latch is unchanged.
 
     Attributes:
         reason: the first that applies, in the order of ``Refusal``.
@@ -61,7 +61,7 @@ class ResetRefused:
 
 
 class Latch:
-    """Remembers violations. One thread only."""
+    """Latch for violations. Not thread-safe."""
 
     def __init__(self) -> None:
         self._state = LatchState.CLEAR
@@ -72,18 +72,18 @@ class Latch:
 
     @property
     def state(self) -> LatchState:
-        """Present state."""
+        """Current state."""
         gone = self._state is not LatchState.CLEAR and not self._present
         return LatchState.CAUSE_GONE if gone else self._state
 
     @property
     def faulted(self) -> bool:
-        """Whether any of the causes is a fault, after which a device needs recovery."""
+        """True if any of the causes is a fault, after which a device needs recovery."""
         return self._state is LatchState.FAULTED
 
     @property
     def first_cause(self) -> Violation | None:
-        """What latched it, or None while it is clear."""
+        """The violation that latched it, or None while it is clear."""
         return next(iter(self._causes.values()), None)
 
     @property
@@ -92,7 +92,7 @@ class Latch:
         return tuple(self._causes.values())
 
     def update(self, violations: Sequence[Violation]) -> None:
-        """Take in one cycle's violations; an empty sequence says that no cause is present any more."""
+        """Apply one cycle's violations; an empty sequence means that no cause is present any more."""
         latching = [violation for violation in violations if violation.severity is not Severity.LIMIT]
         self._present = bool(latching)
         for violation in latching:
@@ -104,12 +104,12 @@ class Latch:
                 self._state = LatchState.TRIPPED
 
     def reset(self, token: OperatorToken, *, at_rest: bool, commanded: bool) -> ResetDone | ResetRefused:
-        """Clear the latch if it may be cleared.
+        """Clear the latch if all conditions for a reset are met.
 
         Args:
-            token: made by a person after the latest violation. Each works once, so a held button does nothing.
-            at_rest: whether every arm stands still.
-            commanded: whether anybody still asks for a motion.
+            token: made by an operator after the latest violation. Each works once, so a held button does nothing.
+            at_rest: True if every arm is at rest.
+            commanded: True if a motion is still commanded.
         """
         refusals = {
             Refusal.NOT_LATCHED: self._state is LatchState.CLEAR,

@@ -1,4 +1,4 @@
-"""A path in the plane: straight pieces between points, endless in the last one's direction."""
+"""Planar paths: straight segments between points, extended beyond the last one in its direction."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A point seen from a path.
+    """Projection of a point onto a path.
 
     Attributes:
-        along_m: how far along the path its nearest point lies; beyond the path's length after the end.
+        along_m: arc length of the nearest point on the path; beyond the path's length after its end.
         cross_track_error_m: distance from the path, positive to its left.
     """
 
@@ -27,13 +27,13 @@ class Place:
 
 
 class Path:
-    """Straight pieces between points, m.
+    """Straight segments between points, m.
 
     Args:
-        points: two or more, none like the one before.
+        points: two or more; consecutive points differ.
 
     Raises:
-        ControlError: there are fewer, or two in a row are the same.
+        ControlError: there are fewer, or two consecutive points are equal.
     """
 
     def __init__(self, points: Sequence[Point]) -> None:
@@ -52,7 +52,7 @@ class Path:
 
     @property
     def length_m(self) -> float:
-        """From the first point to the last."""
+        """Length from the first point to the last."""
         return self._reached[-1]
 
     @property
@@ -61,17 +61,17 @@ class Path:
         return self._end
 
     def point(self, along_m: float) -> Point:
-        """The point at ``along_m``, which may lie beyond the end."""
+        """Return the point at arc length ``along_m``, which may lie beyond the end."""
         i = self._piece(along_m)
         rest = along_m - self._reached[i]
         return self._starts[i][0] + rest * self._directions[i][0], self._starts[i][1] + rest * self._directions[i][1]
 
     def direction(self, along_m: float) -> Point:
-        """Unit vector of the piece at ``along_m``."""
+        """Return the unit vector of the segment at arc length ``along_m``."""
         return self._directions[self._piece(along_m)]
 
     def place(self, p: Point, since_m: float, within_m: float) -> Place:
-        """Where ``p`` is, looked for from ``since_m`` to ``within_m`` further, so that loops do not confuse it."""
+        """Project ``p`` onto the path between ``since_m`` and ``within_m`` further, so that loops are not ambiguous."""
         best, nearest = Place(since_m, 0.0), float("inf")
         last = len(self._starts) - 1
         for i in range(self._piece(since_m), last + 1):

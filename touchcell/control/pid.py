@@ -19,15 +19,15 @@ SMOOTHING: Final = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PidGains:
-    """Gains and clips, checked once. Vectors become diagonal matrices; everything is kept as read-only arrays.
+    """Gains and limits, validated once. Vectors become diagonal matrices; all are kept as read-only arrays.
 
     Attributes:
         kp: proportional gain (6, 6) or its diagonal (6,), 1/s. Row i makes component i of the twist.
         ki: integral gain, likewise, 1/s^2.
         kd: derivative gain, likewise, dimensionless.
         integral_limit: largest magnitude (6,) of each component of the integral term ``ki @ int(e)``, m/s and rad/s.
-        integral_zone: an error component (6,) larger than this is not integrated, m and rad: on the long way to a new
-            reference the integral would only gather what it has to give back as overshoot.
+        integral_zone: an error component (6,) larger than this is not integrated, m and rad (anti-windup): after a step
+            of the reference the integral would only cause overshoot.
         output_limit: largest magnitude (6,) of each component of the output, feedforward included, m/s and rad/s.
 
     Raises:
@@ -53,17 +53,17 @@ class PidGains:
 
     @property
     def controlled(self) -> NDArray[np.bool_]:
-        """(6,) bool: which components of the twist feedback acts on; a zero row leaves one alone."""
+        """(6,) bool: components of the twist with feedback, that is with a non-zero gain row."""
         return np.asarray((self.kp != 0.0).any(axis=1) | (self.ki != 0.0).any(axis=1) | (self.kd != 0.0).any(axis=1))
 
 
 class Pid:
     """``V = V_ff + Kp e + Ki int(e) + Kd de/dt``, backward Euler.
 
-    The error is smoothed by an exponentially weighted average before it is differentiated. It is the integral *term*
-    that is accumulated and clipped: with constant gains that is the paper's clipped integral, in units that people can
-    judge. Errors outside the integral zone do not add to it. After ``reset`` the first step has no derivative and no
-    history, so it starts without a kick.
+    The error is smoothed by an exponentially weighted average before it is differentiated. The integral *term* is
+    accumulated and clipped, in m/s and rad/s: with constant gains that equals the paper's clipped integral. Errors
+    outside the integral zone are not integrated. After ``reset`` the first step has no derivative and no history, so it
+    starts without a kick.
     """
 
     def __init__(self, gains: PidGains) -> None:
@@ -71,21 +71,22 @@ class Pid:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Clear the integral, the derivative and the error history."""
         self._integral = np.zeros(6)
         self._smoothed: Array | None = None
 
     @property
     def integral(self) -> Array:
-        """Present integral term, (6,) m/s and rad/s."""
+        """Current integral term, (6,) m/s and rad/s."""
         return self._integral.copy()
 
     def step(self, e: Array, V_ff: Array, dt_s: float) -> Array:
-        """The twist (6,) for error ``e`` (6,) and feedforward ``V_ff`` (6,), ``dt_s`` after the step before.
+        """Return the twist (6,) for error ``e`` (6,) and feedforward ``V_ff`` (6,), ``dt_s`` after the previous step.
 
         Raises:
-            ControlError: something is not finite or of the wrong shape, or ``dt_s`` is not positive. The state is as
-                before then.
+            ControlError: an argument is not finite or of the wrong shape, or ``dt_s`` is not positive. The state is
+                then
+                unchanged.
         """
         e = _finite("e", e, (6,))
         V_ff = _finite("V_ff", V_ff, (6,))
@@ -115,7 +116,7 @@ def _finite(name: str, value: ArrayLike, *shapes: tuple[int, ...]) -> Array:
 
 
 def _clipped(array: Array, limit: Array) -> Array:
-    # np.clip takes several times as long for numbers this few.
+    # np.clip is several times slower on arrays this small.
     return np.minimum(np.maximum(array, -limit), limit)
 
 

@@ -11,19 +11,19 @@ from touchcell.geometry.types import Array
 
 
 class TactileServo:
-    """From a contact pose to a twist of the tool.
+    """Map a contact pose to a twist of the tool.
 
     With ``T_s_f`` the surface frame in the sensor frame and ``T_s*_f`` the reference, the error motion is
-    ``E = T_s_f inv(T_s*_f) = T_s_s*``: where the sensor should be, seen from where it is. Hence ``e = log(E)`` is the
+    ``E = T_s_f inv(T_s*_f) = T_s_s*``: the desired sensor pose in the current sensor frame. Hence ``e = log(E)`` is the
     twist that takes the sensor there in one second, and positive gains close the loop. Pressed 1 mm less than the
     reference, ``e = [0 0 +0.001 0 0 0]``: the z axis points out of the tip, into the surface.
 
-    The feedforward twist is given in the reference frame {s*} and carried to {s} by ``Ad(E)``, so a tangential one
+    The feedforward twist is given in the reference frame {s*} and mapped to {s} by ``Ad(E)``, so a tangential one
     stays tangential to the surface while the sensor is still tilted.
 
     A component whose gain rows are zero is not controlled. Its part of the reference is taken from the measurement
-    (as extrinsic-xyz components of ``T_f_s``, SPEC part 2), so that a large shear which nobody controls does not leak
-    into depth and tilt through the logarithm, and a scene pays only for the axes that it uses.
+    (as extrinsic-xyz components of ``T_f_s``), so that a large uncontrolled shear does not leak into depth and tilt
+    through the logarithm.
 
     Args:
         T_sref_f: reference contact (4, 4), surface frame in the desired sensor frame.
@@ -32,7 +32,7 @@ class TactileServo:
         period_s: time step assumed for the first estimate after a reset.
 
     Raises:
-        GeometryError: a pose is none.
+        GeometryError: an argument is not a pose.
         ControlError: ``period_s`` is not positive.
     """
 
@@ -48,7 +48,7 @@ class TactileServo:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past: integral, derivative and the twist that is held."""
+        """Clear the integral, the derivative and the held twist."""
         self._pid.reset()
         self._t_ns: int | None = None
         self._V_tcp = np.zeros(6)
@@ -56,7 +56,7 @@ class TactileServo:
 
     @property
     def active(self) -> bool:
-        """Whether it has seen a valid estimate since the latest reset."""
+        """True once a valid estimate has arrived since the latest reset."""
         return self._t_ns is not None
 
     @property
@@ -66,34 +66,35 @@ class TactileServo:
 
     @property
     def reference_mm_deg(self) -> Array:
-        """(6,) the desired contact as Euler components of ``T_f_sref``; NaN for axes that are not controlled."""
+        """(6,) desired contact as Euler components of ``T_f_sref``; NaN for axes that are not controlled."""
         return np.where(self._free, np.nan, self._reference)
 
     def error(self, T_s_f: Array) -> Array:
-        """Error motion ``e`` (6,), m and rad, in the sensor frame; see the class for its sign."""
+        """Return the error motion ``e`` (6,), m and rad, in the sensor frame; see the class for its sign."""
         return se3.log(self._error_pose(T_s_f))
 
     def step(self, T_s_f: Array | None, t_ns: int, V_ff: Array) -> Array:
-        """Twist (6,) of the tool centre point along tool axes.
+        """Return the twist (6,) of the tool centre point along tool axes.
 
-        The controller advances once for each new estimate; until the next one its output is held, so frames may come
-        more slowly than control cycles without kicks from the derivative.
+        The controller advances once for each new estimate and holds its output until the next one, so frames may arrive
+        more slowly than control cycles without derivative kicks.
 
         Args:
-            T_s_f: the estimate (4, 4); None while there is no valid one. Then nothing moves, feedforward included, and
-                the past is forgotten.
-            t_ns: the time that the estimate is for.
+            T_s_f: the estimate (4, 4); None while there is no valid one. Then the output is zero, feedforward included,
+                and
+                the state is reset.
+            t_ns: time of the estimate.
             V_ff: feedforward twist (6,) in the reference frame {s*}.
 
         Raises:
-            GeometryError, ControlError: something is not finite, of the wrong shape or no pose.
+            GeometryError, ControlError: an argument is not finite, of the wrong shape or not a pose.
         """
         if T_s_f is None:
             self.reset()
         elif self._t_ns is None or t_ns > self._t_ns:
             E = self._error_pose(T_s_f)
             dt_s = self._period_s if self._t_ns is None else (t_ns - self._t_ns) * 1e-9
-            with np.errstate(invalid="ignore"):  # the controller refuses what is not finite, by name
+            with np.errstate(invalid="ignore"):  # the controller raises on non-finite arguments, by name
                 V_ff_s = se3.adjoint(E) @ V_ff
             e = se3.log(E)
             V_s = self._pid.step(e, V_ff_s, dt_s)

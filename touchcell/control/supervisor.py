@@ -1,4 +1,4 @@
-"""The supervisor: sees every command before the arms do, and decides whether anything may move."""
+"""The supervisor: checks every command before it is sent, and decides whether motion is allowed."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from touchcell.control.latch import Latch, LatchState, ResetDone, ResetRefused
 from touchcell.drivers.core.device import OperatorToken
 
 LIMIT_FOR_NS: Final = 300_000_000
-"""A violation that only limits becomes a trip when it lasts longer (PEERS 4.2)."""
+"""A LIMIT violation that lasts longer becomes a trip."""
 
 REDUCED: Final = 0.25
-"""Share of the speed that is left while a violation limits."""
+"""Speed scaling while a LIMIT violation is present."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the supervisor says to one cycle.
+    """Decision of the supervisor for one cycle.
 
     Attributes:
-        allow: whether the commands may be sent. If not, every arm is told to stop.
-        speed: share of their speed with which they may be sent.
-        violations: what is wrong in this cycle.
-        trip: the first cause while the latch is not clear, as an error for whoever has to give up.
+        allow: True if the commands may be sent. If not, every arm is commanded to stop.
+        speed: factor in [0, 1] by which their speed is scaled.
+        violations: all violations of this cycle.
+        trip: the first cause while the latch is not clear, as an error for the caller to raise.
     """
 
     allow: bool
@@ -42,7 +42,7 @@ class Verdict:
 
 
 class _Remembered:
-    """A timed rule with its marks, to be asked like any other."""
+    """A timed interlock with its state, wrapped as a stateless one."""
 
     def __init__(self, rule: TimedInterlock) -> None:
         self.name = rule.name
@@ -56,16 +56,16 @@ class _Remembered:
 
 
 class Supervisor:
-    """Applies the interlocks to each cycle and holds the latch.
+    """Apply the interlocks to each cycle and hold the latch.
 
-    That every number is finite is checked before anything else, whatever the configuration: a NaN passes every
-    comparison that the others would make. A rule that raises is a fault, not a pass. What timed rules remember from one
-    cycle to the next is kept in ``_Remembered``, and nowhere else.
+    Finiteness of all numbers is checked first, whatever the configuration: every comparison with NaN is false, so the
+    other interlocks would pass it. An interlock that raises is a fault, not a pass. The state of timed interlocks is
+    kept in ``_Remembered`` only.
 
     Args:
-        interlocks: the configured rules.
-        latch: remembers what they find.
-        rest_m_s, rest_rad_s: an arm that measures at most these speeds is at rest.
+        interlocks: the configured interlocks.
+        latch: stores their violations.
+        rest_m_s, rest_rad_s: an arm whose measured speeds are at most these is at rest.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Supervisor:
         rest_rad_s: float = 1e-2,
     ) -> None:
         self._finite = Finite()
-        # Told apart once: isinstance with a Protocol costs more than most rules.
+        # Classified once: isinstance with a Protocol costs more than most interlocks.
         self._rules = tuple(_Remembered(rule) if isinstance(rule, TimedInterlock) else rule for rule in interlocks)
         self._latch = latch
         self._rest_m_s = rest_m_s
@@ -86,15 +86,15 @@ class Supervisor:
 
     @property
     def latch(self) -> Latch:
-        """The latch, to be read."""
+        """The latch, read-only."""
         return self._latch
 
     def review(self, view: CellView, alarms: Sequence[Violation] = ()) -> Verdict:
-        """Check ``view``, latch what it shows, and say whether its commands may be sent. Never raises.
+        """Check ``view``, latch its violations, and decide whether its commands may be sent. Never raises.
 
         Args:
-            view: what is known in this cycle.
-            alarms: what others have found, the watchdog for one; taken as it is.
+            view: snapshot of this cycle.
+            alarms: violations from other sources, such as the watchdog; used as they are.
         """
         violations = (*alarms, *self._violations(view))
         self._latch.update(violations)
@@ -107,7 +107,7 @@ class Supervisor:
         )
 
     def reset(self, token: OperatorToken, view: CellView, alarms: Sequence[Violation] = ()) -> ResetDone | ResetRefused:
-        """Clear the latch on a person's request, judged on ``view`` and ``alarms`` as they are; nothing moves by it."""
+        """Clear the latch at an operator's request, judged on the current ``view`` and ``alarms``; nothing moves."""
         self._latch.update((*alarms, *self._violations(view)))
         return self._latch.reset(
             token,
@@ -122,8 +122,8 @@ class Supervisor:
         return self._escalated(found, view.now_ns)
 
     def _escalated(self, found: Sequence[Violation], now_ns: int) -> tuple[Violation, ...]:
-        """``found``, with a trip in place of each limit that has lasted for too long."""
-        limiting = {(v.interlock, v.subject) for v in found if v.severity is Severity.LIMIT and not v.may_last}
+        """Return ``found`` with a trip in place of each LIMIT violation that has lasted too long."""
+        limiting = {(v.interlock, v.subject) for v in found if v.severity is Severity.LIMIT and v.escalates}
         self._limited_since_ns = {key: self._limited_since_ns.get(key, now_ns) for key in limiting}
         lasting = {key for key, since_ns in self._limited_since_ns.items() if now_ns - since_ns > LIMIT_FOR_NS}
         return tuple(
@@ -142,5 +142,5 @@ def _checked(interlock: Interlock, view: CellView) -> Violation | None:
     try:
         return interlock.check(view)
     except Exception as error:
-        reason = f"the rule could not be applied: {error!r}"
+        reason = f"the interlock could not be evaluated: {error!r}"
         return Violation(interlock.name, Severity.FAULT, "cell", reason, view.now_ns)

@@ -1,4 +1,4 @@
-"""Turns what a caller passed into a clean array, or says what is wrong with it. Both backends refuse through here."""
+"""Validate arguments: turn what a caller passed into a clean array, or raise. Both backends validate through here."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def real(function: str, argument: str, value: ArrayLike, core: tuple[int, ...]) 
     try:
         array = np.asarray(value)
     except ValueError as error:
-        raise GeometryError(function, argument, f"is no array: {error}") from error
+        raise GeometryError(function, argument, f"is not an array: {error}") from error
     if array.dtype.kind not in "fiu":
         raise GeometryError(function, argument, f"has dtype {array.dtype}, not real numbers")
     if array.shape[-len(core) :] != core:
@@ -47,12 +47,20 @@ def numbers(function: str, argument: str, value: ArrayLike, core: tuple[int, ...
 
 
 def twist(function: str, argument: str, value: ArrayLike) -> Array:
-    """Return ``value`` as exponential coordinates or twists, (..., 6)."""
+    """Return ``value`` as exponential coordinates or twists, (..., 6).
+
+    Raises:
+        GeometryError: as ``numbers``.
+    """
     return numbers(function, argument, value, (6,))
 
 
 def pose(function: str, argument: str, value: ArrayLike) -> Array:
-    """Return ``value`` as poses, (..., 4, 4), whose rotations are rotations to ``ROTATION_TOLERANCE``."""
+    """Return ``value`` as poses, (..., 4, 4), whose rotation blocks are orthonormal to ``ROTATION_TOLERANCE``.
+
+    Raises:
+        GeometryError: as ``real``, or it is not a rigid transform.
+    """
     T = numbers(function, argument, value, (4, 4))
     # Python's own floats are ten times faster than numpy on a single pose, and the same expressions serve both.
     entries: Any = T.ravel().tolist() if T.ndim == 2 else T.reshape(-1, 16).T.copy()
@@ -74,7 +82,7 @@ def pose(function: str, argument: str, value: ArrayLike) -> Array:
     if np.any(determinant < 0.0):
         raise GeometryError(function, argument, "mirrors space: the determinant of R is -1")
     if np.max(np.abs(np.asarray(bottom).T - (0.0, 0.0, 0.0, 1.0)), initial=0.0) > ROTATION_TOLERANCE:
-        raise GeometryError(function, argument, "is no pose: its last row is not [0, 0, 0, 1]")
+        raise GeometryError(function, argument, "is not a pose: its last row is not [0, 0, 0, 1]")
     return T
 
 

@@ -1,4 +1,4 @@
-"""SE(3) kernels in Python and numpy: the reference for the compiled ones, and what runs where they are missing.
+"""SE(3) kernels in Python and numpy: the reference for the compiled ones, and the fallback where those are not built.
 
 Each kernel takes the entries of its argument and returns the entries of its result, row by row. An entry is a Python
 float for one element and a column for a batch, so one formula serves both.
@@ -33,7 +33,7 @@ Entry: TypeAlias = Any
 """A float, or a float64 column."""
 
 Formula: TypeAlias = Callable[..., tuple[Entry, ...]]
-"""From entries to entries."""
+"""A kernel: maps the entries of its argument to the entries of its result."""
 
 TERMS = 9
 SERIES_A = [(-1) ** k / factorial(2 * k + 1) for k in range(TERMS)]
@@ -197,7 +197,7 @@ def _left_jacobian_inverse(x: Entry, y: Entry, z: Entry, a: Entry, b: Entry, c: 
 def _dual(
     x: Entry, y: Entry, z: Entry, a: Entry, b: Entry, c: Entry, f: Entry, g: Entry, df: Entry, dg: Entry
 ) -> tuple[Entry, ...]:
-    """[[M, N], [0, M]] with M = I + f W + g W^2, N its derivative along v; df, dg are 2 df/ds, 2 dg/ds."""
+    """Return [[M, N], [0, M]] with M = I + f W + g W^2, N its derivative along v; df, dg are 2 df/ds, 2 dg/ds."""
     fa, fb, fc = f * a, f * b, f * c
     gab, gac, gbc = g * a * b, g * a * c, g * b * c
     m00, m01, m02 = 1.0 - g * (b * b + c * c), gab - fc, gac + fb
@@ -289,7 +289,7 @@ def _closed_dg(s: Entry) -> tuple[Entry, ...]:
 
 
 def _angle_per_sine(qw: Entry, n2: Entry) -> tuple[Entry, Entry]:
-    """Rotation vector per vector part of an unnormalised quaternion with qw >= 0, and the half angle's cotangent."""
+    """Return rotation vector per vector part of an unnormalised quaternion with qw >= 0, and cot of the half angle."""
     # Below this the squares underflow; the angle is then 2 |q| / qw to the last bit, and the cotangent is not used.
     tiny = n2 < 1e-290
     if isinstance(n2, float):
@@ -304,7 +304,7 @@ def _angle_per_sine(qw: Entry, n2: Entry) -> tuple[Entry, Entry]:
 def _quaternion(
     r00: float, r01: float, r02: float, r10: float, r11: float, r12: float, r20: float, r21: float, r22: float
 ) -> tuple[float, ...]:
-    """Unnormalised quaternion (w >= 0, x, y, z), from the row of 4 q q' with the largest diagonal."""
+    """Return the unnormalised quaternion (w >= 0, x, y, z), from the row of 4 q q' with the largest diagonal."""
     trace = r00 + r11 + r22
     if trace > 0.0:
         w, x, y, z = 1.0 + trace, r21 - r12, r02 - r20, r10 - r01
@@ -320,7 +320,7 @@ def _quaternion(
 def _quaternion_columns(
     r00: Array, r01: Array, r02: Array, r10: Array, r11: Array, r12: Array, r20: Array, r21: Array, r22: Array
 ) -> tuple[Array, ...]:
-    """``_quaternion`` for columns."""
+    """Compute ``_quaternion`` for columns."""
     trace = r00 + r11 + r22
     w, x, y, z = 1.0 + trace, r21 - r12, r02 - r20, r10 - r01
     turned = np.flatnonzero(trace <= 0.0)

@@ -13,7 +13,7 @@ from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.types import Array
 
 SMALLEST_PIVOT = 32.0 * float(np.finfo(np.float64).eps)
-"""Of a Cholesky factorisation, in units of the variance: below, a covariance cannot be told from a singular one.
+"""Of a Cholesky factorisation, in units of the variance: below it, a covariance is numerically singular.
 
 Conditions up to 1e14 pass, and scales of the axes however different. Where those make several pivots small at once,
 another order of summation, such as LAPACK's, may still find none: so every kernel factorises as ``cholesky`` does.
@@ -64,12 +64,15 @@ def predict(U: Array, T: Array, S: Array, Q: Array | None) -> tuple[Array, Array
 def fuse(
     T1: Array, S1: Array, T2: Array, S2: Array, tolerance: float, max_iterations: int
 ) -> tuple[Array, Array, int, float] | None:
-    """Gauss-Newton on whitened residuals. Returns mean, covariance, updates made and normalised innovation squared.
+    """Fuse two Gaussians by Gauss-Newton on whitened residuals.
 
     With S_i = C_i C_i', e_i = log(T T_i^-1) and G_i = J_l^-1(e_i), each step solves C_i^-1 (e_i + G_i x) = 0 in the
-    least squares sense by QR, so no covariance is inverted and no normal equations are formed. A step counts as none
-    when it is below the tolerance, or below what the rounding of the poses looks like in standard deviations, which for
-    those below 1e-9 rad is more.
+    least squares sense by QR, so no covariance is inverted and no normal equations are formed. A step counts as zero
+    when it is below the tolerance, or below the rounding error of the poses in standard deviations, which is the larger
+    of the two for standard deviations below 1e-9 rad.
+
+    Returns:
+        Mean, covariance, number of updates, and normalised innovation squared.
     """
     C1, C2 = cholesky(S1), cholesky(S2)
     if C1 is None or C2 is None:
@@ -83,7 +86,7 @@ def fuse(
         triangle = np.asarray(np.linalg.qr(stack, mode="r"))
         R, y = triangle[:6, :6], triangle[:6, 6]
         if iteration == 0:
-            # What no x can explain: e' (G P1 G' + P2)^-1 e, without forming the sum.
+            # The residual that no x can reduce: e' (G P1 G' + P2)^-1 e, without forming the sum.
             nis = float(triangle[6, 6] ** 2)
         if y @ y < max(tolerance * tolerance, float(np.square(R * scale).sum())):
             root = np.linalg.inv(R)
@@ -93,9 +96,9 @@ def fuse(
 
 
 def cholesky(S: Array) -> Array | None:
-    """Lower Cholesky factor of a symmetric matrix, or None if it is not safely positive definite.
+    """Return the lower Cholesky factor of a symmetric matrix, or None if it is not safely positive definite.
 
-    On Python's floats: for one 6x6 matrix that is faster than numpy's call and its checks.
+    Computed on Python floats: for one 6x6 matrix that is faster than numpy's call and its checks.
     """
     rows: list[list[float]] = []
     for i, row in enumerate(S.tolist()):
@@ -112,7 +115,7 @@ def cholesky(S: Array) -> Array | None:
 
 
 def symmetric(S: Array) -> Array | None:
-    """The mean of S and its transpose, or None if they differ by more than rounding or are not finite."""
+    """Return the mean of S and its transpose, or None if they differ by more than rounding or are not finite."""
     if not np.abs(S).max() <= _check.LARGEST:
         return None
     difference = np.abs(S - S.T)
@@ -124,7 +127,10 @@ def symmetric(S: Array) -> Array | None:
 
 
 def semidefinite(Q: Array) -> Array | None:
-    """Q made symmetric if it is positive semidefinite, else None. An axis without noise is a zero row and column."""
+    """Return Q made symmetric if it is positive semidefinite, else None.
+
+    An axis without noise is a zero row and column.
+    """
     if not _is(Q, (6, 6)):
         return None
     noise = symmetric(Q)
@@ -134,7 +140,7 @@ def semidefinite(Q: Array) -> Array | None:
     quiet = variances == 0.0
     if noise[quiet].any():
         return None
-    # Raised by a hair, a singular Q is positive definite and an indefinite one is not.
+    # Adding a small diagonal makes a singular Q positive definite, but not an indefinite one.
     raised = noise.copy()
     raised.flat[::7] += np.where(quiet, 1.0, 1e-9 * variances)
     try:

@@ -1,4 +1,4 @@
-"""What can go wrong in geometry, as a type with attributes."""
+"""Errors of the geometry package."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from touchcell.errors import TouchcellError
 
 
 class GeometryError(TouchcellError, ValueError):
-    """An argument of a geometric function has the wrong shape, is not finite, or is no rigid transform.
+    """An argument of a geometric function has the wrong shape, is not finite, or is not a rigid transform.
 
     Attributes:
-        function: the function that refused.
-        argument: the name of the offending argument.
+        function: name of the function that raised.
+        argument: name of the offending argument.
     """
 
     def __init__(self, function: str, argument: str, reason: str, *, hint: str = "") -> None:

@@ -1,4 +1,4 @@
-"""Gaussians over poses, and the two steps of a filter on them: move (``compound``) and combine (``fuse``).
+"""Gaussians over poses, and the two steps of a filter on them: predict (``compound``) and correct (``fuse``).
 
 A ``PoseGaussian`` perturbs its mean on the left, T = exp(e) mean with e ~ N(0, covariance), so e is [v, w] in metres
 and radians along the axes of the frame in which the pose is given. Theory: Barfoot and Furgale, Associating
@@ -29,10 +29,10 @@ class NotPositiveDefinite(GeometryError):
 
 
 class NotConverged(GeometryError):
-    """``fuse`` did not settle.
+    """``fuse`` did not converge within its iteration limit.
 
     Attributes:
-        iterations: how many updates were made.
+        iterations: number of updates made.
     """
 
     def __init__(self, iterations: int) -> None:
@@ -46,7 +46,7 @@ class NotConverged(GeometryError):
 
 
 class _Kernels(Protocol):
-    """What both backends offer; None stands for arguments that are not clean."""
+    """Interface of both backends. They return None for invalid arguments."""
 
     def admit(self, mean: Array, covariance: Array, /) -> tuple[Array, Array] | None: ...
     def predict(self, U: Array, T: Array, S: Array, Q: Array | None, /) -> tuple[Array, Array] | None: ...
@@ -68,14 +68,14 @@ _kernels = _choose()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseGaussian:
-    """A pose and how far off it may be.
+    """A pose and its uncertainty.
 
     Attributes:
         mean: (4, 4) pose, read-only.
         covariance: (6, 6) of e in T = exp(e) mean, [v, w], m and rad; read-only, exactly symmetric.
 
     Raises:
-        GeometryError: the mean is no pose, or a shape is wrong.
+        GeometryError: the mean is not a pose, or a shape is wrong.
         NotPositiveDefinite: the covariance is not finite, asymmetric beyond rounding (1e-6 in units of the standard
             deviations), or singular to double precision.
     """
@@ -96,12 +96,12 @@ class PoseGaussian:
 
 @dataclass(frozen=True, slots=True)
 class FusionRecord:
-    """How a fusion went.
+    """Diagnostics of a fusion.
 
     Attributes:
         iterations: updates made to the prior's mean.
         nis: normalised innovation squared, e' (P1' + P2)^-1 e with the innovation e between the two means and P1'
-            the prior's covariance carried to it. Chi-squared with 6 degrees of freedom if the two agree.
+            the prior's covariance transported to it. Chi-squared with 6 degrees of freedom if the two are consistent.
     """
 
     iterations: int
@@ -109,16 +109,16 @@ class FusionRecord:
 
 
 def from_exponential(xi: ArrayLike, covariance_xi: ArrayLike) -> PoseGaussian:
-    """Gaussian over T = exp(xi + d), d ~ N(0, covariance_xi), to first order: covariance J_l(xi) S J_l(xi)'.
+    """Return the Gaussian over T = exp(xi + d), d ~ N(0, covariance_xi), to first order: covariance J_l(xi) S J_l(xi)'.
 
-    This is how a network's output, exponential coordinates with a Gaussian over them, becomes a Gaussian over poses.
+    Converts a network's output, exponential coordinates with a Gaussian over them, into a Gaussian over poses.
 
     Args:
         xi: (6,) [v, w], m and rad.
         covariance_xi: (6, 6).
 
     Raises:
-        NotPositiveDefinite: the covariance is none, as for ``PoseGaussian``.
+        NotPositiveDefinite: the covariance is invalid, as for ``PoseGaussian``.
     """
     J = se3.left_jacobian(xi)
     if J.ndim != 2:
@@ -130,20 +130,20 @@ def from_exponential(xi: ArrayLike, covariance_xi: ArrayLike) -> PoseGaussian:
 
 
 def inverse(g: PoseGaussian) -> PoseGaussian:
-    """Gaussian over the inverse pose. Exact."""
+    """Return the Gaussian over the inverse pose. Exact."""
     mean = se3.inverse(g.mean)
     Ad = se3.adjoint(mean)
     return PoseGaussian(mean, Ad @ g.covariance @ Ad.T)
 
 
 def compound(T: ArrayLike, g: PoseGaussian, noise: ArrayLike | None = None, order: Literal[2, 4] = 2) -> PoseGaussian:
-    """Gaussian over exp(w) T g, w ~ N(0, noise), for a known pose T: the prediction of a filter.
+    """Return the Gaussian over exp(w) T g, w ~ N(0, noise), for a known pose T: the prediction step of a filter.
 
     Without noise both orders are exact. With it, the second order suffices below 0.1 rad of standard deviation.
 
     Args:
         T: (4, 4), the frame of ``g`` in the new frame.
-        g: what is known so far.
+        g: the prior.
         noise: (6, 6) positive semidefinite, [v, w], m and rad; zero rows and columns for axes without noise.
         order: 2, or 4 for Barfoot and Furgale's fourth-order terms.
 
@@ -169,7 +169,7 @@ def compound(T: ArrayLike, g: PoseGaussian, noise: ArrayLike | None = None, orde
 def fuse(
     prior: PoseGaussian, observation: PoseGaussian, *, tolerance: float = 1e-6, max_iterations: int = 50
 ) -> tuple[PoseGaussian, FusionRecord]:
-    """The product of two Gaussians over one pose: the correction of a filter.
+    """Return the product of two Gaussians over one pose: the correction step of a filter.
 
     Minimises the sum of squared Mahalanobis distances by Gauss-Newton from the prior's mean, on whitened residuals;
     the covariance is that of the linearisation at the final mean. To the tolerance, the inputs may be exchanged.
@@ -194,11 +194,11 @@ def fuse(
 
 
 def mahalanobis_squared(g: PoseGaussian, T: ArrayLike) -> float:
-    """e' S^-1 e of a pose T = exp(e) mean. Chi-squared with 6 degrees of freedom for poses drawn from ``g``.
+    """Return e' S^-1 e of a pose T = exp(e) mean. Chi-squared with 6 degrees of freedom for poses drawn from ``g``.
 
     Raises:
-        GeometryError: ``T`` is no pose.
-        NotPositiveDefinite: the covariance is so near a singular one that the other backend alone admits it.
+        GeometryError: ``T`` is not a pose.
+        NotPositiveDefinite: the covariance is so close to singular that only the other backend accepts it.
     """
     e = se3.log(se3.compose(_single_pose("mahalanobis_squared", "T", T), se3.inverse(g.mean)))
     root = _plain_gaussian.cholesky(g.covariance)
@@ -209,7 +209,7 @@ def mahalanobis_squared(g: PoseGaussian, T: ArrayLike) -> float:
 
 
 def _fourth_order(S: Array, Q: Array) -> Array:
-    """What the fourth order adds to S + Q (Barfoot and Furgale 2014, section III)."""
+    """Return the fourth-order terms to add to S + Q (Barfoot and Furgale 2014, section III)."""
     A_S, A_Q = _moment(S), _moment(Q)
     mixed = A_Q @ S + A_S @ Q
     Svv, Svw, Sww = S[:3, :3], S[:3, 3:], S[3:, 3:]
@@ -241,7 +241,7 @@ def _single_pose(function: str, argument: str, value: ArrayLike) -> Array:
 
 
 def _matrix(function: str, argument: str, value: ArrayLike) -> Array:
-    """A (6, 6) float64 array of anything, finite or not."""
+    """Return ``value`` as a (6, 6) float64 array, finite or not."""
     array = _check.real(function, argument, value, (6, 6))
     if array.shape != (6, 6):
         raise GeometryError(function, argument, f"has shape {array.shape}, not (6, 6)")

@@ -2,14 +2,14 @@
 
 A pose ``T_a_b`` is a 4x4 matrix, the pose of frame b in frame a, so ``T_a_c = compose(T_a_b, T_b_c)``. Exponential
 coordinates and twists are ``[v, w]``: linear first, metres and radians. Every function takes one element or any
-leading batch shape, an empty one too, and returns new float64 arrays.
+leading batch shape, including an empty one, and returns new float64 arrays.
 
-What is not a number, not finite, of the wrong shape, or not a rotation where a pose is expected (to 1e-6, so that
+Input that is not numeric, not finite, of the wrong shape, or not a rotation where a pose is expected (to 1e-6, so that
 rotations rounded to float32 pass) raises ``GeometryError`` with the function and the argument.
 
-A C extension does the work where it is built; the environment variable ``TOUCHCELL_PURE_PYTHON`` selects the plain
-kernels instead, which use the same formulas. ``BACKEND`` says which one runs. Formulas: Barfoot, State Estimation for
-Robotics (2nd ed. 2024), chapter 8, with the coefficients and the Jacobian blocks rewritten so that nothing cancels
+A C extension is used where it is built; the environment variable ``TOUCHCELL_PURE_PYTHON`` selects the plain
+kernels instead, which use the same formulas. ``BACKEND`` names the one in use. Formulas: Barfoot, State Estimation for
+Robotics (2nd ed. 2024), chapter 8, with the coefficients and the Jacobian blocks rewritten to avoid cancellation
 (``touchcell/geometry/_plain.py``).
 """
 
@@ -40,7 +40,7 @@ __all__ = [
 
 
 class _Kernels(Protocol):
-    """What both backends offer."""
+    """Interface of both backends."""
 
     def exp(self, xi: ArrayLike, /) -> Array: ...
     def log(self, T: ArrayLike, /) -> Array: ...
@@ -71,7 +71,7 @@ PROJECTABLE = 0.5
 
 
 def exp(xi: ArrayLike) -> Array:
-    """Pose from exponential coordinates.
+    """Return the pose with the given exponential coordinates.
 
     Args:
         xi: (..., 6) [v, w], m and rad; any angle.
@@ -83,19 +83,19 @@ def exp(xi: ArrayLike) -> Array:
 
 
 def log(T: ArrayLike) -> Array:
-    """Exponential coordinates of a pose, with a rotation angle in [0, pi].
+    """Return the exponential coordinates of a pose, with a rotation angle in [0, pi].
 
     Args:
         T: (..., 4, 4).
 
     Returns:
-        (..., 6) [v, w], m and rad, accurate at every angle; at an exact half turn one of the two valid answers.
+        (..., 6) [v, w], m and rad, accurate at every angle; at an exact half turn one of the two valid solutions.
     """
     return _kernels.log(T)
 
 
 def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> Array:
-    """``T_a_c``, the product of two poses, broadcast over leading shapes.
+    """Return ``T_a_c``, the product of two poses, broadcast over leading shapes.
 
     Rounding drifts by 2e-13 in 1e6 products; ``project`` removes it.
     """
@@ -103,17 +103,17 @@ def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> Array:
 
 
 def inverse(T_a_b: ArrayLike) -> Array:
-    """``T_b_a``, from the transpose of the rotation."""
+    """Return ``T_b_a``, using the transpose of the rotation."""
     return _kernels.inverse(T_a_b)
 
 
 def adjoint(T_a_b: ArrayLike) -> Array:
-    """(..., 6, 6) matrix that takes a twist in frame b, [v, w], to the same twist in frame a."""
+    """Return the (..., 6, 6) matrix that maps a twist in frame b, [v, w], to the same twist in frame a."""
     return _kernels.adjoint(T_a_b)
 
 
 def left_jacobian(xi: ArrayLike) -> Array:
-    """(..., 6, 6) J with exp(xi + d) = exp(J d) exp(xi) to first order in d; the right Jacobian is J(-xi).
+    """Return the left Jacobian J, (..., 6, 6): exp(xi + d) = exp(J d) exp(xi) to first order; the right one is J(-xi).
 
     Args:
         xi: (..., 6) [v, w], m and rad; any angle.
@@ -122,16 +122,16 @@ def left_jacobian(xi: ArrayLike) -> Array:
 
 
 def left_jacobian_inverse(xi: ArrayLike) -> Array:
-    """(..., 6, 6) inverse of ``left_jacobian``, so that log(exp(d) exp(xi)) = xi + J^-1 d to first order in d.
+    """Return the (..., 6, 6) inverse of ``left_jacobian``: log(exp(d) exp(xi)) = xi + J^-1 d to first order in d.
 
     Args:
-        xi: (..., 6) [v, w], m and rad. Made for angles to pi, as ``log`` returns them; singular at 2 pi.
+        xi: (..., 6) [v, w], m and rad. Accurate for angles up to pi, as ``log`` returns them; singular at 2 pi.
     """
     return _kernels.left_jacobian_inverse(xi)
 
 
 def from_euler_mm_deg(pose: ArrayLike) -> Array:
-    """Pose from the numbers people write: R = Rz(gamma) Ry(beta) Rx(alpha), extrinsic xyz.
+    """Return the pose given by mm and degrees: R = Rz(gamma) Ry(beta) Rx(alpha), extrinsic xyz.
 
     Args:
         pose: (..., 6) [x_mm, y_mm, z_mm, alpha_deg, beta_deg, gamma_deg].
@@ -143,17 +143,17 @@ def from_euler_mm_deg(pose: ArrayLike) -> Array:
 
 
 def to_euler_mm_deg(T: ArrayLike) -> Array:
-    """(..., 6) [x_mm, y_mm, z_mm, alpha_deg, beta_deg, gamma_deg] of a pose, beta in [-90, 90].
+    """Return (..., 6) [x_mm, y_mm, z_mm, alpha_deg, beta_deg, gamma_deg] of a pose, beta in [-90, 90].
 
-    At beta = +-90 deg (gimbal lock) only gamma -+ alpha is determined: gamma is then whatever rounding left in the
-    first column of R, zero if nothing, and alpha is measured after turning back by gamma and so makes up for it. The
+    At beta = +-90 deg (gimbal lock) only gamma -+ alpha is determined: gamma then follows the rounding residue in the
+    first column of R (zero if there is none), and alpha, measured after rotating back by gamma, compensates for it. The
     pose round-trips everywhere.
     """
     return _kernels.to_euler_mm_deg(T)
 
 
 def project(T: ArrayLike) -> Array:
-    """Nearest pose to a matrix that is almost one, for instance after many products or from another program.
+    """Return the pose nearest to an almost rigid matrix, for instance after many products or from another program.
 
     The rotation becomes its orthogonal polar factor, the nearest rotation in the Frobenius norm, by the Newton-Schulz
     iteration R <- R (3 I - R'R)/2 (Higham, Functions of Matrices, 2008, section 8.3); the translation is kept.
@@ -162,7 +162,7 @@ def project(T: ArrayLike) -> Array:
         T: (..., 4, 4) with ``|R'R - I| <= 0.5`` in the Frobenius norm, det R > 0, and last row [0, 0, 0, 1] to 1e-3.
 
     Raises:
-        GeometryError: it is further from a pose than that; nothing nearby would be meant.
+        GeometryError: ``T`` is further from a pose than that.
     """
     nearest = np.array(_check.numbers("project", "T", T, (4, 4)))
     R = nearest[..., :3, :3]
@@ -174,7 +174,7 @@ def project(T: ArrayLike) -> Array:
     if np.any(np.linalg.det(R) < 0.0):
         raise GeometryError("project", "T", "mirrors space: the determinant of R is negative")
     if np.any(np.abs(nearest[..., 3, :] - (0.0, 0.0, 0.0, 1.0)) > 1e-3):
-        raise GeometryError("project", "T", "is no pose: its last row is not [0, 0, 0, 1]")
+        raise GeometryError("project", "T", "is not a pose: its last row is not [0, 0, 0, 1]")
     # The distance e becomes at most 3/4 e^2 + 1/4 e^3, so seven steps take 0.5 to rounding.
     for _ in range(7):
         R = R @ (1.5 * identity - 0.5 * gram)

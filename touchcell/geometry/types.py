@@ -1,4 +1,4 @@
-"""Names for the arrays that touchcell passes about. Shapes are in each docstring."""
+"""Array types used throughout touchcell. Shapes are stated in each docstring."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The MuJoCo model behind a dynamic scene: table, free objects, and soft tips on carriages.
 
-Settings and why: docs/simulation.md. Imported only where ``physics: dynamic`` is asked for.
+Settings and why: docs/explanation/simulation.md. Imported only where ``physics: dynamic`` is asked for.
 """
 
 from __future__ import annotations

@@ -324,7 +324,7 @@ class TipLawConfig(_Part):
 class SceneConfig(_Part, SceneSection):
     """The ``scene:`` section of a cell file. Poses are in the world frame.
 
-    ``physics`` says how true it is (docs/simulation.md). ``kinematic``: surfaces move as they were told, whatever
+    ``physics`` is the fidelity (docs/explanation/simulation.md). ``kinematic``: surfaces move as prescribed, whatever
     touches them. ``quasi_static``: besides, objects slide on the table where tips push them, without inertia and always
     upright. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms`` within ``step_ms``,
     the grid on which arms move and contacts are kept.

@@ -1,1 +1,1 @@
-"""Tasks as state machines over abilities: what the cell does, without knowing which devices do it."""
+"""Tasks: state machines over device protocols, independent of the devices that a cell uses."""

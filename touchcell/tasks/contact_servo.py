@@ -1,4 +1,4 @@
-"""One arm with the tactile sensor that it carries: what it feels, and how it is moved to hold a contact."""
+"""Contact servo: one arm with the tactile sensor that it carries, controlled to hold a reference contact."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from touchcell.tasks.interface import Observation, TaskConfig, TaskContext
 
 
 class Behavior(Protocol):
-    """What a hand does besides holding its contact, once that has settled."""
+    """Motion on top of a held contact, active once that has settled."""
 
     @property
     def feedforward(self) -> Array:
@@ -31,18 +31,18 @@ class Behavior(Protocol):
         ...
 
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
-        """Take in one cycle and tell whether the work is done.
+        """Process one cycle and return True when the behavior has finished.
 
         Args:
-            dt_s: how long the cycle was.
-            before: T_base_sensor (4, 4) a cycle ago.
+            dt_s: duration of the cycle.
+            before: T_base_sensor (4, 4) one cycle ago.
             now: T_base_sensor (4, 4).
             T_s_f: valid contact pose (4, 4), or None.
         """
         ...
 
     def telemetry(self) -> Mapping[str, float]:
-        """Named numbers for recording and plots, units in the names."""
+        """Return named numbers for recording and plots, units in the names."""
         ...
 
 
@@ -53,18 +53,18 @@ SixGains = Annotated[Six, Field(description="x, y, z, alpha, beta, gamma of the 
 
 
 class ContactServoConfig(TaskConfig):
-    """Parameters of one hand's servo.
+    """Parameters of one contact servo.
 
     Attributes:
         kp_per_s: proportional gain of each axis.
         ki_per_s2: integral gain of each axis.
         kd: derivative gain of each axis.
-        max_integral_speed_mm_s: largest speed that integral action may ask for.
-        max_integral_turn_deg_s: largest turning rate that integral action may ask for.
+        max_integral_speed_mm_s: largest speed that integral action may contribute.
+        max_integral_turn_deg_s: largest angular rate that integral action may contribute.
         integral_zone_mm: larger errors are not integrated, so that pressing in does not overshoot ...
         integral_zone_deg: ... nor does turning.
         max_speed_mm_s: largest speed of the sensor along each axis.
-        max_turn_deg_s: largest turning rate of the sensor about each axis.
+        max_turn_deg_s: largest angular rate of the sensor about each axis.
         settle_tolerance_mm: the contact is steady when the controlled errors are below these ...
         settle_tolerance_deg: ... two.
         max_frame_age_ms: the arm stops when the newest frame is older.
@@ -86,7 +86,7 @@ class ContactServoConfig(TaskConfig):
     max_state_age_ms: PositiveFloat = 50.0
 
     def gains(self) -> PidGains:
-        """Gains and clips in SI units."""
+        """Return gains and limits in SI units."""
         return PidGains(
             np.array(self.kp_per_s),
             np.array(self.ki_per_s2),
@@ -109,11 +109,11 @@ class ContactServo:
         sensor: role of its tactile sensor.
         config: parameters.
         reference_mm_deg: contact to hold, (6,) Euler components of ``T_f_s``.
-        run: what it does once settled.
+        run: behavior once settled.
         context: of the cell.
 
     Attributes:
-        T_base_sensor: (4, 4) where the sensor is; None where that is not known or too old.
+        T_base_sensor: (4, 4) pose of the sensor; None where it is unknown or too old.
         contact: newest estimate; None where there is none or its frame is too old.
 
     Raises:
@@ -144,12 +144,12 @@ class ContactServo:
 
     @property
     def has_fresh_data(self) -> bool:
-        """Whether there are a fresh frame and a fresh arm state."""
+        """True if both the frame and the arm state are fresh."""
         return self.T_base_sensor is not None and self.contact is not None
 
     @property
     def in_contact(self) -> bool:
-        """Whether the newest frame is of a contact."""
+        """True if the newest frame shows a contact."""
         return self.contact is not None and self.contact.in_contact
 
     @property
@@ -160,7 +160,7 @@ class ContactServo:
         return None if self.contact.belief is None else self.contact.belief.mean
 
     def update(self, observation: Observation) -> None:
-        """Take what can be relied on from a cycle's observation."""
+        """Update sensor pose and contact from an observation, dropping what is stale."""
         now_ns, limits = observation.now_ns, self._config
         arm = observation.arms.get(self.arm)
         self._before, self.T_base_sensor = self.T_base_sensor, None
@@ -171,11 +171,11 @@ class ContactServo:
             self.contact = None
 
     def reset_travel(self) -> None:
-        """Measure the way from here."""
+        """Measure the travelled distance from the current pose."""
         self._start = self.T_base_sensor
 
     def travelled_m(self) -> float:
-        """Way of the sensor since ``reset_travel``; 0 while it cannot be told."""
+        """Return the distance of the sensor from its pose at ``reset_travel``, m; 0 while it is unknown."""
         if self.T_base_sensor is None:
             return 0.0
         if self._start is None:
@@ -183,7 +183,7 @@ class ContactServo:
         return float(np.linalg.norm(self.T_base_sensor[:3, 3] - self._start[:3, 3]))
 
     def steady(self) -> bool:
-        """Whether the errors of the latest servo step are small and it was not held back."""
+        """Return True if the errors of the latest servo step are within tolerance and its output was not limited."""
         if self.T_s_f is None or not self.controller.active:
             return False
         e = self.controller.latest_error
@@ -191,34 +191,34 @@ class ContactServo:
         return bool(small and np.linalg.norm(e[3:]) <= np.radians(self._config.settle_tolerance_deg))
 
     def advance(self, dt_s: float) -> bool:
-        """Let ``run`` take in a cycle of which the motion is known; returns whether its work is done."""
+        """Update the behavior if the motion of the cycle is known; return True when it has finished."""
         if self.T_base_sensor is None or self._before is None:
             return False
         return self.run.update(dt_s, self._before, self.T_base_sensor, self.T_s_f)
 
     def along_z(self, speed_m_s: float) -> Array:
-        """Twist (6,) of the tool that moves the sensor along its axis."""
+        """Return the twist (6,) of the tool that moves the sensor along its z axis."""
         V_tcp: Array = self._Ad_tcp_sensor @ np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0])
         return V_tcp
 
     def servo_step(self, V_ff: Array) -> Array | None:
-        """Twist (6,) of the tool that holds the contact; None while there is no valid one."""
+        """Return the twist (6,) of the tool that holds the contact; None while there is no valid estimate."""
         V_tcp = self.controller.step(self.T_s_f, 0 if self.contact is None else self.contact.t_ns, V_ff)
         return None if self.T_s_f is None else V_tcp
 
     def telemetry(self, observation: Observation, *, servoing: bool) -> Mapping[str, float]:
-        """Age of the newest frame, and while ``servoing`` errors, references and what ``run`` has to tell."""
-        told: dict[str, float] = {}
+        """Return the age of the newest frame, and while ``servoing`` errors, references and the behavior's values."""
+        values: dict[str, float] = {}
         contact = observation.contacts.get(self.sensor)
         if contact is not None:
-            told["frame_age_ms"] = 1e-6 * (observation.now_ns - contact.t_frame_ns)
+            values["frame_age_ms"] = 1e-6 * (observation.now_ns - contact.t_frame_ns)
         if not (servoing and self.controller.active):
-            return told
+            return values
         errors, references = (_UNITS * self.controller.latest_error).tolist(), self.controller.reference_mm_deg.tolist()
         for name, error, reference in zip(_COMPONENTS, errors, references, strict=True):
             if math.isfinite(reference):
-                told[f"error_{name}"], told[f"reference_{name}"] = error, reference
-        return {**told, **self.run.telemetry()}
+                values[f"error_{name}"], values[f"reference_{name}"] = error, reference
+        return {**values, **self.run.telemetry()}
 
 
 _COMPONENTS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")

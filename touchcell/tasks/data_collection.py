@@ -1,7 +1,7 @@
-"""Collect labelled images: touch a known surface again and again, each time in another way (paper, Algorithm 1).
+"""Collect labelled images: touch a known surface repeatedly with varied contacts (paper, Algorithm 1).
 
-For each sample the sensor tilts out of contact, is pressed in along the surface's normal, sheared along it, and stands
-still while a frame is taken. Label and frame go to the cell, which keeps them.
+For each sample the sensor tilts out of contact, is pressed in along the surface normal, sheared along the surface, and
+rests while a frame is taken. The cell stores frame and label.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ class DataCollectionConfig(TaskConfig):
     """Parameters of data collection. The ranges are those of the public data.
 
     Attributes:
-        samples: how many to collect, counting those that earlier runs have left.
+        samples: number of samples to collect, including those of earlier runs.
         seed: of the contacts; sample k is the same whenever it is taken.
-        depth_mm: least and greatest indentation.
+        depth_mm: smallest and largest indentation.
         tilt_deg: radius of the disc of tilts.
         shear_mm: radius of the disc of shears.
-        torsion_deg: largest turn about the surface's normal.
+        torsion_deg: largest rotation about the surface normal.
         clearance_mm: gap between tip and surface while the sensor tilts.
         speed_mm_s: speed out of contact.
         press_speed_mm_s: speed in contact.
-        turn_deg_s: turning rate.
-        settle_ms: how long the sensor has stood still when a frame counts.
+        turn_deg_s: angular rate.
+        settle_ms: time at rest before a frame is used.
         move_timeout_s: longest time of each motion.
         max_frame_age_ms: the arm stops when the newest frame is older.
         max_state_age_ms: the arm stops when its newest state is older.
@@ -89,7 +89,7 @@ _MOVING = (CollectState.LIFT, CollectState.TILT, CollectState.PRESS, CollectStat
 
 
 def collect_table(config: DataCollectionConfig) -> Table:
-    """States and transitions of data collection."""
+    """Return the states and transitions of data collection."""
     s = CollectState
     longest_s = config.move_timeout_s
     return Table(
@@ -132,7 +132,7 @@ def collect_table(config: DataCollectionConfig) -> Table:
 
 @dataclass(frozen=True, slots=True)
 class _Sight:
-    """What can be relied on in one cycle: None where it is missing or too old."""
+    """Valid, fresh data of one cycle: None where missing or too old."""
 
     now_ns: int
     T_base_s: Array | None
@@ -140,14 +140,14 @@ class _Sight:
 
     @property
     def T_s_f(self) -> Array | None:  # noqa: N802  the field's own name
-        """Where the surface is, (4, 4)."""
+        """Pose of the surface in the sensor frame, (4, 4)."""
         return None if self.contact is None or self.contact.belief is None else self.contact.belief.mean
 
 
 class DataCollection(MachineTask):
-    """The task in execution; see ``touchcell.tasks.interface.Task`` for what its members mean.
+    """The data collection task; see ``touchcell.tasks.interface.Task`` for its members.
 
-    Its estimator has to know where the surface is, also out of contact (``kind: known_surface``).
+    Its estimator has to know the surface pose, also out of contact (``kind: known_surface``).
 
     Args:
         config: its parameters.
@@ -197,33 +197,33 @@ class DataCollection(MachineTask):
         return self._taken < self._config.samples
 
     def was_stopped(self) -> bool:
-        """Guard: a person asked for the end."""
+        """Guard: the operator requested a stop."""
         return self._stop_seen
 
     def withdraw(self, record: TransitionRecord) -> None:
-        """On entry: straight back from wherever the sensor is, turned as it is."""
+        """On entry: straight back from the current pose, orientation unchanged."""
         self._goal = None
 
     def aim_tilt(self, record: TransitionRecord) -> None:
-        """On entry: the next sample's tilt, above where it will touch."""
+        """On entry: the next sample's tilt, above its contact point."""
         _, _, _, alpha, beta, _ = self._sample()
         self._aim([0.0, 0.0, -self._config.clearance_mm, alpha, beta, 0.0])
 
     def aim_press(self, record: TransitionRecord) -> None:
-        """On entry: down to its depth."""
+        """On entry: press in to its depth."""
         _, _, depth, alpha, beta, _ = self._sample()
         self._aim([0.0, 0.0, depth, alpha, beta, 0.0])
 
     def aim_shear(self, record: TransitionRecord) -> None:
-        """On entry: along the surface."""
+        """On entry: shear along the surface."""
         self._aim(self._sample())
 
     def start_grab(self, record: TransitionRecord) -> None:
-        """On entry: stay, and count the time."""
+        """On entry: rest, and start the settling time."""
         self._arrived_ns = record.t_ns
 
     def _sample(self) -> list[float]:
-        """Contact T_f_s of the sample in hand, mm and degrees."""
+        """Return the contact T_f_s of the current sample, mm and degrees."""
         config = self._config
         T_f_s = random_poses(
             1,
@@ -251,7 +251,7 @@ class DataCollection(MachineTask):
         return _Sight(now_ns, T_base_s, contact)
 
     def _watch(self, observation: Observation) -> Mapping[str, Array]:
-        """Post what this cycle means for the present state; returns the label of a frame that is to be kept."""
+        """Post the events of this cycle for the current state; return the label of a frame to be stored."""
         if observation.operator_stop and not self._stop_seen:
             self._stop_seen = True
             self._post(STOP, "operator")
@@ -291,11 +291,11 @@ class DataCollection(MachineTask):
         self._machine.post(event, reason, epoch=self._machine.epoch)
 
     def _twist(self) -> Array | None:
-        """Twist (6,) of the sensor in the present state; None where it has to stand still."""
+        """Return the twist (6,) of the sensor in the current state; None where it has to rest."""
         T_base_s, state = self._sight.T_base_s, self._machine.state
         if T_base_s is None or self._T_base_f is None or state not in _MOVING:
             return None
-        # Away from the surface it may go without seeing.
+        # Moving away from the surface is allowed without fresh frames.
         if self._sight.contact is None and state is not CollectState.RETRACT:
             return None
         if self._goal is None:
@@ -308,7 +308,7 @@ class DataCollection(MachineTask):
 
 SPEC = TaskSpec(
     name="data_collection",
-    summary="touch a known surface in many ways and label what the sensor sees",
+    summary="touch a known surface with varied contacts and store labelled frames",
     config=DataCollectionConfig,
     arms={ARM: frozenset({"TcpSource", "TwistSink", "Stoppable"})},
     sensors=frozenset({SENSOR}),

@@ -1,4 +1,4 @@
-"""State diagrams of the tasks in ``docs/tasks.md``: ``python -m touchcell.tasks.diagrams [FILE]`` writes them anew."""
+"""State diagrams of the tasks: ``python -m touchcell.tasks.diagrams [FILE]`` redraws docs/explanation/tasks.md."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from touchcell.tasks.servoing import servo_table
 from touchcell.tasks.state_machine import Table, mermaid
 from touchcell.tasks.surface_following import SurfaceFollowingConfig
 
-PAGE: Final = Path(__file__).parents[2] / "docs" / "tasks.md"
+PAGE: Final = Path(__file__).parents[2] / "docs" / "explanation" / "tasks.md"
 
 _BLOCK: Final = re.compile(r"(<!-- diagram: (\w+) -->\n).*?(<!-- end of diagram -->)", re.DOTALL)
 
 
 def tables() -> Mapping[str, Table]:
-    """The tables that are drawn, by the word in their markers."""
+    """Return the tables that are drawn, by the name in their markers."""
     return {
         "servoing": servo_table("servoing", SurfaceFollowingConfig(), run_timeout_s=1.0),
         "data_collection": collect_table(DataCollectionConfig()),
@@ -29,7 +29,11 @@ def tables() -> Mapping[str, Table]:
 
 
 def redrawn(page: str) -> str:
-    """``page`` with every diagram between its markers drawn from the code. Raises KeyError for an unknown one."""
+    """Return ``page`` with every diagram between its markers drawn from the code.
+
+    Raises:
+        KeyError: a marker names an unknown diagram.
+    """
     known = tables()
 
     def draw(block: re.Match[str]) -> str:
@@ -39,7 +43,7 @@ def redrawn(page: str) -> str:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Redraw the diagrams of the page named, or of ``docs/tasks.md``."""
+    """Redraw the diagrams of the given page, or of ``docs/explanation/tasks.md``."""
     page = Path(arguments[0]) if arguments else PAGE
     page.write_text(redrawn(page.read_text(encoding="utf-8")), encoding="utf-8")
 

@@ -1,5 +1,7 @@
-"""Push an object to a target with two arms: the leader pushes and steers, the follower holds the far side and goes
-along, which keeps tall objects from toppling (paper 3.3.4)."""
+"""Push an object to a target with two arms (paper 3.3.4).
+
+The leader pushes and steers; the follower holds the far side and moves along, which keeps tall objects from toppling.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +24,15 @@ FOLLOWER_SENSOR: Final = "follower_sensor"
 
 
 class FollowerConfig(ContactServoConfig):
-    """Parameters of the follower: object tracking at a depth that presses the object on the leader.
+    """Parameters of the follower: object tracking at a depth that presses the object onto the leader.
 
     Attributes:
         reference_mm_deg: contact to hold; only the components with gains count.
-        active: whether it also goes ahead of the object, as fast as the leader drives and turns it, so that touch has
-            only to correct that: both arms active. Else it only gives way, as in the paper.
-        turn_deg_per_mm: how far the object turns per sideways motion of the leader's contact; of an 80 mm square it is
-            0.9, a / (a^2 + c^2) with a from its middle to the contact and c its friction radius.
+        active: if True, its feedforward also moves it with the object, as fast as the leader drives and turns it, so
+            that
+            touch only corrects the rest: both arms are active. If False, it only complies, as in the paper.
+        turn_deg_per_mm: rotation of the object per lateral motion of the leader's contact; of an 80 mm square it is
+            0.9, a / (a^2 + c^2) with a from its centre to the contact and c its friction radius.
     """
 
     active: bool = False
@@ -43,11 +46,11 @@ class FollowerConfig(ContactServoConfig):
 
 
 class DualArmPushingConfig(PushConfig, ServoConfig):
-    """Parameters of dual-arm pushing; what is said of pushing is the leader's, in the leader's base frame.
+    """Parameters of dual-arm pushing; those of pushing apply to the leader, in the leader's base frame.
 
     Attributes:
-        align_max_mm_s: largest sideways speed: more than alone, since the follower drags behind.
-        follower: the other hand's.
+        align_max_mm_s: largest lateral speed: more than for a single arm, since the follower adds drag.
+        follower: parameters of the follower's servo.
     """
 
     align_max_mm_s: PositiveFloat = 15.0
@@ -55,11 +58,11 @@ class DualArmPushingConfig(PushConfig, ServoConfig):
 
 
 class Follow:
-    """The run of the follower: with the object, as the leader drives it. The leader says when it is done.
+    """Behavior of the follower: moves with the object as the leader drives it. The leader decides when it is done.
 
     Args:
         config: parameters.
-        push: what the leader does; None for a follower that only gives way.
+        push: the leader's behavior; None for a follower that only complies.
     """
 
     def __init__(self, config: DualArmPushingConfig, push: Push | None) -> None:
@@ -71,8 +74,11 @@ class Follow:
 
     @property
     def feedforward(self) -> Array:
-        """Twist (6,) in the desired sensor frame: that of a point of the object as far beyond its middle as the leader
-        is before it. The follower's left is the leader's right."""
+        """Twist (6,) in the desired sensor frame.
+
+        It is that of a point of the object as far beyond its centre as the leader is before it. The follower's left is
+        the leader's right.
+        """
         if self._push is None:
             return np.zeros(6)
         turn_rad_s = self._turn_per_m * self._push.left_m_s
@@ -81,21 +87,21 @@ class Follow:
 
     @property
     def timeout_s(self) -> float:
-        """As long as the leader takes."""
+        """Infinite: the leader's timeout applies."""
         return float("inf")
 
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
-        """Never done by itself."""
+        """Return False: it never finishes by itself."""
         self._y_is_left = -float(np.sign(now[2, 0]))
         return False
 
     def telemetry(self) -> Mapping[str, float]:
-        """Nothing more."""
+        """Return no further telemetry."""
         return {}
 
 
 def build(config: DualArmPushingConfig, context: TaskContext) -> ServoTask:
-    """The task in a cell that has ``leader`` and ``follower`` with a sensor each."""
+    """Build the task for a cell that has ``leader`` and ``follower`` with a sensor each."""
     push, hold = Push(config), config.follower
     leader = ContactServo(LEADER, LEADER_SENSOR, config, config.reference_mm_deg, push, context)
     follow = Follow(config, push if hold.active else None)

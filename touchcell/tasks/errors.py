@@ -1,4 +1,4 @@
-"""What can go wrong in tasks, as types with attributes."""
+"""Errors of the tasks."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from touchcell.errors import TouchcellError
 
 
 class TaskDefinitionError(TouchcellError, ValueError):
-    """A task's table is wrong; found when the task is built, before anything moves.
+    """A task's table is invalid; raised when the task is built, before anything moves.
 
     Attributes:
         task: name of the task.
-        problems: everything that is wrong, one sentence each.
+        problems: all problems found, one sentence each.
     """
 
     def __init__(self, task: str, problems: Sequence[str]) -> None:

@@ -1,14 +1,14 @@
-"""Between a task and the cell that runs it: what the task sees each cycle and what it asks for.
+"""Interface between a task and the cell that runs it: observations in, actions out.
 
-A task never touches a device. The run loop reads the devices, hands over an ``Observation``, puts the ``Action``
-through the supervisor, and sends what is left. So every task is tested with plain data and an injected clock.
+A task never touches a device. The run loop reads the devices, passes an ``Observation``, checks the ``Action`` with the
+supervisor, and sends what it allows. So every task is tested with plain data and an injected clock.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from pydantic import BaseModel, ConfigDict
 
@@ -16,6 +16,7 @@ from touchcell.drivers.core.commands import TwistCommand
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.registry import Registry
 
 
 class TaskConfig(BaseModel):
@@ -26,15 +27,15 @@ class TaskConfig(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What the cell knows at one control cycle.
+    """State of the cell at one control cycle.
 
     Attributes:
         now_ns: time of the cycle.
         arms: newest state of each arm, by role in the task ("arm", "leader", ...).
         contacts: newest estimate of each tactile sensor, by role ("sensor", ...); a role is missing until its first
             frame has been processed.
-        operator_stop: whether a person asked for an orderly end.
-        ended: whether no sensor will deliver anything more, because recordings have been played.
+        operator_stop: True if the operator requested an orderly end.
+        ended: True if no sensor will deliver further frames, because the recordings have ended.
     """
 
     now_ns: int
@@ -46,12 +47,12 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """What the task asks for in one control cycle.
+    """Commands and data of a task for one control cycle.
 
     Attributes:
-        twists: a command for each arm that shall move; an arm without one is told to stop.
+        twists: a command for each arm that shall move; an arm without one is stopped.
         telemetry: named numbers for recording and plots, units in the names.
-        labels: contact T_f_s (4, 4) that the newest frame of a sensor shows, by role: the frame is kept with it.
+        labels: contact T_f_s (4, 4) shown by the newest frame of a sensor, by role: the frame is stored with it.
     """
 
     twists: Mapping[str, TwistCommand] = field(default_factory=dict)
@@ -61,7 +62,7 @@ class Action:
 
 @dataclass(frozen=True, slots=True)
 class TransitionRecord:
-    """One change of a task's state."""
+    """One transition of a task's state machine."""
 
     t_ns: int
     source: str
@@ -71,45 +72,45 @@ class TransitionRecord:
 
 
 class Task(Protocol):
-    """A task in execution."""
+    """A running task."""
 
     @property
     def state(self) -> str:
-        """Name of the present state."""
+        """Name of the current state."""
         ...
 
     @property
     def finished(self) -> bool:
-        """Whether a terminal state has been reached."""
+        """True if a terminal state has been reached."""
         ...
 
     @property
     def succeeded(self) -> bool:
-        """Whether that state means that the task did what it promises."""
+        """True if that state means that the task has achieved its goal."""
         ...
 
     @property
     def transitions(self) -> tuple[TransitionRecord, ...]:
-        """Every change of state so far."""
+        """All transitions so far."""
         ...
 
     def tick(self, observation: Observation) -> Action:
-        """Advance by one cycle. Never blocks, never raises for what devices may do."""
+        """Process one cycle. Never blocks, and never raises for a device's behaviour."""
         ...
 
     def trip(self, now_ns: int, reason: str) -> None:
-        """The supervisor has latched: go to the tripped state, from which nothing moves."""
+        """Enter the tripped state, from which nothing moves, because the supervisor has latched."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class TaskContext:
-    """What a task needs to know of the cell that it will run in.
+    """Properties of the cell that a task needs.
 
     Attributes:
         rate_hz: control cycles per second.
         T_tcp_sensor: pose (4, 4) of each sensor role in the tool frame of the arm that carries it.
-        kept: how many labelled frames earlier runs of this cell have left.
+        kept: number of labelled frames that earlier runs of this cell have stored.
     """
 
     rate_hz: float
@@ -122,13 +123,13 @@ class TaskSpec:
     """A task's entry point (group ``touchcell.tasks``).
 
     Attributes:
-        name: the word in the cell file.
+        name: value of ``task`` in the cell file.
         summary: one line for ``touchcell list``.
         config: pydantic model of its parameters.
-        arms: roles of arms and the abilities (names in ``touchcell.drivers.core.protocols``) each must have.
-        sensors: roles of tactile sensors it needs.
-        build: makes the task from its parameters and the context.
-        labels_frames: whether it labels frames, which the cell has to put somewhere.
+        arms: roles of arms and the protocols (names in ``touchcell.drivers.core.protocols``) each must provide.
+        sensors: roles of the tactile sensors it needs.
+        build: builds the task from its parameters and the context.
+        labels_frames: True if it labels frames, which the cell has to store.
     """
 
     name: str
@@ -138,3 +139,7 @@ class TaskSpec:
     sensors: frozenset[str]
     build: Callable[[Any, TaskContext], Task]
     labels_frames: bool = False
+
+
+TASKS: Final = Registry("touchcell.tasks", "task", TaskSpec)
+"""All installed tasks."""

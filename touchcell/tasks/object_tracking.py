@@ -1,4 +1,4 @@
-"""Track an object: keep the contact as it is while the object moves (paper 5, object tracking)."""
+"""Track an object: hold the contact while the object moves (paper 5, object tracking)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class ObjectTrackingConfig(ServoConfig):
 
     Attributes:
         depth_mm: indentation to hold, normal to the surface and without shear.
-        duration_s: how long to track.
+        duration_s: duration of the tracking.
     """
 
     depth_mm: PositiveFloat = 6.0
@@ -30,7 +30,7 @@ class ObjectTrackingConfig(ServoConfig):
 
 
 class Track:
-    """The run of object tracking: no feedforward, until the time is over."""
+    """Behavior of object tracking: no feedforward, until the time is over."""
 
     def __init__(self, config: ObjectTrackingConfig) -> None:
         self._left_s = config.duration_s
@@ -38,26 +38,26 @@ class Track:
 
     @property
     def feedforward(self) -> Array:
-        """No twist (6,): the object leads."""
+        """Zero twist (6,): the object leads."""
         return np.zeros(6)
 
     @property
     def timeout_s(self) -> float:
-        """A second more than the run takes."""
+        """Duration plus one second."""
         return self._timeout_s
 
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
-        """Count the time."""
+        """Return True once the duration has passed."""
         self._left_s -= dt_s
         return self._left_s <= 0.0
 
     def telemetry(self) -> Mapping[str, float]:
-        """Nothing more."""
+        """Return no further telemetry."""
         return {}
 
 
 def build(config: ObjectTrackingConfig, context: TaskContext) -> ServoTask:
-    """The task in a cell that has ``arm`` and ``sensor``."""
+    """Build the task for a cell that has ``arm`` and ``sensor``."""
     reference = (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0)
     servo = ContactServo(ARM, SENSOR, config, reference, Track(config), context)
     return ServoTask("object_tracking", config, context, servo)

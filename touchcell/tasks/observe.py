@@ -1,4 +1,4 @@
-"""Only look: perception without an arm, on a live camera or on recorded images, until told or until they end."""
+"""Observe: perception without an arm, on a live camera or on recorded images, until stopped or until they end."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class ObserveConfig(TaskConfig):
     """Parameters of observing.
 
     Attributes:
-        first_frame_timeout_s: give up when no frame has come by then.
-        idle_timeout_s: the source has ended when no new frame has come for this long.
-        duration_s: longest time to look.
+        first_frame_timeout_s: longest wait for the first frame.
+        idle_timeout_s: the source counts as ended when no new frame has come for this long.
+        duration_s: longest duration of the task.
     """
 
     first_frame_timeout_s: PositiveFloat = 5.0
@@ -45,7 +45,7 @@ class ObserveState(Enum):
 
 
 def observe_table(config: ObserveConfig) -> Table:
-    """States and transitions of observing; being told to stop is its ordinary end."""
+    """Return the states and transitions of observing; an operator's stop is its ordinary end."""
     s = ObserveState
     return Table(
         "observe",
@@ -71,7 +71,7 @@ def observe_table(config: ObserveConfig) -> Table:
 
 
 class Observe(MachineTask):
-    """The task in execution; see ``touchcell.tasks.interface.Task``. It never commands anything."""
+    """The observing task; see ``touchcell.tasks.interface.Task``. It never commands anything."""
 
     def __init__(self, config: ObserveConfig, context: TaskContext) -> None:
         self._config = config
@@ -81,7 +81,7 @@ class Observe(MachineTask):
         self._frames = 0
 
     def tick(self, observation: Observation) -> Action:
-        """Advance by one cycle: no commands, only numbers."""
+        """Process one cycle: no commands, only telemetry."""
         if self.finished:
             return Action()
         if observation.operator_stop:
@@ -92,7 +92,7 @@ class Observe(MachineTask):
             self._seen_ns = observation.now_ns
             self._frames += 1
         if observation.ended:
-            self._machine.post("ended", "the recording has been played")
+            self._machine.post("ended", "the recording has ended")
         if self._machine.state is ObserveState.WAIT and self._frames:
             self._machine.post("frame")
         idle_s = (observation.now_ns - self._seen_ns) * 1e-9
@@ -121,7 +121,7 @@ class Observe(MachineTask):
 
 SPEC = TaskSpec(
     name="observe",
-    summary="show what the sensor feels, without an arm",
+    summary="show the tactile perception of a sensor, without an arm",
     config=ObserveConfig,
     arms={},
     sensors=frozenset({SENSOR}),

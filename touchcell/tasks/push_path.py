@@ -1,9 +1,9 @@
-"""Where to push an object: the shortest smooth way to a place and heading, around obstacles.
+"""Path planning for pushing: the shortest smooth path to a position and heading, around obstacles.
 
-A stably pushed object is steered like a car. Pushed at a point ``a`` behind its middle it turns, per way, by
-``a tan(phi) / c^2`` when the force leans by ``phi`` from the contact normal, with ``c`` the friction radius of its
-bottom (the ellipsoidal limit surface, Goyal, Ruina & Papadopoulos 1991). The force cannot lean further than the
-friction cone, so no turn is narrower than ``c^2 / (a mu)``; ways are made of straight pieces and arcs no narrower
+A stably pushed object is steered like a car. Pushed at a point ``a`` behind its centre it turns, per distance, by
+``a tan(phi) / c^2`` when the force is inclined by ``phi`` to the contact normal, with ``c`` the friction radius of its
+bottom (the ellipsoidal limit surface, Goyal, Ruina & Papadopoulos 1991). The force stays inside the friction cone, so
+the turning radius is at least ``c^2 / (a mu)``; paths are made of straight segments and arcs of that radius or more
 (Dubins 1957).
 """
 
@@ -21,13 +21,13 @@ Pose = tuple[float, float, float]
 """x and y, m, and heading, rad."""
 
 STEP_M = 0.005
-# Kinds of way, and for those of three arcs, on which side of the other two the middle one lies.
+# Dubins words, and for those of three arcs, on which side of the other two the middle one lies.
 _KINDS = (("LSL", 0), ("RSR", 0), ("LSR", 0), ("RSL", 0), ("LRL", 1), ("LRL", -1), ("RLR", 1), ("RLR", -1))
 _VIA_DIRECTIONS = 24
 
 
 class NoPathFound(TouchcellError, ValueError):
-    """There is no way that is smooth enough and clear of the obstacles.
+    """No path is smooth enough and clear of the obstacles.
 
     Attributes:
         start, goal: poses.
@@ -35,71 +35,74 @@ class NoPathFound(TouchcellError, ValueError):
 
     def __init__(self, start: Pose, goal: Pose) -> None:
         super().__init__(
-            f"no way from {_told(start)} to {_told(goal)} clear of the obstacles; smaller turns or clearances may help"
+            f"no path from {_format(start)} to {_format(goal)} clear of the obstacles; "
+            "a smaller turning radius or clearance may help"
         )
         self.start = start
         self.goal = goal
 
 
-def _told(pose: Pose) -> str:
+def _format(pose: Pose) -> str:
     return f"({1e3 * pose[0]:.0f}, {1e3 * pose[1]:.0f}) mm, {math.degrees(pose[2]):.0f} deg"
 
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """A disc that the object's middle keeps out of: the obstacle and half of the object. Metres."""
+    """Disc that the object's centre keeps out of: the obstacle enlarged by half of the object. Metres."""
 
     x_m: float
     y_m: float
     radius_m: float
 
     def hits(self, points: Sequence[Point]) -> bool:
-        """Whether a point lies inside."""
+        """Return True if any point lies inside."""
         limit = self.radius_m - 1e-6
         return any(math.hypot(x - self.x_m, y - self.y_m) < limit for x, y in points)
 
 
 def min_turning_radius_m(contact_m: float, friction_radius_m: float, friction: float) -> float:
-    """Least radius of a stable push's turn.
+    """Return the smallest turning radius of a stable push, m.
 
     Args:
-        contact_m: from the object's middle to where it is pushed.
+        contact_m: distance from the object's centre to the contact.
         friction_radius_m: of its bottom; see ``touchcell.simulation.solids.friction_radius_m``.
-        friction: of the skin on the object.
+        friction: friction coefficient between skin and object.
     """
     return friction_radius_m**2 / (contact_m * friction)
 
 
 def plan(start: Pose, goal: Pose, turn_m: float, obstacles: Sequence[Obstacle] = ()) -> list[Point]:
-    """Points every few millimetres on the shortest way found, without the start, the goal the last one.
+    """Plan the shortest path found, as points every few millimetres, without the start; the last one is the goal.
 
-    Without obstacles it is the shortest there is. With them, ways past one pose beside an obstacle are tried too.
+    Without obstacles it is the shortest of all. With them, paths through one via pose beside an obstacle are tried too.
 
     Args:
-        start: of the object's middle.
+        start: pose of the object's centre.
         goal: likewise.
-        turn_m: radius of its turns.
-        obstacles: what its middle keeps out of.
+        turn_m: turning radius.
+        obstacles: discs that its centre keeps out of.
 
     Raises:
-        NoWay: none is clear.
+        NoPathFound: no candidate is clear.
     """
     best: list[Point] | None = None
     length = math.inf
-    for way, travelled_m in _ways(start, goal, turn_m, obstacles):
-        if travelled_m < length and not any(obstacle.hits(way) for obstacle in obstacles):
-            best, length = way, travelled_m
+    for path, travelled_m in _candidates(start, goal, turn_m, obstacles):
+        if travelled_m < length and not any(obstacle.hits(path) for obstacle in obstacles):
+            best, length = path, travelled_m
     if best is None:
         raise NoPathFound(start, goal)
     return best
 
 
 def length_m(points: Sequence[Point]) -> float:
-    """Of the pieces between points."""
+    """Return the length of the polyline through ``points``, m."""
     return sum(math.hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(points))
 
 
-def _ways(start: Pose, goal: Pose, turn_m: float, obstacles: Sequence[Obstacle]) -> Iterator[tuple[list[Point], float]]:
+def _candidates(
+    start: Pose, goal: Pose, turn_m: float, obstacles: Sequence[Obstacle]
+) -> Iterator[tuple[list[Point], float]]:
     for kind in _KINDS:
         if found := _dubins(start, goal, turn_m, *kind):
             yield found
@@ -110,22 +113,25 @@ def _ways(start: Pose, goal: Pose, turn_m: float, obstacles: Sequence[Obstacle])
             at = obstacle.x_m + around_m * math.cos(angle), obstacle.y_m + around_m * math.sin(angle)
             for side in (0.5 * math.pi, -0.5 * math.pi):
                 via = (*at, angle + side)
-                there = _shortest(start, via, turn_m, obstacles)
-                onwards = _shortest(via, goal, turn_m, obstacles)
-                if there is not None and onwards is not None:
-                    yield there[0] + onwards[0], there[1] + onwards[1]
+                to_via = _shortest(start, via, turn_m, obstacles)
+                from_via = _shortest(via, goal, turn_m, obstacles)
+                if to_via is not None and from_via is not None:
+                    yield to_via[0] + from_via[0], to_via[1] + from_via[1]
 
 
 def _shortest(
     start: Pose, goal: Pose, turn_m: float, obstacles: Sequence[Obstacle]
 ) -> tuple[list[Point], float] | None:
-    found = [way for kind in _KINDS if (way := _dubins(start, goal, turn_m, *kind)) is not None]
-    clear = [way for way in found if not any(obstacle.hits(way[0]) for obstacle in obstacles)]
-    return min(clear, key=lambda way: way[1], default=None)
+    found = [path for kind in _KINDS if (path := _dubins(start, goal, turn_m, *kind)) is not None]
+    clear = [path for path in found if not any(obstacle.hits(path[0]) for obstacle in obstacles)]
+    return min(clear, key=lambda path: path[1], default=None)
 
 
 def _dubins(start: Pose, goal: Pose, turn_m: float, word: str, side: int) -> tuple[list[Point], float] | None:
-    """The way of one kind, as points and length: turns to the left and right and straight pieces, as in ``word``."""
+    """Return the points and length of the Dubins path given by ``word``, or None where it does not exist.
+
+    L and R are arcs to the left and right, S is a straight segment.
+    """
     first, last = _turning(word[0]), _turning(word[2])
     ax, ay = _centre(start, first, turn_m)
     bx, by = _centre(goal, last, turn_m)
@@ -143,7 +149,7 @@ def _dubins(start: Pose, goal: Pose, turn_m: float, word: str, side: int) -> tup
     else:
         if apart > 4.0 * turn_m or apart < 1e-9:
             return None
-        # Three circles of one size touch: the middle one's centre stands over the middle of the others'.
+        # Three circles of one radius touch: the middle one's centre is over the midpoint of the others' centres.
         lean = math.acos(apart / (4.0 * turn_m))
         to_middle = towards + side * lean
         mx, my = ax + 2.0 * turn_m * math.cos(to_middle), ay + 2.0 * turn_m * math.sin(to_middle)
@@ -172,13 +178,13 @@ def _centre(pose: Pose, turning: float, turn_m: float) -> Point:
 
 
 def _arc(heading: float, to: float, turning: float) -> float:
-    """Angle to turn by, from 0 up to a whole turn."""
+    """Return the angle to turn by, from 0 up to a whole turn."""
     angle = (turning * (to - heading)) % (2.0 * math.pi)
     return 0.0 if 2.0 * math.pi - angle < 1e-9 else angle
 
 
 def _go(pose: Pose, turning: float, amount: float, turn_m: float) -> Pose:
-    """On by ``amount`` turning radii."""
+    """Return the pose after ``amount`` turning radii."""
     x, y, heading = pose
     if turning == 0.0:
         return x + amount * turn_m * math.cos(heading), y + amount * turn_m * math.sin(heading), heading

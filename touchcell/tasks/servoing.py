@@ -1,4 +1,4 @@
-"""The machine of every task that holds contacts: find the surface, settle, do the work, withdraw."""
+"""State machine of all tasks that hold contacts: approach the surface, settle, run the behavior, retract."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ SENSOR: Final = "sensor"
 
 
 class ServoConfig(ContactServoConfig):
-    """Parameters of every task that holds contacts; what is said of one hand holds for the one that leads.
+    """Parameters of all tasks that hold contacts; those of one contact servo apply to the leading arm.
 
     Attributes:
         approach_speed_mm_s: speed towards the surface, along the sensor's z axis.
-        approach_distance_mm: give up when no contact was made within it.
+        approach_distance_mm: the approach fails when no contact was made within it.
         settle_time_s: the contact has settled when errors were below the tolerances for this long.
-        settle_timeout_s: give up when it has not settled by then.
+        settle_timeout_s: settling fails when it takes longer.
         retract_mm: distance to withdraw at the end.
         retract_speed_mm_s: speed of that.
-        max_reapproach: how often a lost contact is searched for again.
+        max_reapproach: number of times that a lost contact is searched for again.
         stale_timeout_s: the task trips when the arm has been stopped for lack of a valid estimate for this long.
-        prepare_timeout_s: give up when there is no first frame and arm state by then.
+        prepare_timeout_s: longest wait for the first frame and arm state.
     """
 
     approach_speed_mm_s: PositiveFloat = 10.0
@@ -65,7 +65,7 @@ class ServoState(Enum):
 
 
 def servo_table(task: str, config: ServoConfig, run_timeout_s: float) -> Table:
-    """States and transitions of a servoing task; travel times are given twice over before they time out."""
+    """Return the states and transitions of a servoing task; motions time out after twice their nominal duration."""
     s = ServoState
     approach_s = 2.0 * config.approach_distance_mm / config.approach_speed_mm_s + 1.0
     retract_s = 2.0 * config.retract_mm / config.retract_speed_mm_s + 1.0
@@ -108,20 +108,20 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float) -> Table:
 
 
 class ServoTask(MachineTask):
-    """A task in execution; see ``touchcell.tasks.interface.Task`` for what its members mean.
+    """A running servoing task; see ``touchcell.tasks.interface.Task`` for its members.
 
-    While hands look for the surface or hold it, they move only on fresh frames, fresh arm states and valid beliefs, all
-    of them or none. When they withdraw, which is away from the surface, a fresh arm state is enough. A hand that has
-    made its contact holds it until the others have made theirs.
+    While the contact servos search for the surface or hold it, they move only on fresh frames, fresh arm states and
+    valid estimates, all of them or none. When they retract, away from the surface, a fresh arm state suffices. A servo
+    that has made its contact holds it until the others have made theirs.
 
     Args:
         name: the task's name.
-        config: parameters of its machine.
+        config: parameters of its state machine.
         context: of the cell.
-        hands: what holds the contacts. A task with several tells the sensor's role in the names of its telemetry.
+        servos: the contact servos. With several, telemetry names begin with the sensor's role.
 
     Raises:
-        TaskDefinitionError: the table is wrong.
+        TaskDefinitionError: the table is invalid.
     """
 
     def __init__(self, name: str, config: ServoConfig, context: TaskContext, *servos: ContactServo) -> None:
@@ -137,7 +137,7 @@ class ServoTask(MachineTask):
         self._finished_run = False
 
     def tick(self, observation: Observation) -> Action:
-        """Advance by one cycle."""
+        """Process one cycle."""
         if self.finished:
             return Action()
         dt_s = (observation.now_ns - self._now_ns) * 1e-9
@@ -161,22 +161,22 @@ class ServoTask(MachineTask):
         return self._reapproaches < self._config.max_reapproach
 
     def was_stopped(self) -> bool:
-        """Guard: a person asked for the end."""
+        """Guard: the operator requested a stop."""
         return self._stop_seen
 
     def has_finished(self) -> bool:
-        """Guard: the work was done."""
+        """Guard: the behavior has finished."""
         return self._finished_run
 
     def start_approach(self, record: TransitionRecord) -> None:
-        """On entry: measure the way from here."""
+        """On entry: measure the travelled distance from here."""
         self._reapproaches += record.event == "lost"
         for servo in self._servos:
             servo.reset_travel()
         self._blind_s = 0.0
 
     def start_settle(self, record: TransitionRecord) -> None:
-        """On entry: begin to servo, without a past."""
+        """On entry: reset the controllers."""
         for servo in self._servos:
             servo.controller.reset()
         self._steady_s = 0.0
@@ -187,14 +187,14 @@ class ServoTask(MachineTask):
         self._blind_s = 0.0
 
     def start_retract(self, record: TransitionRecord) -> None:
-        """On entry: measure the way from here, or go on measuring if a stop only confirms it."""
+        """On entry: measure the travelled distance from here, unless a stop only confirms a retraction under way."""
         if record.source != state_name(ServoState.RETRACT):
             for servo in self._servos:
                 servo.reset_travel()
         self._finished_run = self._finished_run or record.event == "finished"
 
     def _watch(self, observation: Observation, dt_s: float) -> None:
-        """Post what this cycle's observation means for the present state."""
+        """Post the events of this cycle's observation for the current state."""
         if observation.operator_stop and not self._stop_seen:
             self._stop_seen = True
             self._machine.post(STOP, "operator")
@@ -218,7 +218,7 @@ class ServoTask(MachineTask):
                     self._post("settled")
             case ServoState.RUN:
                 self._watch_contact(dt_s)
-                # Every hand takes the cycle in, whether another one has finished already or not.
+                # Every servo processes the cycle, even if another one has already finished.
                 finished = [servo.advance(dt_s) for servo in servos]
                 if any(finished):
                     self._post("finished")
@@ -245,7 +245,7 @@ class ServoTask(MachineTask):
         self._machine.post(event, reason, epoch=self._machine.epoch)
 
     def _twists(self) -> list[tuple[ContactServo, Array]]:
-        """Twist (6,) of each tool that moves in the present state."""
+        """Return the twist (6,) of each tool that moves in the current state."""
         state = self._machine.state
         if state is ServoState.RETRACT:
             speed_m_s = -1e-3 * self._config.retract_speed_mm_s
@@ -282,6 +282,6 @@ class ServoTask(MachineTask):
         telemetry: dict[str, float] = {}
         for servo in self._servos:
             prefix = f"{servo.sensor}_" if len(self._servos) > 1 else ""
-            told = servo.telemetry(observation, servoing=servoing)
-            telemetry |= {f"{prefix}{name}": value for name, value in told.items()}
+            values = servo.telemetry(observation, servoing=servoing)
+            telemetry |= {f"{prefix}{name}": value for name, value in values.items()}
         return telemetry

@@ -1,4 +1,4 @@
-"""Push an object to a target with one arm: press, steer by moving the contact sideways, stop there (paper 3.3.3)."""
+"""Push an object to a target with one arm: press, steer by moving the contact laterally, stop there (paper 3.3.3)."""
 
 from __future__ import annotations
 
@@ -21,28 +21,30 @@ Mm = tuple[float, float]
 
 
 class PushConfig(ContactServoConfig):
-    """Parameters of whoever pushes. The servo keeps the sensor normal to the object; how deep it is pressed is left to
-    the object's friction, and where it touches, to target alignment.
+    """Parameters of the pushing arm.
+
+    The servo keeps the sensor normal to the object; the indentation results from the object's friction, and the contact
+    point is left to target alignment.
 
     Attributes:
         reference_mm_deg: contact to hold; only the components with gains count.
         target_mm: x and y of the target in the arm's base frame, whose z axis is upright.
-        path_mm: points to push it past on the way there, where no way is planned.
-        goal_heading_deg: how it shall head there, as the contact normal from the base's x axis; then, or with
-            obstacles, the way is planned (``touchcell.tasks.push_path``).
+        path_mm: waypoints before the target, where no path is planned.
+        goal_heading_deg: heading of the contact normal at the target, from the base's x axis; with it, or with
+            obstacles,
+            the path is planned (``touchcell.tasks.push_path``).
         obstacles_mm: x, y and radius of discs on the table.
-        clearance_mm: how far the object's middle keeps from obstacles.
-        turning_radius_mm: of planned ways; no less than a stable push can turn.
+        clearance_mm: smallest distance of the object's centre from obstacles.
+        turning_radius_mm: of planned paths; no less than a stable push can turn.
         push_speed_mm_s: speed along the sensor's axis.
-        object_center_offset_mm: the object's middle, ahead of the middle of the tip: the tip's radius and half of the
-        object. It is
-            what is brought to the target, and about which the object turns.
-        look_ahead_mm: how far ahead on the way the middle is aimed.
-        align_kp_mm_s_per_deg: sideways speed per degree of the bearing of the point that is aimed at.
-        align_ki_deg_per_mm_s: how fast it is headed aside per distance from the way.
+        object_center_offset_mm: the object's centre, ahead of the centre of the tip: the tip's radius and half of the
+            object. That point is brought to the target, and the object turns about it.
+        look_ahead_mm: look-ahead distance on the path.
+        align_kp_mm_s_per_deg: lateral speed per degree of the bearing of the look-ahead point.
+        align_ki_deg_per_mm_s: crab angle rate per cross-track error.
         align_kd_mm_per_deg: derivative gain on the bearing.
-        align_max_mm_s: largest sideways speed.
-        push_timeout_s: give up when it has not arrived by then.
+        align_max_mm_s: largest lateral speed.
+        push_timeout_s: longest duration of the push.
     """
 
     reference_mm_deg: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -64,7 +66,7 @@ class PushConfig(ContactServoConfig):
     push_timeout_s: PositiveFloat = 120.0
 
     def alignment(self) -> TargetAlignment:
-        """The controller that steers, in SI units."""
+        """Return the steering controller, in SI units."""
         per_rad = 1e-3 * np.degrees(1.0)
         gains = AlignmentGains(
             kp=self.align_kp_mm_s_per_deg * per_rad,
@@ -76,21 +78,21 @@ class PushConfig(ContactServoConfig):
         )
         return TargetAlignment(self.route, gains)
 
-    def route(self, middle: Point, heading_rad: float) -> Sequence[Point]:
-        """Points of the way, m, from where the object's middle is and heads. Raises NoWay."""
+    def route(self, center: Point, heading_rad: float) -> Sequence[Point]:
+        """Return the waypoints, m, from the object's centre and heading. Raises NoPathFound."""
         target = 1e-3 * self.target_mm[0], 1e-3 * self.target_mm[1]
         if self.goal_heading_deg is None and not self.obstacles_mm:
             return [*((1e-3 * x, 1e-3 * y) for x, y in self.path_mm), target]
-        goal_rad = math.atan2(target[1] - middle[1], target[0] - middle[0])
+        goal_rad = math.atan2(target[1] - center[1], target[0] - center[0])
         if self.goal_heading_deg is not None:
             goal_rad = math.radians(self.goal_heading_deg)
         obstacles = [Obstacle(1e-3 * x, 1e-3 * y, 1e-3 * (r + self.clearance_mm)) for x, y, r in self.obstacles_mm]
-        return plan((*middle, heading_rad), (*target, goal_rad), 1e-3 * self.turning_radius_mm, obstacles)
+        return plan((*center, heading_rad), (*target, goal_rad), 1e-3 * self.turning_radius_mm, obstacles)
 
     @model_validator(mode="after")
-    def _one_kind_of_way(self) -> Self:
+    def _waypoints_or_planning(self) -> Self:
         if self.path_mm and (self.goal_heading_deg is not None or self.obstacles_mm):
-            raise ValueError("path_mm is a way already: leave out goal_heading_deg and obstacles_mm")
+            raise ValueError("path_mm already defines the path: leave out goal_heading_deg and obstacles_mm")
         return self
 
 
@@ -99,7 +101,7 @@ class SingleArmPushingConfig(PushConfig, ServoConfig):
 
 
 class Push:
-    """The run of pushing: forward along the contact normal, sideways by target alignment, until the target is near."""
+    """Behavior of pushing: forward along the contact normal, lateral target alignment, until the target is reached."""
 
     def __init__(self, config: PushConfig) -> None:
         self._speed_m_s = 1e-3 * config.push_speed_mm_s
@@ -112,7 +114,7 @@ class Push:
 
     @property
     def left_m_s(self) -> float:
-        """How fast alignment moves the contact to the left of the contact normal."""
+        """Lateral speed of the contact commanded by alignment, positive to the left of the contact normal."""
         return self._left_m_s
 
     @property
@@ -122,11 +124,11 @@ class Push:
 
     @property
     def timeout_s(self) -> float:
-        """As the parameters say."""
+        """The configured timeout."""
         return self._timeout_s
 
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
-        """Look where the object stands to its target."""
+        """Update target alignment; return True when the target is reached."""
         if T_s_f is None:
             self._alignment.pause()
             self._left_m_s = 0.0
@@ -137,16 +139,16 @@ class Push:
         return self._aim.remaining_m <= 0.0
 
     def telemetry(self) -> Mapping[str, float]:
-        """Way that is left, distance of the target from the contact normal, and how the object is steered."""
+        """Return remaining distance, lateral errors, heading, and the alignment command."""
         if self._aim is None:
             return {}
         heading_deg = float(np.degrees(self._aim.heading_rad))
         goal_deg = self._goal_heading_deg
         off = {} if goal_deg is None else {"heading_error_deg": math.remainder(heading_deg - goal_deg, 360.0)}
         return {
-            "rest_mm": 1e3 * self._aim.remaining_m,
-            "target_aside_mm": 1e3 * self._aim.target_lateral_error_m,
-            "aside_mm": 1e3 * self._aim.cross_track_error_m,
+            "remaining_mm": 1e3 * self._aim.remaining_m,
+            "target_lateral_error_mm": 1e3 * self._aim.target_lateral_error_m,
+            "cross_track_error_mm": 1e3 * self._aim.cross_track_error_m,
             "bearing_deg": float(np.degrees(self._aim.theta_rad)),
             "heading_deg": heading_deg,
             "align_mm_s": 1e3 * self._left_m_s,
@@ -155,7 +157,7 @@ class Push:
 
 
 def build(config: SingleArmPushingConfig, context: TaskContext) -> ServoTask:
-    """The task in a cell that has ``arm`` and ``sensor``."""
+    """Build the task for a cell that has ``arm`` and ``sensor``."""
     servo = ContactServo(ARM, SENSOR, config, config.reference_mm_deg, Push(config), context)
     return ServoTask("single_arm_pushing", config, context, servo)
 

@@ -1,8 +1,8 @@
 """State machines for tasks: a table as data, checked when it is built, run by one thread on injected time.
 
-The engine is ``transitions``, with its traps closed (PEERS 4.3, faults E6 and E7): no automatic ``to_<state>`` triggers
-that pass guards by, no timer threads, no exception that leaves a half-entered state, no callback that is found missing
-only when it is needed, no failed guard that says nothing.
+The engine is ``transitions``, without its pitfalls: no automatic ``to_<state>`` triggers that bypass guards, no timer
+threads, no exception that leaves a state half entered, no callback that is found missing only when it is needed, no
+guard that fails silently.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from touchcell.tasks.errors import TaskDefinitionError
 from touchcell.tasks.interface import TransitionRecord
 
 STOP: Final = "stop"
-"""A person asks for an orderly end."""
+"""The operator requests an orderly end."""
 TRIP: Final = "trip"
-"""An interlock has latched: nothing may move."""
+"""An interlock has latched: no motion is allowed."""
 FAULT: Final = "fault"
-"""Something failed that the task cannot judge."""
+"""An unexpected failure."""
 
 OBLIGATORY: Final = (STOP, TRIP, FAULT)
 """Events that every state but the terminal ones accepts, whatever its guards say."""
@@ -32,7 +32,7 @@ REFUSALS_KEPT: Final = 256
 
 
 def state_name(state: Enum) -> str:
-    """How a state is called in records, messages and diagrams."""
+    """Return the name of a state as used in records, messages and diagrams."""
     return state.name.lower()
 
 
@@ -42,10 +42,10 @@ class StateDef:
 
     Attributes:
         state: the enum member.
-        timeout_s: longest stay; None only for a terminal state, which has no way out.
+        timeout_s: longest stay; None only for a terminal state, which has no outgoing transition.
         on_timeout: event that ends a stay of ``timeout_s``.
-        on_enter: name of the model's method called on entry, as ``method(record)``. It may start work, never wait.
-        terminal: whether the task is over here.
+        on_enter: name of the model's method called on entry, as ``method(record)``. It may start work, never block.
+        terminal: True if the task ends here.
     """
 
     state: Enum
@@ -60,10 +60,10 @@ class TransitionDef:
     """One row of the table. Rows of the same event are tried from top to bottom.
 
     Attributes:
-        event: what happens.
-        source: where; None means every state that is not terminal.
-        target: where it leads.
-        guard: name of the model's method, ``method() -> bool`` without effects, that must agree; None for always.
+        event: trigger.
+        source: source state; None for every state that is not terminal.
+        target: target state.
+        guard: name of the model's method, ``method() -> bool`` without side effects; None for always.
     """
 
     event: str
@@ -74,14 +74,14 @@ class TransitionDef:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A task's states and transitions; the first state is where it starts."""
+    """A task's states and transitions; the first state is the initial one."""
 
     task: str
     states: tuple[StateDef, ...]
     transitions: tuple[TransitionDef, ...]
 
     def sources(self, row: TransitionDef) -> tuple[Enum, ...]:
-        """The states that ``row`` starts from."""
+        """Return the source states of ``row``."""
         if row.source is not None:
             return (row.source,)
         return tuple(definition.state for definition in self.states if not definition.terminal)
@@ -89,14 +89,14 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """The event led to a transition."""
+    """The event caused a transition."""
 
     record: TransitionRecord
 
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """The event changed nothing, and why."""
+    """The event was refused, with the reason."""
 
     event: str
     reason: str
@@ -110,24 +110,24 @@ class _Posted:
 
 
 class _Model:
-    """What ``transitions`` decorates with its triggers. Nobody else sees it."""
+    """Private model that ``transitions`` decorates with its triggers."""
 
     state: Enum
     trigger: Callable[..., bool]
 
 
 class TaskMachine:
-    """Runs a ``Table``.
+    """Run a ``Table``.
 
     Events are posted from anywhere in the loop and take effect in ``tick``, in order. A posted event may be bound to
-    the present stay in a state; should that state be left before it is drained, it is dropped. Timeouts are such.
+    the current stay in a state; if that state is left before it is processed, it is dropped. Timeouts work that way.
 
     Args:
         table: states and transitions.
         model: has the methods that the table names.
 
     Raises:
-        TaskDefinitionError: with everything that is wrong with the table.
+        TaskDefinitionError: the table is invalid; lists all problems.
     """
 
     def __init__(self, table: Table, model: object) -> None:
@@ -168,36 +168,36 @@ class TaskMachine:
 
     @property
     def state(self) -> Enum:
-        """Present state."""
+        """Current state."""
         return self._engine_model.state
 
     @property
     def active_states(self) -> tuple[Enum, ...]:
-        """The states that are not terminal, as the table names them."""
+        """The states that are not terminal, in the order of the table."""
         return tuple(state for state, definition in self._definitions.items() if not definition.terminal)
 
     @property
     def finished(self) -> bool:
-        """Whether the present state is terminal."""
+        """True if the current state is terminal."""
         return self._definitions[self.state].terminal
 
     @property
     def epoch(self) -> int:
-        """Number of the present stay in a state; rises with every transition."""
+        """Number of the current stay in a state; rises with every transition."""
         return self._epoch
 
     @property
     def records(self) -> tuple[TransitionRecord, ...]:
-        """Every transition so far."""
+        """All transitions so far."""
         return tuple(self._records)
 
     @property
     def refusals(self) -> tuple[Refused, ...]:
-        """The latest events that changed nothing."""
+        """The latest refused events."""
         return tuple(self._refusals)
 
     def stay_s(self) -> float:
-        """Seconds in the present state at the latest tick; 0 before the first."""
+        """Return the seconds in the current state at the latest tick; 0 before the first."""
         return 0.0 if self._entered_ns is None else (self._now_ns - self._entered_ns) * 1e-9
 
     def post(self, event: str, reason: str = "", *, epoch: int | None = None) -> None:
@@ -205,7 +205,7 @@ class TaskMachine:
         self._queue.append(_Posted(event, reason, epoch))
 
     def tick(self, now_ns: int) -> None:
-        """Let time be ``now_ns``: drain the queue, then end a stay that has lasted too long."""
+        """Set the time to ``now_ns``, process the queue, then time out a stay that has lasted too long."""
         self._now_ns = now_ns
         if self._entered_ns is None:
             self._entered_ns = now_ns
@@ -217,12 +217,12 @@ class TaskMachine:
         self._drain()
 
     def fire(self, event: str, reason: str = "", *, now_ns: int | None = None) -> Accepted | Refused:
-        """Let an event take effect at once, ahead of the queue, at ``now_ns`` or the time of the latest tick.
+        """Process an event at once, ahead of the queue, at ``now_ns`` or the time of the latest tick.
 
         From within a callback it is refused: post it instead.
         """
         if self._firing is not None:
-            return self._refuse(event, f"{self._firing.event!r} is still taking effect")
+            return self._refuse(event, f"{self._firing.event!r} is still being processed")
         self._now_ns = self._now_ns if now_ns is None else now_ns
         return self._fire(_Posted(event, reason, None))
 
@@ -234,7 +234,7 @@ class TaskMachine:
         if posted.event not in self._events:
             return self._refuse(posted.event, "no such event")
         if posted.epoch is not None and posted.epoch != self._epoch:
-            return self._refuse(posted.event, "the state that it belongs to has been left")
+            return self._refuse(posted.event, "the state it was bound to has been left")
         self._firing = posted
         self._source = self.state
         self._failed_guards.clear()
@@ -249,7 +249,7 @@ class TaskMachine:
         finally:
             self._firing = None
         if len(self._records) == count:
-            return self._refuse(posted.event, f"guard {' and '.join(self._failed_guards)} said no")
+            return self._refuse(posted.event, f"guard {' and '.join(self._failed_guards)} returned False")
         return Accepted(self._records[count])
 
     def _entered(self, event: EventData) -> None:
@@ -268,7 +268,7 @@ class TaskMachine:
             self._fail(f"{callback} raised {error!r}")
 
     def _fail(self, reason: str) -> None:
-        # Ahead of whatever is queued: nothing may act in a state that was only half entered.
+        # Ahead of the queue: nothing may act in a half-entered state.
         self._queue.appendleft(_Posted(FAULT, reason, None))
 
     def _refuse(self, event: str, reason: str) -> Refused:
@@ -287,7 +287,7 @@ class TaskMachine:
 
 
 def lint(table: Table, model: object) -> list[str]:
-    """Everything that is wrong with ``table`` for a task whose methods are ``model``'s; empty if nothing is."""
+    """Return all problems of ``table`` for a task whose methods are ``model``'s; empty if there are none."""
     problems: list[str] = []
     definitions = {definition.state: definition for definition in table.states}
     if len(definitions) != len(table.states):
@@ -366,7 +366,7 @@ def _closure(start: Sequence[Enum], edges: dict[Enum, set[Enum]]) -> set[Enum]:
 
 
 def mermaid(table: Table) -> str:
-    """The table as a Mermaid state diagram; events that every active state accepts leave the box around them."""
+    """Return the table as a Mermaid state diagram; events accepted by every active state leave the box around them."""
     active = [definition for definition in table.states if not definition.terminal]
     terminal = [definition for definition in table.states if definition.terminal]
     arrows: dict[tuple[str, str], list[str]] = {}

@@ -1,4 +1,4 @@
-"""What every task with a machine tells the cell about itself, so that a task has only its own behaviour to write."""
+"""Base class of tasks with a state machine."""
 
 from __future__ import annotations
 
@@ -8,43 +8,43 @@ from touchcell.tasks.interface import Action, Observation, TransitionRecord
 from touchcell.tasks.state_machine import TRIP, TaskMachine, state_name
 
 DONE = "done"
-"""Name of the state in which a task has done what it promises."""
+"""Name of the state in which a task has succeeded."""
 
 
 class MachineTask(ABC):
-    """A task in execution; ``touchcell.tasks.interface.Task`` documents its members. Subclasses make ``_machine``."""
+    """A running task; ``touchcell.tasks.interface.Task`` documents its members. Subclasses set ``_machine``."""
 
     _machine: TaskMachine
 
     @property
     def state(self) -> str:
-        """Name of the present state."""
+        """Name of the current state."""
         return state_name(self._machine.state)
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Names of the states that it may be in before it has finished, the first one first."""
+        """Names of the non-terminal states, the initial one first."""
         return tuple(state_name(state) for state in self._machine.active_states)
 
     @property
     def finished(self) -> bool:
-        """Whether a terminal state has been reached."""
+        """True if a terminal state has been reached."""
         return self._machine.finished
 
     @property
     def succeeded(self) -> bool:
-        """Whether that state is ``done``."""
+        """True if that state is ``done``."""
         return self.state == DONE
 
     @property
     def transitions(self) -> tuple[TransitionRecord, ...]:
-        """Every change of state so far."""
+        """All transitions so far."""
         return self._machine.records
 
     def trip(self, now_ns: int, reason: str) -> None:
-        """Go to the tripped state, from which nothing moves."""
+        """Enter the tripped state, from which nothing moves."""
         self._machine.fire(TRIP, reason, now_ns=now_ns)
 
     @abstractmethod
     def tick(self, observation: Observation) -> Action:
-        """Advance by one cycle."""
+        """Process one cycle."""

@@ -1,4 +1,4 @@
-"""Follow a surface: glide over it at constant depth, normal to it, in one direction (paper 5, surface following)."""
+"""Follow a surface: slide over it at constant depth, normal to it, in one direction (paper 5, surface following)."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
 
 
 class SurfaceFollowingConfig(ServoConfig):
-    """Parameters of surface following. Shear is left alone: its gains are zero.
+    """Parameters of surface following. Shear is not controlled: its gains are zero.
 
     Attributes:
         depth_mm: indentation to hold, normal to the surface.
         speed_mm_s: tangential speed of the sensor.
         direction_deg: direction of travel, from the sensor's x axis towards its y axis.
-        distance_mm: way of the sensor until the task is done.
+        distance_mm: distance that the sensor travels.
     """
 
     depth_mm: PositiveFloat = 3.0
@@ -32,7 +32,7 @@ class SurfaceFollowingConfig(ServoConfig):
 
 
 class Follow:
-    """The run of surface following: a tangential feedforward until the way along it is done."""
+    """Behavior of surface following: a tangential feedforward until the distance is covered."""
 
     def __init__(self, config: SurfaceFollowingConfig) -> None:
         angle = np.radians(config.direction_deg)
@@ -48,21 +48,24 @@ class Follow:
 
     @property
     def timeout_s(self) -> float:
-        """Twice the time that the way takes, and a second."""
+        """Twice the nominal duration, plus one second."""
         return self._timeout_s
 
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
-        """Count the way along the direction of travel, so that noise and corrections do not add to it."""
+        """Add up the distance along the direction of travel; return True once it is covered.
+
+        Noise and corrections in other directions do not count.
+        """
         self._left_m -= float(self._direction @ now[:3, :3].T @ (now[:3, 3] - before[:3, 3]))
         return self._left_m <= 0.0
 
     def telemetry(self) -> Mapping[str, float]:
-        """Nothing more."""
+        """Return no further telemetry."""
         return {}
 
 
 def build(config: SurfaceFollowingConfig, context: TaskContext) -> ServoTask:
-    """The task in a cell that has ``arm`` and ``sensor``."""
+    """Build the task for a cell that has ``arm`` and ``sensor``."""
     reference = (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0)
     servo = ContactServo(ARM, SENSOR, config, reference, Follow(config), context)
     return ServoTask("surface_following", config, context, servo)
@@ -70,7 +73,7 @@ def build(config: SurfaceFollowingConfig, context: TaskContext) -> ServoTask:
 
 SPEC = TaskSpec(
     name="surface_following",
-    summary="glide over an unknown surface at constant depth and normal to it",
+    summary="slide over an unknown surface at constant depth and normal to it",
     config=SurfaceFollowingConfig,
     arms={ARM: frozenset({"TcpSource", "TwistSink", "Stoppable"})},
     sensors=frozenset({SENSOR}),

@@ -82,7 +82,7 @@ class BenchModule(pytest.Module):
 
 def _rig_of(plan: CellPlan, device: DevicePlan) -> FixtureFactory:
     """A rig that knows nothing but the device itself."""
-    from touchcell.cell.runtime.compose import build_devices
+    from touchcell.cell.runtime.devices import build_devices
     from touchcell.drivers.core.clock import MonotonicClock, VirtualClock
     from touchcell.testing.emulation.rig import DeviceFixture
 

@@ -34,8 +34,8 @@ def test_a_cell_that_ships_is_found_from_anywhere(tmp_path: Path, monkeypatch: p
 
 
 def test_unknown_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "nothing", "--out", str(tmp_path)]) == EXIT_BAD_INPUT
-    assert "se3" in capsys.readouterr().err
+    assert main(["bench", "se2", "--out", str(tmp_path)]) == EXIT_BAD_INPUT
+    assert "did you mean 'se3'?" in capsys.readouterr().err
 
 
 def test_replay_without_a_model_says_how_to_make_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.cli.main import main
-from touchcell.cell.experiments.runner import ExperimentSpec, Scale, installed, run_experiment, spec
+from touchcell.cell.experiments.runner import EXPERIMENTS, ExperimentSpec, Scale, run_experiment
 from touchcell.cell.experiments.table import Column, Row, table, to_json
 from touchcell.cell.experiments.trials import Finished, Perform, Trial, perform_all
 from touchcell.cell.recording.mcap import read
@@ -132,13 +132,13 @@ def test_scale_counts_repetitions():
     assert [Scale().repetitions(5), Scale(quick=True).repetitions(5), Scale(3, quick=True).repetitions(5)] == [5, 1, 3]
 
 
-@pytest.mark.parametrize("name", installed())
+@pytest.mark.parametrize("name", EXPERIMENTS.names())
 def test_every_trial_of_every_experiment_is_a_cell_that_makes_sense(name, tmp_path):
     import yaml
 
     from touchcell.cell.config.schema import plan_cell
 
-    experiment = spec(name)
+    experiment = EXPERIMENTS.load(name)
     trials = experiment.trials(Scale())
     assert len({each.name for each in trials}) == len(trials)
     assert {each.row for each in experiment.trials(Scale(quick=True))} <= {each.row for each in trials}

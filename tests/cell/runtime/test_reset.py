@@ -24,7 +24,8 @@ from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_TASK_FAI
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
-from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
 from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest, Request, ask_run, is_waiting
 from touchcell.cell.runtime.watchdog import NullWatchdog
@@ -278,7 +279,7 @@ class NotedWatch(NullWatchdog):
 
 def test_nobody_guards_while_it_waits_so_that_no_arm_obeys(tmp_path: Path) -> None:
     run = tripped(tmp_path)
-    watch = run.cell.watch = NotedWatch()
+    watch = run.cell.watchdog = NotedWatch()
     run.fault(stale=False)
     run.go(2)
     run.ask(OperatorRequest.RESET)

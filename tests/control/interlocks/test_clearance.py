@@ -153,7 +153,7 @@ def test_links_are_where_kinematics_put_them_and_move_as_the_command_asks():
     T = body.frames(jointed(q, dq), 0.01)
     np.testing.assert_allclose(T[1:-1], CHAIN.link_poses(q + 0.01 * dq), atol=1e-9)
     np.testing.assert_allclose(T[-1], CHAIN.forward(q + 0.01 * dq), atol=2e-5)
-    with pytest.raises(ValueError, match="joints"):
+    with pytest.raises(ValueError, match="joint angles"):
         body.frames(replace(jointed(q, dq), joints=None))
 
 

@@ -13,7 +13,7 @@ from touchcell.drivers.core.arm import JointLimitsConfig
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
 from touchcell.drivers.core.device import Lifecycle
-from touchcell.drivers.core.gate import TwistGate, TwistLimits
+from touchcell.drivers.core.gate import FIRST_STEP_S, TwistGate, TwistLimits
 from touchcell.drivers.core.lease import LeaseManager
 from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain
 from touchcell.drivers.kinematics.joint_limits import IkSettings
@@ -126,7 +126,8 @@ def test_after_a_silence_it_starts_from_rest() -> None:
     bench = Bench()
     for _ in range(100):
         bench.send(np.array([0.1, 0, 0, 0, 0, 0]))
-    assert bench.send(np.array([0.1, 0, 0, 0, 0, 0]), dt_s=0.2).command.twist[0] == pytest.approx(0.5 * 0.1)
+    first = bench.send(np.array([0.1, 0, 0, 0, 0, 0]), dt_s=0.2).command.twist[0]
+    assert first == pytest.approx(20.0 * FIRST_STEP_S**2)
 
 
 def free_bench(**changes: float) -> Bench:

@@ -71,7 +71,7 @@ def test_nothing_impossible_is_encoded(field: str, value: float) -> None:
 
 def test_no_command_reads_as_enable() -> None:
     tau = 10.0 - 3 * 20 / 4095
-    with pytest.raises(CodecError, match="would read as enable"):
+    with pytest.raises(CodecError, match="would be interpreted as enable"):
         codec.encode_mit(MitCommand(12.5, 30.0, 500.0, 5.0, tau), R4310)
 
 
@@ -119,7 +119,7 @@ def test_impossible_register_values_are_refused(register: int, value: float) -> 
 def test_every_status_is_normal_or_a_fault() -> None:
     assert codec.fault(codec.DISABLED) is None
     assert codec.fault(codec.ENABLED) is None
-    # PROTOCOLS part 1.2: 8 OV, 9 UV, A OC, B MOS, C rotor, D lost communication, E overload; 5 and 6 are newer.
+    # Damiao's manual: 8 OV, 9 UV, A OC, B MOS, C rotor, D lost communication, E overload; 5 and 6 are newer.
     assert set(codec.FAULTS) == {5, 6, 8, 9, 0xA, 0xB, 0xC, 0xD, 0xE}
     for status in range(2, 16):
         code = codec.fault(status)
@@ -132,7 +132,7 @@ def test_every_status_is_normal_or_a_fault() -> None:
 
 
 def test_bus_load_matches_what_is_known_of_these_arms() -> None:
-    # PROTOCOLS part 1.2: seven motors, classic 1 Mbit/s: at most 47 % at 250 Hz, 95 % at 500 Hz;
+    # Seven motors, classic 1 Mbit/s: at most 47 % at 250 Hz, 95 % at 500 Hz;
     # CAN FD 1M/5M 69-77 % at 1 kHz.
     assert codec.bus_load(7, 250, 1_000_000) == pytest.approx(0.47, abs=0.01)
     assert codec.bus_load(7, 500, 1_000_000) == pytest.approx(0.945, abs=0.01)

@@ -184,7 +184,7 @@ def test_identity_golden() -> None:
 
 
 def test_every_bit_of_the_status_is_a_known_fault() -> None:
-    # PROTOCOLS part 2 and Feetech's memory table, address 65: 0 voltage, 1 encoder, 2 heat, 3 current, 5 overload.
+    # Feetech's memory table, address 65: 0 voltage, 1 encoder, 2 heat, 3 current, 5 overload.
     assert set(codec.FAULT_BITS) == set(range(8))
     assert codec.faults(0) == ()
     assert [bit.fault_class for bit in codec.faults(0b101111)] == [

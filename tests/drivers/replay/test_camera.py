@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.errors import (
     ConnectError,
@@ -16,7 +15,7 @@ from touchcell.drivers.core.errors import (
     TransportTimeout,
 )
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
-from touchcell.drivers.core.spec import DriverContext
+from touchcell.drivers.core.spec import DRIVERS, DriverContext
 from touchcell.drivers.replay.camera import ReplayCamera, ReplayCameraConfig
 
 
@@ -38,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def play(folder: Path, clock: VirtualClock, rate_hz: float = 10.0) -> ReplayCamera:
-    camera = registry.spec("replay_camera").build(
+    camera = DRIVERS.load("replay_camera").build(
         "camera", ReplayCameraConfig(data=folder, rate_hz=rate_hz), DriverContext(clock)
     )
     assert isinstance(camera, ReplayCamera)
@@ -49,7 +48,7 @@ def test_it_is_a_frame_source(folder: Path) -> None:
     camera = play(folder, VirtualClock())
     assert isinstance(camera, FrameSource)
     assert isinstance(camera, HealthSource)
-    assert registry.spec("replay_camera").capabilities.abilities == {"FrameSource", "HealthSource"}
+    assert DRIVERS.load("replay_camera").capabilities.abilities == {"FrameSource", "HealthSource"}
     with pytest.raises(LifecycleError):
         camera.latest()
 

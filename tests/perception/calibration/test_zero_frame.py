@@ -6,9 +6,9 @@ import pytest
 from tests.helpers.marker_samples import REST, SIZE
 from tests.perception.models.test_model_file import make_model
 from touchcell.cell.cli.calibrate import calibrate
-from touchcell.cell.runtime.compose import MODELS
 from touchcell.errors import ConfigError, DataError
 from touchcell.geometry.types import Array, ImageArray
+from touchcell.paths import MODELS
 from touchcell.perception.calibration.zero_frame import find_change, lattice_turns, similarity
 from touchcell.perception.errors import TrainingError
 from touchcell.perception.models.camera_change import CameraChange, load_change

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from touchcell.cell.config.schema import NetworkEstimator
-from touchcell.cell.runtime.compose import build_filter
+from touchcell.cell.runtime.sensor import build_filter
 from touchcell.geometry import se3
 from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.gaussian import NotPositiveDefinite, PoseGaussian

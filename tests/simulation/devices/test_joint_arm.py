@@ -8,12 +8,11 @@ from pydantic import ValidationError
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop
-from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.errors import LifecycleError
 from touchcell.drivers.core.lease import Lease
-from touchcell.drivers.core.spec import DriverContext
+from touchcell.drivers.core.spec import DRIVERS, DriverContext
 from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain
 from touchcell.drivers.kinematics.inverse import joints_for_pose
 from touchcell.errors import ConfigError
@@ -28,7 +27,7 @@ DOWN = {"panda": (450.0, 50.0, 300.0, 180.0, 0.0, 0.0), "ur5e": (-450.0, -150.0,
 
 
 def make(clock: VirtualClock, model: str = "panda", scene: object = None, **changes: object) -> SimJointArm:
-    spec = registry.spec("sim_joint_arm")
+    spec = DRIVERS.load("sim_joint_arm")
     config = spec.config.model_validate({"model": model, "start_pose_mm_deg": DOWN[model], **changes})
     arm = spec.build("arm", config, DriverContext(clock, scene=scene))
     assert isinstance(arm, SimJointArm)
@@ -170,7 +169,7 @@ def test_a_panda_tracks_a_moving_plate_in_a_dynamic_scene(tmp_path: Path) -> Non
 
 
 def test_what_it_cannot_reach_is_told() -> None:
-    with pytest.raises(ConfigError, match="found no joint angles"):
+    with pytest.raises(ConfigError, match="no inverse kinematics solution"):
         make(VirtualClock(), start_pose_mm_deg=(1500, 0, 300, 180, 0, 0))
     with pytest.raises(ConfigError, match="is not 7 angles"):
         make(VirtualClock(), near_joints_deg=(0, 0, 0, 0, 0, 0))

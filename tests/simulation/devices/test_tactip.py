@@ -2,13 +2,12 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.errors import DeviceGone, LifecycleError, StaleData, TransportTimeout
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.drivers.core.samples import Stamped, TcpState
-from touchcell.drivers.core.spec import DriverContext
+from touchcell.drivers.core.spec import DRIVERS, DriverContext
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.simulation.devices.arm import SimArm
@@ -24,7 +23,7 @@ class Cell:
         self.clock = VirtualClock()
         self.scene: Scene = SceneConfig.model_validate({"surfaces": {"table": {"kind": "plane"}}}).build(self.clock)
         context = DriverContext(self.clock, {}, self.scene, seed)
-        arm_spec, tip_spec = registry.spec("sim_arm"), registry.spec("sim_tactip")
+        arm_spec, tip_spec = DRIVERS.load("sim_arm"), DRIVERS.load("sim_tactip")
         arm = arm_spec.build("arm", arm_spec.config(start_pose_mm_deg=(400, 0, 125, 180, 0, 0)), context)
         assert isinstance(arm, SimArm)
         self.arm = arm
@@ -49,7 +48,7 @@ class Cell:
 
 def test_the_spec_tells_the_truth() -> None:
     cell = Cell()
-    assert registry.spec("sim_tactip").capabilities.abilities == {"FrameSource", "HealthSource"}
+    assert DRIVERS.load("sim_tactip").capabilities.abilities == {"FrameSource", "HealthSource"}
     assert isinstance(cell.tip, FrameSource)
     assert isinstance(cell.tip, HealthSource)
 
@@ -177,7 +176,7 @@ def test_a_late_camera_delivers_old_frames() -> None:
 
 def test_it_needs_a_scene_and_a_simulated_arm() -> None:
     cell = Cell()
-    spec = registry.spec("sim_tactip")
+    spec = DRIVERS.load("sim_tactip")
     config = SimTactipConfig(mounted_on="arm")
     with pytest.raises(ConfigError, match="needs a scene"):
         spec.build("tip2", config, DriverContext(cell.clock, {"arm": cell.arm}))
@@ -230,7 +229,7 @@ def test_a_simulated_sensor_sits_on_any_arm_that_tells_its_pose() -> None:
     clock, arm = VirtualClock(), Told()
     scene: Scene = SceneConfig.model_validate({"surfaces": {"table": {"kind": "plane"}}}).build(clock)
     config = SimTactipConfig(mounted_on="arm", rate_hz=50, latency_ms=0)
-    tip = registry.spec("sim_tactip").build("tip", config, DriverContext(clock, {"arm": arm}, scene, 0))  # type: ignore[dict-item]
+    tip = DRIVERS.load("sim_tactip").build("tip", config, DriverContext(clock, {"arm": arm}, scene, 0))  # type: ignore[dict-item]
     assert isinstance(tip, SimTactip)
     with pytest.raises(DeviceGone):
         tip.connect()

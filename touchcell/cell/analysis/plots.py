@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from touchcell.cell.analysis.run_data import Run, tip_points
 from touchcell.cell.recording.messages import COMPONENTS
@@ -26,7 +25,7 @@ _TITLES = dict(
 _PANELS = ("z_mm", "alpha_deg", "beta_deg", "x_mm", "y_mm", "gamma_deg")
 # A TacTip's (SPEC part 2): ticks of this length from the tip's centre trace the surface that it is pressed on.
 _TIP_RADIUS_MM = 20.0
-_LEAST_SPAN_MM = 1.0
+_LEAST_EXTENT_MM = 1.0
 _STATE_COLOURS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52", "#8172b3", "#937860", "#da8bc3", "#8c8c8c")
 
 
@@ -39,7 +38,8 @@ def plot_contact(run: Run, sensor: str, path: Path, *, last_s: float | None = No
     truth = run.series(f"/sensors/{sensor}/truth")
     task = run.series("/task")
     assert contact is not None
-    figure, axes = plt.subplots(2, 3, figsize=(15, 7), sharex=True, layout="constrained")
+    figure = Figure(figsize=(15, 7), layout="constrained")
+    axes = figure.subplots(2, 3, sharex=True)
     for axis, name in zip(axes.flat, _PANELS, strict=True):
         value, sigma = contact.column(name), contact.column(f"sigma_{name}")
         axis.fill_between(contact.t_s, value - 2 * sigma, value + 2 * sigma, color="#4c72b0", alpha=0.2, lw=0)
@@ -59,7 +59,6 @@ def plot_contact(run: Run, sensor: str, path: Path, *, last_s: float | None = No
             axis.set_xlim(contact.t_s[-1] - last_s, contact.t_s[-1])
     figure.suptitle(f"{sensor}: contact pose and shear of the sensor in the surface frame")
     figure.savefig(path, dpi=100)
-    plt.close(figure)
     return path
 
 
@@ -67,7 +66,8 @@ def plot_agreement(run: Run, sensor: str, path: Path) -> Path:
     """Estimates against what is true, of single frames and of the filter, with the mean absolute error of each."""
     truth = run.series(f"/sensors/{sensor}/truth")
     assert truth is not None
-    figure, axes = plt.subplots(2, 3, figsize=(14, 9), layout="constrained")
+    figure = Figure(figsize=(14, 9), layout="constrained")
+    axes = figure.subplots(2, 3)
     for topic, label, colour, size in (
         ("measurement", "one frame", "#c44e52", 5),
         ("contact", "filtered", "#4c72b0", 5),
@@ -78,9 +78,8 @@ def plot_agreement(run: Run, sensor: str, path: Path) -> Path:
         index = np.clip(np.searchsorted(truth.t_s, series.t_s + 1e-6, side="right") - 1, 0, len(truth.t_s) - 1)
         for axis, name in zip(axes.flat, _PANELS, strict=True):
             true, value = truth.column(name)[index], series.column(name)
-            errors = np.abs(value - true)
-            errors = errors[np.isfinite(errors)]
-            error = float(np.mean(errors)) if len(errors) else float("nan")
+            off = np.abs(value - true)
+            error = np.nanmean(off) if np.isfinite(off).any() else np.nan
             axis.plot(true, value, ".", ms=size, alpha=0.35, color=colour, mew=0, label=f"{label}: {error:.3f}")
     for axis, name in zip(axes.flat, _PANELS, strict=True):
         low, high = axis.get_xlim()
@@ -92,7 +91,6 @@ def plot_agreement(run: Run, sensor: str, path: Path) -> Path:
     axes[0, 0].set_ylabel("estimate")
     axes[1, 0].set_ylabel("estimate")
     figure.savefig(path, dpi=100)
-    plt.close(figure)
     return path
 
 
@@ -105,7 +103,8 @@ def plot_trajectory(run: Run, path: Path, mounts: Mapping[str, tuple[Array, Arra
         mounts: by arm, the poses (4, 4) of its base in the world and of its sensor in its tool; none means that both
             are the same.
     """
-    figure, axes = plt.subplots(1, 2, figsize=(15, 6), layout="constrained")
+    figure = Figure(figsize=(15, 6), layout="constrained")
+    axes = figure.subplots(1, 2)
     states = _states(run)
     colours = {state: _STATE_COLOURS[i % len(_STATE_COLOURS)] for i, state in enumerate(states)}
     for arm in run.roles("arms", "tcp"):
@@ -121,26 +120,22 @@ def plot_trajectory(run: Run, path: Path, mounts: Mapping[str, tuple[Array, Arra
             _draw_axes(axis, T, points, (i, j))
             axis.set_xlabel("xyz"[i] + " (mm)")
             axis.set_ylabel("xyz"[j] + " (mm)")
-            # A path that stays in one point, or is along one axis, has no width of its own.
-            axis.margins(0.05)
-            for limits, set_limits in ((axis.get_xlim(), axis.set_xlim), (axis.get_ylim(), axis.set_ylim)):
-                if limits[1] - limits[0] < _LEAST_SPAN_MM:
-                    middle = 0.5 * (limits[0] + limits[1])
-                    set_limits(middle - 0.5 * _LEAST_SPAN_MM, middle + 0.5 * _LEAST_SPAN_MM)
             axis.set_aspect("equal", adjustable="datalim")
+            # A path straight along the view has no extent of its own.
+            axis.update_datalim([points[0, [i, j]] - _LEAST_EXTENT_MM, points[0, [i, j]] + _LEAST_EXTENT_MM])
             axis.grid(alpha=0.3)
     axes[0].set_title("from the side; ticks show the sensor's axis as far as its tip")
     axes[1].set_title("from above")
-    handles = [plt.Line2D([], [], color=colour, lw=2, label=state) for state, colour in colours.items()]
+    handles = [Line2D([], [], color=colour, lw=2, label=state) for state, colour in colours.items()]
     axes[0].legend(handles=handles, fontsize=9, loc="best")
     figure.savefig(path, dpi=100)
-    plt.close(figure)
     return path
 
 
 def plot_budget(stages_ms: Mapping[str, Array], path: Path, title: str) -> Path:
     """Median and 99th percentile of the time that each stage takes, as bars in the order given."""
-    figure, axis = plt.subplots(figsize=(9, 0.5 * len(stages_ms) + 1.5), layout="constrained")
+    figure = Figure(figsize=(9, 0.5 * len(stages_ms) + 1.5), layout="constrained")
+    axis = figure.subplots()
     position = np.arange(len(stages_ms))
     for percentile, colour in ((99, "#c6d3ea"), (50, "#4c72b0")):
         widths = [float(np.percentile(times, percentile)) for times in stages_ms.values()]
@@ -152,7 +147,6 @@ def plot_budget(stages_ms: Mapping[str, Array], path: Path, title: str) -> Path:
     axis.legend()
     axis.grid(axis="x", alpha=0.3)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
     return path
 
 
@@ -161,21 +155,21 @@ def _states(run: Run) -> list[str]:
     return list(dict.fromkeys(str(row.get("state")) for row in task.rows)) if task is not None else ["run"]
 
 
-def _draw_path(axis: plt.Axes, run: Run, t_s: Array, points: Array, colours: dict[str, str]) -> None:
+def _draw_path(axis: Axes, run: Run, t_s: Array, points: Array, colours: dict[str, str]) -> None:
     for state, colour in colours.items():
         inside = run.during(t_s, state)
         shown = np.where(inside[:, None], points, np.nan)
         axis.plot(shown[:, 0], shown[:, 1], color=colour, lw=1.6)
 
 
-def _draw_axes(axis: plt.Axes, T: Array, points: Array, view: tuple[int, int]) -> None:
+def _draw_axes(axis: Axes, T: Array, points: Array, view: tuple[int, int]) -> None:
     ticks = np.linspace(0, len(T) - 1, 25).astype(int)
     tips = points[ticks] + _TIP_RADIUS_MM * T[ticks, :3, 2]
     for start, end in zip(points[ticks], tips, strict=True):
         axis.plot([start[view[0]], end[view[0]]], [start[view[1]], end[view[1]]], color="black", lw=0.7, alpha=0.6)
 
 
-def _shade_states(axis: plt.Axes, run: Run) -> None:
+def _shade_states(axis: Axes, run: Run) -> None:
     """Light bands where the task was running, so that approach and retreat do not look like errors."""
     task = run.series("/task")
     if task is None:
@@ -186,7 +180,7 @@ def _shade_states(axis: plt.Axes, run: Run) -> None:
     )
 
 
-def _limit(axis: plt.Axes, value: Array, truth: Array) -> None:
+def _limit(axis: Axes, value: Array, truth: Array) -> None:
     """Axis limits from the values, not from wide uncertainty at first contact."""
     finite = np.concatenate([value[np.isfinite(value)], truth[np.isfinite(truth)]])
     if len(finite):

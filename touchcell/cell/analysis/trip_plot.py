@@ -5,10 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
 
 from touchcell.cell.analysis.run_data import Run
 
@@ -17,7 +14,8 @@ _BEFORE_S, _AFTER_S = 1.0, 0.5
 
 def plot_trip(run: Run, trip_s: float, cause: dict[str, Any] | None, path: Path, moment: str = "trip") -> Path:
     """Speed sent and measured, depth, and the age of frames, from a second before the moment until after the stop."""
-    figure, axes = plt.subplots(3, 1, figsize=(11, 8), sharex=True, layout="constrained")
+    figure = Figure(figsize=(11, 8), layout="constrained")
+    axes = figure.subplots(3, 1, sharex=True)
     speed, depth, age = axes
     axes[-1].set_xlim(-_BEFORE_S, _AFTER_S)
     for role in run.roles("arms", "tcp"):
@@ -54,5 +52,4 @@ def plot_trip(run: Run, trip_s: float, cause: dict[str, Any] | None, path: Path,
     if cause is not None:
         figure.suptitle(f"{cause['interlock']}: {cause['subject']}: {cause['reason']}")
     figure.savefig(path, dpi=110)
-    plt.close(figure)
     return path

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from touchcell.testing.emulation.rig import rig_of
+from touchcell.testing.emulation.rig import RIGS
 
 _RATE_S = 1.0
 _CYCLES = 100
@@ -32,7 +32,7 @@ def ours(name: str, folder: Path, address: int) -> dict[str, Any]:
     from touchcell.drivers.core.clock import MonotonicClock
     from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 
-    rig = rig_of(name, folder, address)
+    rig = RIGS.load(name)(folder, address)
     clock = MonotonicClock()
     # An arm or a camera, as the rig says; which calls that allows is known only then.
     device: Any = rig.build(clock)

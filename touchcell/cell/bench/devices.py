@@ -16,7 +16,6 @@ import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from touchcell.cell.bench.provenance import provenance
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.testing.conformance.client import MovingClient
 from touchcell.testing.conformance.context import Bench, DeviceUnderTest
-from touchcell.testing.emulation.rig import rig_of
+from touchcell.testing.emulation.rig import RIGS
 
 _RIGS = ("ur", "franka", "damiao_can", "feetech_serial", "v4l2")
 _TRIALS = 20
@@ -59,7 +58,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
         print(f"{name} ...", flush=True)
         with tempfile.TemporaryDirectory(prefix="touchcell-bench-") as folder:
             address = 1000 + (os.getpid() % 30_000) * 16 + number
-            seat = DeviceUnderTest(partial(rig_of, name), Path(folder), address)
+            seat = DeviceUnderTest(RIGS.load(name), Path(folder), address)
             try:
                 rows[name] = _measure(seat)
                 rows[f"{name}, vendor"] = _vendor(seat)

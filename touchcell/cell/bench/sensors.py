@@ -25,8 +25,10 @@ import yaml
 from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.bench.quantiles import median_and_p99
 from touchcell.cell.config.schema import plan_cell
-from touchcell.cell.runtime.compose import Cell, Sensor, compose
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import Progress, RunLoop, StopRequest
+from touchcell.cell.runtime.sensor import Sensor
 from touchcell.drivers.core.clock import Clock
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate

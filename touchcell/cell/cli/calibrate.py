@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from touchcell.cell.config.schema import plan_cell
-from touchcell.cell.runtime.compose import build_devices
+from touchcell.cell.runtime.devices import build_devices
 from touchcell.drivers.core.protocols import FrameSource
 from touchcell.drivers.replay.dataset import natural_order, read_image
 from touchcell.errors import ConfigError, DataError

@@ -11,7 +11,7 @@ import numpy as np
 from touchcell.cell.cli import discovery
 from touchcell.cell.cli.discovery import Found
 from touchcell.cell.config.schema import CellPlan, plan_cell
-from touchcell.cell.runtime.compose import build_devices
+from touchcell.cell.runtime.devices import build_devices
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.errors import DeviceError, LifecycleError
 from touchcell.drivers.core.protocols import FrameSource, HealthSource, JointSource, TcpSource

@@ -2,37 +2,42 @@
 
 from __future__ import annotations
 
-from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import Any
 
-from touchcell import registry as entry_points
-from touchcell.cell.bench.catalog import benchmarks
+from touchcell.cell.bench.catalog import benchmark_names
+from touchcell.cell.experiments.runner import EXPERIMENTS
 from touchcell.control.interlocks.config import INTERLOCKS
-from touchcell.drivers.core import spec as drivers_registry
+from touchcell.drivers.core.spec import DRIVERS
+from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
-from touchcell.tasks import registry as tasks_registry
+from touchcell.registry import Registry
+from touchcell.tasks.interface import TASKS
+from touchcell.testing.emulation.launcher import EMULATORS
 
 
 def listing() -> dict[str, list[tuple[str, str]]]:
     """Title -> rows of (name, one line). A third party's broken plug-in is shown as such instead of hiding the rest."""
     return {
-        "drivers": [(name, _summary(point)) for name, point in sorted(drivers_registry.installed().items())],
-        "tasks": [(name, _summary(point)) for name, point in sorted(tasks_registry.installed().items())],
+        "drivers": _rows(DRIVERS),
+        "tasks": _rows(TASKS),
         "interlocks": [(spec.kind, spec.summary) for spec in INTERLOCKS.values()],
-        "emulators": [(name, "") for name in sorted(entry_points.installed("touchcell.emulators"))],
-        "experiments": [
-            (name, _summary(point)) for name, point in sorted(entry_points.installed("touchcell.experiments").items())
-        ],
-        "benchmarks": [(name, "") for name in sorted(benchmarks())],
+        "emulators": [(name, "") for name in EMULATORS.names()],
+        "experiments": _rows(EXPERIMENTS),
+        "benchmarks": [(name, "") for name in benchmark_names()],
         "cells that ship": [(f"configs/{path.name}", _first_comment(path)) for path in _shipped()],
     }
 
 
-def _summary(point: EntryPoint) -> str:
+def _rows(registry: Registry[Any]) -> list[tuple[str, str]]:
+    return [(name, _summary(registry, name)) for name in registry.names()]
+
+
+def _summary(registry: Registry[Any], name: str) -> str:
     try:
-        spec = point.load()
-    except Exception as error:
-        return f"cannot be loaded: {error!r}"
+        spec = registry.load(name)
+    except ConfigError as error:
+        return str(error)
     extra = getattr(spec, "extra", None)
     return f"{spec.summary}{f' [needs touchcell[{extra}]]' if extra else ''}"
 

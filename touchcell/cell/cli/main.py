@@ -16,18 +16,18 @@ from touchcell.errors import TouchcellError
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0 done, 1 task or device failed, 2 bad input, 3 an interlock tripped."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if words[:1] == ["emulate"]:
-        from touchcell.testing.emulation.launcher import main as emulate
-
-        return emulate(words[1:])
     passed_on: list[str] = []
     if words[:1] == ["bench"] and "--" in words:
         # argparse hands the dashes on to the subcommand's parser, which then claims the words behind them.
         at = words.index("--")
         words, passed_on = words[:at], words[at + 1 :]
-    options = _parser().parse_args(words)
-    options.passed_on = passed_on
     try:
+        if words[:1] == ["emulate"]:
+            from touchcell.testing.emulation.launcher import main as emulate
+
+            return emulate(words[1:])
+        options = _parser().parse_args(words)
+        options.passed_on = passed_on
         code: int = options.run(options)
         return code
     except TouchcellError as error:
@@ -394,23 +394,21 @@ def _ask(options: argparse.Namespace) -> int:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from touchcell.cell.bench.catalog import benchmarks
+    from touchcell.cell.bench.catalog import benchmark
 
-    known = benchmarks()
-    if options.name not in known:
-        print(f"benchmarks: {', '.join(sorted(known))}", file=sys.stderr)
-        return EXIT_BAD_INPUT
+    run = benchmark(options.name)
     options.out.mkdir(parents=True, exist_ok=True)
-    known[options.name].load()([*options.rest, *options.passed_on], options.out)
+    run([*options.rest, *options.passed_on], options.out)
     return EXIT_OK
 
 
 def _experiment(options: argparse.Namespace) -> int:
     # Each trial has a core; libraries that start a thread for every core would only be in each other's way.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from touchcell.cell.experiments.runner import Scale, installed, run_experiment, spec
+    from touchcell.cell.experiments.runner import EXPERIMENTS, Scale, run_experiment
 
-    experiments = [spec(name) for name in (installed() if options.name == "all" else [options.name])]
+    names = EXPERIMENTS.names() if options.name == "all" else (options.name,)
+    experiments = [EXPERIMENTS.load(name) for name in names]
     scale = Scale(options.trials, options.quick)
     jobs = options.jobs or os.cpu_count() or 1
     tables = []

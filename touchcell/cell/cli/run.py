@@ -6,10 +6,10 @@ import contextlib
 import errno
 import hashlib
 import json
-import shutil
 import sys
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import RECORDING, Recorder
 from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, note_crashes, stop_record
-from touchcell.cell.runtime.compose import Cell, compose
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.heap import trim_heap
 from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
 from touchcell.cell.runtime.operator_channel import OperatorChannel
@@ -34,6 +35,21 @@ _EXIT = {
     Outcome.ERROR: EXIT_TASK_FAILED,
     Outcome.TRIPPED: EXIT_TRIPPED,
 }
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A run that has ended.
+
+    Attributes:
+        result: how it ended.
+        folder: its run folder.
+        summary: the text of its report.
+    """
+
+    result: RunResult
+    folder: Path
+    summary: str
 
 
 def run_cell(
@@ -58,12 +74,33 @@ def run_cell(
     Raises:
         ConfigError, ModelError, RunFolderError, ConnectError: before anything moves.
     """
-    plan = plan_cell(path, {} if data is None else {"data": data}, model=model)
+    run = run_plan(plan_cell(path, {} if data is None else {"data": data}, model=model), out=out, live=live)
+    print(run.summary)
+    if moving:
+        from touchcell.cell.experiments.animation import animate
+
+        print(f"  {animate(run.folder).name}")
+    if run.result.outcome not in (Outcome.DONE, Outcome.STOPPED):
+        print(f"`touchcell why {run.folder}` explains")
+    return _EXIT[run.result.outcome]
+
+
+def run_plan(plan: CellPlan, *, out: Path | None = None, live: bool = False) -> FinishedRun:
+    """Compose and run a planned cell to its end, and write its run folder.
+
+    Args:
+        plan: the cell.
+        out: run folder, made for this run or empty; None for ``runs/NAME-TIME``.
+        live: show a progress line.
+
+    Raises:
+        ConfigError, ModelError, RunFolderError, ConnectError: before anything moves.
+    """
     cell = compose(plan)
     trim_heap()
     with run_directory(plan.cell.name, out) as folder:
         try:
-            shutil.copyfile(path, folder / "cell.yaml")
+            (folder / "cell.yaml").write_text(plan.text())
         except OSError as error:
             raise RunFolderError(folder, f"cannot be written: {error.strerror}") from None
         result = _run(cell, folder, live)
@@ -71,24 +108,17 @@ def run_cell(
             (folder / "result.json").write_text(json.dumps(_result_json(plan, result), indent=1) + "\n")
         except OSError as error:
             print(f"touchcell: no result.json: {error.strerror}", file=sys.stderr)
-    _report(folder, moving=moving)
-    if result.outcome not in (Outcome.DONE, Outcome.STOPPED):
-        print(f"`touchcell why {folder}` explains")
-    return _EXIT[result.outcome]
+    return FinishedRun(result, folder, _report(folder))
 
 
-def _report(folder: Path, *, moving: bool) -> None:
-    """Write and print the report; a disk without room for it keeps the recording, which the report is made from."""
+def _report(folder: Path) -> str:
+    """Write the report; a disk without room for it keeps the recording, which the report is made from."""
     try:
-        print(write_report(folder))
-        if moving:
-            from touchcell.cell.experiments.animation import animate
-
-            print(f"  {animate(folder).name}")
+        return write_report(folder)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
             raise
-        print(f"touchcell: no report: {error.strerror}; `touchcell report {folder}` makes it later", file=sys.stderr)
+        return f"no report: {error.strerror}; `touchcell report {folder}` makes it later"
 
 
 def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
@@ -102,9 +132,9 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
         stop_on_keys(stop, desk=desk) as look_at_keys,
         _live_line(cell.plan, live) as show,
     ):
-        cell.watch.note_to(folder)
+        cell.watchdog.note_to(folder)
         if live:
-            print("\n".join(cell.watch.words()))
+            print("\n".join(cell.watchdog.describe()))
 
         def after_cycle(progress: Progress) -> None:
             look_at_keys()

@@ -7,28 +7,29 @@ task fit, and says which devices the task does not need, so that they are not ev
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
+import yaml
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag, model_validator
 
-from touchcell.cell.config.stopping_distance import StoppingDistance, overshoot, together
+from touchcell.cell.config.settings import with_settings
+from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
 from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile, load
 from touchcell.control.interlocks.basic import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.control.interlocks.config import INTERLOCKS, REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
-from touchcell.drivers.core import spec as driver_registry
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.device import DeactivatePolicy
 from touchcell.drivers.core.scene import scene_section
-from touchcell.drivers.core.spec import DriverConfig, DriverSpec
+from touchcell.drivers.core.spec import DRIVERS, DriverConfig, DriverSpec
 from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.tasks import registry as task_registry
-from touchcell.tasks.interface import TaskConfig, TaskSpec
+from touchcell.tasks.interface import TASKS, TaskConfig, TaskSpec
 
 M = TypeVar("M", bound=BaseModel)
 Three = tuple[float, float, float]
@@ -183,11 +184,16 @@ class SensorSection(_OpenSection):
 
 
 class TaskSection(_OpenSection):
-    """The task, which arms and sensors play its roles, and the task's own keys."""
+    """The task, which arms and sensors play its roles, and the task's own keys; ``steps:`` alone names the task too."""
 
     name: str
     arms: dict[str, str] = {}
     sensors: dict[str, str] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named_by_its_steps(cls, section: Any) -> Any:
+        return {"name": "steps", **section} if isinstance(section, dict) and "steps" in section else section
 
 
 class RecordingSection(_Section):
@@ -267,8 +273,9 @@ class CellPlan:
         task_config: its validated parameters.
         skipped: devices of the file that this task does not need and that are not built.
         devices: every device of the file, whether the task needs it or not.
-        overshoots: by the name of a workspace or clearance, how far its arm gets beyond it, or the two fastest arms
-            towards each other, before they stand.
+        stopping_distances: by the name of a workspace or clearance, how far its arm gets beyond it, or the two fastest
+            arms towards each other, before they stand.
+        settings: values that were set in place of the file's own, by dotted key.
     """
 
     file: Path
@@ -282,32 +289,54 @@ class CellPlan:
     skipped: tuple[str, ...]
     devices: Mapping[str, DevicePlan]
     stopping_distances: Mapping[str, StoppingDistance] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        devices = [f"{name} {device.spec.name}" for name, device in {**self.arms, **self.sensors}.items()]
+        return f"<CellPlan {self.cell.name!r}: task {self.task.name}, {', '.join(devices)}>"
+
+    def text(self) -> str:
+        """The cell file as it is planned: the file itself, or YAML of its content with ``settings`` in place."""
+        if not self.settings:
+            return self.file.read_text()
+        data = with_settings(load(self.file).data, self.settings)
+        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
 
 
-def plan_cell(path: Path, overrides: Mapping[str, Any] | None = None, *, model: str | None = None) -> CellPlan:
+def plan_cell(
+    path: str | PathLike[str],
+    overrides: Mapping[str, Any] | None = None,
+    *,
+    model: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> CellPlan:
     """Read and check a cell file without connecting anything.
 
     Args:
         path: the YAML file.
         overrides: driver keys set from the command line (``--data``), for every device whose driver has such a key.
         model: network model in place of the one that the file names.
+        settings: values in place of the file's own, by dotted key ("task.speed_mm_s", "arms.arm.limits").
 
     Raises:
         ConfigError: with file, line, key, value and remedy; InvalidCell for several at once.
     """
-    file = load(path)
+    file = load(Path(path))
+    if settings:
+        file = replace(file, data=with_settings(file.data, settings))
     if model is not None and isinstance(sensors := file.data.get("sensors"), dict):
         for sensor in sensors.values():
             estimator = sensor.get("estimator") if isinstance(sensor, dict) else None
             if isinstance(estimator, dict) and estimator.get("kind") == "network":
                 estimator["model"] = model
-    return _Planner(file, overrides or {}).plan()
+    return _Planner(file, overrides or {}, settings or {}).plan()
 
 
 class _Planner:
-    def __init__(self, file: YamlFile, overrides: Mapping[str, Any]) -> None:
+    def __init__(self, file: YamlFile, overrides: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
         self._file = file
         self._overrides = overrides
+        self._settings = settings
         self._problems: list[ConfigError] = []
 
     def plan(self) -> CellPlan:
@@ -351,6 +380,7 @@ class _Planner:
             tuple(skipped),
             devices,
             stopping_distances,
+            self._settings,
         )
 
     def _require_scene_fits(self, cell: CellFile) -> None:
@@ -361,7 +391,7 @@ class _Planner:
 
     def _task(self, cell: CellFile) -> tuple[TaskSpec | None, TaskConfig | None]:
         try:
-            spec = task_registry.spec(cell.task.name)
+            spec = TASKS.load(cell.task.name)
         except ConfigError as error:
             self._add(("task", "name"), error.reason, value=cell.task.name, hint=error.hint)
             return None, None
@@ -426,7 +456,7 @@ class _Planner:
         kind: str,
     ) -> DevicePlan | None:
         try:
-            spec = driver_registry.spec(section.driver)
+            spec = DRIVERS.load(section.driver)
         except ConfigError as error:
             self._add((*at, "driver"), error.reason, value=section.driver, hint=error.hint)
             return None
@@ -555,7 +585,7 @@ class _Planner:
             lever_m = 1e-3 * max((float(np.linalg.norm(end)) for end in ends), default=0.0)
             if (way := _overshoot(arm, lever_m, cell.rate_hz)) is not None:
                 ways.append(way)
-        both = together(sorted(ways, key=lambda way: way.total_m)[-2:])
+        both = combined(sorted(ways, key=lambda way: way.total_m)[-2:])
         if both.total_m > 1e-3 * entry.limit_mm:
             self._add(
                 ("interlocks", name, "limit_mm"),

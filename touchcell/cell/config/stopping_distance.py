@@ -46,7 +46,7 @@ def overshoot(limits: TwistLimits, lever_m: float, rate_hz: float, latency_s: fl
     return StoppingDistance(speed_m_s, speed_m_s / rate_hz, speed_m_s * latency_s, braking_m)
 
 
-def together(ways: Sequence[StoppingDistance]) -> StoppingDistance:
+def combined(ways: Sequence[StoppingDistance]) -> StoppingDistance:
     """The overshoot of two points that come towards each other: the sum of theirs."""
     return StoppingDistance(
         sum(way.speed_m_s for way in ways),

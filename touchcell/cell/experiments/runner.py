@@ -11,15 +11,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from touchcell import registry as entry_points
 from touchcell.cell.analysis.provenance import provenance
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.experiments.table import Column, Row, table, to_json
 from touchcell.cell.experiments.trials import Finished, Perform, Trial, perform_all
-
-GROUP = "touchcell.experiments"
+from touchcell.registry import Registry
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,14 +64,8 @@ class ExperimentSpec:
     notes: tuple[str, ...] = ()
 
 
-def installed() -> list[str]:
-    """Names of all experiments."""
-    return sorted(entry_points.installed(GROUP))
-
-
-def spec(name: str) -> ExperimentSpec:
-    """The experiment ``name``. Raises ConfigError with a suggestion for an unknown one."""
-    return entry_points.load(GROUP, "experiment", name, ExperimentSpec)
+EXPERIMENTS: Final = Registry("touchcell.experiments", "experiment", ExperimentSpec)
+"""All installed experiments."""
 
 
 def run_experiment(experiment: ExperimentSpec, folder: Path, scale: Scale, *, jobs: int = 1, live: bool = False) -> str:

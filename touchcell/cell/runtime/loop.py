@@ -24,9 +24,10 @@ from touchcell.cell.recording.messages import (
     tcp_message,
     verdict_message,
 )
-from touchcell.cell.runtime.compose import Cell, Sensor
+from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.operator_channel import OperatorChannel
 from touchcell.cell.runtime.reset_procedure import ResetProcedure
+from touchcell.cell.runtime.sensor import Sensor
 from touchcell.cell.runtime.stopping import Stopper, StopReport
 from touchcell.cell.runtime.timing import CycleTimes
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
@@ -194,7 +195,7 @@ class RunLoop:
             if self._cell.scene is not None:
                 # In real time it has to catch up with all that happened since it was made.
                 self._cell.scene.objects()
-            self._cell.watch.begin()
+            self._cell.watchdog.begin()
         except TouchcellError as error:
             self._error = error
         self._start_ns = self._due_ns = self._cell.clock.now_ns()
@@ -223,7 +224,7 @@ class RunLoop:
             self._reason = "stopped at once by the operator"
             return False
         try:
-            cell.watch.beat()
+            cell.watchdog.beat()
             self._cycle()
         except DeviceError as error:
             if self._desk is None:
@@ -245,7 +246,7 @@ class RunLoop:
         roles = {arm.name: role for role, arm in cell.arms.items()}
         now_ns, latch = cell.clock.now_ns(), cell.supervisor.latch
         # Whoever looks on from outside may know better why a device does not answer.
-        latch.update(cell.watch.alarms(now_ns))
+        latch.update(cell.watchdog.alarms(now_ns))
         fault = Violation("device", Severity.FAULT, roles.get(error.device, error.device), str(error), now_ns)
         is_new = (fault.interlock, fault.subject) not in {(cause.interlock, cause.subject) for cause in latch.causes}
         latch.update([fault])
@@ -259,7 +260,7 @@ class RunLoop:
         self._waited_from_ns = self._cell.clock.now_ns()
         stops = self._come_to_rest()
         # A black box takes longer to write than a watchdog waits. Arms that nobody guards obey no motion.
-        self._cell.watch.end()
+        self._cell.watchdog.end()
         self._waiting = ResetProcedure(self._cell, self._leases, desk)
         desk.open()
         self._due_ns = self._cell.clock.now_ns()
@@ -277,7 +278,7 @@ class RunLoop:
         try:
             states, contacts, now_ns = self._look()
             view = replace(self._view(now_ns, states, contacts, Action()), at_work=False)
-            cell.supervisor.review(view, cell.watch.alarms(now_ns))
+            cell.supervisor.review(view, cell.watchdog.alarms(now_ns))
             if not all(arm.at_rest() for arm in self._arms.values()):
                 self._stop_arms(tripped=True)
                 self._come_to_rest()
@@ -314,11 +315,11 @@ class RunLoop:
         cell = self._cell
         self._ending = True
         # Whoever looks on from outside may know better why a device does not answer.
-        if self._error is not None and (alarms := cell.watch.alarms(cell.clock.now_ns())):
+        if self._error is not None and (alarms := cell.watchdog.alarms(cell.clock.now_ns())):
             cell.supervisor.latch.update(alarms)
         self._stop_arms(tripped=self._error is not None or cell.supervisor.latch.first_cause is not None)
         stops = self._come_to_rest()
-        cell.watch.end()
+        cell.watchdog.end()
         if self._desk is not None:
             self._desk.close()
         for role, lease in self._leases.items():
@@ -374,7 +375,7 @@ class RunLoop:
         observation = Observation(now_ns, states, contacts, operator_stop=self._stop.count > 0, ended=ended)
         action = cell.task.tick(observation)
         thought = time.perf_counter_ns()
-        verdict = cell.supervisor.review(self._view(now_ns, states, contacts, action), cell.watch.alarms(now_ns))
+        verdict = cell.supervisor.review(self._view(now_ns, states, contacts, action), cell.watchdog.alarms(now_ns))
         judged = time.perf_counter_ns()
         sent: dict[str, Sent[TwistCommand]] = {}
         if verdict.allow:
@@ -455,7 +456,7 @@ class RunLoop:
 
     def _record_state(self, role: str, state: Stamped[TcpState]) -> None:
         # Arms on their way to rest are still guarded.
-        self._cell.watch.beat()
+        self._cell.watchdog.beat()
         try:
             message = tcp_message(state)
         except TouchcellError as error:

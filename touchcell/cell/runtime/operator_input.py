@@ -12,6 +12,7 @@ import os
 import select
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -57,6 +58,10 @@ class FolderInUse(TouchcellError):
 @contextlib.contextmanager
 def stop_on_signals(stop: StopRequest) -> Iterator[None]:
     """The first Ctrl-C, SIGTERM or lost terminal ends the task in an orderly way, the second stops at once."""
+    if threading.current_thread() is not threading.main_thread():
+        # Python delivers signals to the main thread, and lets no other set a handler.
+        yield
+        return
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = {number: signal.signal(number, lambda *_: stop.ask()) for number in numbers}
     try:

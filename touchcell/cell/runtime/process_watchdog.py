@@ -56,7 +56,7 @@ def process_lines(plan: CellPlan) -> list[str]:
     return lines
 
 
-class ProcessWatch:
+class ProcessWatchdog:
     """The chain, as the run loop sees it; see ``touchcell.cell.runtime.watchdog.Watch``.
 
     Args:
@@ -77,7 +77,7 @@ class ProcessWatch:
     ) -> None:
         self.chain.__exit__(kind, error, trace)
 
-    def prove(self) -> None:
+    def self_test(self) -> None:
         """The self-test: both links have to stop all arms in time. Raises SelfTestFailed."""
         from touchcell.drivers.hosting.self_test import self_test
 
@@ -127,7 +127,7 @@ class ProcessWatch:
         """Have the watchdog write ``watchdog.json`` there when it stops the arms."""
         self.chain.note_to(folder / NOTES)
 
-    def words(self) -> Sequence[str]:
+    def describe(self) -> Sequence[str]:
         """Each process and what scheduling and memory it got, and what the self-test measured."""
         lines = [f"host {link.name!r}: process {link.pid}, {link.realtime}" for link in self.chain.hosts]
         watchdog = self.chain.watchdog

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from touchcell.cell.runtime.compose import Cell
+from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest, Request
 from touchcell.control.interlocks.snapshot import CellView
 from touchcell.control.latch import LatchState, ResetDone
@@ -69,10 +69,10 @@ class ResetProcedure:
                 # A host forgets its stop only for an arm that nobody holds.
                 for role, lease in self._leases.items():
                     self._cell.arms[role].release(lease)
-                self._cell.watch.clear()
+                self._cell.watchdog.clear()
             except DeviceError as error:
                 return False, f"refused: {error}"
-        outcome = supervisor.reset(token, view, self._cell.watch.alarms(view.now_ns))
+        outcome = supervisor.reset(token, view, self._cell.watchdog.alarms(view.now_ns))
         if not isinstance(outcome, ResetDone):
             return False, f"refused: {outcome.reason.value}"
         self.resets.append(outcome)
@@ -88,7 +88,7 @@ class ResetProcedure:
             for role in self._leases:
                 if self._cell.arms[role].owner is None:
                     self._leases[role] = self._cell.arms[role].acquire(self._cell.task_name)
-            self._cell.watch.begin()
+            self._cell.watchdog.begin()
         except DeviceError as error:
             return False, f"refused: {error}"
         return True, "the task starts again from its first state"

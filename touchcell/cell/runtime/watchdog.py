@@ -26,7 +26,7 @@ class Watchdog(Protocol):
         """End it, after all devices have been given back."""
         ...
 
-    def prove(self) -> None:
+    def self_test(self) -> None:
         """Show that it stops moving arms; called with all devices active. Raises DeviceError if it does not."""
         ...
 
@@ -54,7 +54,7 @@ class Watchdog(Protocol):
         """Leave a note in the run folder when it stops the arms, also if the loop cannot."""
         ...
 
-    def words(self) -> Sequence[str]:
+    def describe(self) -> Sequence[str]:
         """What there is, in lines for people."""
         ...
 
@@ -70,7 +70,7 @@ class NullWatchdog:
     ) -> None:
         return None
 
-    def prove(self) -> None:
+    def self_test(self) -> None:
         """Nothing to prove."""
 
     def begin(self) -> None:
@@ -92,6 +92,6 @@ class NullWatchdog:
     def note_to(self, folder: Path) -> None:
         """Nobody writes."""
 
-    def words(self) -> Sequence[str]:
+    def describe(self) -> Sequence[str]:
         """Nothing to say."""
         return ()

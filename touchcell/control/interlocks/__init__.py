@@ -1,1 +1,1 @@
-"""Safety rules over a snapshot of the cell."""
+"""Safety interlocks: rules that are checked on a snapshot of the cell."""

@@ -1,4 +1,4 @@
-"""Limits that every cell needs: finite numbers, workspace, tilt, speed, depth, and the age of what was measured."""
+"""Interlocks that every cell needs: finite numbers, workspace, tilt, speed, depth, and age of the measurements."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from touchcell.geometry.types import Array
 
 @dataclass(frozen=True, slots=True)
 class Finite:
-    """Every number in the view and in the commands is finite. Always on, and asked before all others."""
+    """Require every number in the view and in the commands to be finite. Always on, and checked first."""
 
     name: str = "finite"
     severity: Severity = Severity.FAULT
@@ -59,7 +59,7 @@ class Finite:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Workspace:
-    """A point of an arm's tool stays inside a box along the axes of the arm's base; motion back into it is allowed.
+    """Keep a point of an arm's tool inside a box along the axes of the arm's base; motion back into it is allowed.
 
     Attributes:
         arm: role of the arm.
@@ -95,7 +95,7 @@ class Workspace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tilt:
-    """The z axis of an arm's tool, or of the sensor on it, stays in a cone; motion back into it is allowed.
+    """Keep the z axis of an arm's tool, or of the sensor on it, in a cone; motion back into it is allowed.
 
     Attributes:
         arm: role of the arm.
@@ -128,7 +128,7 @@ class Tilt:
 
 @dataclass(frozen=True, slots=True)
 class TcpSpeed:
-    """No tool centre point moves, or is told to move, faster than the limits."""
+    """Limit the measured and the commanded speed of every tool centre point."""
 
     name: str
     severity: Severity
@@ -156,7 +156,7 @@ class TcpSpeed:
 
 @dataclass(frozen=True, slots=True)
 class Depth:
-    """No sensor is pressed in deeper than the limit."""
+    """Limit the indentation of every sensor."""
 
     name: str
     severity: Severity
@@ -182,7 +182,7 @@ class Depth:
 
 @dataclass(frozen=True, slots=True)
 class FrameAge:
-    """Every sensor's newest frame is younger than the limit, and none comes from the future."""
+    """Limit the age of every sensor's newest frame; a time stamp in the future is a violation too."""
 
     name: str
     severity: Severity
@@ -195,7 +195,7 @@ class FrameAge:
 
 @dataclass(frozen=True, slots=True)
 class ArmStateAge:
-    """Every arm's newest state is younger than the limit, and none comes from the future."""
+    """Limit the age of every arm's newest state; a time stamp in the future is a violation too."""
 
     name: str
     severity: Severity
@@ -209,7 +209,7 @@ class ArmStateAge:
 def _check_ages(
     rule: FrameAge | ArmStateAge, what: str, stamps: Mapping[str, tuple[int, int | None]], now_ns: int
 ) -> Violation | None:
-    """The oldest of ``stamps`` (time and frame number by role) if it is too old, or one that lies in the future."""
+    """Return a violation for the oldest of ``stamps`` (time and frame number by role), or for one in the future."""
     for role, (t_ns, seq) in sorted(stamps.items(), key=lambda item: item[1][0]):
         age_s = (now_ns - t_ns) * 1e-9
         if not 0.0 <= age_s <= rule.limit_s:
@@ -231,7 +231,7 @@ def _check_ages(
 class WorkspaceConfig(GradedSettings):
     """Box for a sensor, or for the tool centre point of an arm without one, along the axes of the arm's base.
 
-    ``margin_mm`` is how far outside the box nothing stands: a cell whose arm may overshoot by more is refused.
+    ``margin_mm`` is the free space around the box: a cell whose stopping distance may exceed it is refused.
     """
 
     kind: Literal["workspace"]
@@ -248,14 +248,18 @@ class WorkspaceConfig(GradedSettings):
         return self
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
-        """The rule. Raises ConfigError for a sensor that the cell does not have."""
+        """Return the ``Workspace`` interlock. Raises ConfigError for a sensor that the cell does not have."""
         T_tcp_point = _guarded(name, self.sensor, T_tcp_sensor)
         min_m, max_m = 1e-3 * np.array(self.min_mm), 1e-3 * np.array(self.max_mm)
         return Workspace(name, self.level, self.arm, T_tcp_point, min_m, max_m)
 
 
 def _guarded(name: str, sensor: str | None, T_tcp_sensor: Mapping[str, Array]) -> Array:
-    """Pose (4, 4) of the sensor in the tool frame, or the identity. Raises ConfigError for one that is not there."""
+    """Return the pose (4, 4) of the sensor in the tool frame, or the identity without one.
+
+    Raises:
+        ConfigError: the task has no such sensor.
+    """
     if sensor is None:
         return np.eye(4)
     if sensor not in T_tcp_sensor:
@@ -284,7 +288,7 @@ class TiltConfig(GradedSettings):
         return self
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
-        """The rule. Raises ConfigError for a sensor that the cell does not have."""
+        """Return the ``Tilt`` interlock. Raises ConfigError for a sensor that the cell does not have."""
         axis = _guarded(name, self.sensor, T_tcp_sensor)[:3, 2]
         direction = np.array(self.direction) / np.linalg.norm(self.direction)
         return Tilt(name, self.level, self.arm, axis, direction, math.radians(self.limit_deg))
@@ -298,38 +302,38 @@ class TcpSpeedConfig(InterlockSettings):
     limit_rad_s: PositiveFloat
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
-        """The rule."""
+        """Return the ``TcpSpeed`` interlock."""
         return TcpSpeed(name, self.level, self.limit_m_s, self.limit_rad_s)
 
 
 class DepthConfig(GradedSettings):
-    """Deepest indentation of any sensor."""
+    """Largest indentation of any sensor."""
 
     kind: Literal["depth"]
     limit_mm: PositiveFloat
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
-        """The rule."""
+        """Return the ``Depth`` interlock."""
         return Depth(name, self.level, 1e-3 * self.limit_mm)
 
 
 class FrameAgeConfig(InterlockSettings):
-    """Oldest tactile frame."""
+    """Largest age of a tactile frame."""
 
     kind: Literal["frame_age"]
     limit_ms: PositiveFloat
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
-        """The rule."""
+        """Return the ``FrameAge`` interlock."""
         return FrameAge(name, self.level, 1e-3 * self.limit_ms)
 
 
 class ArmStateAgeConfig(InterlockSettings):
-    """Oldest arm state."""
+    """Largest age of an arm state."""
 
     kind: Literal["arm_state_age"]
     limit_ms: PositiveFloat
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
-        """The rule."""
+        """Return the ``ArmStateAge`` interlock."""
         return ArmStateAge(name, self.level, 1e-3 * self.limit_ms)

@@ -1,4 +1,4 @@
-"""The interlock that keeps arms apart from each other, from what stands around, and from themselves."""
+"""Interlock that keeps arms clear of each other, of obstacles, and of themselves."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _NEGLIGIBLE_M = 1e-7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clearance:
-    """Nothing comes nearer to an arm than ``limit_m``, and towards what is nearer than ``slow_m`` it goes slowly.
+    """Keep every arm at least ``limit_m`` from everything, and slow its approach to what is nearer than ``slow_m``.
 
-    Motion that takes the two apart is allowed. What counts is where a command would lead within 10 ms.
+    Motion that increases the distance is allowed. The check uses the pose to which a command would lead within 10 ms.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Clearance:
     slow_m: float
 
     def check(self, view: CellView) -> Violation | None:
-        """The nearest two of those that are too near and do not go apart."""
+        """Return a violation for the nearest pair that is too near and not separating."""
         apart = self.clearances.distances(self._frames(view, 0.0))
         if not np.min(apart, initial=np.inf) < self.slow_m:
             return None
@@ -65,14 +65,14 @@ class Clearance:
             value=apart_m,
             limit=limit_m,
             unit="m",
-            may_last=True,
+            escalates=False,
         )
 
 
 class ClearanceConfig(SpatialInterlockConfig):
-    """Least distance of every arm from the others, from the cell's ``obstacles:`` and from itself.
+    """Smallest distance of every arm to the others, to the cell's ``obstacles:`` and to itself.
 
-    Nearer than ``slow_mm`` motion towards each other is slowed to a quarter, for as long as it lasts.
+    Nearer than ``slow_mm``, approaching motion is slowed to a quarter for as long as it continues.
     """
 
     kind: Literal["clearance"]
@@ -86,7 +86,7 @@ class ClearanceConfig(SpatialInterlockConfig):
         return self
 
     def build_in_scene(self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene) -> Clearance:
-        """The rule. Raises ConfigError where there is nothing that could come near anything."""
+        """Return the ``Clearance`` interlock. Raises ConfigError if there are no two bodies that could collide."""
         bodies = planning_scene.bodies
         counts = {role: body.link_count + 2 for role, body in bodies.items()}
         clearances = Clearances({role: body.capsules for role, body in bodies.items()}, counts, planning_scene.boxes)

@@ -1,7 +1,7 @@
-"""How far bodies are apart: capsules on arms against each other and against boxes. Pure geometry, no state.
+"""Distances between bodies: capsules on arms against each other and against boxes. Pure geometry, no state.
 
-A capsule is all that lies within a radius of a segment. Its two ends may be fixed to different frames of an arm: one
-from the shoulder to the tool stands for the links between of an arm that tells only where its tool is.
+A capsule is the set of points within a radius of a segment. Its two ends may be fixed to different frames of an arm:
+one from the shoulder to the tool stands for all links between, for an arm that reports only its tool pose.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from touchcell.geometry.types import Array
 
 BASE = 0
 TOOL = -1
-"""Frames of an arm: its base, its links from 1 on where it tells its joints, and last its tool."""
+"""Frames of an arm: its base, its links from 1 on if it reports joint angles, and last its tool."""
 _LINKS_APART = 4
-"""Neighbouring links always touch, and those around a wrist nearly so: their joints' limits keep them apart."""
+"""Neighbouring links always touch, and those around a wrist nearly so: their joint limits keep them apart."""
 
 
 @dataclass(frozen=True, slots=True)
 class Capsule:
-    """A part of an arm.
+    """Capsule-shaped part of an arm.
 
     Attributes:
-        name: for people.
-        frames: of its two ends, as numbers among the arm's frames.
+        name: name in messages.
+        frames: indices of the arm's frames to which its two ends are fixed.
         ends_m: (3,) of each, in its frame.
         radius_m: around the segment between them.
     """
@@ -39,10 +39,10 @@ class Capsule:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Box:
-    """Something that stands still, a table perhaps.
+    """Static box, for example a table.
 
     Attributes:
-        name: for people.
+        name: name in messages.
         T_world_box: pose (4, 4) of its centre.
         half_m: (3,) half of its sides.
     """
@@ -54,7 +54,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two things that shall stay apart: the capsule's arm, what it is, and what it is near to."""
+    """Two bodies whose distance is checked: the capsule and its arm, and the other body."""
 
     arm: str
     part: str
@@ -63,18 +63,18 @@ class Pair:
 
 
 class Clearances:
-    """All distances that matter between the capsules of some arms, and from them to some boxes.
+    """Distances of all checked pairs: between the capsules of some arms, and from them to some boxes.
 
-    Capsules of one arm are held against each other where their links are at least four apart; those fixed to a base at
-    both ends are not held against boxes, as neither moves.
+    Capsules of one arm are checked against each other where their links are at least four apart; those fixed to a base
+    at both ends are not checked against boxes, as neither moves.
 
     Args:
         bodies: capsules of each arm, by its role.
-        frame_counts: how many frames each arm has.
-        boxes: what stands around.
+        frame_counts: number of frames of each arm.
+        boxes: static obstacles.
 
     Attributes:
-        pairs: what the numbers of ``distances`` are between, in their order.
+        pairs: the pair that each entry of ``distances`` belongs to, in order.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Clearances:
         self._half = np.array([box.half_m for box in boxes]).reshape(-1, 3)[self._of_boxes[1]]
 
     def distances(self, T_world_frames: Array) -> Array:
-        """(p,) m between the two of each pair; negative by how far they overlap, at most by a capsule's radius.
+        """Return (p,) distances in m of all pairs; negative where they overlap, by at most a capsule's radius.
 
         Args:
             T_world_frames: (f, 4, 4) all frames of all arms, in the order of ``bodies``.
@@ -132,17 +132,17 @@ def _links_between(frames: tuple[int, int], other: tuple[int, int]) -> int:
 
 
 def segment_distances(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
-    """(n,) distances between segments a0-a1 and b0-b1, each (n, 3); either may be a point.
+    """Return (n,) distances between segments a0-a1 and b0-b1, each (n, 3); either may be a point.
 
-    The place on one line that is nearest to the other is clamped to its segment, then what is nearest to it on the
-    other segment is sought, and what is nearest to that on the first (Ericson 2005, Real-Time Collision Detection).
-    Of nearly parallel segments of a metre the distance may come out 2 um too long.
+    The point on one line that is nearest to the other is clamped to its segment, then the point nearest to it on the
+    other segment is found, and the one nearest to that on the first (Ericson 2005, Real-Time Collision Detection).
+    For nearly parallel segments of a metre the distance may come out 2 um too long.
     """
     sides = np.stack((a1 - a0, b1 - b0, a0 - b0), axis=1)
     products = np.matmul(sides, sides.transpose(0, 2, 1))
     uu, uv, uw, vv, vw = (products[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
     slant = uu * vv - uv * uv
-    # Along parallel lines every place is as near as any other.
+    # Along parallel lines all points are equally near.
     s = np.where(slant > 1e-12 * uu * vv, uv * vw - vv * uw, 0.0) / np.maximum(slant, _TINY)
     s = np.minimum(np.maximum(s, 0.0), 1.0)
     t = np.minimum(np.maximum((uv * s + vw) / np.maximum(vv, _TINY), 0.0), 1.0)
@@ -153,10 +153,10 @@ def segment_distances(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
 
 
 def segment_box_distances(a0: Array, a1: Array, T_world_box: Array, half_m: Array) -> Array:
-    """(n,) distances between segments a0-a1 (n, 3) and solid boxes at (n, 4, 4) with half sides (n, 3); 0 if they meet.
+    """Return (n,) distances between segments a0-a1 (n, 3) and solid boxes; 0 where they meet.
 
-    Along the segment the squared distance is convex and made of parabolas that join where a face's plane is crossed; so
-    its slope, taken at those places, brackets the one where it is zero.
+    The boxes are at (n, 4, 4) with half sides (n, 3). Along the segment the squared distance is convex and made of
+    parabolas that join where a face's plane is crossed; so its slope at those points brackets its zero.
     """
     R, origin = T_world_box[:, :3, :3], T_world_box[:, :3, 3]
     p = np.einsum("nij,ni->nj", R, a0 - origin)
@@ -173,7 +173,7 @@ def segment_box_distances(a0: Array, a1: Array, T_world_box: Array, half_m: Arra
     slope = np.einsum("nki,ni->nk", outside, d)
     rising = np.argmax(slope >= 0.0, axis=1)
     rows = np.arange(len(p))
-    # All falling: the end is nearest. Rising from the start on: the start is.
+    # Slope negative everywhere: the end is nearest. Positive from the start: the start is.
     rising = np.where(slope[:, -1] < 0.0, 7, rising)
     before = np.maximum(rising - 1, 0)
     low, high = slope[rows, before], slope[rows, rising]

@@ -1,8 +1,8 @@
-"""Interlocks: pure rules over a ``CellView``, and the section of the cell file that sets their limits.
+"""All interlocks, and the section of the cell file that sets their limits.
 
-Each rule is a small frozen dataclass with a ``check``; each is configured by a model whose keys carry their units.
-None of them changes a command: they say when motion has to slow down or to end. Rules that need a past are in
-``touchcell.control.interlocks.timers`` and the modules named after what they watch.
+An interlock is a small frozen dataclass with a pure ``check`` over a ``CellView``, configured by a model whose keys
+carry their units. None of them changes a command: they request slower motion or a stop. Interlocks with state are in
+``touchcell.control.interlocks.timers`` and the modules named after what they monitor.
 """
 
 from __future__ import annotations
@@ -69,10 +69,10 @@ InterlockConfig = Annotated[
     | ClearanceConfig,
     Field(discriminator="kind"),
 ]
-"""One entry of the ``interlocks:`` section; ``kind`` says which."""
+"""One entry of the ``interlocks:`` section, discriminated by ``kind``."""
 
 InterlocksConfig = dict[str, InterlockConfig]
-"""The ``interlocks:`` section: settings by a name that people choose."""
+"""The ``interlocks:`` section: settings by a user-chosen name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class InterlockSpec:
     """One kind of interlock, for ``touchcell list``.
 
     Attributes:
-        kind: the word in the cell file.
+        kind: value of ``kind`` in the cell file.
         summary: one line.
         config: its settings; None for what is always on.
     """
@@ -91,45 +91,45 @@ class InterlockSpec:
 
 
 REQUIRED_TO_MOVE: Final = frozenset({"workspace", "tcp_speed", "arm_state_age"})
-"""Kinds that a cell must have for a task that moves an arm."""
+"""Kinds that a task which moves an arm requires."""
 REQUIRED_TO_TOUCH: Final = frozenset({"depth", "frame_age"})
-"""Kinds that it must have besides when the task feels."""
+"""Kinds that such a task also requires if it uses a tactile sensor."""
 
 INTERLOCKS: Final[Mapping[str, InterlockSpec]] = MappingProxyType(
     {
         spec.kind: spec
         for spec in (
-            InterlockSpec("finite", "every number is finite; always on, asked before all others", None),
+            InterlockSpec("finite", "every number is finite; always on, checked first", None),
             InterlockSpec("workspace", "sensor or tool stays inside a box in the arm's base frame", WorkspaceConfig),
             InterlockSpec("tcp_speed", "measured and commanded tool speed stay below limits", TcpSpeedConfig),
             InterlockSpec("depth", "no sensor is pressed in too deep", DepthConfig),
             InterlockSpec("frame_age", "tactile frames are fresh", FrameAgeConfig),
             InterlockSpec("arm_state_age", "arm states are fresh", ArmStateAgeConfig),
             InterlockSpec("tilt", "sensor or tool points along a direction within a cone", TiltConfig),
-            InterlockSpec("frame_frozen", "tactile pictures change, noise and all", FrameFrozenConfig),
+            InterlockSpec("frame_frozen", "tactile frames are not frozen: their content changes", FrameFrozenConfig),
             InterlockSpec("exposure", "brightness stays near that of the first frames", ExposureConfig),
-            InterlockSpec("uncertain", "the depth is known well enough", UncertainConfig),
-            InterlockSpec("out_of_range", "the network stays in the range that it was trained on", OutOfRangeConfig),
-            InterlockSpec("inconsistent", "the filter's innovations fit its covariance", InconsistentConfig),
-            InterlockSpec("contact_lost", "a contact that was made is not missing for long", ContactLostConfig),
-            InterlockSpec("shear", "no contact is sheared until it saturates or slips", ShearConfig),
-            InterlockSpec("torsion", "no contact is twisted too far", TorsionConfig),
-            InterlockSpec("slip", "no contact is sheared further than its depth can hold", SlipConfig),
-            InterlockSpec("markers_lost", "most of the markers expected in view are seen", MarkersLostConfig),
+            InterlockSpec("uncertain", "standard deviation of the depth is below a limit", UncertainConfig),
+            InterlockSpec("out_of_range", "the estimate stays inside the network's training range", OutOfRangeConfig),
+            InterlockSpec("inconsistent", "innovations match the filter's covariance", InconsistentConfig),
+            InterlockSpec("contact_lost", "an established contact is not lost for long", ContactLostConfig),
+            InterlockSpec("shear", "shear of every contact stays below saturation or slip", ShearConfig),
+            InterlockSpec("torsion", "torsion of every contact stays below a limit", TorsionConfig),
+            InterlockSpec("slip", "shear per depth of every contact stays below slip", SlipConfig),
+            InterlockSpec("markers_lost", "most of the markers expected in view are detected", MarkersLostConfig),
             InterlockSpec("out_of_step", "leader and follower keep their distance and share the load", OutOfStepConfig),
-            InterlockSpec("object_lost", "what two sensors hold stays between them", ObjectLostConfig),
-            InterlockSpec("toppling", "what is pushed or held does not begin to lean", TopplingConfig),
-            InterlockSpec("tracking", "an arm moves as it was sent", TrackingConfig),
-            InterlockSpec("standstill", "an arm that is told to stand does", StandstillConfig),
-            InterlockSpec("clearance", "arms keep away from each other, obstacles and themselves", ClearanceConfig),
-            InterlockSpec("limited", "no gate holds an arm back for long", LimitedConfig),
+            InterlockSpec("object_lost", "the object held by two sensors stays between them", ObjectLostConfig),
+            InterlockSpec("toppling", "the pushed or held object does not begin to topple", TopplingConfig),
+            InterlockSpec("tracking", "an arm follows its commanded velocity", TrackingConfig),
+            InterlockSpec("standstill", "an arm that is commanded to stop stays at rest", StandstillConfig),
+            InterlockSpec("clearance", "arms keep clear of each other, obstacles and themselves", ClearanceConfig),
+            InterlockSpec("limited", "no gate limits an arm's command for long", LimitedConfig),
         )
     }
 )
 
 
 def parse_interlocks(section: Mapping[str, Any]) -> dict[str, InterlockConfig]:
-    """The ``interlocks:`` section as settings.
+    """Parse the ``interlocks:`` section.
 
     Raises:
         ConfigError: for the first entry that is unknown, incomplete, not positive or inverted, with its key.
@@ -153,15 +153,15 @@ def build_interlocks(
     T_tcp_sensor: Mapping[str, Array],
     planning_scene: PlanningScene | None = None,
 ) -> tuple[Interlock | TimedInterlock, ...]:
-    """The rules of a cell.
+    """Build the interlocks of a cell.
 
     Args:
         settings: by name.
-        T_tcp_sensor: (4, 4) where each sensor sits, by role.
-        surroundings: where arms stand and what they look like.
+        T_tcp_sensor: (4, 4) pose of each sensor in the tool frame, by role.
+        planning_scene: base poses and collision bodies of the arms, and the obstacles.
 
     Raises:
-        ConfigError: a rule is about something that is not there.
+        ConfigError: an interlock names an arm or a sensor that the cell does not have.
     """
     return tuple(
         config.build_in_scene(name, T_tcp_sensor, planning_scene or PlanningScene())

@@ -1,4 +1,4 @@
-"""What an interlock raises, as a type with attributes."""
+"""Errors of the interlocks."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ class SafetyTrip(TouchcellError):
 
     Attributes:
         interlock: name of the interlock that was violated first.
-        subject: role of the arm or the sensor it was about.
-        value: what was found, in ``unit``; None where there is no number for it.
-        limit: what is allowed, in ``unit``; None likewise.
+        subject: role of the arm or sensor concerned.
+        value: offending value in ``unit``; None where there is no number for it.
+        limit: its limit in ``unit``; None likewise.
         unit: of both.
         t_ns: time of the control cycle.
-        frame_seq: number of the tactile frame that showed it, where it was one.
+        frame_seq: number of the tactile frame that caused it, where it was one.
     """
 
     def __init__(

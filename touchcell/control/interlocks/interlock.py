@@ -1,4 +1,4 @@
-"""What an interlock is: a pure rule over a snapshot of the cell."""
+"""Base protocol of the interlocks: a pure rule over a snapshot of the cell."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from touchcell.control.interlocks.violation import Severity, Violation
 
 
 class Interlock(Protocol):
-    """A rule. ``check`` is a pure function of the view; what it raises counts as a fault."""
+    """A stateless interlock. ``check`` is a pure function of the view; an exception in it counts as a fault."""
 
     @property
     def name(self) -> str:
@@ -18,9 +18,9 @@ class Interlock(Protocol):
 
     @property
     def severity(self) -> Severity:
-        """What a violation asks for."""
+        """Severity of its violations."""
         ...
 
     def check(self, view: CellView) -> Violation | None:
-        """The worst violation in ``view``, or None."""
+        """Return the worst violation in ``view``, or None."""
         ...

@@ -1,4 +1,4 @@
-"""Interlocks about what an arm does with what it was sent."""
+"""Interlocks on how an arm follows its commands."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ from touchcell.geometry.types import Array
 
 @dataclass(frozen=True, slots=True)
 class Standstill:
-    """An arm that was told to stand stays where it stood ``settle_s`` after, and ``settle_s`` after each violation."""
+    """Require an arm that was commanded to stop to stay at rest.
+
+    Its reference is where it stood ``settle_s`` after the stop or after its latest violation.
+    """
 
     name: str
     severity: Severity
@@ -34,7 +37,7 @@ class Standstill:
     settle_s: float
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
-        """The first arm that has drifted too far."""
+        """Return a violation for the first arm that has drifted too far."""
         marks: dict[str, TimerState] = {}
         found: Violation | None = None
         for role, arm in view.arms.items():
@@ -45,10 +48,10 @@ class Standstill:
             if not mark.values and view.now_ns - mark.since_ns >= round(1e9 * self.settle_s):
                 mark = TimerState(mark.since_ns, values=tuple(position.tolist()))
             drift_m = math.dist(position, mark.values) if mark.values else 0.0
-            # Told once: where it stands from now on is what counts, or nobody could ever reset this.
+            # The position is taken anew after a violation, or the latch could never be reset.
             marks[role] = TimerState(view.now_ns) if drift_m > self.limit_m else mark
             if found is None and drift_m > self.limit_m:
-                reason = f"has drifted by {1e3 * drift_m:.2f} mm while told to stand, limit {1e3 * self.limit_m:g} mm"
+                reason = f"drifted by {1e3 * drift_m:.2f} mm while commanded to stop, limit {1e3 * self.limit_m:g} mm"
                 found = Violation(
                     self.name, self.severity, role, reason, view.now_ns, value=drift_m, limit=self.limit_m, unit="m"
                 )
@@ -64,26 +67,26 @@ def _tracking_errors(view: CellView) -> Iterator[Reading]:
 
 def _limited(view: CellView) -> Mapping[str, str]:
     return {
-        role: f"held back ({', '.join(adjustment.limit for adjustment in arm.sent.adjustments)})"
+        role: f"limited by its gate ({', '.join(adjustment.limit for adjustment in arm.sent.adjustments)})"
         for role, arm in view.arms.items()
         if arm.sent is not None and arm.sent.limited
     }
 
 
 class StandstillConfig(InterlockSettings):
-    """How far an arm may drift while it is told to stand, and how long it may take to come to rest before."""
+    """Largest drift of an arm that is commanded to stop, and the time that it may take to come to rest."""
 
     kind: Literal["standstill"]
     limit_mm: PositiveFloat
     settle_ms: NonNegativeFloat
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
+        """Return the ``Standstill`` interlock."""
         return Standstill(name, self.level, 1e-3 * self.limit_mm, 1e-3 * self.settle_ms)
 
 
 class TrackingConfig(InterlockSettings):
-    """Largest difference between the velocity that was sent and the measured one, and how long it may be larger."""
+    """Largest difference between commanded and measured velocity, and how long it may be exceeded."""
 
     kind: Literal["tracking"]
     limit_mm_s: PositiveFloat
@@ -91,7 +94,7 @@ class TrackingConfig(InterlockSettings):
     hold_ms: NonNegativeFloat
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
+        """Return the interlock on the velocity error."""
         leave, hold_s = self.leave_mm_s or LEAVE * self.limit_mm_s, 1e-3 * self.hold_ms
         return Sustained(
             name, self.level, _tracking_errors, "off what was sent by", self.limit_mm_s, leave, "mm/s", hold_s
@@ -99,11 +102,11 @@ class TrackingConfig(InterlockSettings):
 
 
 class LimitedConfig(InterlockSettings):
-    """Longest time for which an arm's gate may hold back what the task asks for."""
+    """Longest time for which an arm's gate may limit the task's commands."""
 
     kind: Literal["limited"]
     limit_ms: PositiveFloat
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
+        """Return the interlock on limited commands."""
         return OnDelay(name, self.level, _limited, 1e-3 * self.limit_ms)

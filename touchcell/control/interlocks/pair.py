@@ -1,4 +1,4 @@
-"""Interlocks about what sensors push or hold: do two keep step, does the object stay between them, and upright?
+"""Interlocks on a pushed or held object: synchronised contacts, object not lost, object not toppling.
 
 Roles are those of the tasks with two arms: ``leader`` pushes, ``follower`` holds against it, each with its sensor.
 """
@@ -24,9 +24,9 @@ from touchcell.control.interlocks.timers import (
     Sustained,
     TimedInterlock,
     TimerState,
+    number_state,
     overdue,
-    share,
-    shared,
+    select_state,
 )
 from touchcell.control.interlocks.violation import Severity
 from touchcell.drivers.core.samples import TcpState
@@ -34,19 +34,19 @@ from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 
 _REFERENCE_DEPTH_M = 1e-3
-"""Contacts more shallow than this tell too little of a surface's direction to be a reference."""
+"""Shallower contacts determine the surface normal too poorly to be a reference."""
 _RATE_S = 0.2
-"""Over about this time the rate of leaning is taken; a single frame's tilt is too noisy."""
+"""Time over which the tilt rate is taken; a single frame's tilt is too noisy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Carried:
-    """A sensor and where its arm stands: enough to see in the world what it feels.
+    """A sensor and the base of its arm: what is needed to express its contact in the world frame.
 
     Attributes:
         role: of the sensor.
         T_world_base: (4, 4) of its arm's base.
-        T_tcp_sensor: (4, 4) where it sits.
+        T_tcp_sensor: (4, 4) pose of the sensor in the tool frame.
     """
 
     role: str
@@ -54,21 +54,21 @@ class Carried:
     T_tcp_sensor: Array
 
     def contact(self, view: CellView) -> SensorView | None:
-        """Its contact, where it has one and an arm carries it."""
+        """Return its contact, or None without contact or without an arm that carries it."""
         sensor = view.sensors.get(self.role)
         return sensor if sensor is not None and sensor.T_s_f is not None and sensor.arm in view.arms else None
 
     def pose(self, view: CellView, sensor: SensorView) -> Array:
-        """(4, 4) of the sensor in the world as measured."""
+        """Return the measured pose (4, 4) of the sensor in the world."""
         placed: Array = self.T_world_base @ _state(view, sensor).T_base_tcp @ self.T_tcp_sensor
         return placed
 
     def velocity(self, view: CellView, sensor: SensorView) -> Array:
-        """(3,) of its tip in the world as measured."""
+        """Return the measured velocity (3,) of its tip in the world, m/s."""
         state = _state(view, sensor)
         x, y, z = (state.T_base_tcp[:3, :3] @ self.T_tcp_sensor[:3, 3]).tolist()
         wx, wy, wz = state.twist[3:].tolist()
-        # np.cross takes ten times as long.
+        # np.cross is ten times slower.
         velocity = state.twist[:3] + np.array([wy * z - wz * y, wz * x - wx * z, wx * y - wy * x])
         turned: Array = self.T_world_base[:3, :3] @ velocity
         return turned
@@ -81,21 +81,21 @@ def _state(view: CellView, sensor: SensorView) -> TcpState:
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """Leader and follower, while the task is at work in one of ``states``, or in any if none are named."""
+    """Leader and follower, while the task works in one of ``states``, or in any if none are named."""
 
     leader: Carried
     follower: Carried
     states: frozenset[str]
 
     def contacts(self, view: CellView) -> tuple[SensorView, SensorView] | None:
-        """Both contacts, where both are made."""
+        """Return both contacts, or None unless both are made."""
         if not view.works_in(self.states):
             return None
         leading, following = self.leader.contact(view), self.follower.contact(view)
         return None if leading is None or following is None else (leading, following)
 
     def closing(self, view: CellView) -> Iterator[Reading]:
-        """How fast, mm/s, the two tips come nearer to each other or part. What is rigid leaves them as far apart."""
+        """Yield the rate in mm/s at which the distance of the two tips changes. A rigid object keeps it at zero."""
         if (contacts := self.contacts(view)) is not None:
             way = self.leader.pose(view, contacts[0])[:3, 3] - self.follower.pose(view, contacts[1])[:3, 3]
             distance_m = math.sqrt(float(way @ way))
@@ -105,7 +105,7 @@ class _Pair:
                 yield Reading(self.follower.role, 1e3 * closing_m_s, contacts[1].seq)
 
     def uneven(self, view: CellView) -> Iterator[Reading]:
-        """How much deeper, mm, one of them is pressed in than the other."""
+        """Yield the difference of the two indentations in mm."""
         if (contacts := self.contacts(view)) is not None:
             leading, following = contacts[0].depth_m, contacts[1].depth_m
             if leading is not None and following is not None:
@@ -114,7 +114,7 @@ class _Pair:
 
 @dataclass(frozen=True, slots=True)
 class ObjectLost:
-    """Once both sensors have touched it, what they hold is not missing from either for longer than allowed."""
+    """Limit the time without contact at either sensor once both have touched the object."""
 
     name: str
     severity: Severity
@@ -123,7 +123,7 @@ class ObjectLost:
     states: frozenset[str]
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
-        """The sensor whose contact has been missing for longest, if too long."""
+        """Return a violation for the sensor whose contact has been missing longest, if too long."""
         if not view.works_in(self.states):
             return None, {}
         touching = {role: role in view.sensors and view.sensors[role].in_contact for role in self.sensors}
@@ -140,16 +140,16 @@ class ObjectLost:
 
 @dataclass(frozen=True, slots=True)
 class Toppling:
-    """What the sensors touch does not lean further, or faster, than allowed, nor slides up or down along them.
+    """Limit the tilt and tilt rate of the touched object, and its sliding up or down along the sensors.
 
-    How far it leans is how far the surface under each sensor has turned from the horizontal direction that it had when
-    the contact was made, in the world, whatever the sensor did meanwhile. What faces the other way turns the other way,
-    so with two sensors it is the mean of both. Sliding is the part of the shear that is vertical in the world: it comes
-    before anything can be seen to lean.
+    The tilt is how far the surface under each sensor has turned from the horizontal direction that it had when the
+    contact was made, in the world, independent of the sensor's own motion. Surfaces that face opposite ways turn
+    opposite ways, so with two sensors it is the mean of both. Sliding is the vertical part of the shear in the world:
+    it precedes any measurable tilt.
 
     Attributes:
-        sensors: the one that pushes first.
-        lean, rate, slide: limits, as rules over readings that are taken here.
+        sensors: the pushing one first.
+        lean, rate, slide: limits, as interlocks over readings taken here.
     """
 
     name: str
@@ -161,7 +161,7 @@ class Toppling:
     states: frozenset[str]
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
-        """The first of lean, rate and slide that is too large for too long."""
+        """Return the first violation of the limits of tilt, tilt rate and slide."""
         if not view.works_in(self.states):
             return None, {}
         marks: dict[str, TimerState] = {}
@@ -172,7 +172,7 @@ class Toppling:
             assert sensor.T_s_f is not None
             R = carried.pose(view, sensor)[:3, :3] @ sensor.T_s_f[:3, :3]
             elevation = math.asin(max(-1.0, min(1.0, float(R[2, 2]))))
-            # Where the sensor has gone in the surface's frame.
+            # Displacement of the sensor in the surface's frame.
             shear = -sensor.T_s_f[:3, :3].T @ sensor.T_s_f[:3, 3]
             slides.append(Reading(carried.role, 1e3 * abs(float(R[2, :2] @ shear[:2])), sensor.seq))
             mark = past.get(carried.role)
@@ -190,14 +190,14 @@ class Toppling:
             readings[1].append(Reading(subject, abs(rate_deg_s), seq))
         found = None
         for k, rule in enumerate((self.lean, self.rate, self.slide)):
-            violation, left = rule.over(view, readings[k], share(past, k))
-            marks.update(shared(left, k))
+            violation, left = rule.over(view, readings[k], select_state(past, k))
+            marks.update(number_state(left, k))
             found = found or violation
         return found, marks
 
 
 def _rate(value: float, now_ns: int, mark: TimerState | None) -> tuple[float, TimerState]:
-    """Rate of ``value`` per second over about ``_RATE_S``, and the mark for the next cycle."""
+    """Return the rate of ``value`` per second over about ``_RATE_S``, and the timer state for the next cycle."""
     if mark is None:
         return 0.0, TimerState(now_ns, values=(value,))
     slow = mark.values[0]
@@ -218,7 +218,7 @@ class _PairSettings(SpatialInterlockConfig):
 
 
 class OutOfStepConfig(_PairSettings):
-    """Fastest change of the distance between leader's and follower's tips, and largest difference of their depths."""
+    """Largest rate at which the tips of leader and follower close or part, and largest difference of their depths."""
 
     kind: Literal["out_of_step"]
     leader: str = "leader"
@@ -230,7 +230,7 @@ class OutOfStepConfig(_PairSettings):
     def build_in_scene(
         self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene
     ) -> TimedInterlock:
-        """The rule. Raises ConfigError for a sensor that the cell does not have."""
+        """Return the interlock on synchronised contacts. Raises ConfigError for a sensor that the cell lacks."""
         leader = _carried(name, "leader_sensor", self.leader_sensor, self.leader, T_tcp_sensor, planning_scene)
         follower = _carried(name, "follower_sensor", self.follower_sensor, self.follower, T_tcp_sensor, planning_scene)
         pair, hold_s = _Pair(leader, follower, frozenset(self.states)), 1e-3 * self.hold_ms
@@ -248,7 +248,7 @@ class OutOfStepConfig(_PairSettings):
 
 
 class ObjectLostConfig(_PairSettings):
-    """Longest time for which what both sensors had touched may be missing from either."""
+    """Longest time without contact at either sensor once both have touched the object."""
 
     kind: Literal["object_lost"]
     severity: Literal["trip", "fault"] = "trip"
@@ -257,7 +257,7 @@ class ObjectLostConfig(_PairSettings):
     def build_in_scene(
         self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene
     ) -> TimedInterlock:
-        """The rule. Raises ConfigError for a sensor that the cell does not have."""
+        """Return the ``ObjectLost`` interlock. Raises ConfigError for a sensor that the cell does not have."""
         for key, role in (("leader_sensor", self.leader_sensor), ("follower_sensor", self.follower_sensor)):
             _require_sensor(name, key, role, T_tcp_sensor)
         sensors = (self.leader_sensor, self.follower_sensor)
@@ -265,10 +265,9 @@ class ObjectLostConfig(_PairSettings):
 
 
 class TopplingConfig(SpatialInterlockConfig):
-    """Largest angle and rate of leaning of what is touched, and largest shear up or down; how long each may be larger.
+    """Largest tilt and tilt rate of the touched object, and largest vertical shear; how long each may be exceeded.
 
-    ``sensors`` are one that pushes, or the one that pushes and the one that holds against it, with the ``arms`` that
-    carry them.
+    ``sensors`` are the pushing one, or the pushing and the counter-pushing one, with the ``arms`` that carry them.
     """
 
     kind: Literal["toppling"]
@@ -284,7 +283,7 @@ class TopplingConfig(SpatialInterlockConfig):
     def build_in_scene(
         self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene
     ) -> TimedInterlock:
-        """The rule. Raises ConfigError for a sensor that the cell does not have."""
+        """Return the ``Toppling`` interlock. Raises ConfigError for a sensor that the cell does not have."""
         if len(self.arms) < len(self.sensors):
             raise ConfigError("names fewer arms than sensors", key=f"interlocks.{name}.arms", value=self.arms)
         carried = tuple(

@@ -1,4 +1,4 @@
-"""Where arms stand, what they look like and what stands around them, for rules about more than one of them."""
+"""Planning scene: base poses and collision bodies of the arms, and the obstacles, for interlocks on several arms."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """What an arm looks like, and where it stands.
+    """Collision body of an arm, and the pose of its base.
 
     Attributes:
         T_world_base: pose (4, 4) of its base.
         capsules: its parts; frame 0 is the base, frames from 1 on are the links, the last is the tool.
         kinematics: of an arm whose links have capsules; None where only base and tool are frames.
-        link_count: how many links that are.
+        link_count: number of links with frames.
     """
 
     T_world_base: Array
@@ -38,14 +38,18 @@ class Body:
     link_count: int = 0
 
     def frames(self, arm: ArmView, ahead_s: float = 0.0) -> Array:
-        """(link_count + 2, 4, 4) in the world as measured, or as its command would move them within ``ahead_s``."""
+        """Return (link_count + 2, 4, 4) frames in the world, measured or moved along the command for ``ahead_s``.
+
+        Raises:
+            ValueError: link frames are needed but the joint angles were not read.
+        """
         T_base_tcp, twist = arm.state.value.T_base_tcp, arm.commanded_twist() if ahead_s else None
         ik = self.kinematics()
         T = np.empty((self.link_count + 2, 4, 4))
         T[0] = np.eye(4)
         if ik is not None:
             if arm.joints is None:
-                raise ValueError("nobody has read the joints")
+                raise ValueError("the joint angles were not read")
             q = arm.joints.value.q
             if twist is not None:
                 q = q + ahead_s * ik.solve(q, twist).dq
@@ -60,12 +64,12 @@ class Body:
 
 @dataclass(frozen=True, slots=True)
 class PlanningScene:
-    """What rules about several things at once have to know besides the view.
+    """Data besides the view that interlocks on several arms need.
 
     Attributes:
         T_world_base: pose (4, 4) of each arm's base, by role; one that is not named stands at the world's origin.
-        bodies: what the arms look like, by role, where a rule asks for it.
-        boxes: what stands around them.
+        bodies: collision bodies of the arms, by role, where an interlock needs them.
+        boxes: static obstacles.
     """
 
     T_world_base: Mapping[str, Array] = field(default_factory=dict)
@@ -74,10 +78,10 @@ class PlanningScene:
 
 
 class SpatialInterlockConfig(InterlockSettings):
-    """Settings of a rule that has to know where things are."""
+    """Settings of an interlock that needs the planning scene."""
 
     @abstractmethod
     def build_in_scene(
         self, name: str, T_tcp_sensor: Mapping[str, Array], planning_scene: PlanningScene
     ) -> Interlock | TimedInterlock:
-        """The rule. Raises ConfigError for what is not there."""
+        """Return the interlock. Raises ConfigError for an arm, sensor or body that the cell does not have."""

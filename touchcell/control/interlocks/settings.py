@@ -1,4 +1,4 @@
-"""What the settings of all interlocks have in common."""
+"""Base classes of the interlocks' settings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from touchcell.control.interlocks.violation import Severity
 
 
 class InterlockSettings(BaseModel):
-    """Base of the settings: unknown keys refused, no limit has a default."""
+    """Base of the settings: unknown keys are refused, no limit has a default."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -18,15 +18,15 @@ class InterlockSettings(BaseModel):
 
     @property
     def level(self) -> Severity:
-        """The severity as the rules use it."""
+        """The severity as the interlocks use it."""
         return Severity[self.severity.upper()]
 
 
 class GradedSettings(InterlockSettings):
-    """Settings of a rule that may also ask for slower motion first; a limit that lasts becomes a trip."""
+    """Settings of an interlock that may first slow the motion; a limit violation that lasts becomes a trip."""
 
     severity: Literal["limit", "trip", "fault"] = "trip"  # type: ignore[assignment]
 
 
 LEAVE = 0.8
-"""Once above its limit, a value counts as above until it has fallen to this share of it, unless the file says more."""
+"""Hysteresis: default fraction of the limit to which a value must fall before it counts as below again."""

@@ -1,4 +1,4 @@
-"""What the interlocks look at in one control cycle: measured, stamped, and the command that is about to go out."""
+"""Snapshot of the cell that the interlocks check in one control cycle: stamped measurements and pending commands."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from touchcell.geometry.types import Array
 
 @dataclass(frozen=True, slots=True)
 class ArmView:
-    """One arm.
+    """Snapshot of one arm.
 
     Attributes:
         state: newest measured state.
-        command: what is about to be sent; None when it is told to stop.
-        sent: what its gate let through in the cycle before, and why it differs; None when it was told to stop.
-        joints: newest joint angles, where an interlock looks at them.
+        command: the command about to be sent; None when the arm is commanded to stop.
+        sent: the command that its gate passed in the previous cycle, and its adjustments; None for a stop.
+        joints: newest joint angles, where an interlock needs them.
     """
 
     state: Stamped[TcpState]
@@ -29,11 +29,11 @@ class ArmView:
     joints: Stamped[JointState] | None = None
 
     def commanded_twist(self) -> Array | None:
-        """(6,) the command's twist of the tool centre point along base axes; None without a command."""
+        """(6,) twist of the tool centre point along base axes that the command asks for; None without a command."""
         return None if self.command is None else in_base_axes(self.command, self.state.value.T_base_tcp)
 
     def commanded_velocity(self, T_tcp_point: Array) -> Array | None:
-        """(3,) velocity along base axes that the command asks of a point of the tool; None without a command."""
+        """Return the (3,) commanded velocity of a point of the tool along base axes; None without a command."""
         twist = self.commanded_twist()
         if twist is None:
             return None
@@ -43,23 +43,23 @@ class ArmView:
 
 @dataclass(frozen=True, slots=True)
 class SensorView:
-    """One tactile sensor.
+    """Snapshot of one tactile sensor.
 
     Attributes:
         t_frame_ns: capture stamp of the newest frame.
         seq: its number.
-        in_contact: whether it touches anything.
+        in_contact: True while it touches anything.
         depth_m: estimated indentation; None without contact.
-        in_range: False when the network left the range that it was trained on.
+        in_range: False when the estimate is outside the network's training range.
         nis: normalised innovation squared of the last filter correction, where there was one.
         sigma_depth_m: standard deviation of the depth, where there is one.
-        shear_m: size of the estimated tangential shear; None without contact.
+        shear_m: magnitude of the estimated tangential shear; None without contact.
         torsion_rad: estimated rotation about the surface normal; None without contact.
-        content: number that changes with the frame's picture, noise included; None where nobody looks at it.
+        content: hash that changes with the frame's image, noise included; None where no interlock needs it.
         brightness: the frame's mean grey level; None likewise.
         T_s_f: (4, 4) estimated pose of the surface in the sensor's frame; None without contact.
-        markers: share of the markers expected in view that are seen; None where the estimator looks at none.
-        arm: role of the arm that carries it; None where nothing moves it.
+        markers: fraction of the markers expected in view that are detected; None for an estimator without markers.
+        arm: role of the arm that carries it; None for a fixed sensor.
     """
 
     t_frame_ns: int
@@ -80,9 +80,9 @@ class SensorView:
 
 @dataclass(frozen=True, slots=True)
 class CellView:
-    """The cell at ``now_ns``: arms and sensors by their role in the task, and the state that the task is in.
+    """Snapshot of the cell at ``now_ns``: arms and sensors by their role in the task, and the task's state.
 
-    ``at_work`` is False while a run that has tripped waits for a person: then nothing is being pushed or held.
+    ``at_work`` is False while a tripped run waits for an operator: then nothing is being pushed or held.
     """
 
     now_ns: int
@@ -92,5 +92,5 @@ class CellView:
     at_work: bool = True
 
     def works_in(self, states: frozenset[str]) -> bool:
-        """Whether the task is at work, and in one of ``states`` if any are named."""
+        """Return True if the task is at work, and in one of ``states`` if any are named."""
         return self.at_work and (not states or self.task_state in states)

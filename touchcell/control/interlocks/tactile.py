@@ -1,4 +1,4 @@
-"""Interlocks that only touch can have: are the frames live, is the estimate worth anything, does the contact hold."""
+"""Interlocks on tactile sensing: frames are live, estimates are valid, the contact holds."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ _BASELINE_FRAMES = 10
 
 @dataclass(frozen=True, slots=True)
 class FrameFrozen:
-    """Frames change while time passes: by content where the image is looked at, else by number."""
+    """Require frames to change with time: by content where the image is hashed, else by frame number."""
 
     name: str
     severity: Severity
     limit_s: float
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
-        """The sensor whose picture has stood still for longest, if too long."""
+        """Return a violation for the sensor whose frame has been unchanged longest, if too long."""
         marks = {}
         for role, sensor in view.sensors.items():
             identity = (float(sensor.seq if sensor.content is None else sensor.content),)
@@ -49,14 +49,14 @@ class FrameFrozen:
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """The brightness of a sensor's frames stays near that of the first ten."""
+    """Keep the brightness of a sensor's frames near that of the first ten."""
 
     name: str
     severity: Severity
     limit_percent: float
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
-        """The first sensor whose frames have become too bright or too dark."""
+        """Return a violation for the first sensor whose frames have become too bright or too dark."""
         marks = dict(past)
         found: Violation | None = None
         for role, sensor in view.sensors.items():
@@ -88,7 +88,7 @@ class Exposure:
 
 @dataclass(frozen=True, slots=True)
 class ContactLost:
-    """A contact that was made in one of ``states`` is not missing for longer than allowed while they last."""
+    """Limit the time without contact, after one was made, while the task is in one of ``states``."""
 
     name: str
     severity: Severity
@@ -96,7 +96,7 @@ class ContactLost:
     states: frozenset[str]
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
-        """The sensor whose contact has been missing for longest, if too long."""
+        """Return a violation for the sensor whose contact has been missing longest, if too long."""
         if view.task_state not in self.states:
             return None, {}
         marks = {
@@ -140,7 +140,7 @@ def _markers_missing(view: CellView) -> Iterator[Reading]:
 
 @dataclass(frozen=True, slots=True)
 class _ShearPerDepth:
-    """How far contacts are sheared for their depth, where they are deep enough for that to be known."""
+    """Ratio of shear to depth of each contact that is deep enough for a reliable ratio."""
 
     min_depth_m: float
     states: frozenset[str]
@@ -158,13 +158,13 @@ def _out_of_range(view: CellView) -> Mapping[str, str]:
 
 
 class FrameFrozenConfig(InterlockSettings):
-    """Longest time that a sensor's picture may stay the same, noise and all."""
+    """Longest time that a sensor's image may stay identical, noise included."""
 
     kind: Literal["frame_frozen"]
     limit_ms: PositiveFloat
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
+        """Return the ``FrameFrozen`` interlock."""
         return FrameFrozen(name, self.level, 1e-3 * self.limit_ms)
 
 
@@ -175,24 +175,24 @@ class ExposureConfig(InterlockSettings):
     limit_percent: PositiveFloat
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
+        """Return the ``Exposure`` interlock."""
         return Exposure(name, self.level, self.limit_percent)
 
 
 class ContactLostConfig(InterlockSettings):
-    """Longest time without a contact that there was, while the task is in one of ``states``."""
+    """Longest time without an established contact while the task is in one of ``states``."""
 
     kind: Literal["contact_lost"]
     limit_ms: PositiveFloat
     states: tuple[str, ...] = Field(default=("approach", "settle", "run"), min_length=1)
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
+        """Return the ``ContactLost`` interlock."""
         return ContactLost(name, self.level, 1e-3 * self.limit_ms, frozenset(self.states))
 
 
 class UncertainConfig(GradedSettings):
-    """Largest standard deviation of the estimated depth, and how long it may be larger."""
+    """Largest standard deviation of the estimated depth, and how long it may be exceeded."""
 
     kind: Literal["uncertain"]
     limit_mm: PositiveFloat
@@ -200,7 +200,7 @@ class UncertainConfig(GradedSettings):
     hold_ms: NonNegativeFloat = 0.0
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
+        """Return the interlock on the standard deviation of the depth."""
         leave, hold_s = self.leave_mm or LEAVE * self.limit_mm, 1e-3 * self.hold_ms
         what = "standard deviation of the depth"
         return Sustained(name, self.level, _depth_deviations, what, self.limit_mm, leave, "mm", hold_s)
@@ -213,12 +213,12 @@ class OutOfRangeConfig(GradedSettings):
     limit_ms: PositiveFloat
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
+        """Return the interlock on the training range."""
         return OnDelay(name, self.level, _out_of_range, 1e-3 * self.limit_ms)
 
 
 class InconsistentConfig(GradedSettings):
-    """Largest normalised innovation squared of the filter, and in how many frames on end it may be larger.
+    """Largest normalised innovation squared of the filter, and in how many consecutive frames it may be exceeded.
 
     A consistent filter with six degrees of freedom exceeds 22.5 in one frame of a thousand.
     """
@@ -229,7 +229,7 @@ class InconsistentConfig(GradedSettings):
     frames: PositiveInt
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
+        """Return the interlock on the filter's consistency."""
         leave = self.leave_nis or LEAVE * self.limit_nis
         what = "normalised innovation squared"
         return Sustained(name, self.level, _innovations, what, self.limit_nis, leave, "", frames=self.frames)
@@ -244,7 +244,7 @@ class ShearConfig(GradedSettings):
     hold_ms: NonNegativeFloat = 0.0
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
+        """Return the interlock on shear."""
         leave, hold_s = self.leave_mm or LEAVE * self.limit_mm, 1e-3 * self.hold_ms
         return Sustained(name, self.level, _shears, "sheared by", self.limit_mm, leave, "mm", hold_s)
 
@@ -258,16 +258,16 @@ class TorsionConfig(GradedSettings):
     hold_ms: NonNegativeFloat = 0.0
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
+        """Return the interlock on torsion."""
         leave, hold_s = self.leave_deg or LEAVE * self.limit_deg, 1e-3 * self.hold_ms
         return Sustained(name, self.level, _torsions, "twisted by", self.limit_deg, leave, "deg", hold_s)
 
 
 class SlipConfig(GradedSettings):
-    """Largest tangential shear of a contact for its depth, while the task is at work in ``states``, or in any state.
+    """Largest ratio of tangential shear to depth of a contact, while the task is in one of ``states``, or in any.
 
-    On the real images estimates of shear fall behind the motion once shear exceeds depth: there the skin begins to
-    slide. Contacts more shallow than ``min_depth_mm`` are not judged.
+    On real images, estimates of shear fall behind the motion once shear exceeds depth: there the skin begins to
+    slide. Contacts shallower than ``min_depth_mm`` are not judged.
     """
 
     kind: Literal["slip"]
@@ -278,16 +278,16 @@ class SlipConfig(GradedSettings):
     states: tuple[str, ...] = ()
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
+        """Return the interlock on shear per depth."""
         leave, hold_s = self.leave_ratio or LEAVE * self.limit_ratio, 1e-3 * self.hold_ms
         measure = _ShearPerDepth(1e-3 * self.min_depth_mm, frozenset(self.states))
         return Sustained(name, self.level, measure, "shear per depth", self.limit_ratio, leave, "", hold_s)
 
 
 class MarkersLostConfig(InterlockSettings):
-    """Largest share of the markers expected in view that may be missing, and in how many frames on end.
+    """Largest fraction of the markers expected in view that may be missing, and in how many consecutive frames.
 
-    Only estimators that look at markers tell; for others it never trips.
+    Only estimators that detect markers report it; for others it never trips.
     """
 
     kind: Literal["markers_lost"]
@@ -296,7 +296,7 @@ class MarkersLostConfig(InterlockSettings):
     frames: PositiveInt = 1
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
-        """The rule."""
+        """Return the interlock on missing markers."""
         leave = self.leave_percent or LEAVE * self.limit_percent
         what = "markers missing:"
         return Sustained(name, self.level, _markers_missing, what, self.limit_percent, leave, "%", frames=self.frames)

@@ -1,7 +1,7 @@
-"""Rules with a past: values that stay beyond a limit, conditions that last.
+"""Interlocks with state: values that stay beyond a limit, conditions that last.
 
-Such a rule remembers nothing itself. It is given the marks that it left in the cycle before and returns new ones, so it
-is a pure function like the others; the supervisor keeps the marks of all rules in one place.
+Such an interlock stores nothing itself. It is given the timer states of the previous cycle and returns new ones, so it
+is a pure function like the others; the supervisor keeps the states of all interlocks in one place.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from touchcell.control.interlocks.violation import Severity, Violation
 
 @dataclass(frozen=True, slots=True)
 class TimerState:
-    """What a rule remembers of one arm or sensor.
+    """State that an interlock keeps for one arm or sensor.
 
     Attributes:
-        since_ns: when it began.
-        count: how many frames have shown it.
+        since_ns: time at which the condition began.
+        count: number of frames that have shown it.
         seq: the latest of them.
-        values: numbers to compare with.
+        values: reference values to compare with.
     """
 
     since_ns: int
@@ -32,15 +32,15 @@ class TimerState:
 
 
 InterlockState = Mapping[str, TimerState]
-"""The marks of one rule, by the role of the arm or the sensor."""
+"""Timer states of one interlock, by the role of the arm or the sensor."""
 
 Judgement = tuple[Violation | None, InterlockState]
-"""The worst violation, or None, and the marks for the next cycle."""
+"""The worst violation, or None, and the timer states for the next cycle."""
 
 
 @runtime_checkable
 class TimedInterlock(Protocol):
-    """A rule with a past. ``judge`` is a pure function; what it raises counts as a fault."""
+    """An interlock with state. ``evaluate`` is a pure function; an exception in it counts as a fault."""
 
     @property
     def name(self) -> str:
@@ -49,17 +49,17 @@ class TimedInterlock(Protocol):
 
     @property
     def severity(self) -> Severity:
-        """What a violation asks for."""
+        """Severity of its violations."""
         ...
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
-        """The violation in ``view``, if any, given the marks of the cycle before."""
+        """Return the violation in ``view``, if any, and the new state, given that of the previous cycle."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A number about one arm or sensor in this cycle, with the frame that it comes from."""
+    """A number measured on one arm or sensor in this cycle, and the number of the frame that it comes from."""
 
     subject: str
     value: float
@@ -68,16 +68,16 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Sustained:
-    """A value is not above its limit for longer than allowed.
+    """Limit how long a value may exceed its limit, with hysteresis.
 
     Once above ``limit`` it counts as above until it is at or below ``leave``.
 
     Attributes:
-        measure: the readings of a cycle; a subject without one is forgotten.
-        what: words in front of the value.
+        measure: returns the readings of a cycle; the state of a subject without one is dropped.
+        what: text in front of the value.
         limit, leave: in ``unit``.
-        hold_s: how long it may be above.
-        frames: how many frames it takes; a subject whose readings have no frame counts once.
+        hold_s: time for which it may be above.
+        frames: number of frames above the limit that make a violation; readings without a frame count once.
     """
 
     name: str
@@ -91,11 +91,11 @@ class Sustained:
     frames: int = 1
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
-        """The first subject that is above for too long."""
+        """Return a violation for the first subject that is above for too long."""
         return self.over(view, self.measure(view), past)
 
     def over(self, view: CellView, readings: Iterable[Reading], past: InterlockState) -> Judgement:
-        """The same for readings that somebody else has taken."""
+        """Evaluate readings that the caller has taken."""
         marks: dict[str, TimerState] = {}
         found: Violation | None = None
         for reading in readings:
@@ -132,41 +132,41 @@ class Sustained:
 
 @dataclass(frozen=True, slots=True)
 class AnyOf:
-    """Several rules under one name: the first that is broken counts."""
+    """Several interlocks under one name; the first violated one counts."""
 
     name: str
     severity: Severity
     rules: tuple[TimedInterlock, ...]
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
-        """The violation of the first rule that has one."""
+        """Return the first violation of its interlocks."""
         marks: dict[str, TimerState] = {}
         found: Violation | None = None
         for k, rule in enumerate(self.rules):
-            violation, left = rule.evaluate(view, share(past, k))
-            marks.update(shared(left, k))
+            violation, left = rule.evaluate(view, select_state(past, k))
+            marks.update(number_state(left, k))
             found = found or violation
         return found, marks
 
 
-def share(past: InterlockState, number: int) -> InterlockState:
-    """The marks of the rule with that number, of several under one name."""
+def select_state(past: InterlockState, number: int) -> InterlockState:
+    """Return the state of interlock ``number`` of several under one name."""
     prefix = f"{number}:"
     return {key.removeprefix(prefix): mark for key, mark in past.items() if key.startswith(prefix)}
 
 
-def shared(marks: InterlockState, number: int) -> InterlockState:
-    """``marks`` of the rule with that number, to be kept with those of others."""
+def number_state(marks: InterlockState, number: int) -> InterlockState:
+    """Return the state of interlock ``number`` with keys that keep it apart from the others' under one name."""
     return {f"{number}:{key}": mark for key, mark in marks.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class OnDelay:
-    """A condition does not last longer than allowed.
+    """On-delay timer (IEC 61131-3 TON): limit how long a condition may last.
 
     Attributes:
-        condition: subject -> what is the matter with it, for those that it applies to in this cycle.
-        limit_s: how long it may last.
+        condition: returns a description of the condition for each subject that it applies to in this cycle.
+        limit_s: longest allowed duration.
     """
 
     name: str
@@ -175,16 +175,16 @@ class OnDelay:
     limit_s: float
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
-        """The subject for which it has lasted longest, if too long."""
+        """Return a violation for the subject with the longest duration, if too long."""
         matters = self.condition(view)
         marks = {subject: past.get(subject, TimerState(view.now_ns)) for subject in matters}
         return overdue(self.name, self.severity, view, marks, self.limit_s, lambda s: matters[s]), marks
 
 
 def overdue(
-    name: str, severity: Severity, view: CellView, marks: InterlockState, limit_s: float, words: Callable[[str], str]
+    name: str, severity: Severity, view: CellView, marks: InterlockState, limit_s: float, describe: Callable[[str], str]
 ) -> Violation | None:
-    """A violation about the oldest mark if it is older than ``limit_s``; ``words`` say what is the matter with it."""
+    """Return a violation for the oldest state if older than ``limit_s``; ``describe`` gives the condition's text."""
     subject = min(marks, key=lambda s: marks[s].since_ns, default=None)
     if subject is None:
         return None
@@ -192,7 +192,7 @@ def overdue(
     if lasted_ns <= round(1e9 * limit_s):
         return None
     lasted_s = 1e-9 * lasted_ns
-    reason = f"{words(subject)} for {1e3 * lasted_s:.0f} ms, limit {1e3 * limit_s:g} ms"
+    reason = f"{describe(subject)} for {1e3 * lasted_s:.0f} ms, limit {1e3 * limit_s:g} ms"
     sensor = view.sensors.get(subject)
     return Violation(
         name,

@@ -1,4 +1,4 @@
-"""What an interlock says when its rule is broken."""
+"""Violations: what an interlock reports, and how severe it is."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from touchcell.control.interlocks.errors import SafetyTrip
 
 
 class Severity(IntEnum):
-    """How much a violation asks for, in rising order."""
+    """Reaction that a violation requests, in rising order."""
 
     LIMIT = 1
-    """Motion goes on, slower; a violation that lasts becomes a trip. It is reported."""
+    """Motion continues at reduced speed, and the violation is reported; one that lasts becomes a trip."""
     TRIP = 2
-    """Controlled stop, latched; a person resets it once the cause has gone."""
+    """Controlled stop, latched; an operator resets it once the cause has gone."""
     FAULT = 3
-    """A device or its data can no longer be trusted: the same, and the device needs recovery."""
+    """A device or its data can no longer be trusted: stop as for a trip, and the device needs recovery."""
 
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """One broken rule.
+    """A violated interlock.
 
     Attributes:
         interlock: the interlock's name.
-        severity: what it asks for.
-        subject: role of the arm or the sensor it is about.
-        reason: what is wrong, in words.
+        severity: the requested reaction.
+        subject: role of the arm or sensor concerned.
+        reason: description for the operator.
         t_ns: time of the control cycle.
-        value: what was found, in ``unit``; None where there is no number for it.
-        limit: what is allowed, in ``unit``; None likewise.
+        value: offending value in ``unit``; None where there is no number for it.
+        limit: its limit in ``unit``; None likewise.
         unit: of both.
-        frame_seq: number of the tactile frame that showed it, where it was one.
-        may_last: whether motion may stay slowed for as long as it likes; else a limit that lasts becomes a trip.
+        frame_seq: number of the tactile frame that caused it, where it was one.
+        escalates: True if a LIMIT violation that lasts becomes a trip; False if motion may stay slowed indefinitely.
     """
 
     interlock: str
@@ -45,10 +45,10 @@ class Violation:
     limit: float | None = None
     unit: str = ""
     frame_seq: int | None = None
-    may_last: bool = False
+    escalates: bool = True
 
     def as_error(self) -> SafetyTrip:
-        """The same as an exception, for those who must not go on."""
+        """Return the same as an exception, for callers that must not continue."""
         return SafetyTrip(
             self.interlock,
             self.subject,

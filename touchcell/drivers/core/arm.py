@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.command_checks import finite_array, finite_number
 from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
 from touchcell.drivers.core.device import DeactivatePolicy, Device, Lifecycle
 from touchcell.drivers.core.errors import (
@@ -94,6 +95,7 @@ class Arm(Device):
         self._max_state_age_s = max_state_age_s
         self._desk = LeaseManager(name)
         self._gate = TwistGate(name, limits, self._desk, clock, max_ttl_s=max_ttl_s)
+        self._stop_count = 0
 
     @property
     def limits(self) -> TwistLimits:
@@ -133,11 +135,20 @@ class Arm(Device):
             CommandRejected: nothing was sent; ``reason`` tells why.
             StaleData: the pose is too old to turn a twist along tool axes, or the joints to be kept within limits.
         """
+        stop_count = self._stop_count
         sent = self._gate.admit(
             command, lease, self.state, self._tool_pose(command), self._project_to_feasible, self._local_ik
         )
-        left_s = command.ttl_s - (sent.t_ns - command.t_ns) * 1e-9
-        self._stream_twist(sent.command.twist, max(left_s, _SHORTEST_TTL_S), sent.t_ns)
+        admitted = sent.command
+        left_s = admitted.ttl_s - (sent.t_ns - admitted.t_ns) * 1e-9
+        self._stream_twist(admitted.twist, max(left_s, _SHORTEST_TTL_S), sent.t_ns)
+        if self._stop_count != stop_count:
+            # Another thread has stopped or faulted the arm since; the twist may have reached it after that stop.
+            self._gate.reset()
+            if self.state in (Lifecycle.ACTIVE, Lifecycle.FAULTED):
+                with suppress(DeviceError):
+                    self._begin_stop(StopCategory.STOP_AND_HOLD)
+            raise CommandRejected(self.name, Rejection.MODE, "stopped while the command was on its way")
         return sent
 
     @final
@@ -156,6 +167,7 @@ class Arm(Device):
             )
         if self.state not in (Lifecycle.ACTIVE, Lifecycle.FAULTED):
             return
+        self._stop_count += 1
         self._gate.reset()
         removes_power = category is not StopCategory.STOP_AND_HOLD
         if removes_power:
@@ -214,7 +226,7 @@ class Arm(Device):
     def _deactivate(self, policy: DeactivatePolicy) -> None:
         self._give_up_command()
         self._begin_stop(StopCategory.STOP_AND_HOLD)
-        self._await_rest()
+        self.await_rest()
         self._after_rest(policy)
 
     @final
@@ -229,10 +241,13 @@ class Arm(Device):
         return latched
 
     def _give_up_command(self) -> None:
+        self._stop_count += 1
         self._desk.revoke()
         self._gate.reset()
 
-    def _await_rest(self) -> None:
+    @final
+    def await_rest(self) -> None:
+        """Wait until it stands. Raises DeviceFault if it still moves long after it could have stopped."""
         limits = self._limits
         braking_s = max(limits.speed_m_s / limits.accel_m_s2, limits.rot_speed_rad_s / limits.rot_accel_rad_s2)
         deadline_ns = self._clock.now_ns() + round((braking_s + _REST_MARGIN_S) * 1e9)
@@ -256,13 +271,8 @@ class Arm(Device):
 
         The order is the twist gate's. Raises CommandRejected with the first reason that applies.
         """
-        target = np.asarray(q, dtype=np.float64)
-        if not (np.isfinite(target).all() and np.isfinite(speed_fraction)):
-            raise CommandRejected(self.name, Rejection.NON_FINITE, "joint goal is not finite", value=q)
-        if target.shape != (joints,):
-            raise CommandRejected(
-                self.name, Rejection.SHAPE, f"joint goal has shape {target.shape}, not ({joints},)", value=target.shape
-            )
+        speed_fraction = finite_number(self.name, "speed fraction", speed_fraction)
+        target = finite_array(self.name, "joint goal", q, (joints,))
         self._desk.check(lease)
         if self.state is not Lifecycle.ACTIVE:
             raise CommandRejected(self.name, Rejection.MODE, f"device is {self.state.value}, not active")

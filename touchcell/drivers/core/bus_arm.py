@@ -1,6 +1,6 @@
-"""What arms share whose motors hang on a bus and leave Cartesian control to the host.
+"""Base class of arms whose motors share a bus and whose Cartesian control runs on the host.
 
-One loop, on a thread of the driver, turns the setpoint into goals, collects the answers, and latches what is wrong.
+A control loop in a thread of the driver sends setpoints, collects replies, and latches faults.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ _PARK_SPEED_FRACTION = 0.5
 
 
 class BusArmConfig(DriverConfig):
-    """Keys that such arms share. ``chain`` is a shipped description or a YAML file.
+    """Common configuration keys of bus arms. ``chain``: name of a shipped chain description or path of a YAML file.
 
-    A joint that is ``tracking_error_deg`` off its setpoint, an answer older than ``max_silence_s``, or more than
-    ``max_missed_fraction`` of the cycles without all answers is a fault.
+    A joint that deviates by ``tracking_error_deg`` from its setpoint, a reply older than ``max_silence_s``, or more
+    than ``max_missed_fraction`` of the cycles without all replies is a fault.
     """
 
     chain: str
@@ -69,7 +69,7 @@ class BusArmConfig(DriverConfig):
     @property
     @abstractmethod
     def joint_count(self) -> int:
-        """How many motors are listed."""
+        """Number of configured motors."""
 
     @model_validator(mode="after")
     def _can_park(self) -> Self:
@@ -80,10 +80,10 @@ class BusArmConfig(DriverConfig):
         return self
 
     def named_chain(self, key: str) -> ChainDescription:
-        """The arm, as its chain tells it.
+        """Return the chain description of the arm.
 
         Raises:
-            ConfigError: there is none, or it has another number of joints than motors are listed under ``key``.
+            ConfigError: unknown chain, or its number of joints differs from the number of motors under ``key``.
         """
         found = ChainDescription.named(self.chain)
         if len(found.joints) != self.joint_count:
@@ -91,7 +91,7 @@ class BusArmConfig(DriverConfig):
         return found
 
     def require_park_within(self, chain: ChainDescription) -> None:
-        """Raises ConfigError: the park pose is outside the limits of a joint."""
+        """Check that the park pose is within the joint limits. Raises ConfigError."""
         for index, (joint, angle_deg) in enumerate(zip(chain.joints, self.park_deg or (), strict=False)):
             if not joint.lower_deg <= angle_deg <= joint.upper_deg:
                 raise ConfigError(
@@ -100,13 +100,13 @@ class BusArmConfig(DriverConfig):
 
 
 class BusArm(JointArm):
-    """One arm on a bus. A subclass gives the bus, the cycle, and how its motors are switched off.
+    """An arm on a bus. Subclasses implement the bus, the cycle, and how motors are switched off.
 
     Args:
         name: the device's name in the cell.
         config: checked configuration.
         clock: real time; the loop is a thread and cannot run on a virtual clock.
-        chain: of its joints.
+        chain: kinematic chain of the arm.
     """
 
     _config: BusArmConfig
@@ -119,12 +119,12 @@ class BusArm(JointArm):
         self._setpoint = JointSetpoint(chain, self._ik, self.limits)
         self._thread: threading.Thread | None = None
         self._closing = threading.Event()
-        # Held by the loop for one cycle, and by whoever needs the bus or changes what the loop sends.
+        # Held by the loop for one cycle, and by any code that needs the bus or changes what the loop sends.
         self._lock = threading.RLock()
         self._forget()
 
     def _forget(self) -> None:
-        """Start without samples and without trouble."""
+        """Discard samples and faults of an earlier connection."""
         self._trouble: DeviceError | None = None
         self._enabled = [False] * self._chain.joint_count
         self._joints: Stamped[JointState] | None = None
@@ -136,17 +136,17 @@ class BusArm(JointArm):
         self._follows_until_ns = 0
 
     def at_rest(self) -> bool:
-        """Whether setpoint and joints stand still, as far as the joints' speeds can be told."""
+        """Return whether setpoint and joints are at standstill, within the resolution of the measured joint speeds."""
         sample = self._joints
         fresh = sample is not None and sample.age_s(self._clock.now_ns()) <= self._config.max_silence_s
-        # A twist that has just been taken over moves the setpoint in the next cycle only.
+        # A twist accepted just now moves the setpoint in the next cycle only.
         due = self._clock.now_ns() < self._follows_until_ns
         if sample is None or not fresh or due or self._setpoint.moving:
             return False
         return bool((np.abs(sample.value.dq) <= _REST_SPEED_RAD_S).all())
 
     def health(self) -> dict[str, float | int | str | bool]:
-        """Counters of the loop, and what limits the motion."""
+        """Return counters of the loop and the active limits."""
         return {
             "implausible": self._implausible,
             "overruns": self._overruns,
@@ -157,7 +157,7 @@ class BusArm(JointArm):
 
     @abstractmethod
     def _open_bus(self) -> None:
-        """Open the bus; nothing runs yet."""
+        """Open the bus; the loop is not running yet."""
 
     @abstractmethod
     def _close_bus(self) -> None:
@@ -165,14 +165,14 @@ class BusArm(JointArm):
 
     @abstractmethod
     def _cycle(self, now_ns: int, dt_s: float, until_ns: int) -> None:
-        """Send goals ``dt_s`` after those before, and take answers until ``until_ns``. The lock is held."""
+        """Send setpoints ``dt_s`` after the previous ones and collect replies until ``until_ns``. The lock is held."""
 
     @abstractmethod
     def _switch_off(self) -> None:
-        """Take the power off all motors."""
+        """Switch all motors off."""
 
     def _hold(self) -> None:
-        """Leave the motors to hold by themselves, where they can."""
+        """Let the motors hold their position by themselves, where supported."""
 
     def _open(self) -> None:
         self._forget()
@@ -196,7 +196,7 @@ class BusArm(JointArm):
 
     def _require_loop(self) -> None:
         if self._thread is None or not self._thread.is_alive():
-            raise DeviceGone(self.name, "the bus has gone", hint="disconnect and connect again")
+            raise DeviceGone(self.name, "lost connection to the bus", hint="disconnect and connect again")
 
     def _after_rest(self, policy: DeactivatePolicy) -> None:
         if policy is DeactivatePolicy.BRAKE:
@@ -240,7 +240,7 @@ class BusArm(JointArm):
             self._clock.sleep_until_ns(self._clock.now_ns() + 5_000_000)
 
     def _parked(self) -> bool:
-        """Whether every joint is near the park pose; never where there is none."""
+        """Return whether every joint is near the park pose; False without a park pose."""
         if self._config.park_deg is None:
             return False
         away = np.abs(self.joints().value.q - np.deg2rad(self._config.park_deg))
@@ -263,7 +263,7 @@ class BusArm(JointArm):
             except DeviceError as error:
                 self._latch(error)
             except Exception as error:
-                self._latch(DeviceFault(self.name, f"the loop of its bus died: {error!r}", needs=Remedy.SERVICE))
+                self._latch(DeviceFault(self.name, f"control loop failed: {error!r}", needs=Remedy.SERVICE))
                 return
             last_ns = now_ns
             next_ns += period_ns
@@ -275,7 +275,7 @@ class BusArm(JointArm):
             self._clock.sleep_until_ns(next_ns)
 
     def _check_missed(self) -> None:
-        """Latch when too many of the latest cycles went without all answers."""
+        """Latch a fault when too many of the latest cycles ended without all replies."""
         full = len(self._missed) == self._missed.maxlen
         if full and sum(self._missed) > self._config.max_missed_fraction * len(self._missed):
             what = f"complete state in {sum(self._missed)} of {len(self._missed)} cycles"
@@ -284,17 +284,17 @@ class BusArm(JointArm):
             )
 
     def _check_tracking(self, q: Array, due: Array) -> None:
-        """Latch when an enabled joint of ``q`` is too far from where it was ``due``, both (n,) rad."""
+        """Latch a fault when an enabled joint in ``q`` deviates too far from setpoint ``due``, both (n,) rad."""
         error = np.where(self._enabled, np.abs(q - due), 0.0)
         worst = int(np.argmax(error))
         if error[worst] > np.deg2rad(self._config.tracking_error_deg):
-            # Hold where the arm is, so that whatever blocks it is no longer pushed against.
+            # Hold the measured position, so that the arm stops pushing against whatever blocks it.
             self._setpoint.reset(q)
             self._latch(
                 DeviceFault(
                     self.name,
                     f"joint {self._chain.joint_names[worst]} is {np.rad2deg(error[worst]):.1f} deg off its setpoint",
                     fault_class=FaultClass.MOTION,
-                    hint="look for a collision, a load or tool that is too heavy, or a wrong offset",
+                    hint="check for a collision, an excessive payload or tool, or a wrong joint offset",
                 )
             )

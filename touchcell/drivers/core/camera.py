@@ -1,8 +1,8 @@
-"""What all live cameras have in common: the newest frame or an error that says why there is none.
+"""Common base of all live cameras: deliver the newest frame, or an error with the reason why there is none.
 
-The queue of frames is emptied when somebody reads, only the newest is kept, and it is decoded once, when it is wanted.
-So no reader thread is needed where a queue can be emptied without blocking and is deep enough for the longest pause
-between two reads. After a longer one it is full of old frames, which is seen and answered by waiting for the next.
+The frame queue is drained when the application reads; only the newest frame is kept, and it is decoded once, on demand.
+No reader thread is needed where a queue can be drained without blocking and is deep enough for the longest pause
+between two reads. After a longer pause the queue is full of old frames; this is detected and a new frame is awaited.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SHORTEST_WAIT_S = 1e-3
 
 
 class CameraConfig(DriverConfig):
-    """Settings that every live camera has. Each is read back; a camera that gives something else is refused.
+    """Settings of every live camera. Each one is read back; a camera that applies another value is refused.
 
     Attributes:
         device: node of the camera. Names under /dev/v4l/by-id or by-path stay with the camera; /dev/videoN may not.
@@ -62,13 +62,13 @@ class CameraConfig(DriverConfig):
 
 
 class UnsupportedSetting(ConfigError):
-    """The camera did not take a setting.
+    """The camera did not apply a setting.
 
     Attributes:
         device: name of the camera in the cell.
         setting: key of the setting.
-        asked: what the configuration says.
-        given: what reads back from the device; None when it has no such setting.
+        asked: configured value.
+        given: value read back from the device; None if it has no such setting.
     """
 
     def __init__(self, device: str, setting: str, asked: object, given: object) -> None:
@@ -87,14 +87,14 @@ class UnsupportedSetting(ConfigError):
 
 @dataclass(frozen=True, slots=True)
 class RawFrame:
-    """A frame as it came, not decoded.
+    """An undecoded frame as received.
 
     Attributes:
         data: its bytes, in the configured pixel format.
-        t_ns: stamp.
-        seq: number, going on over restarts of the stream.
-        t_device_ns: the device's own stamp where it is not the one in ``t_ns``.
-        quality: SUSPECT without a trustworthy stamp.
+        t_ns: timestamp.
+        seq: sequence number, continuous over restarts of the stream.
+        t_device_ns: timestamp of the device's own clock, if that is not ``t_ns``.
+        quality: SUSPECT without a trustworthy timestamp.
     """
 
     data: bytes
@@ -105,14 +105,14 @@ class RawFrame:
 
 
 class Camera(Device):
-    """A live camera; use it from one thread.
+    """Base class of live cameras; use an instance from one thread.
 
-    Frames flow from READY on: a camera moves nothing, so ACTIVE adds no more. Nothing is set before ``configure``.
-    FAULTED is reached when the camera has gone, is silent for ``stall_s``, or sends more than 10 bad frames in 30.
+    Frames flow from READY on; ACTIVE adds nothing, because a camera moves nothing. ``configure`` applies the settings.
+    The camera is FAULTED when it is disconnected, silent for ``stall_s``, or sends more than 10 bad frames in 30.
 
     Args:
         name: the device's name in the cell.
-        clock: injected time; must be CLOCK_MONOTONIC for a device whose frames the kernel stamps.
+        clock: injected clock; must be CLOCK_MONOTONIC for a device whose frames the kernel stamps.
         config: settings.
     """
 
@@ -128,15 +128,15 @@ class Camera(Device):
 
     @final
     def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
-        """Newest frame.
+        """Return the newest frame.
 
         Never blocks, except after a pause so long that the queue overflowed: then up to four periods for a new frame.
 
         Raises:
-            StaleData: it is older than ``max_age_s``, or than ``stall_s`` where that is None.
-            CorruptMessage: it cannot be decoded; it is counted as bad.
-            DeviceGone: the camera has gone and is now FAULTED, as it is after ``stall_s`` of silence (TransportTimeout)
-                and after too many bad frames (CorruptMessage).
+            StaleData: the frame is older than ``max_age_s``, or than ``stall_s`` if that is None.
+            CorruptMessage: the frame cannot be decoded; it is counted as bad.
+            DeviceGone: the camera is disconnected and now FAULTED. Silence for ``stall_s`` (TransportTimeout) and too
+                many bad frames (CorruptMessage) also make it FAULTED.
             LifecycleError: not READY or ACTIVE.
         """
         self._require("read frames", Lifecycle.READY, Lifecycle.ACTIVE)
@@ -149,13 +149,13 @@ class Camera(Device):
 
     @final
     def next(self, after_seq: int, timeout_s: float) -> Stamped[Frame]:
-        """Newest frame if ``seq > after_seq``, else the next one.
+        """Return the newest frame if its ``seq > after_seq``, else wait for the next one.
 
         Raises:
-            TransportTimeout: none came within ``timeout_s``.
-            CorruptMessage: it cannot be decoded; it is counted as bad.
-            DeviceGone: the camera has gone and is now FAULTED, as it is after ``stall_s`` of silence (TransportTimeout)
-                and after too many bad frames (CorruptMessage).
+            TransportTimeout: none arrived within ``timeout_s``.
+            CorruptMessage: the frame cannot be decoded; it is counted as bad.
+            DeviceGone: the camera is disconnected and now FAULTED. Silence for ``stall_s`` (TransportTimeout) and too
+                many bad frames (CorruptMessage) also make it FAULTED.
             LifecycleError: not READY or ACTIVE.
         """
         self._require("read frames", Lifecycle.READY, Lifecycle.ACTIVE)
@@ -166,7 +166,7 @@ class Camera(Device):
 
     @final
     def health(self) -> dict[str, float | int | str | bool]:
-        """Counters of good, lost, unread, frozen and bad frames, brightness and its drift, settings as read back."""
+        """Return frame counters (good, lost, unread, frozen, bad), brightness and its drift, settings as read back."""
         if self._state in (Lifecycle.READY, Lifecycle.ACTIVE):
             try:
                 self._refresh()
@@ -180,17 +180,17 @@ class Camera(Device):
         }
 
     def _begin_stream(self) -> None:
-        """To be called once frames flow: waits for the first good one. Raises TransportTimeout, DeviceGone."""
+        """Wait for the first good frame; call once the stream runs. Raises TransportTimeout, DeviceGone."""
         self._watch.reset_errors()
         self._overflowed = False
         self._since_ns = self._clock.now_ns()
         before = self._last_seq
         self._await_after(before, _FIRST_FRAME_S, _FIRST_FRAME_S)
         if self._last_seq == before:
-            raise TransportTimeout(self.name, "first frame", _FIRST_FRAME_S, hint="does it stream elsewhere?")
+            raise TransportTimeout(self.name, "first frame", _FIRST_FRAME_S, hint="is the camera in use elsewhere?")
 
     def _keep(self, frame: RawFrame) -> None:
-        """To be called by ``_collect`` with each good frame, in order."""
+        """Store a good frame; ``_collect`` calls this in order of arrival."""
         self._newest = frame
         self._last_seq = frame.seq
 
@@ -203,7 +203,7 @@ class Camera(Device):
         self._judge(self._config.stall_s)
 
     def _silence_s(self) -> float:
-        # At most since it could deliver: the newest frame may be from before a recovery or an overflow.
+        # Counted from the latest event: the newest frame may date from before a recovery or an overflow.
         return min(self._age_s(), (self._clock.now_ns() - self._since_ns) * 1e-9)
 
     def _empty_queue(self) -> None:
@@ -211,7 +211,7 @@ class Camera(Device):
         give_up_ns = now_ns + round(_UNREAD_PERIODS / self._config.rate_hz * 1e9)
         overflowed = self._collect()
         if overflowed and not self._overflowed:
-            # A full queue silences the camera, so its silence counts from now.
+            # A full queue stops the camera, so silence counts from now.
             self._since_ns = now_ns
         while overflowed and (left_ns := give_up_ns - self._clock.now_ns()) > 0:
             self._wait(left_ns * 1e-9)
@@ -237,7 +237,7 @@ class Camera(Device):
                 self.name, f"too many bad frames, most of them {worst}", hint="check the cable and the USB bandwidth"
             )
         if self._silence_s() > stall_s:
-            raise TransportTimeout(self.name, "good frame", stall_s, hint="the camera hangs; plug it in again")
+            raise TransportTimeout(self.name, "good frame", stall_s, hint="unplug the camera and plug it in again")
 
     def _read(self, raw: RawFrame) -> Stamped[Frame]:
         if self._decoded is None or self._decoded.seq != raw.seq:
@@ -283,16 +283,16 @@ class Camera(Device):
 
     @abstractmethod
     def _collect(self) -> bool:
-        """Take every waiting frame and ``_keep`` the good ones; True if the newest was followed by an overflow."""
+        """Take every waiting frame and ``_keep`` the good ones; True if an overflow followed the newest one."""
 
     @abstractmethod
     def _wait(self, timeout_s: float) -> None:
-        """Return when a frame waits or after ``timeout_s``. Raises DeviceGone."""
+        """Return when a frame is available or after ``timeout_s``. Raises DeviceGone."""
 
     @abstractmethod
     def _exposure_and_gain(self) -> tuple[float | None, float | None]:
-        """Exposure time in s and gain, as read back, where known."""
+        """Return exposure time in s and gain as read back, None where unknown."""
 
     @abstractmethod
     def _settings(self) -> dict[str, float | int | str | bool]:
-        """Settings as read back, and warnings, for ``health``."""
+        """Return the settings as read back, and warnings, for ``health``."""

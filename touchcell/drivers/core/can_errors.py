@@ -1,4 +1,4 @@
-"""What CAN error frames say, after linux/can/error.h (classes in the id, detail in the data)."""
+"""Decode CAN error frames as defined in linux/can/error.h (classes in the id, details in the data)."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ _PASSIVE = 0x30
 
 
 def describe(arbitration_id: int) -> str:
-    """The error classes of an error frame, in words."""
+    """Return the error classes of an error frame as text."""
     return ", ".join(name for bit, name in CLASSES.items() if arbitration_id & bit) or "unspecified error"
 
 
 def is_error_passive(arbitration_id: int, data: bytes) -> bool:
-    """Whether the controller has become error-passive (data byte 1, receiver or transmitter)."""
+    """Return whether the controller is error-passive (data byte 1, receiver or transmitter)."""
     return bool(arbitration_id & CONTROLLER) and len(data) > 1 and bool(data[1] & _PASSIVE)

@@ -1,4 +1,4 @@
-"""Whether an arm is the one that its chain file describes."""
+"""Check that the connected arm matches its chain description."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from touchcell.geometry.types import Array
 
 
 def require_same_arm(device: str, chain: SerialChain, q: Array, T_base_tcp: Array) -> None:
-    """Hold a chain against what a controller says of its own arm.
+    """Compare the forward kinematics of a chain with the pose that the controller reports.
 
     Args:
-        device: name for the error.
-        chain: how we describe it.
-        q: (n,) rad, told together with ...
-        T_base_tcp: ... this pose (4, 4).
+        device: device name for the error.
+        chain: configured kinematic chain.
+        q: (n,) rad, reported by the controller together with ``T_base_tcp``.
+        T_base_tcp: (4, 4) tool pose reported by the controller.
 
     Raises:
-        DeviceFault: the poses lie further apart than two arms of one model.
+        DeviceFault: the poses differ by more than manufacturing tolerances of one model.
     """
     apart = se3.compose(se3.inverse(chain.forward(q)), T_base_tcp)
     away_m, turned_rad = float(np.linalg.norm(apart[:3, 3])), float(np.linalg.norm(se3.log(apart)[3:]))
     if away_m > _SAME_ARM_M or turned_rad > _SAME_ARM_RAD:
         raise DeviceFault(
             device,
-            f"its tool is {1e3 * away_m:.0f} mm and {np.rad2deg(turned_rad):.1f} deg from where the chain puts it",
+            f"tool pose is {1e3 * away_m:.0f} mm and {np.rad2deg(turned_rad):.1f} deg from the one its chain gives",
             fault_class=FaultClass.CONFIGURATION,
             needs=Remedy.OPERATOR,
-            hint="name the chain of this arm's model, and the tool that it carries",
+            hint="set `chain` to this arm's model and `tool` to the mounted tool",
         )
 
 

@@ -1,4 +1,4 @@
-"""Time: injected everywhere, so that a simulated cell is deterministic and runs as fast as it can."""
+"""Clocks, injected everywhere, so that a simulated cell is deterministic and runs faster than real time."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """Monotonic time in integer nanoseconds."""
+    """Monotonic clock in integer nanoseconds."""
 
     def now_ns(self) -> int:
-        """Nanoseconds since an arbitrary start; never goes back."""
+        """Return nanoseconds since an arbitrary epoch; never decreases."""
         ...
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Return at ``t_ns`` or at once if it has passed."""
+        """Sleep until ``t_ns``; return at once if that has passed."""
         ...
 
 
 class MonotonicClock:
-    """The machine's CLOCK_MONOTONIC, which V4L2 and the vendors' drivers stamp with too."""
+    """CLOCK_MONOTONIC of the machine, which V4L2 and the vendors' drivers also use for timestamps."""
 
     def now_ns(self) -> int:
         return time.monotonic_ns()
@@ -31,7 +31,7 @@ class MonotonicClock:
 
 
 class VirtualClock:
-    """Time that passes only when somebody sleeps. One thread only."""
+    """Simulated clock that advances only when code sleeps. Single-threaded."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns
@@ -43,5 +43,5 @@ class VirtualClock:
         self._now_ns = max(self._now_ns, t_ns)
 
     def advance_s(self, seconds: float) -> None:
-        """Let ``seconds`` pass at once."""
+        """Advance by ``seconds`` at once."""
         self._now_ns += round(seconds * 1e9)

@@ -1,4 +1,4 @@
-"""Commands that say in which frame they hold and for how long."""
+"""Motion commands, each with its reference frame and time-to-live."""
 
 from __future__ import annotations
 
@@ -15,22 +15,31 @@ C = TypeVar("C")
 
 
 class TwistFrame(Enum):
-    """Along whose axes a twist's two vectors are given. Its reference point is always the tool centre point."""
+    """Axes in which both vectors of a twist are expressed. Its reference point is always the tool centre point."""
 
     TCP = "tcp"
     BASE = "base"
 
 
+def read_only(array: Array) -> Array:
+    """A copy of ``array`` that cannot be written to, nor be made writeable."""
+    copy: Array = np.frombuffer(array.tobytes(), array.dtype).reshape(array.shape)
+    return copy
+
+
 @dataclass(frozen=True, slots=True)
 class TwistCommand:
-    """Move the tool centre point with a velocity, for at most ``ttl_s``, then stop.
+    """Move the tool centre point at a velocity for at most ``ttl_s``, then stop.
+
+    A command is a value: it keeps a read-only copy of an array of numbers, so that nothing that sees it on its way to
+    the arm can change it. What is no such array is left as it is, for the gate to judge.
 
     Attributes:
         twist: (6,) [vx vy vz wx wy wz], m/s and rad/s: linear velocity of the tool centre point, angular velocity.
-        frame: whose axes.
-        t_ns: when the command was computed; it has expired at ``t_ns + ttl_s``.
-        ttl_s: how long the arm may move on it without another.
-        t_cause_ns: capture stamp of the sample that caused it, so that sensor-to-command age is measurable.
+        frame: axes in which ``twist`` is expressed.
+        t_ns: time at which the command was computed; it expires at ``t_ns + ttl_s``.
+        ttl_s: time-to-live: how long the arm may follow it without a newer command.
+        t_cause_ns: capture time of the sample that caused it, so that the sensor-to-command latency is measurable.
     """
 
     twist: Array
@@ -39,10 +48,15 @@ class TwistCommand:
     ttl_s: float
     t_cause_ns: int | None = None
 
+    def __post_init__(self) -> None:
+        twist = self.twist
+        if type(twist) is np.ndarray and twist.flags.writeable and twist.dtype == np.float64:
+            object.__setattr__(self, "twist", read_only(twist))
+
 
 @dataclass(frozen=True, slots=True)
 class Sent(Generic[C]):
-    """What really went to the device, and why it differs from what was asked for."""
+    """The command actually sent, and why it differs from the request. Read-only like the command."""
 
     command: C
     t_ns: int
@@ -50,12 +64,12 @@ class Sent(Generic[C]):
 
     @property
     def limited(self) -> bool:
-        """Whether any limit changed the command."""
+        """True if a limit changed the command."""
         return bool(self.adjustments)
 
 
 def in_base_axes(command: TwistCommand, T_base_tcp: Array) -> Array:
-    """The command's twist along base axes, (6,): both vectors turned by the tool's orientation where needed."""
+    """Return the command's twist along base axes, (6,), rotated by the orientation of the tool where needed."""
     if command.frame is TwistFrame.BASE:
         return command.twist
     R = T_base_tcp[:3, :3]

@@ -64,6 +64,9 @@ class Device(ABC):
         self._state = Lifecycle.DISCONNECTED
         self._fault_error: DeviceError | None = None
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name!r}: {self._state.value}>"
+
     @property
     def state(self) -> Lifecycle:
         """Present lifecycle state."""

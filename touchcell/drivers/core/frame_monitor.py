@@ -1,4 +1,4 @@
-"""Judging a stream of camera frames: lost, frozen, damaged, drifting. Pure bookkeeping, no I/O."""
+"""Monitor a stream of camera frames for lost, frozen and corrupt frames and drifting brightness. No I/O."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ _BRIGHTNESS_STEP = 8
 
 
 class FrameMonitor:
-    """Counts what is wrong with the frames of one camera.
+    """Statistics of the frames of one camera.
 
-    A frame is *lost* when the sequence number jumps, *unread* when it was lost because nobody emptied the queue,
-    *frozen* when its bytes equal those of the frame before (sensor noise makes that next to impossible on a live
-    sensor), and *bad* when it was refused. Brightness is compared with that of the first 60 frames that were read.
+    A frame is *lost* when the sequence number jumps, *unread* when it was lost because the queue was not drained in
+    time, *frozen* when its bytes equal those of the previous frame (sensor noise makes that next to impossible on a
+    live sensor), and *bad* when it was rejected. Brightness is compared with that of the first 60 frames that were
+    read.
     """
 
     def __init__(self) -> None:
@@ -39,20 +40,20 @@ class FrameMonitor:
 
     @property
     def out_of_budget(self) -> bool:
-        """Whether more than 10 of the last 30 frames were bad."""
+        """Return whether more than 10 of the last 30 frames were bad."""
         return sum(self._recent_bad) > _BUDGET_BAD
 
     def miss(self, frames: int, *, overrun: bool) -> None:
-        """Count ``frames`` that never came; with ``overrun`` the queue was full, so that it was the reader's fault."""
+        """Count ``frames`` that never arrived; ``overrun``: the queue was full, so the reader was too slow."""
         if overrun:
             self.unread += frames
         else:
             self.lost += frames
 
     def admit(self, data: bytes) -> None:
-        """Count a good frame; ``data`` are its bytes as they came."""
+        """Count a good frame; ``data``: its bytes as received."""
         self.good += 1
-        # All over the picture, as its rim may be black without noise; an odd stride meets both bytes of YUYV.
+        # Sampled over the whole image, as its border may be black without noise; an odd stride hits both bytes of YUYV.
         fingerprint = zlib.crc32(data[:: len(data) // _FINGERPRINT_BYTES | 1])
         if fingerprint == self._fingerprint:
             self.frozen += 1
@@ -63,12 +64,12 @@ class FrameMonitor:
         self._recent_bad.append(False)
 
     def refuse(self, reason: str) -> None:
-        """Count a frame that was refused for ``reason``, a word such as "short"."""
+        """Count a frame rejected for ``reason``, a short name such as "short"."""
         self.bad[reason] = self.bad.get(reason, 0) + 1
         self._recent_bad.append(True)
 
     def look(self, image: ImageArray) -> None:
-        """Note the brightness of a frame that somebody read."""
+        """Record the brightness of a frame that was read."""
         brightness = float(np.mean(image[::_BRIGHTNESS_STEP, ::_BRIGHTNESS_STEP]))
         if len(self._baseline) < _BASELINE_FRAMES:
             self._baseline.append(brightness)
@@ -77,13 +78,13 @@ class FrameMonitor:
             self._brightness += _SMOOTHING * (brightness - self._brightness)
 
     def reset_errors(self) -> None:
-        """Begin a new stream: its first frame follows nothing, and its budget is whole. Counters go on."""
+        """Begin a new stream: no previous frame, no recent errors. Counters continue."""
         self._recent_bad.clear()
         self._fingerprint = None
         self.frozen_run = 0
 
     def readings(self) -> dict[str, float | int | str | bool]:
-        """Named readings for ``health``."""
+        """Return the named readings for ``health``."""
         baseline = sum(self._baseline) / len(self._baseline) if self._baseline else 0.0
         return {
             "frames_good": self.good,

@@ -1,20 +1,22 @@
 """The last check before an arm: finite, shape, frame, lease, mode, freshness, limits, in that order.
 
 ``min``, ``max`` and ``np.clip`` turn NaN into full speed or let it pass, so whatever is not finite is refused before
-any limit is applied. Acceleration and jerk are those of one command after another, never of the measured state; where
-the joints are is measured.
+any limit is applied, and what comes out is checked once more before it may be sent. Acceleration and jerk are those of
+one command after another, never of the measured state; where the joints are is measured.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from touchcell.drivers.core.clock import Clock
-from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame, in_base_axes
+from touchcell.drivers.core.command_checks import checked_twist_command
+from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame, in_base_axes, read_only
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, Rejection
 from touchcell.drivers.core.lease import Lease, LeaseManager
@@ -73,8 +75,8 @@ class TwistGate:
         """Forget the last command: the next one is limited as if from rest."""
         self._last = np.zeros(6)
         self._last_accel = np.zeros(6)
-        self._last_ns = self._clock.now_ns() - round(self._max_ttl_s * 1e9)
-        self._expires_ns = self._last_ns
+        self._last_ns = self._expires_ns = 0
+        self._at_rest = True
 
     def admit(
         self,
@@ -99,13 +101,17 @@ class TwistGate:
             CommandRejected: with the first reason that applies; nothing may be sent.
         """
         now_ns = self._clock.now_ns()
-        self._check(command, lease, state, now_ns)
+        command = self._checked(command, lease, state, now_ns)
         wanted, lost = follow(in_base_axes(command, T_base_tcp))
+        self._require_finite(wanted)
         adjustments = list(lost)
-        if now_ns > self._expires_ns:
-            # After a silence longer than the time-to-live the arm stands: limit from rest.
+        if self._at_rest or now_ns > self._expires_ns:
+            # After a silence longer than the time-to-live the arm stands: limit from rest. When the next command will
+            # come is not known, and the time-to-live is much longer than a cycle.
             self._last, self._last_accel = np.zeros(6), np.zeros(6)
-        dt_s = max(min(command.ttl_s, (now_ns - self._last_ns) * 1e-9), _SHORTEST_STEP_S)
+            dt_s = min(command.ttl_s, FIRST_STEP_S)
+        else:
+            dt_s = max(min(command.ttl_s, (now_ns - self._last_ns) * 1e-9), _SHORTEST_STEP_S)
         limits, local = self._limits, joints()
         wanted = _limited(wanted, limits.speed_m_s, limits.rot_speed_rad_s, adjustments)
         if local is not None:
@@ -119,11 +125,15 @@ class TwistGate:
         allowed = _limited(self._last + step, limits.speed_m_s, limits.rot_speed_rad_s, adjustments)
         if local is not None:
             allowed = _within(local, allowed, adjustments)
+        allowed = read_only(allowed)
+        self._check_output(allowed)
         self._last_accel = (allowed - self._last) / dt_s
         self._last = allowed
         self._last_ns = now_ns
         self._expires_ns = now_ns + round(command.ttl_s * 1e9)
-        return Sent(replace(command, twist=allowed, frame=TwistFrame.BASE), now_ns, tuple(adjustments))
+        self._at_rest = False
+        sent = TwistCommand(allowed, TwistFrame.BASE, command.t_ns, command.ttl_s, command.t_cause_ns)
+        return Sent(sent, now_ns, tuple(adjustments))
 
     def _step(self, way: Array, dt_s: float, adjustments: list[Adjustment]) -> Array:
         """Change of the twist within ``dt_s`` on the ``way`` (6,) to the wanted one.
@@ -155,14 +165,9 @@ class TwistGate:
             return way
         return (last + share * change) * dt_s
 
-    def _check(self, command: TwistCommand, lease: Lease, state: Lifecycle, now_ns: int) -> None:
-        twist = np.asarray(command.twist, dtype=np.float64)
-        if not (all_finite(twist) and math.isfinite(command.ttl_s)):
-            raise self._rejected(Rejection.NON_FINITE, "twist or time-to-live is not finite", command.twist)
-        if twist.shape != (6,):
-            raise self._rejected(Rejection.SHAPE, f"twist has shape {twist.shape}, not (6,)", twist.shape, (6,))
-        if not isinstance(command.frame, TwistFrame):
-            raise self._rejected(Rejection.FRAME, f"unknown frame {command.frame!r}", command.frame)
+    def _checked(self, command: TwistCommand, lease: Lease, state: Lifecycle, now_ns: int) -> TwistCommand:
+        """``command`` with values of its own, or the first reason to refuse it."""
+        command = checked_twist_command(self._device, command)
         self._desk.check(lease)
         if state is not Lifecycle.ACTIVE:
             raise self._rejected(Rejection.MODE, f"device is {state.value}, not active", state)
@@ -173,14 +178,29 @@ class TwistGate:
                 command.ttl_s,
                 self._max_ttl_s,
             )
-        age_s = (now_ns - command.t_ns) * 1e-9
-        if not 0.0 <= age_s <= command.ttl_s:
+        age_ns = now_ns - command.t_ns
+        if not 0 <= age_ns <= round(1e9 * command.ttl_s):
             raise self._rejected(
-                Rejection.EXPIRED,
-                f"computed {age_s:.4f} s ago, lives {command.ttl_s:g} s",
-                age_s,
-                command.ttl_s,
+                Rejection.EXPIRED, f"computed {age_ns} ns ago, lives {command.ttl_s:g} s", age_ns, command.ttl_s
             )
+        return command
+
+    def _check_output(self, twist: Array) -> None:
+        """Refuse what must not be sent, whatever has made it: a driver's ``follow``, its kinematics, or its limits."""
+        linear, angular = _norms(twist)
+        limits = self._limits
+        self._require_finite(twist)
+        if not (linear <= limits.speed_m_s * _ROUNDING and angular <= limits.rot_speed_rad_s * _ROUNDING):
+            raise self._rejected(
+                Rejection.LIMIT,
+                f"the twist to be sent has {linear:g} m/s and {angular:g} rad/s, above the limits",
+                twist,
+                (limits.speed_m_s, limits.rot_speed_rad_s),
+            )
+
+    def _require_finite(self, twist: Array) -> None:
+        if not all_finite(twist):
+            raise self._rejected(Rejection.NON_FINITE, "the twist to be sent is not finite", twist)
 
     def _rejected(self, reason: Rejection, message: str, value: object, limit: object = None) -> CommandRejected:
         return CommandRejected(self._device, reason, message, value=value, limit=limit)
@@ -216,6 +236,8 @@ def _norms(twist: Array) -> tuple[float, float]:
     return math.sqrt(x * x + y * y + z * z), math.sqrt(a * a + b * b + c * c)
 
 
+FIRST_STEP_S: Final = 1e-3
+"""The time over which a first command from rest may accelerate: the shortest control cycle that a cell may have."""
 _PARTS = ("linear", "angular")
 _NEGLIGIBLE = 1e-12
 _SHORTEST_STEP_S = 1e-6

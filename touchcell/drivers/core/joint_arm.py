@@ -1,4 +1,4 @@
-"""What arms share whose driver owns the joints: a loop of theirs publishes joint states and latches trouble."""
+"""Base class of arms whose driver controls the joints: its loop publishes joint states and latches faults."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from touchcell.geometry.types import Array
 
 
 class JointArm(Arm):
-    """An arm with a chain, a setpoint in joint space, and a loop that sets ``_joints`` and ``_trouble``.
+    """An arm with a kinematic chain, a joint-space setpoint, and a loop that sets ``_joints`` and ``_trouble``.
 
-    Subclasses make the attributes below before the loop starts.
+    Subclasses create the attributes below before the loop starts.
     """
 
     _chain: SerialChain
@@ -25,7 +25,7 @@ class JointArm(Arm):
     _trouble: DeviceError | None
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
-        """Newest joint states, stamped when they were asked for. Raises StaleData."""
+        """Return the newest joint states, stamped at the request. Raises StaleData."""
         sample = self._joints
         if sample is None:
             raise StaleData(self.name, float("inf"), max_age_s or 0.0, 0, hint="not all joints have answered yet")
@@ -35,7 +35,7 @@ class JointArm(Arm):
         return sample
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """Newest tool pose and twist, from measured joint angles. Raises StaleData."""
+        """Return the newest tool pose and twist, computed from measured joint angles. Raises StaleData."""
         sample = self.joints(max_age_s)
         T_base_tcp, J = self._chain.forward_and_jacobian(sample.value.q)
         state = TcpState(T_base_tcp, J @ sample.value.dq)
@@ -51,21 +51,21 @@ class JointArm(Arm):
             q, lease, speed_fraction, self._chain.lower, self._chain.upper, self._chain.joint_count
         )
         if self._trouble is not None:
-            raise CommandRejected(self.name, Rejection.MODE, f"in trouble: {self._trouble}")
+            raise CommandRejected(self.name, Rejection.MODE, f"device fault: {self._trouble}")
         self._setpoint.go_to(q, speed_fraction)
 
     def kinematics(self) -> DifferentialIk:
-        """Of its joints."""
+        """Return the differential inverse kinematics of the arm."""
         return self._ik
 
     def _local_ik(self) -> LocalIk:
         return self._ik_at(self._ik, self.joints(self._max_state_age_s).value.q)
 
     def _latch(self, error: DeviceError) -> None:
-        """Keep the first trouble, stop the setpoint, and be FAULTED."""
+        """Store the first fault, stop the setpoint, and set FAULTED."""
         if self._trouble is None:
             self._trouble = error
             self._setpoint.stop()
-        # A transition that was under way in another thread may have overwritten the state: every cycle asserts it.
+        # A concurrent transition in another thread may have overwritten the state, so every cycle sets it again.
         if self.state not in (Lifecycle.DISCONNECTED, Lifecycle.FAULTED):
             self._to_faulted(self._trouble)

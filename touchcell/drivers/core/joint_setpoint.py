@@ -1,7 +1,7 @@
-"""Joint setpoints from expiring twists or joint goals, for arms whose motors take positions.
+"""Generate joint setpoints from expiring twists or joint goals, for position-controlled motors.
 
-The setpoint moves from its own last value, never from a measurement: a loaded or noisy arm does not creep. Whatever
-ends a motion (a stop, an expired twist, another goal), the setpoint first slows down within the acceleration limits.
+The setpoint integrates from its own last value, never from a measurement, so a loaded or noisy arm does not creep.
+Whenever a motion ends (stop, expired twist, new goal), the setpoint first decelerates within the acceleration limits.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ class _Goal:
 
 
 class JointSetpoint:
-    """Where the joints shall be and how fast they shall move there.
+    """Position and velocity setpoint of the joints.
 
-    One thread calls ``step``; the others may be called from any thread and take effect at the next step.
+    One thread calls ``step``; the other methods may be called from any thread and take effect at the next step.
 
     Args:
-        chain: the arm.
-        ik: turns twists into joint velocities within joint limits.
-        limits: speeds and accelerations of the tool centre point, for twists and joint goals alike.
+        chain: kinematic chain of the arm.
+        ik: converts twists into joint velocities within joint limits.
+        limits: speed and acceleration limits of the tool centre point, for twists and for joint goals.
 
     Attributes:
         q, dq: the setpoint (n,) rad and its velocity (n,) rad/s.
-        twist: (6,) along base axes that the setpoint follows now, zero on the way to a joint goal.
-        adjustments: the limits that hold it back now.
+        twist: (6,) along base axes that the setpoint follows now; zero while moving to a joint goal.
+        adjustments: limits that are active now.
     """
 
     def __init__(self, chain: SerialChain, ik: DifferentialIk, limits: TwistLimits) -> None:
@@ -52,35 +52,35 @@ class JointSetpoint:
         self.reset(np.zeros(chain.joint_count))
 
     def reset(self, q: Array) -> None:
-        """Stand at ``q`` (n,) rad."""
+        """Set the setpoint to ``q`` (n,) rad, at rest."""
         self._task: _Twist | _Goal | None = None
         self.q = np.array(q, dtype=np.float64)
         self.dq = np.zeros_like(self.q)
         self.adjustments: tuple[Adjustment, ...] = ()
         self.twist = np.zeros(6)
-        # Joint goals are straight lines in joint space; this is the speed along the line, rad/s.
+        # Joint goals are straight lines in joint space; speed along the line, rad/s.
         self._line = np.zeros_like(self.q)
         self._line_speed = 0.0
 
     @property
     def moving(self) -> bool:
-        """Whether the setpoint moves or is about to."""
+        """True if the setpoint moves or is about to move."""
         return bool(self.dq.any()) or isinstance(self._task, _Goal)
 
     def follow(self, twist: Array, expires_ns: int) -> None:
-        """Follow ``twist`` (6,) along base axes until ``expires_ns``, then slow down and hold."""
+        """Follow ``twist`` (6,) along base axes until ``expires_ns``, then decelerate and hold."""
         self._task = _Twist(np.array(twist, dtype=np.float64), expires_ns)
 
     def go_to(self, q: Array, speed_fraction: float) -> None:
-        """Go to ``q`` (n,) rad in a straight line in joint space, at that fraction of the joint speeds."""
+        """Move to ``q`` (n,) rad in a straight line in joint space at ``speed_fraction`` of the joint speeds."""
         self._task = _Goal(np.array(q, dtype=np.float64), speed_fraction)
 
     def stop(self) -> None:
-        """Slow down and hold."""
+        """Decelerate and hold."""
         self._task = None
 
     def snapshot(self) -> Callable[[int], None]:
-        """What brings setpoint and task back, given how many nanoseconds later it is then."""
+        """Return a function that restores setpoint and motion, given the nanoseconds elapsed since."""
         kept = self._task, self.q, self.dq, self.adjustments, self.twist, self._line, self._line_speed
 
         def restore(later_ns: int) -> None:
@@ -90,7 +90,7 @@ class JointSetpoint:
         return restore
 
     def step(self, now_ns: int, dt_s: float) -> tuple[Array, Array]:
-        """Move on by ``dt_s``; returns setpoint (n,) rad and its velocity (n,) rad/s."""
+        """Advance by ``dt_s``; return the setpoint (n,) rad and its velocity (n,) rad/s."""
         task = self._task
         on_line = self._line_speed > 0.0
         if isinstance(task, _Goal) and not self.twist.any():
@@ -116,11 +116,11 @@ class JointSetpoint:
             self.dq = np.zeros_like(self.q)
             self.adjustments = ()
             return
-        # Solved for where the joints will be half-way, so that a curved path drifts by the second order only.
+        # Solved at the joint angles half a step ahead, so that drift on a curved path is of second order only.
         motion = self._ik.solve(self.q + 0.5 * dt_s * self.dq, twist)
         self.dq = motion.dq
         self.adjustments = motion.adjustments
-        # A motion held back by a limit goes on from the speed that it really has.
+        # A motion slowed by a limit continues from its actual speed.
         self.twist = motion.twist if motion.adjustments else twist
 
     def _step_to_goal(self, goal: _Goal, dt_s: float) -> None:
@@ -154,7 +154,7 @@ class JointSetpoint:
         self.dq = np.zeros_like(self.q)
 
     def _line_limits(self, speed_fraction: float) -> tuple[float, float]:
-        """Speed and acceleration along the line that keep joints and tool centre point within their limits."""
+        """Return speed and acceleration along the line that keep joints and tool centre point within their limits."""
         tool = self._chain.jacobian(self.q) @ self._line
         linear, angular = float(np.linalg.norm(tool[:3])), float(np.linalg.norm(tool[3:]))
         limits = self._limits

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 from touchcell.drivers.core.errors import CommandRejected, Rejection
@@ -23,41 +24,49 @@ class LeaseManager:
         self._device = device
         self._held: Lease | None = None
         self._epoch = 0
+        # Two threads that ask at once must not both be given it.
+        self._lock = threading.Lock()
 
     @property
     def owner(self) -> str | None:
         """Name of the present owner."""
-        return self._held.owner if self._held else None
+        held = self._held
+        return held.owner if held else None
 
     def acquire(self, owner: str) -> Lease:
         """Give ``owner`` the lease. Raises CommandRejected(LEASE) while anyone holds it."""
-        if self._held is not None:
-            raise CommandRejected(
-                self._device,
-                Rejection.LEASE,
-                f"the command lease is held by {self._held.owner!r}",
-                value=owner,
-                hint="release it first; a device obeys one owner at a time",
-            )
-        self._epoch += 1
-        self._held = Lease(self._device, owner, self._epoch)
-        return self._held
+        with self._lock:
+            if (held := self._held) is not None:
+                raise CommandRejected(
+                    self._device,
+                    Rejection.LEASE,
+                    f"the command lease is held by {held.owner!r}",
+                    value=owner,
+                    hint="release it first; a device obeys one owner at a time",
+                )
+            self._epoch += 1
+            self._held = lease = Lease(self._device, owner, self._epoch)
+        return lease
 
     def release(self, lease: Lease) -> None:
         """Take the lease back; releasing one that is no longer held changes nothing."""
-        if self._held is lease:
-            self._held = None
+        with self._lock:
+            if self._held is lease:
+                self._held = None
 
     def revoke(self) -> None:
         """Void whatever lease is out."""
         self._held = None
 
-    def check(self, lease: Lease) -> None:
-        """Raise CommandRejected(LEASE) unless ``lease`` is the one that is held."""
-        if lease is not self._held:
+    def check(self, lease: Lease | None) -> None:
+        """Raise CommandRejected(LEASE) unless ``lease`` is the very one that is held. While none is, none passes."""
+        held = self._held
+        if held is None or lease is not held:
+            owner = getattr(lease, "owner", None)
             raise CommandRejected(
                 self._device,
                 Rejection.LEASE,
-                f"{lease.owner!r} does not hold the command lease",
-                value=lease.owner,
+                f"{owner!r} does not hold the command lease",
+                value=owner,
+                hint="acquire() gives it, once an earlier owner has released it",
             )

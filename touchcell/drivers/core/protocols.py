@@ -1,4 +1,4 @@
-"""What devices can do, as small Protocols. A task asks for abilities, never for a driver by name."""
+"""Small Protocols of device capabilities. Tasks require capabilities, never a driver by name."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ class StopCategory(IntEnum):
 
 @runtime_checkable
 class TcpSource(Protocol):
-    """Tells where the tool centre point is."""
+    """Measures the pose and twist of the tool centre point."""
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """Newest state. Raises StaleData if it is older than ``max_age_s``."""
+        """Return the newest state. Raises StaleData if it is older than ``max_age_s``."""
         ...
 
 
 @runtime_checkable
 class JointSource(Protocol):
-    """Tells its joint angles."""
+    """Measures joint angles."""
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
-        """Newest state. Raises StaleData if it is older than ``max_age_s``."""
+        """Return the newest state. Raises StaleData if it is older than ``max_age_s``."""
         ...
 
 
@@ -44,20 +44,20 @@ class WrenchSource(Protocol):
     """Measures the wrench on the tool."""
 
     def wrench(self, max_age_s: float | None = None) -> Stamped[Array]:
-        """(6,) [force N, torque N m] on the tool centre point along base axes. Raises StaleData."""
+        """Return (6,) [force N, torque N m] at the tool centre point along base axes. Raises StaleData."""
         ...
 
 
 @runtime_checkable
 class TwistSink(Protocol):
-    """Moves by twists that expire."""
+    """Follows twists with a time-to-live."""
 
     def acquire(self, owner: str) -> Lease:
         """Take the command lease. Raises CommandRejected(LEASE) while another holds it."""
         ...
 
     def release(self, lease: Lease) -> None:
-        """Stop and give the lease back."""
+        """Stop and release the lease."""
         ...
 
     def send_twist(self, command: TwistCommand, lease: Lease) -> Sent[TwistCommand]:
@@ -67,43 +67,43 @@ class TwistSink(Protocol):
 
 @runtime_checkable
 class Stoppable(Protocol):
-    """Comes to rest when told; needs no lease."""
+    """Stops on request, without a lease."""
 
     def stop(self, category: StopCategory = StopCategory.STOP_AND_HOLD) -> None:
-        """Begin to stop at once and drop every setpoint. Raises LifecycleError for a category it does not offer."""
+        """Begin to stop at once and discard every setpoint. Raises LifecycleError for an unsupported category."""
         ...
 
     def at_rest(self) -> bool:
-        """Whether it stands still now."""
+        """Return whether the device is at standstill."""
         ...
 
 
 class ServoArm(TcpSource, TwistSink, Stoppable, Protocol):
-    """What a run loop needs of an arm that it moves, in this process or in another."""
+    """An arm that a run loop can move, in this process or in another."""
 
     name: str
 
     @property
     def limits(self) -> TwistLimits:
-        """What its gate allows."""
+        """Limits that the command gate enforces."""
         ...
 
     @property
     def stop_categories(self) -> frozenset[StopCategory]:
-        """Stop categories that it offers in software."""
+        """Stop categories supported in software."""
         ...
 
     def kinematics(self) -> DifferentialIk | None:
-        """Of its joints, for an arm that tells them and whose chain is known; None for others."""
+        """Return the differential inverse kinematics, or None if joint angles or chain are unknown."""
         ...
 
 
 @runtime_checkable
 class JointGoal(Protocol):
-    """Goes to joint angles by its own planner."""
+    """Moves to joint angles by its own planner."""
 
     def go_to_joints(self, q: Array, lease: Lease, *, speed_fraction: float = 0.1) -> None:
-        """Start moving to ``q`` (n,) rad. Raises CommandRejected. ``at_rest`` tells when it has arrived."""
+        """Start moving to ``q`` (n,) rad; ``at_rest`` reports arrival. Raises CommandRejected."""
         ...
 
 
@@ -112,27 +112,27 @@ class FrameSource(Protocol):
     """Delivers camera frames, stamped at capture."""
 
     def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
-        """Newest frame. Raises StaleData if it is older than ``max_age_s``."""
+        """Return the newest frame. Raises StaleData if it is older than ``max_age_s``."""
         ...
 
     def next(self, after_seq: int, timeout_s: float) -> Stamped[Frame]:
-        """First available frame with ``seq > after_seq``. Raises TransportTimeout, EndOfStream, DeviceGone."""
+        """Return the first frame with ``seq > after_seq``. Raises TransportTimeout, EndOfStream, DeviceGone."""
         ...
 
 
 @runtime_checkable
 class HealthSource(Protocol):
-    """Tells how it feels, as named numbers and words for people and interlocks."""
+    """Reports device health as named numbers and texts, for operators and interlocks."""
 
     def health(self) -> dict[str, float | int | str | bool]:
-        """Named readings, e.g. dropped frames, temperatures, mode."""
+        """Return named readings, e.g. dropped frames, temperatures, mode."""
         ...
 
 
 @runtime_checkable
 class NativeWatchdog(Protocol):
-    """Stops by itself when the host falls silent."""
+    """Has a watchdog in the device, which stops it when the host is silent."""
 
     def watchdog_s(self) -> float:
-        """Period after which silence stops it, read back from the device."""
+        """Return the watchdog period as read back from the device: silence for this long stops it."""
         ...

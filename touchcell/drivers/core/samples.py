@@ -1,4 +1,4 @@
-"""What devices deliver: values with the time and the number of the sample they came from."""
+"""Samples that devices deliver: values with timestamp, sequence number and quality."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Quality(Enum):
-    """How far a sample may be trusted."""
+    """Trustworthiness of a sample."""
 
     GOOD = "good"
     SUSPECT = "suspect"
@@ -20,14 +20,14 @@ class Quality(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Stamped(Generic[T]):
-    """A value and when it was true.
+    """A value with the time at which it was measured.
 
     Attributes:
         value: the sample.
-        t_ns: CLOCK_MONOTONIC (or injected clock) time of capture where the device tells, else of reception.
-        seq: number of the sample at its source; a gap means that samples were lost.
+        t_ns: CLOCK_MONOTONIC (or injected clock) time of capture where the device reports it, else of reception.
+        seq: sequence number at the source; a gap means lost samples.
         t_device_ns: the device's own clock, where it has one.
-        quality: SUSPECT when the device itself doubts the sample.
+        quality: SUSPECT when the device itself flags the sample as doubtful.
     """
 
     value: T
@@ -37,7 +37,7 @@ class Stamped(Generic[T]):
     quality: Quality = Quality.GOOD
 
     def age_s(self, now_ns: int) -> float:
-        """Seconds from the sample's stamp to ``now_ns``."""
+        """Return the seconds from the sample's timestamp to ``now_ns``."""
         return (now_ns - self.t_ns) * 1e-9
 
 
@@ -61,7 +61,7 @@ class JointState:
 
 @dataclass(frozen=True, slots=True)
 class TcpState:
-    """Where the tool centre point is and how it moves.
+    """Pose and velocity of the tool centre point.
 
     Attributes:
         T_base_tcp: pose (4, 4).

@@ -1,33 +1,33 @@
-"""What a simulated scene offers to the rest of a cell, which knows it by its entry point alone."""
+"""Interface of simulated scenes for the rest of a cell; simulators are found by entry point."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from pydantic import BaseModel
 
-from touchcell import registry
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.samples import Stamped
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.registry import Registry
 
 
 @dataclass(frozen=True, slots=True)
 class ContactState:
-    """What the tip feels: the only thing that the simulated image depends on, and the ground truth for it.
+    """Contact of one sensor tip: sole input of the simulated image, and ground truth for it.
 
     Attributes:
         T_f_s: (4, 4) effective pose of the sensor in the surface frame, after slip; out of contact its z is minus the
             gap and it carries no shear.
-        T_world_f: (4, 4) pose of the surface frame.
+        T_world_f: (4, 4) pose of the surface frame {f}.
         in_contact: whether the tip touches.
         slipping: whether the contact slid in the last step.
         normal_force_n: force on the tip along the surface normal.
-        shear_force_n: force on the tip along the x and y axes of {f}; zero where the physics does not tell it.
+        shear_force_n: force on the tip along the x and y axes of {f}; zero where the physics does not model it.
     """
 
     T_f_s: Array
@@ -38,8 +38,8 @@ class ContactState:
     shear_force_n: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def T_s_f(self) -> Array:  # noqa: N802  the field's own name
-        """(4, 4) pose of the surface frame in the sensor frame: what the network predicts."""
+    def T_s_f(self) -> Array:  # noqa: N802  standard notation for transforms
+        """(4, 4) pose of the surface frame in the sensor frame: the quantity that the network predicts."""
         return se3.inverse(self.T_f_s)
 
     @property
@@ -49,45 +49,45 @@ class ContactState:
 
     @property
     def force_world_n(self) -> Array:
-        """(3,) force on the tip along the world's axes."""
+        """(3,) force on the tip along world axes."""
         force: Array = self.T_world_f[:3, :3] @ np.array([*self.shear_force_n, -self.normal_force_n])
         return force
 
 
 class SceneTruth(Protocol):
-    """What can be asked of a scene, also of one in another process."""
+    """Ground truth of a scene, in this process or in another."""
 
     def contact(self, sensor: str, t_ns: int | None = None) -> Stamped[ContactState]:
-        """What ``sensor`` feels."""
+        """Return the contact state of ``sensor``."""
         ...
 
     def objects(self) -> Stamped[Mapping[str, Array]]:
-        """T_world_object (4, 4) of every free object."""
+        """Return T_world_object (4, 4) of every free object."""
         ...
 
 
 class Scene(SceneTruth, Protocol):
-    """A scene in this process, which devices are mounted in."""
+    """A scene in this process, in which devices are mounted."""
 
     def has(self, sensor: str) -> bool:
-        """Whether ``sensor`` is mounted."""
+        """Return whether ``sensor`` is mounted."""
         ...
 
 
 class SceneSection(BaseModel):
-    """Base of a ``scene:`` section's model."""
+    """Base of the pydantic model of a ``scene:`` section."""
 
     def build(self, clock: Clock) -> Scene:
-        """The scene, with its motions starting now."""
+        """Build the scene; its motions start now."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True, slots=True)
 class SceneSpec:
-    """A simulator's entry point.
+    """Entry point of a simulator.
 
     Attributes:
-        name: of the simulator.
+        name: name of the simulator.
         summary: one line for ``touchcell list``.
         section: pydantic model of the ``scene:`` section.
     """
@@ -97,9 +97,10 @@ class SceneSpec:
     section: type[SceneSection]
 
 
-GROUP = "touchcell.scenes"
+SCENES: Final = Registry("touchcell.scenes", "scene", SceneSpec)
+"""All installed simulators."""
 
 
 def scene_section() -> type[SceneSection]:
-    """The model of ``scene:`` sections. Raises ConfigError where no simulator is installed."""
-    return registry.load(GROUP, "scene", "simulated", SceneSpec).section
+    """Return the pydantic model of ``scene:`` sections. Raises ConfigError if no simulator is installed."""
+    return SCENES.load("simulated").section

@@ -1,47 +1,44 @@
-"""Which drivers exist and what each can do, known without connecting and without any vendor SDK installed."""
+"""Registry of installed drivers and their capabilities, readable without connecting and without any vendor SDK."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import EntryPoint
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from touchcell import registry as entry_points
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.scene import SceneTruth
 from touchcell.geometry.types import Array
-
-GROUP = "touchcell.drivers"
+from touchcell.registry import Registry
 
 
 class DriverConfig(BaseModel):
-    """Base of every driver's configuration: unknown keys refused, values frozen, units in the names."""
+    """Base of every driver's configuration: unknown keys are rejected, instances are frozen, units are in the names."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What a driver promises, as data. The conformance suite holds it to every entry.
+    """Static capabilities of a driver. The conformance suite verifies every entry.
 
     Attributes:
         kind: "arm" or "camera".
         abilities: names of the Protocols in ``touchcell.drivers.core.protocols`` that its devices satisfy.
         state_rate_hz: rate at which new samples appear.
-        min_command_rate_hz: slowest stream of twists that keeps it moving smoothly; 0 for devices without commands.
-        command_latency_s: typical time from call to wire.
-        stop_categories: IEC 60204-1 categories it can do in software.
-        max_watchdog_s: longest silence after which the device stops by itself; None when only the host's time-to-live
+        min_command_rate_hz: lowest rate of twist commands that gives smooth motion; 0 for devices without commands.
+        command_latency_s: typical time from the call to the transmission.
+        stop_categories: IEC 60204-1 stop categories supported in software.
+        max_watchdog_s: longest silence after which the device stops by itself; None if only the host's time-to-live
             stops it.
         twist_axes: which of [vx vy vz wx wy wz] it can follow.
-        has_brakes: whether it stays up without power.
-        falls_on_power_loss: whether power loss lets it sink.
-        hardware_validated: False while the driver has only met emulators.
-        virtual_time: whether it runs on an injected clock; real hardware does not.
+        has_brakes: whether the arm holds its position without power.
+        falls_on_power_loss: whether the arm sinks when power is lost.
+        hardware_validated: False while the driver has been tested with emulators only.
+        virtual_time: whether the device runs on an injected clock; real hardware does not.
     """
 
     kind: Literal["arm", "camera"]
@@ -60,14 +57,14 @@ class Capabilities:
 
 @dataclass(frozen=True, slots=True)
 class DriverContext:
-    """What a driver may need beyond its own configuration.
+    """Dependencies of a driver beyond its own configuration.
 
     Attributes:
         clock: injected time.
-        devices: devices of the cell that are built already, by name.
+        devices: devices of the cell that are already built, by name.
         scene: the simulated scene, for simulated devices; None in a real cell.
-        seed: seed of everything random.
-        bases: T_world_base (4, 4) of arms by name, where a cell file says where they stand.
+        seed: seed of all randomness.
+        bases: T_world_base (4, 4) of arms by name, where the cell file gives them.
     """
 
     clock: Clock
@@ -79,15 +76,15 @@ class DriverContext:
 
 @dataclass(frozen=True, slots=True)
 class DriverSpec:
-    """A driver's entry point. Its module imports no SDK: that happens when a device is opened.
+    """Entry point of a driver. Its module imports no SDK: that happens when a device is opened.
 
     Attributes:
-        name: the word in the cell file.
+        name: value of ``driver`` in the cell file.
         summary: one line for ``touchcell list``.
-        config: pydantic model of its configuration.
-        capabilities: the static record.
-        build: makes a DISCONNECTED device from name, configuration and context.
-        extra: the optional extra that brings its SDK, or None.
+        config: pydantic model of the configuration.
+        capabilities: static capabilities.
+        build: creates a DISCONNECTED device from name, configuration and context.
+        extra: optional dependency group that installs the SDK, or None.
     """
 
     name: str
@@ -98,11 +95,5 @@ class DriverSpec:
     extra: str | None = None
 
 
-def installed() -> dict[str, EntryPoint]:
-    """Entry points of all installed drivers by name; nothing is imported."""
-    return entry_points.installed(GROUP)
-
-
-def spec(name: str) -> DriverSpec:
-    """The spec of driver ``name``. Raises ConfigError with a suggestion for an unknown one."""
-    return entry_points.load(GROUP, "driver", name, DriverSpec)
+DRIVERS: Final = Registry("touchcell.drivers", "driver", DriverSpec)
+"""All installed drivers."""

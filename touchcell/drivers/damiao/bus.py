@@ -1,13 +1,13 @@
-"""Requests to Damiao motors and their answers, over any python-can bus.
+"""Requests to Damiao motors and their replies, over any python-can bus.
 
-A motor answers only when addressed, so one thread that sends a cycle's requests and collects the answers owns the bus:
-no receive thread is needed, nothing can overflow unseen, and an answer is never waited for twice.
+A motor replies only when addressed, so one thread that sends a cycle's requests and collects the replies owns the bus:
+no receive thread is needed, no queue overflows unnoticed, and no reply is awaited twice.
 
-Answers carry no time. Each is stamped with the moment at which its request was sent, so its age is never understated: a
-motor's requests wait in a queue and its answers come in order (CAN keeps the order of one sender). After a loss the
-queue would stay one entry too long; then a register is read as well, whose answer names itself and so marks the place.
-Of such fences a motor has one under way at a time, and they take turns among four registers: an answer that comes after
-its fence was given up is not taken for the next.
+Replies carry no timestamp. Each is stamped with the time at which its request was sent, so its age is never
+understated: a motor's requests are queued and its replies arrive in order (CAN keeps the order of one sender). After a
+loss the queue would stay one entry too long; then a register is read as well, whose reply identifies itself and so
+marks the position. Such a read is called a fence. Each motor has at most one fence pending, and fences cycle through
+four registers, so a reply that arrives after its fence timed out is not mistaken for the next one's.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _FENCES = (Register.TIMEOUT, Register.CTRL_MODE, Register.MST_ID, Register.ESC_I
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """CAN ids of one motor: it listens to ``esc_id`` and answers on ``mst_id``."""
+    """CAN ids of one motor: commands go to ``esc_id``, replies come on ``mst_id``."""
 
     esc_id: int
     mst_id: int
@@ -48,7 +48,7 @@ class Address:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A motor's state, and when it was asked for (its age is at most the time since)."""
+    """State of a motor, stamped when it was requested (its age is at most the time since)."""
 
     feedback: Feedback
     t_ns: int
@@ -56,7 +56,7 @@ class Answer:
 
 @dataclass(slots=True)
 class Counters:
-    """What has been seen on the bus since it was opened."""
+    """Message statistics since the bus was opened."""
 
     sent: int = 0
     answered: int = 0
@@ -67,13 +67,13 @@ class Counters:
     error_frames: int = 0
 
     def as_dict(self) -> dict[str, int]:
-        """By name."""
+        """Return the counters by name."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 @dataclass(slots=True, eq=False)
 class _Pending:
-    """A request under way; ``fence`` is the register that it reads, or None if it is answered by the motor's state."""
+    """Pending request; ``fence``: the register that it reads, or None if the reply is the motor's state."""
 
     t_ns: int
     fence: Register | None = None
@@ -87,13 +87,13 @@ class MotorBus:
         addresses: the motors.
         connect: opens the python-can bus.
         clock: injected time.
-        max_silence_s: a motor silent for longer is given up by the caller; requests twice as old are forgotten.
+        max_silence_s: silence after which the caller considers a motor lost; requests twice as old are discarded.
         fd: send CAN FD frames with bit rate switching.
 
     Attributes:
-        counters: messages seen and lost.
-        last_error: the newest error frame in words, or "".
-        timeout_ticks: the motors' timeout as last read after a loss, or None; it tells a motor that lost power.
+        counters: message statistics.
+        last_error: text of the newest error frame, or "".
+        timeout_ticks: the motors' timeout as last read after a loss, or None; it reveals a motor that lost power.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class MotorBus:
         self._forget()
 
     def _forget(self) -> None:
-        """Start as on a bus that was never open."""
+        """Reset to the state of a bus that was never open."""
         n = len(self._addresses)
         self._ranges: list[Ranges | None] = [None] * n
         self._pending: list[deque[_Pending]] = [deque() for _ in range(n)]
@@ -134,16 +134,16 @@ class MotorBus:
 
     @property
     def state(self) -> str:
-        """Controller state as python-can and error frames tell it: active, passive, error or closed."""
+        """Return the controller state from python-can and error frames: active, passive, error or closed."""
         if self._bus is None:
             return "closed"
         return "error" if self._bus_off else str(self._bus.state.name).lower()
 
     def open(self) -> None:
-        """Open the bus and read the full scales of every motor; changes nothing in them.
+        """Open the bus and read the full scales of every motor; changes no settings.
 
         Raises:
-            ConnectError: no bus, or motors that do not answer or not as configured; ``causes`` names each.
+            ConnectError: no bus, or motors that do not reply or not as configured; ``causes`` names each.
         """
         self._forget()
         self._bus = self._connect()
@@ -152,37 +152,37 @@ class MotorBus:
             try:
                 self._ranges[index] = self._read_ranges(index)
                 if (found := self.read(index, Register.MST_ID)) != address.mst_id:
-                    raise ConnectError(self._device, f"motor {address.esc_id} answers on {found}, not {address.mst_id}")
+                    raise ConnectError(self._device, f"motor {address.esc_id} replies on {found}, not {address.mst_id}")
             except (TransportTimeout, CodecError, ConnectError) as error:
                 causes.append(error)
         if causes:
             raise ConnectError(
-                self._device, "motors are missing", causes, hint="is the arm powered, and are ids and bit rates right?"
+                self._device, "motors are missing", causes, hint="is the arm powered, are ids and bit rates right?"
             )
 
     def close(self) -> None:
-        """Leave the bus; without effect on one that was never opened."""
+        """Close the bus; does nothing if it was never opened."""
         if self._bus is not None:
             self._bus.shutdown()
             self._bus = None
 
     def ranges(self, index: int) -> Ranges:
-        """Full scales of a motor, as it told."""
+        """Return the full scales that a motor reported."""
         ranges = self._ranges[index]
         assert ranges is not None, "open the bus first"
         return ranges
 
     def read(self, index: int, register: int) -> float | int:
-        """A register of a motor. Raises TransportTimeout, DeviceGone, CodecError."""
+        """Read a register of a motor. Raises TransportTimeout, DeviceGone, CodecError."""
         return self._ask(index, register, codec.read_register(self._addresses[index].esc_id, register))
 
     def write(self, index: int, register: int, value: float | int) -> float | int:
-        """Change a register until the next power cycle; returns what a read afterwards says."""
+        """Set a register until the next power cycle; return the value read back."""
         self._ask(index, register, codec.write_register(self._addresses[index].esc_id, register, value), written=True)
         return self.read(index, register)
 
     def command(self, index: int, data: bytes) -> Feedback:
-        """Send one frame to one motor until it answers, a few times. Raises TransportTimeout, DeviceGone."""
+        """Send one frame to one motor until it replies, a few times. Raises TransportTimeout, DeviceGone."""
         self._settle()
         for _ in range(_TRIES):
             self._send(index, self._addresses[index].esc_id, data)
@@ -194,13 +194,13 @@ class MotorBus:
         raise self._no_answer(index)
 
     def exchange(self, data: Sequence[bytes | None], until_ns: int) -> list[Answer | None]:
-        """Send every motor its frame, or a request for its state where there is none, and collect answers.
+        """Send every motor its frame, or a request for its state if None, and collect the replies.
 
-        Returns as soon as all have answered this very request, and at ``until_ns`` at the latest, with the newest
-        answer that came from each meanwhile.
+        Returns as soon as all have replied to this very request, and at ``until_ns`` at the latest, with the newest
+        reply received from each meanwhile.
 
         Raises:
-            DeviceGone: the bus has gone.
+            DeviceGone: lost connection to the bus.
             DeviceFault: the controller is bus-off.
         """
         self._newest = [None] * len(self._addresses)
@@ -252,11 +252,11 @@ class MotorBus:
         raise self._no_answer(index)
 
     def _no_answer(self, index: int) -> TransportTimeout:
-        what = f"answer of motor {self._addresses[index].esc_id}"
+        what = f"reply of motor {self._addresses[index].esc_id}"
         return TransportTimeout(self._device, what, _TRIES * _ANSWER_S)
 
     def _settle(self) -> None:
-        """Take in what is under way, so that the next answer belongs to the next request."""
+        """Receive pending replies, so that the next reply belongs to the next request."""
         until_ns = self._clock.now_ns() + _SETTLE_NS
         while any(self._pending) and self._receive(until_ns):
             pass
@@ -307,7 +307,7 @@ class MotorBus:
         return True
 
     def _receive(self, until_ns: int) -> bool:
-        """Take in one frame; False when none came in time."""
+        """Process one frame; False if none arrived in time."""
         import can
 
         left_s = (until_ns - self._clock.now_ns()) * 1e-9
@@ -340,7 +340,7 @@ class MotorBus:
         if wanted is None or wanted[0] != index:
             return False
         reply = codec.decode_register_reply(data, self._addresses[index].esc_id, wanted[1])
-        # A second answer to a repeated write must not pass for the read that proves it.
+        # A second reply to a repeated write must not be mistaken for the read-back.
         if reply is None or reply.written != wanted[2]:
             return False
         self._replies.append(reply)
@@ -355,7 +355,7 @@ class MotorBus:
             return False
         if fence.fence is Register.TIMEOUT:
             self.timeout_ticks[index] = int(reply.value)
-        # Whatever was asked for before has been answered or lost.
+        # All earlier requests have been answered or lost.
         while queue.popleft() is not fence:
             pass
         return True
@@ -388,4 +388,6 @@ class MotorBus:
             self._bus_off = False
 
     def _gone(self, error: Exception) -> DeviceGone:
-        return DeviceGone(self._device, f"the CAN bus has gone: {error}", hint="check the adapter, then connect again")
+        return DeviceGone(
+            self._device, f"lost connection to the CAN bus: {error}", hint="check the adapter, then reconnect"
+        )

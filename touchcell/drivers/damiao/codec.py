@@ -1,8 +1,8 @@
 """Wire format of Damiao motors on CAN: pure functions between bytes and values, no I/O.
 
-Standard 11-bit frames of eight bytes. A motor speaks only when spoken to: every frame to its id (``esc_id``) or to the
-parameter id 0x7FF is answered on its master id (``mst_id``). Sources: the maker's "DM-J series" CAN protocol pages as
-restated by the MIT-licensed damiao-motor 1.0.6, LeRobot and i2rt; there is no checksum beyond CAN's own.
+Standard 11-bit frames of eight bytes. A motor sends only replies: every frame to its id (``esc_id``) or to the
+parameter id 0x7FF is answered on its master id (``mst_id``). Sources: the manufacturer's "DM-J series" CAN protocol
+pages as restated by the MIT-licensed damiao-motor 1.0.6, LeRobot and i2rt; there is no checksum beyond CAN's own.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ _FLOAT_REGISTERS = frozenset([*range(0, 7), *range(11, 13), *range(17, 35), *ran
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """Full scales of one motor, which its registers 21, 22 and 23 tell: position, velocity and torque reach from minus
-    to plus these."""
+    """Full scales of one motor, from its registers 21, 22 and 23: position, velocity and torque range from minus to
+    plus these values."""
 
     position_rad: float
     velocity_rad_s: float
@@ -60,7 +60,7 @@ class Ranges:
         for field in ("position_rad", "velocity_rad_s", "torque_n_m"):
             value = getattr(self, field)
             if not (math.isfinite(value) and value > 0.0):
-                raise CodecError(field, value, "is no full scale")
+                raise CodecError(field, value, "is not a valid full scale")
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class MitCommand:
 
 @dataclass(frozen=True, slots=True)
 class Feedback:
-    """One answer of a motor.
+    """State reply of a motor.
 
     Attributes:
         motor: low four bits of its ``esc_id``.
@@ -96,7 +96,7 @@ class Feedback:
 
 @dataclass(frozen=True, slots=True)
 class RegisterReply:
-    """Answer to a register read, or to a write, which only repeats what was to be written."""
+    """Reply to a register read, or to a write, which only echoes the value to be written."""
 
     motor: int
     register: int
@@ -106,7 +106,7 @@ class RegisterReply:
 
 @dataclass(frozen=True, slots=True)
 class StatusCode:
-    """One value of the status nibble, and what it asks for."""
+    """Meaning of one value of the status nibble: fault class, remedy and hint."""
 
     name: str
     fault_class: FaultClass
@@ -121,10 +121,13 @@ LOST_COMMUNICATION = 0xD
 FAULTS: Mapping[int, StatusCode] = MappingProxyType(
     {
         0x5: StatusCode(
-            "sensor error", FaultClass.INTERNAL, Remedy.SERVICE, "the encoder reads nonsense; have the motor checked"
+            "sensor error", FaultClass.INTERNAL, Remedy.SERVICE, "implausible encoder readings; have the motor checked"
         ),
         0x6: StatusCode(
-            "parameter error", FaultClass.CONFIGURATION, Remedy.SERVICE, "re-write the motor's parameters at the bench"
+            "parameter error",
+            FaultClass.CONFIGURATION,
+            Remedy.SERVICE,
+            "rewrite the motor's parameters in the workshop",
         ),
         0x8: StatusCode(
             "over-voltage",
@@ -138,14 +141,16 @@ FAULTS: Mapping[int, StatusCode] = MappingProxyType(
             Remedy.OPERATOR,
             "check the supply and the emergency stop's contactor",
         ),
-        0xA: StatusCode("over-current", FaultClass.OVERLOAD, Remedy.RECOVER, "look for a collision or a short circuit"),
+        0xA: StatusCode(
+            "over-current", FaultClass.OVERLOAD, Remedy.RECOVER, "check for a collision or a short circuit"
+        ),
         0xB: StatusCode("driver too hot", FaultClass.THERMAL, Remedy.RECOVER, "let it cool down"),
         0xC: StatusCode("winding too hot", FaultClass.THERMAL, Remedy.RECOVER, "let it cool down and lower the load"),
         0xD: StatusCode(
             "lost communication",
             FaultClass.COMMUNICATION,
             Remedy.RECOVER,
-            "the host fell silent for longer than the motor's timeout and the motor let go: the arm may have sunk",
+            "the host was silent for longer than the motor's timeout, which disabled it: the arm may have sunk",
         ),
         0xE: StatusCode("overload", FaultClass.OVERLOAD, Remedy.RECOVER, "lower the load"),
     }
@@ -154,19 +159,19 @@ FAULTS: Mapping[int, StatusCode] = MappingProxyType(
 
 
 def fault(status: int) -> StatusCode | None:
-    """What a status nibble means, or None for a healthy motor."""
+    """Return the fault of a status nibble, or None for a healthy motor."""
     if status in (DISABLED, ENABLED):
         return None
-    undocumented = StatusCode(f"undocumented status {status:#x}", FaultClass.INTERNAL, Remedy.SERVICE, "ask the maker")
+    undocumented = StatusCode(f"undocumented status {status:#x}", FaultClass.INTERNAL, Remedy.SERVICE, "ask Damiao")
     return FAULTS.get(status, undocumented)
 
 
 def encode_mit(command: MitCommand, ranges: Ranges) -> bytes:
-    """Eight bytes: q 16 bit, dq, kp, kd, tau 12 bit each, big-endian, each linear over its range, to the nearest step.
+    """Encode eight bytes: q 16 bit, dq, kp, kd, tau 12 bit each, big-endian, linear over the range, rounded to nearest.
 
     Raises:
-        CodecError: a value is not finite or lies outside its range (nothing is ever saturated silently), or all are so
-            near their upper ends that a motor would take the bytes for a special command.
+        CodecError: a value is not finite or out of range (values are never saturated silently), or all are so near
+            their upper ends that a motor would interpret the bytes as a special command.
     """
     q = _steps("q", command.q, -ranges.position_rad, ranges.position_rad, 16)
     dq = _steps("dq", command.dq, -ranges.velocity_rad_s, ranges.velocity_rad_s, 12)
@@ -175,12 +180,12 @@ def encode_mit(command: MitCommand, ranges: Ranges) -> bytes:
     tau = _steps("tau", command.tau, -ranges.torque_n_m, ranges.torque_n_m, 12)
     data = (q << 48 | dq << 36 | kp << 24 | kd << 12 | tau).to_bytes(8, "big")
     if data[:7] == ENABLE[:7] and data[7] >= CLEAR_ERROR[7]:
-        raise CodecError("command", command, "would read as enable, disable, set zero or clear error")
+        raise CodecError("command", command, "would be interpreted as enable, disable, set zero or clear error")
     return data
 
 
 def decode_mit(data: bytes, ranges: Ranges) -> MitCommand:
-    """The inverse of ``encode_mit``, up to half a step. Raises CodecError for a wrong length."""
+    """Decode the bytes of ``encode_mit``, to within half a step. Raises CodecError for a wrong length."""
     _require_length(data)
     bits = int.from_bytes(data, "big")
     return MitCommand(
@@ -193,7 +198,7 @@ def decode_mit(data: bytes, ranges: Ranges) -> MitCommand:
 
 
 def encode_feedback(feedback: Feedback, ranges: Ranges) -> bytes:
-    """Eight bytes as a motor sends them: status and id, q 16 bit, dq and tau 12 bit, two temperatures."""
+    """Encode eight bytes as a motor sends them: status and id, q 16 bit, dq and tau 12 bit, two temperatures."""
     q = _steps("q", feedback.q, -ranges.position_rad, ranges.position_rad, 16)
     dq = _steps("dq", feedback.dq, -ranges.velocity_rad_s, ranges.velocity_rad_s, 12)
     tau = _steps("tau", feedback.tau, -ranges.torque_n_m, ranges.torque_n_m, 12)
@@ -202,10 +207,10 @@ def encode_feedback(feedback: Feedback, ranges: Ranges) -> bytes:
 
 
 def decode_feedback(data: bytes, motor: int, ranges: Ranges) -> Feedback:
-    """Read the answer of motor ``motor`` (its ``esc_id``).
+    """Decode the reply of motor ``motor`` (its ``esc_id``).
 
     Raises:
-        CodecError: wrong length, or another motor's answer.
+        CodecError: wrong length, or a reply of another motor.
     """
     _require_length(data)
     if data[0] & 0xF != motor & 0xF:
@@ -223,17 +228,17 @@ def decode_feedback(data: bytes, motor: int, ranges: Ranges) -> Feedback:
 
 
 def request_feedback(motor: int) -> bytes:
-    """Data of the frame to ``PARAMETER_ID`` that asks a motor for its state without commanding it."""
+    """Return the data of the frame to ``PARAMETER_ID`` that requests a motor's state without commanding it."""
     return struct.pack("<HB5x", motor, _REQUEST_FEEDBACK)
 
 
 def read_register(motor: int, register: int) -> bytes:
-    """Data of the frame to ``PARAMETER_ID`` that asks for a register."""
+    """Return the data of the frame to ``PARAMETER_ID`` that requests a register."""
     return struct.pack("<HBB4x", motor, _READ, register)
 
 
 def write_register(motor: int, register: int, value: float | int) -> bytes:
-    """Data of the frame to ``PARAMETER_ID`` that changes a register until the next power cycle.
+    """Return the data of the frame to ``PARAMETER_ID`` that sets a register until the next power cycle.
 
     Raises:
         CodecError: the value does not fit the register.
@@ -242,25 +247,25 @@ def write_register(motor: int, register: int, value: float | int) -> bytes:
 
 
 def encode_register_reply(motor: int, register: int, value: float | int, *, write: bool = False) -> bytes:
-    """As a motor answers: the request's first four bytes and the value."""
+    """Encode a motor's reply: the request's first four bytes and the value."""
     head = struct.pack("<HBB", motor, _WRITE if write else _READ, register)
     is_float = register in _FLOAT_REGISTERS
     return head + (struct.pack("<f", value) if is_float else struct.pack("<I", value))
 
 
 def is_register_reply(data: bytes, motor: int) -> bool:
-    """Whether ``motor`` answers about any register: its id in 16 bits, then read or write.
+    """Return whether ``data`` is a register reply of ``motor``: its id in 16 bits, then read or write.
 
-    The state of a disabled motor at the lower end of its range (within 0.03 rad of -12.5) can look the same.
+    The state of a disabled motor at the lower end of its range (within 0.03 rad of -12.5) can have the same bytes.
     """
     return len(data) == 8 and data[:2] == struct.pack("<H", motor) and data[2] in (_READ, _WRITE)
 
 
 def decode_register_reply(data: bytes, motor: int, register: int) -> RegisterReply | None:
-    """Read the answer of ``motor`` about ``register``; None if the bytes are something else, such as its state.
+    """Decode the reply of ``motor`` for ``register``; None if the bytes are something else, such as its state.
 
     Raises:
-        CodecError: it is a float that is not finite.
+        CodecError: the value is a float that is not finite.
     """
     if not is_register_reply(data, motor) or data[3] != register:
         return None
@@ -275,14 +280,14 @@ def decode_register_reply(data: bytes, motor: int, register: int) -> RegisterRep
 
 
 def decode_parameter_request(data: bytes) -> tuple[int, int, int, bytes]:
-    """What a motor reads from a frame to ``PARAMETER_ID``: motor, operation, register, four bytes of value."""
+    """Decode a frame to ``PARAMETER_ID``: motor, operation, register, four bytes of value."""
     _require_length(data)
     motor, operation, register = struct.unpack_from("<HBB", data)
     return motor, operation, register, data[4:]
 
 
 def frame_time_s(bitrate: int, data_bitrate: int | None = None) -> float:
-    """Longest time that one eight-byte standard frame takes on the bus, worst-case stuff bits included.
+    """Return the longest time that one eight-byte standard frame takes on the bus, with worst-case stuff bits.
 
     Args:
         bitrate: bit/s, of the arbitration phase for CAN FD.
@@ -298,7 +303,7 @@ def frame_time_s(bitrate: int, data_bitrate: int | None = None) -> float:
 
 
 def bus_load(motors: int, rate_hz: float, bitrate: int, data_bitrate: int | None = None) -> float:
-    """Fraction of the bus that a command to and an answer from every motor take at ``rate_hz``, at worst."""
+    """Return the worst-case fraction of the bus used by a command and a reply per motor at ``rate_hz``."""
     return 2 * motors * rate_hz * frame_time_s(bitrate, data_bitrate)
 
 
@@ -319,7 +324,7 @@ def _register_bytes(register: int, value: float | int) -> bytes:
             raise CodecError(f"register {register}", value, "is not finite")
         return struct.pack("<f", value)
     if not (isinstance(value, int) and 0 <= value < 1 << 32):
-        raise CodecError(f"register {register}", value, "is no unsigned 32-bit number")
+        raise CodecError(f"register {register}", value, "is not an unsigned 32-bit number")
     return struct.pack("<I", value)
 
 

@@ -1,12 +1,11 @@
-"""Arms of Damiao motors in MIT mode on CAN (OpenArm, YAM, reBot and home-made ones), over python-can.
+"""Driver for arms of Damiao motors in MIT mode on CAN (OpenArm, YAM, reBot and home-made ones), with python-can.
 
-The makers give no Cartesian control, so this driver owns it: a loop of its own turns expiring twists into joint
-setpoints (``touchcell.drivers.core.joint_setpoint``), adds the torques that carry the arm's weight, and sends every
-motor a position, a velocity and a torque. The same loop collects the answers; motors speak only when asked, so one
-thread is enough.
+The motors have no Cartesian control, so it runs on the host: a loop converts expiring twists into joint setpoints
+(``touchcell.drivers.core.joint_setpoint``), adds gravity compensation torques, and sends every motor a position, a
+velocity and a torque. The same loop collects the replies; motors send only replies, so one thread suffices.
 
-What stops the arm: an expired twist, by slowing down in the loop; a dead host process, by each motor holding its last
-position and then, after its own timeout, letting go. **An arm without brakes sinks then**, and whenever it is disabled.
+Stop mechanisms: when a twist expires, the loop decelerates; when the host process dies, each motor holds its last
+position and disables itself after its own timeout. **An arm without brakes sinks then**, and whenever it is disabled.
 """
 
 from __future__ import annotations
@@ -48,12 +47,12 @@ _DOES_NOT_ENABLE = codec.StatusCode(
     "does not enable", FaultClass.INTERNAL, Remedy.OPERATOR, "check power and emergency stop"
 )
 _DISABLED_ITSELF = codec.StatusCode(
-    "disabled itself", FaultClass.ELECTRICAL, Remedy.OPERATOR, "did it lose power, or has it a second host?"
+    "disabled itself", FaultClass.ELECTRICAL, Remedy.OPERATOR, "did it lose power, or does another host control it?"
 )
 
 
 class MotorConfig(BaseModel):
-    """One joint's motor. The joint's angle is ``direction`` times the motor's angle, plus ``offset_deg``."""
+    """Configuration of one joint's motor: joint angle = ``direction`` times motor angle, plus ``offset_deg``."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -66,10 +65,10 @@ class MotorConfig(BaseModel):
 
 
 class DamiaoCanConfig(BusArmConfig):
-    """Configuration of one arm.
+    """Configuration of a Damiao arm.
 
-    ``interface``, ``channel`` and ``bus_options`` go to python-can; bit rates are those of the bus, which the adapter
-    or ``ip link`` sets.
+    ``interface``, ``channel`` and ``bus_options`` go to python-can; the bit rates are those set by the adapter or by
+    ``ip link``.
     """
 
     interface: str = "socketcan"
@@ -88,7 +87,7 @@ class DamiaoCanConfig(BusArmConfig):
 
     @property
     def joint_count(self) -> int:
-        """How many motors are listed."""
+        """Number of configured motors."""
         return len(self.motors)
 
     @model_validator(mode="after")
@@ -108,14 +107,14 @@ class DamiaoCanConfig(BusArmConfig):
 
     @property
     def bus_load(self) -> float:
-        """Largest part of the bus that commands and answers take."""
+        """Worst-case fraction of the bus used by commands and replies."""
         return codec.bus_load(len(self.motors), self.rate_hz, self.bitrate, self.data_bitrate if self.fd else None)
 
     def describe(self) -> ChainDescription:
-        """The arm.
+        """Return the chain description of the arm.
 
         Raises:
-            ConfigError: there is none, it has another number of joints, or the park pose is outside their limits.
+            ConfigError: unknown chain, wrong number of joints, or a park pose outside the joint limits.
         """
         found = self.named_chain("motors")
         self.require_park_within(found)
@@ -123,7 +122,7 @@ class DamiaoCanConfig(BusArmConfig):
 
 
 class DamiaoCanArm(BusArm):
-    """One arm; see the module for what stops it and what then happens.
+    """Driver for a Damiao arm; see the module for its stop mechanisms.
 
     Args:
         name: the device's name in the cell.
@@ -153,14 +152,14 @@ class DamiaoCanArm(BusArm):
         self._answers: list[Answer | None] = [None] * len(self._config.motors)
 
     def watchdog_s(self) -> float:
-        """Silence after which the motors let go, as read back from them; the longest of them."""
+        """Return the timeout after which the motors disable themselves, as read back; the longest of them."""
         known = [ticks for ticks in self._bus.timeout_ticks if ticks is not None]
         if len(known) < len(self._enabled):
-            raise LifecycleError(self.name, "tell the watchdog", self.state.value, [Lifecycle.READY.value])
+            raise LifecycleError(self.name, "read the watchdog's period", self.state.value, [Lifecycle.READY.value])
         return max(known) * codec.TIMEOUT_TICK_S
 
     def health(self) -> dict[str, float | int | str | bool]:
-        """Counters of the bus and the loop, temperatures, status, what limits the motion."""
+        """Return counters of the bus and the loop, temperatures, status, active limits."""
         readings: dict[str, float | int | str | bool] = dict(self._bus.counters.as_dict())
         readings |= {
             "bus_state": self._bus.state,
@@ -190,7 +189,7 @@ class DamiaoCanArm(BusArm):
                         f"motor {motor.esc_id} is in control mode {mode}, not MIT (1)",
                         key="motors",
                         value=mode,
-                        hint="set register 10 to 1 with the maker's tool; a driver does not change modes",
+                        hint="set register 10 to 1 with the manufacturer's tool; a driver does not change modes",
                     )
                 self._check_ranges(index)
                 self._set_watchdog(index)
@@ -214,7 +213,7 @@ class DamiaoCanArm(BusArm):
                 self._check_watchdog(index, int(self._bus.read(index, Register.TIMEOUT)))
             if all(self._enabled):
                 return
-            # Motors that hold already keep their setpoint, whatever load makes them sag.
+            # Motors that are enabled already keep their setpoint, whatever load makes them sag.
             self._setpoint.reset(np.where(self._enabled, self._setpoint.q, q))
             self._enable([index for index, on in enumerate(self._enabled) if not on])
 
@@ -234,10 +233,10 @@ class DamiaoCanArm(BusArm):
             self._trouble = None
 
     def _fresh_answer(self, index: int) -> Answer:
-        """The loop's newest answer. ResetProcedure for a silent motor here would let the others' timeouts run out."""
+        """Return the loop's newest reply. Waiting for a silent motor here would let the others' timeouts expire."""
         answer, limit_s = self._answers[index], self._config.max_silence_s
         if answer is None or (self._clock.now_ns() - answer.t_ns) * 1e-9 > limit_s:
-            raise TransportTimeout(self.name, f"answer of motor {self._config.motors[index].esc_id}", limit_s)
+            raise TransportTimeout(self.name, f"reply of motor {self._config.motors[index].esc_id}", limit_s)
         return answer
 
     def _check_ranges(self, index: int) -> None:
@@ -248,19 +247,19 @@ class DamiaoCanArm(BusArm):
         joint = self._chain.joint_names[index]
         if np.abs(ends).max() > ranges.position_rad:
             raise ConfigError(
-                f"joint {joint} reaches {np.abs(ends).max():.2f} rad, its motor tells {ranges.position_rad:.2f}",
+                f"joint {joint} reaches {np.abs(ends).max():.2f} rad, its motor only {ranges.position_rad:.2f}",
                 key=f"motors[{index}]",
             )
         if self._chain.speed[index] > ranges.velocity_rad_s:
             raise ConfigError(
-                f"joint {joint} may turn at {self._chain.speed[index]:.2f} rad/s, "
-                f"its motor's full scale is {ranges.velocity_rad_s:.2f}",
+                f"the speed limit of joint {joint} is {self._chain.speed[index]:.2f} rad/s, "
+                f"its motor's full scale {ranges.velocity_rad_s:.2f}",
                 key=f"motors[{index}]",
             )
         push = motor.kp_n_m_rad * float(np.deg2rad(self._config.tracking_error_deg))
         if push > min(self._chain.torque[index], ranges.torque_n_m):
             raise ConfigError(
-                f"kp of joint {joint} pushes with {push:.1f} N m before tracking_error_deg trips, more than its torque",
+                f"kp of joint {joint} gives {push:.1f} N m before tracking_error_deg trips, more than its torque",
                 key=f"motors[{index}].kp_n_m_rad",
                 value=motor.kp_n_m_rad,
             )
@@ -279,17 +278,17 @@ class DamiaoCanArm(BusArm):
                 f"not {self._config.watchdog_s:g} s",
                 vendor_code="TIMEOUT",
                 fault_class=FaultClass.CONFIGURATION,
-                hint="did it lose power? configure again; without the timeout a dead host leaves the arm pushing",
+                hint="did it lose power? configure again; without the timeout an arm whose host died keeps pushing",
             )
 
     def _enable(self, indices: list[int]) -> None:
-        """Enable these motors at the setpoint; if one does not obey, none of them stays enabled."""
+        """Enable these motors at the setpoint; if one fails, disable all of them."""
         frames = self._frames(self._setpoint.q, np.zeros_like(self._setpoint.q))
         try:
             for index in indices:
                 self._enabled[index] = True
                 self._bus.command(index, codec.ENABLE)
-                # Enabled without gains the motor is limp: give it its setpoint before the next one is enabled.
+                # A motor enabled without gains is limp: send its setpoint before the next one is enabled.
                 status = self._bus.command(index, frames[index]).status
                 if status != codec.ENABLED:
                     code = codec.fault(status) or _DOES_NOT_ENABLE
@@ -302,7 +301,7 @@ class DamiaoCanArm(BusArm):
         self._disable(range(len(self._enabled)))
 
     def _disable(self, indices: Sequence[int]) -> None:
-        """Disable these motors as far as they can still be reached."""
+        """Disable these motors, as far as they are reachable."""
         with self._lock:
             for index in indices:
                 if not self._enabled[index]:
@@ -313,7 +312,7 @@ class DamiaoCanArm(BusArm):
                 except DeviceGone:
                     return
                 except TransportTimeout:
-                    # Its own timeout disables a motor that does not hear us.
+                    # An unreachable motor is disabled by its own timeout.
                     continue
 
     def _cycle(self, now_ns: int, dt_s: float, until_ns: int) -> None:
@@ -353,7 +352,7 @@ class DamiaoCanArm(BusArm):
             self._check_tracking(self._joints.value.q, self._setpoint.q)
 
     def _plausible(self, index: int, answer: Answer | None) -> Answer | None:
-        """The answer, unless the motor cannot have turned that far since the last one."""
+        """Return the reply, or None if the motor cannot have turned that far since the last one."""
         before = self._answers[index]
         if answer is None or before is None:
             return answer
@@ -386,7 +385,7 @@ class DamiaoCanArm(BusArm):
         limit_s = self._config.max_silence_s
         for motor, answer in zip(self._config.motors, self._answers, strict=True):
             if answer is not None and (now_ns - answer.t_ns) * 1e-9 > limit_s:
-                self._latch(TransportTimeout(self.name, f"answer of motor {motor.esc_id}", limit_s))
+                self._latch(TransportTimeout(self.name, f"reply of motor {motor.esc_id}", limit_s))
         self._check_missed()
 
     def _check_fences(self) -> None:

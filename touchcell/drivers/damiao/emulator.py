@@ -1,8 +1,8 @@
-"""An arm of Damiao motors on an emulated CAN bus: registers, MIT impedance control, in-motor timeout, faults.
+"""Emulator of an arm of Damiao motors on a CAN bus: registers, MIT impedance control, in-motor timeout, faults.
 
-Each motor is a second-order system (inertia, viscous friction, the weight of the arm that the chain description gives)
-integrated in steps of 0.5 ms. Inertias are constant and uncoupled: this proves protocol and fault handling, not
-dynamics. Until a motor is first enabled the arm lies on its stand; afterwards a disabled joint sinks against friction.
+Each motor is a second-order system (inertia, viscous friction, the weight of the arm from its chain description)
+integrated in steps of 0.5 ms. Inertias are constant and uncoupled: this tests protocol and fault handling, not
+dynamics. Until a motor is first enabled the arm rests on its stand; afterwards a disabled joint sinks against friction.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MODELS: Mapping[str, codec.Ranges] = {
     "4340": codec.Ranges(12.5, 10.0, 28.0),
     "8009": codec.Ranges(12.5, 45.0, 54.0),
 }
-"""Full scales as the makers of damiao-motor and i2rt publish them."""
+"""Full scales as published by damiao-motor and i2rt."""
 
 FACTORY_TIMEOUT_TICKS = 8000
 
@@ -45,8 +45,8 @@ class Motor:
     """Registers and status of one motor; its mechanics are integrated by the arm.
 
     Args:
-        esc_id: id that it listens to.
-        mst_id: id that it answers on.
+        esc_id: CAN id of its commands.
+        mst_id: CAN id of its replies.
         ranges: full scales.
     """
 
@@ -58,7 +58,7 @@ class Motor:
         self.power_up()
 
     def power_up(self) -> None:
-        """As after switching on: disabled, saved registers."""
+        """Reset to the state after switching on: disabled, saved registers."""
         self.status = codec.DISABLED
         self.command = codec.MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
         self.heard_s = -math.inf
@@ -76,41 +76,41 @@ class Motor:
 
     @property
     def timeout_s(self) -> float:
-        """Longest silence while enabled; 0 is off."""
+        """Longest silence while enabled, s; 0 is off."""
         return float(self.registers[codec.Register.TIMEOUT]) * codec.TIMEOUT_TICK_S
 
 
 class DamiaoArm(Emulator):
-    """Emulates an arm; ``q`` of motor i is joint i of the chain, without offset.
+    """Emulator of an arm; ``q`` of motor i is joint i of the chain, without offset.
 
     Args:
-        path: of the hub's socket.
-        chain: the arm, for its weight, its mechanical stops and the tool's true position.
+        path: socket of the hub.
+        chain: kinematic chain, for its weight, its mechanical stops and the tool's true position.
         models: motor model per joint, a key of ``MODELS``.
         start_deg: angles on the stand.
         first_id: ``esc_id`` of the first motor; master ids are 0x10 higher.
         inertia: (n,) kg m^2 at the output shafts.
-        friction: (n,) N m s/rad, which is also what brakes a disabled joint.
+        friction: (n,) N m s/rad; also brakes a disabled joint.
     """
 
     faults: ClassVar[Mapping[str, str]] = {
-        "pause": "no motor listens or answers",
-        "silent": "this motor (index from 0) neither listens nor answers",
-        "drop": "lose this many answers",
-        "delay": "answers come this many seconds late",
-        "corrupt": "invert every bit of this many answers, as a broken adapter might",
-        "foreign": "this many answers carry another motor's id in their data",
-        "out_of_order": "this many answers are overtaken by the same motor's next one",
+        "pause": "no motor receives or replies",
+        "silent": "this motor (index from 0) neither receives nor replies",
+        "drop": "lose this many replies",
+        "delay": "replies arrive this many seconds late",
+        "corrupt": "invert every bit of this many replies, as a broken adapter might",
+        "foreign": "this many replies carry another motor's id in their data",
+        "out_of_order": "this many replies are overtaken by the same motor's next one",
         "unplug": "the adapter vanishes",
         "bus_off": "the controller goes bus-off and passes nothing",
         "error_frames": "report this many bus errors",
-        "fault_bits": "[motor index, status nibble]: the motor reports it and lets go",
-        "hot": "[motor index, degrees Celsius] of the winding; at 100 the motor lets go",
-        "push": "[motor index, N m]: somebody pushes that joint",
+        "fault_bits": "[motor index, status nibble]: the motor reports it and disables itself",
+        "hot": "[motor index, degrees Celsius] of the winding; at 100 the motor disables itself",
+        "push": "[motor index, N m]: external torque on that joint",
         "refuse": "this motor (index from 0) does not enable",
         "nan": "the full-scale registers read as NaN",
         "restart": "the motors lose power for a moment",
-        "reset": "everything is as it was when the emulator started",
+        "reset": "return to the state at the start of the emulator",
     }
 
     def __init__(
@@ -157,7 +157,7 @@ class DamiaoArm(Emulator):
         self._let_go_position: list[float] | None = None
 
     async def start(self) -> None:
-        """Open the hub and let time run."""
+        """Open the hub and start the simulated time."""
         self._start_s = self._now_s()
         self._hub.open()
         self._ticker = asyncio.create_task(self._tick())
@@ -169,7 +169,7 @@ class DamiaoArm(Emulator):
         self._hub.close()
 
     def state(self) -> dict[str, Any]:
-        """The truth: angles, tool position, what is energised, what was received."""
+        """Return the ground truth: angles, tool position, enabled motors, received frames."""
         self._hub.drain()
         self._integrate()
         T_base_tcp = self._chain.forward(self._q)
@@ -196,7 +196,7 @@ class DamiaoArm(Emulator):
         }
 
     def on_fault(self, fault: str, value: Any) -> None:
-        """Faults that act at once."""
+        """Apply faults that act at once."""
         if fault == "unplug":
             self._hub.close()
         elif fault == "bus_off":
@@ -222,7 +222,7 @@ class DamiaoArm(Emulator):
             self._reset()
 
     def on_clear(self, fault: str) -> None:
-        """Plug in again; leave bus-off."""
+        """Reconnect the adapter; leave bus-off."""
         if fault == "unplug":
             self._hub.open()
         elif fault == "bus_off":
@@ -234,7 +234,7 @@ class DamiaoArm(Emulator):
     async def _tick(self) -> None:
         while True:
             await asyncio.sleep(_TICK_S)
-            # A late emulator must not take its own lateness for the host's silence.
+            # A late emulator must not mistake its own lateness for silence of the host.
             self._hub.drain()
             self._check_timeouts()
             self._integrate()
@@ -385,7 +385,7 @@ class DamiaoArm(Emulator):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Command line of ``touchcell emulate damiao``."""
+    """Add the command-line arguments of ``touchcell emulate damiao``."""
     parser.add_argument("path", type=Path, help="socket of the hub; clients use it as python-can channel")
     parser.add_argument("--chain", default="generic_6r", help="shipped chain description, or a YAML file")
     parser.add_argument("--tool", help='tool as JSON, e.g. \'{"origin_mm": [0, 0, 80], "mass_kg": 0.2}\'')
@@ -395,7 +395,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def build(arguments: argparse.Namespace) -> DamiaoArm:
-    """Make the emulator from its command line."""
+    """Build the emulator from its command-line arguments."""
     is_file = Path(arguments.chain).suffix == ".yaml"
     read = ChainDescription.read(Path(arguments.chain)) if is_file else ChainDescription.shipped(arguments.chain)
     tool = Tool.model_validate_json(arguments.tool) if arguments.tool else None

@@ -1,4 +1,4 @@
-"""The ``damiao_can`` driver on six emulated motors."""
+"""Test fixture: the ``damiao_can`` driver with six emulated motors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TOOL = {"origin_mm": [0, 0, 80], "mass_kg": 0.15, "com_mm": [0, 0, 40]}
 
 
 def config(channel: Path, **changes: object) -> damiao_can.DamiaoCanConfig:
-    """Six motors on the hub at ``channel``; slow and patient enough for a busy machine."""
+    """Return a configuration of six motors on the hub at ``channel``, with rates and timeouts for a busy machine."""
     stiff = [90.0, 90.0, 90.0, 40.0, 40.0, 30.0]
     motors = [
         {"esc_id": i + 1, "mst_id": i + 0x11, "kp_n_m_rad": kp, "kd_n_m_s_rad": 3.0 if i < 3 else 1.5}
@@ -34,7 +34,7 @@ def config(channel: Path, **changes: object) -> damiao_can.DamiaoCanConfig:
 
 
 def rig(folder: Path, address: int) -> DeviceFixture:
-    """One arm on a hub of its own in ``folder``; ``address`` tells several apart."""
+    """Build one arm on a hub of its own in ``folder``; ``address`` keeps several apart."""
     channel = folder / f"can-{address}"
 
     def start() -> EmulatorProcess:
@@ -65,7 +65,7 @@ def rig(folder: Path, address: int) -> DeviceFixture:
             "unplug": (True, "fault"),
         },
         notes=(
-            "a motor that loses communication lets go; that its windings then brake is not assumed",
+            "a motor that loses communication disables itself; that its windings then brake is not assumed",
             "any frame to a motor, also a request for its state, feeds its timeout",
             "registers can be read while a motor is enabled",
         ),

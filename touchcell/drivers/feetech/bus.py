@@ -1,9 +1,10 @@
-"""Requests to Feetech servos and their answers, over a half-duplex serial line.
+"""Requests to Feetech servos and their replies, over a half-duplex serial line.
 
-Servos speak only when asked, so one thread at a time owns the line and no receive thread is needed. An answer carries
-neither time nor number. It is stamped with the moment at which it was asked for, so its age is never understated, and
-the requests for states ask for blocks of sixteen lengths in turn: an answer that comes cycles too late has the wrong
-length and is counted as late instead of being taken for a fresh one.
+Servos send only replies, so one thread at a time owns the line and no receive thread is needed. A reply carries neither
+time nor number. It is stamped with the time of its request, so its age is never understated, and successive requests
+for
+states ask for blocks of sixteen different lengths in turn: a reply that arrives cycles too late has the wrong length
+and is counted as late instead of being mistaken for a fresh one.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _READ_SIZE = 4096
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A servo's state, and when it was asked for (its age is at most the time since)."""
+    """State of a servo, stamped when it was requested (its age is at most the time since)."""
 
     state: ServoState
     t_ns: int
@@ -36,7 +37,7 @@ class Answer:
 
 @dataclass(slots=True)
 class Counters:
-    """What has been seen on the line since it was opened."""
+    """Message statistics since the line was opened."""
 
     sent: int = 0
     answered: int = 0
@@ -47,22 +48,22 @@ class Counters:
     not_sent: int = 0
 
     def as_dict(self) -> dict[str, int]:
-        """By name."""
+        """Return the counters by name."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 class ServoBus:
-    """The servos of one arm on one line. Every public call takes the line for itself while it lasts.
+    """The servos of one arm on one serial line. Every public method holds the line exclusively.
 
     Args:
         device: name for errors.
         ids: the servos, in the order of the joints.
         connect: opens the pyserial port, non-blocking.
         clock: injected time.
-        echo: whether the adapter hears what it sends.
+        echo: whether the adapter echoes transmitted bytes.
 
     Attributes:
-        counters: messages seen and lost.
+        counters: message statistics.
     """
 
     def __init__(
@@ -81,10 +82,10 @@ class ServoBus:
         self.counters = Counters()
 
     def open(self) -> None:
-        """Open the port and ask every servo who it is; changes nothing in them.
+        """Open the port and read the identity of every servo; changes no settings.
 
         Raises:
-            ConnectError: no port, or servos that do not answer; ``causes`` names each.
+            ConnectError: no port, or servos that do not reply; ``causes`` names each.
         """
         self._port = self._connect()
         self._buffer = b""
@@ -99,31 +100,31 @@ class ServoBus:
                 causes.append(error)
         if causes:
             raise ConnectError(
-                self._device, "servos are missing", causes, hint="is the arm powered, and are ids and baud rate right?"
+                self._device, "servos are missing", causes, hint="is the arm powered, are ids and baud rate right?"
             )
 
     def close(self) -> None:
-        """Leave the line; without effect on one that was never opened."""
+        """Close the line; does nothing if it was never opened."""
         with self._lock:
             if self._port is not None:
                 self._port.close()
                 self._port = None
 
     def identity(self, servo: int) -> Identity:
-        """What the servo told when the line was opened."""
+        """Return the identity read when the line was opened."""
         return self._identities[servo]
 
     def read(self, servo: int, register: int, length: int) -> bytes:
-        """Registers of one servo. Raises TransportTimeout, DeviceGone, ConnectError for an unexpected echo."""
+        """Read registers of one servo. Raises TransportTimeout, DeviceGone, ConnectError for an unexpected echo."""
         return self._ask(servo, codec.read(servo, register, length), length)
 
     def write(self, servo: int, register: int, data: bytes) -> None:
-        """Write to one servo and see in its registers that it was done.
+        """Write to one servo and verify its registers.
 
         Raises:
-            TransportTimeout: it does not answer.
-            CorruptMessage: its registers say otherwise.
-            DeviceGone: the adapter has gone.
+            TransportTimeout: it does not reply.
+            CorruptMessage: its registers differ.
+            DeviceGone: lost connection to the adapter.
         """
         with self._lock:
             self._ask(servo, codec.write(servo, register, data), 0)
@@ -133,16 +134,16 @@ class ServoBus:
                 )
 
     def write_goals(self, goals: Mapping[int, tuple[int, int]]) -> None:
-        """Send each servo its goal in ticks and its speed there in its own unit; none answers."""
+        """Send each servo its goal in ticks and its speed in its own unit, without replies."""
         data = {servo: codec.goal(ticks, speed) for servo, (ticks, speed) in goals.items()}
         with self._lock:
             self._send(codec.sync_write(Register.GOAL_POSITION, data))
 
     def read_states(self, until_ns: int) -> list[Answer | None]:
-        """Ask all servos for their state; returns when all have answered, and at ``until_ns`` at the latest.
+        """Request the state of all servos; return when all have replied, and at ``until_ns`` at the latest.
 
         Raises:
-            DeviceGone: the adapter has gone.
+            DeviceGone: lost connection to the adapter.
         """
         with self._lock:
             self._turn = (self._turn + 1) % len(codec.STATE_STARTS)
@@ -185,23 +186,25 @@ class ServoBus:
                     for packet in packets:
                         if codec.encode(packet) == request:
                             raise ConnectError(
-                                self._device, "the adapter hears what it sends", hint="set echo: true in the cell file"
+                                self._device,
+                                "the adapter echoes transmitted bytes",
+                                hint="set echo: true in the cell file",
                             )
                         if packet.servo == servo and len(packet.data) == length:
                             return packet.data
                         self.counters.unexpected += 1
                 self._await_quiet()
-            raise TransportTimeout(self._device, f"answer of servo {servo}", _ANSWER_TIMEOUT_S)
+            raise TransportTimeout(self._device, f"reply of servo {servo}", _ANSWER_TIMEOUT_S)
 
     def _drain(self) -> None:
-        """Forget what came since the last answer that was waited for."""
+        """Discard bytes received since the last awaited reply."""
         found = codec.split(self._buffer + self._read(0.0))
         self.counters.late += len(found.packets)
         self.counters.corrupt += found.damaged + bool(found.rest)
         self._buffer = b""
 
     def _await_quiet(self) -> None:
-        """Wait until nobody speaks, so that the next answer belongs to the next request."""
+        """Wait until the line is quiet, so that the next reply belongs to the next request."""
         deadline_ns = self._clock.now_ns() + round(_LONGEST_NOISE_S * 1e9)
         self._drain()
         while self._clock.now_ns() < deadline_ns and (late := self._read(_QUIET_S)):
@@ -209,7 +212,7 @@ class ServoBus:
             self._drain()
 
     def _send(self, data: bytes) -> bool:
-        """Whether it went out (and came back, where the adapter echoes)."""
+        """Send; return whether it went out (and came back, if the adapter echoes)."""
         import serial
 
         try:
@@ -232,13 +235,13 @@ class ServoBus:
         if self._buffer.startswith(data):
             self._buffer = self._buffer[len(data) :]
             return True
-        # Somebody else spoke at the same time, or the echo is damaged: so was perhaps what the servos heard.
+        # Another sender collided, or the echo is corrupt: so was perhaps what the servos received.
         self.counters.corrupt += 1
         self._buffer = b""
         return False
 
     def _receive(self, until_ns: int, longest: int) -> tuple[Packet, ...] | None:
-        """The packets that are there, maybe none yet; None when nothing more came in time."""
+        """Return the received packets, maybe none yet; None if nothing more arrived in time."""
         if not self._buffer or not (found := codec.split(self._buffer, longest)).packets:
             heard = self._read(max(until_ns - self._clock.now_ns(), 0) * 1e-9)
             if not heard:
@@ -260,5 +263,5 @@ class ServoBus:
 
     def _gone(self, error: Exception) -> DeviceGone:
         return DeviceGone(
-            self._device, f"the serial port has gone: {error}", hint="check the adapter, then connect again"
+            self._device, f"lost connection to the serial port: {error}", hint="check the adapter, then reconnect"
         )

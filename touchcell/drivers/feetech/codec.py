@@ -1,9 +1,10 @@
 """Wire format of Feetech STS bus servos: pure functions between bytes and values, no I/O.
 
-Packets both ways are ``FF FF id length code data... checksum``: length counts code, data and checksum; code is an
-instruction to a servo or the error byte of its answer; the checksum is the inverted low byte of the sum from id to the
-last data byte. Numbers are little-endian, signs a bit of their own. Sources: Feetech's "SMS/STS series memory table"
-and "communication protocol manual", as restated by the Unlicense feetech-servo-sdk 1.0.0 and by LeRobot's tables.
+Packets in both directions are ``FF FF id length code data... checksum``: length counts code, data and checksum; code is
+an instruction to a servo or the error byte of its reply; the checksum is the inverted low byte of the sum from id to
+the last data byte. Numbers are little-endian, with a separate sign bit. Sources: Feetech's "SMS/STS series memory
+table" and "communication protocol manual", as restated by the Unlicense feetech-servo-sdk 1.0.0 and by LeRobot's
+tables.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _OVERHEAD = 6
 
 
 class Instruction(IntEnum):
-    """What a host asks of a servo."""
+    """Instruction byte of a request."""
 
     PING = 1
     READ = 2
@@ -40,7 +41,7 @@ class Instruction(IntEnum):
 
 
 class Register(IntEnum):
-    """Addresses that the driver uses; those below 40 survive a loss of power."""
+    """Register addresses used by the driver; those below 40 are non-volatile."""
 
     FIRMWARE = 0
     MODEL = 3
@@ -74,11 +75,11 @@ POSITION_MODE = 0
 """Value of ``Register.MODE``."""
 
 IDENTITY_LENGTH = 50
-"""Bytes from ``Register.FIRMWARE`` that ``decode_identity`` takes; more than any state block has."""
+"""Number of bytes from ``Register.FIRMWARE`` that ``decode_identity`` reads; more than any state block has."""
 
 STATE_STARTS = tuple(range(Register.TORQUE_ENABLE - 15, Register.TORQUE_ENABLE + 1))
-"""First addresses of the blocks that ``decode_state`` takes; all end behind ``Register.CURRENT``, so that the length of
-an answer tells which request it belongs to."""
+"""First addresses of the blocks that ``decode_state`` reads; all end behind ``Register.CURRENT``, so that the length of
+a reply identifies its request."""
 
 _STATE_END = Register.CURRENT + 2
 _RETURN_DELAY_UNIT_S = 2e-6
@@ -87,7 +88,7 @@ _CURRENT_UNIT_A = 6.5e-3
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One packet: an instruction to ``servo`` or, with the error byte as ``code``, its answer."""
+    """One packet: an instruction to ``servo`` or, with the error byte as ``code``, its reply."""
 
     servo: int
     code: int
@@ -96,12 +97,12 @@ class Packet:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What was in a buffer.
+    """Packets found in a buffer.
 
     Attributes:
-        packets: whole ones with a right checksum, in order.
-        rest: bytes that may be the beginning of another.
-        damaged: how often something that is no packet was skipped.
+        packets: complete packets with a valid checksum, in order.
+        rest: bytes that may be the beginning of another packet.
+        damaged: number of invalid sequences that were skipped.
     """
 
     packets: tuple[Packet, ...]
@@ -111,15 +112,15 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What a servo remembers without power.
+    """Non-volatile settings of a servo.
 
     Attributes:
-        return_delay_s: how long it waits before it answers.
-        acknowledges: whether it answers writes too.
-        min_ticks, max_ticks: it clips goals to these.
+        return_delay_s: delay before a reply.
+        acknowledges: whether it also replies to writes.
+        min_ticks, max_ticks: goal limits enforced by the servo.
         multi_turn: whether it counts turns instead of wrapping at 4096.
-        speed_unit_ticks_s: what one unit of its speeds means.
-        homing_offset_ticks: what it subtracts from the encoder.
+        speed_unit_ticks_s: one unit of its speeds.
+        homing_offset_ticks: offset subtracted from the encoder.
     """
 
     model: int
@@ -136,10 +137,10 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class ServoState:
-    """What one servo tells of itself in a control cycle; positions in ticks, speeds in its own unit.
+    """State of one servo in a control cycle; positions in ticks, speeds in the servo's own unit.
 
     Attributes:
-        load: duty cycle of the motor, -1 to 1; it is no torque.
+        load: duty cycle of the motor, -1 to 1; not a torque.
         status: bits of ``FAULT_BITS``.
     """
 
@@ -157,7 +158,7 @@ class ServoState:
 
 @dataclass(frozen=True, slots=True)
 class FaultBit:
-    """One bit of the status, and what it asks for."""
+    """Meaning of one status bit: fault class, remedy and hint."""
 
     name: str
     fault_class: FaultClass
@@ -172,30 +173,32 @@ FAULT_BITS: Mapping[int, FaultBit] = MappingProxyType(
         ),
         1: FaultBit("encoder error", FaultClass.INTERNAL, Remedy.SERVICE, "replace the servo"),
         2: FaultBit("too hot", FaultClass.THERMAL, Remedy.OPERATOR, "let it cool down, and lighten the load"),
-        3: FaultBit("too much current", FaultClass.OVERLOAD, Remedy.RECOVER, "look for a collision or a short circuit"),
+        3: FaultBit(
+            "too much current", FaultClass.OVERLOAD, Remedy.RECOVER, "check for a collision or a short circuit"
+        ),
         5: FaultBit(
             "overload",
             FaultClass.OVERLOAD,
             Remedy.RECOVER,
-            "it pushes with a fifth of its torque until its torque is switched off: support the arm, then recover",
+            "it keeps a fifth of its torque until its torque is switched off: support the arm, then recover",
         ),
     }
     | {
-        bit: FaultBit(f"reserved bit {bit}", FaultClass.INTERNAL, Remedy.SERVICE, "not in Feetech's documents")
+        bit: FaultBit(f"reserved bit {bit}", FaultClass.INTERNAL, Remedy.SERVICE, "undocumented by Feetech")
         for bit in (4, 6, 7)
     }
 )
 
 
 def faults(status: int) -> tuple[FaultBit, ...]:
-    """The faults that a status or error byte tells, lowest bit first."""
+    """Return the faults in a status or error byte, lowest bit first."""
     return tuple(FAULT_BITS[bit] for bit in range(8) if status >> bit & 1)
 
 
 def encode(packet: Packet) -> bytes:
-    """A packet as bytes. Raises CodecError for an id above the broadcast id or too much data."""
+    """Encode a packet. Raises CodecError for an id above the broadcast id or too much data."""
     if not 0 <= packet.servo <= BROADCAST_ID:
-        raise CodecError("servo", packet.servo, "is no id")
+        raise CodecError("servo", packet.servo, "is not a valid id")
     if len(packet.data) > _LONGEST_DATA:
         raise CodecError("data", len(packet.data), f"is more than {_LONGEST_DATA} bytes")
     body = bytes([packet.servo, len(packet.data) + 2, packet.code]) + packet.data
@@ -203,8 +206,8 @@ def encode(packet: Packet) -> bytes:
 
 
 def split(buffer: bytes, longest: int = _LONGEST_DATA) -> Found:
-    """Find the packets in ``buffer``; whoever waits for at most ``longest`` data bytes says so, lest a damaged length
-    swallow the packets behind it."""
+    """Find the packets in ``buffer``; ``longest``: most data bytes expected, so that a corrupt length does not swallow
+    the packets behind it."""
     packets: list[Packet] = []
     damaged = 0
     at = 0
@@ -227,14 +230,14 @@ def split(buffer: bytes, longest: int = _LONGEST_DATA) -> Found:
                 continue
         if servo != 0xFF:
             damaged += 1
-        # What looks like a header may be data: the next one may begin one byte further on.
+        # An apparent header may be data: the next one may begin one byte further on.
         at = start + 1
         if buffer[at : at + 2] != _HEADER:
             at += 1
 
 
 def read(servo: int, register: int, length: int) -> bytes:
-    """Ask ``servo`` for ``length`` bytes from ``register``."""
+    """Request ``length`` bytes from ``register`` of ``servo``."""
     return encode(Packet(servo, Instruction.READ, bytes([register, length])))
 
 
@@ -244,12 +247,12 @@ def write(servo: int, register: int, data: bytes) -> bytes:
 
 
 def sync_read(servos: tuple[int, ...], register: int, length: int) -> bytes:
-    """Ask ``servos`` for the same registers; each answers, in this order."""
+    """Request the same registers of ``servos``; each replies, in this order."""
     return encode(Packet(BROADCAST_ID, Instruction.SYNC_READ, bytes([register, length, *servos])))
 
 
 def sync_write(register: int, data: Mapping[int, bytes]) -> bytes:
-    """Write equally long data to each servo at once; none answers. Raises CodecError for unequal lengths."""
+    """Write equally long data to each servo at once, without replies. Raises CodecError for unequal lengths."""
     lengths = {len(piece) for piece in data.values()}
     if len(lengths) != 1:
         raise CodecError("data", sorted(lengths), "is not equally long for all servos")
@@ -258,10 +261,10 @@ def sync_write(register: int, data: Mapping[int, bytes]) -> bytes:
 
 
 def goal(ticks: int, speed: int) -> bytes:
-    """Registers from ``Register.GOAL_POSITION`` on that send a servo to ``ticks`` at ``speed`` in its own unit.
+    """Encode the registers from ``Register.GOAL_POSITION`` on for a move to ``ticks`` at ``speed`` in the servo's unit.
 
     Raises:
-        CodecError: they do not fit, or the speed is zero, which some servos take for their fastest.
+        CodecError: out of range, or the speed is zero, which some servos interpret as their maximum.
     """
     if speed <= 0:
         raise CodecError("speed", speed, "is not positive")
@@ -269,28 +272,28 @@ def goal(ticks: int, speed: int) -> bytes:
 
 
 def word(value: int) -> bytes:
-    """An unsigned 16-bit number. Raises CodecError."""
+    """Encode an unsigned 16-bit number. Raises CodecError."""
     if not 0 <= value <= 0xFFFF:
         raise CodecError("value", value, "does not fit 16 bits")
     return value.to_bytes(2, "little")
 
 
 def signed_word(value: int, sign_bit: int = 15) -> bytes:
-    """A 16-bit number with its sign in a bit of its own. Raises CodecError."""
+    """Encode a 16-bit number in sign-magnitude form. Raises CodecError."""
     if abs(value) >= 1 << sign_bit:
         raise CodecError("value", value, f"does not fit {sign_bit} bits and a sign")
     return word(abs(value) | (1 << sign_bit if value < 0 else 0))
 
 
 def from_signed_word(data: bytes, sign_bit: int = 15) -> int:
-    """The inverse of ``signed_word``; higher bits than the sign are ignored."""
+    """Decode ``signed_word``; bits above the sign are ignored."""
     raw = int.from_bytes(data, "little")
     magnitude = raw & ((1 << sign_bit) - 1)
     return -magnitude if raw >> sign_bit & 1 else magnitude
 
 
 def decode_identity(data: bytes) -> Identity:
-    """The first 50 registers of a servo. Raises CodecError."""
+    """Decode the first 50 registers of a servo. Raises CodecError."""
     if len(data) != IDENTITY_LENGTH:
         raise CodecError("identity", len(data), f"is not {IDENTITY_LENGTH} bytes long")
     phase = data[Register.PHASE]
@@ -309,19 +312,19 @@ def decode_identity(data: bytes) -> Identity:
 
 
 def state_length(start: int) -> int:
-    """Bytes of the state block that begins at ``start``."""
+    """Return the length in bytes of the state block that begins at ``start``."""
     return _STATE_END - start
 
 
 def decode_state(data: bytes) -> ServoState:
-    """A state block, wherever it began.
+    """Decode a state block of any start address.
 
     Raises:
-        CodecError: wrong length, or a position that a single-turn servo cannot tell.
+        CodecError: wrong length, or a position outside one turn of a single-turn servo.
     """
     start = _STATE_END - len(data)
     if start not in STATE_STARTS:
-        raise CodecError("state", len(data), "is no length of a state block")
+        raise CodecError("state", len(data), "is not the length of a state block")
 
     def at(register: int, length: int = 2) -> bytes:
         return data[register - start : register - start + length]
@@ -344,13 +347,14 @@ def decode_state(data: bytes) -> ServoState:
 
 
 def unwrap(ticks: int, centre: float) -> int:
-    """The count nearest to ``centre`` that reads as ``ticks`` on a servo that wraps at 4096."""
+    """Return the count nearest to ``centre`` that reads as ``ticks`` on a servo that wraps at 4096."""
     turns = round((centre - ticks) / TICKS_PER_TURN)
     return ticks + turns * TICKS_PER_TURN
 
 
 def cycle_time_s(servos: int, baudrate: int, return_delay_s: float) -> float:
-    """Longest time on the wire, ten bits a byte, of one control cycle: a sync write of goals and a sync read of states.
+    """Return the longest time on the wire, ten bits a byte, of a control cycle: sync write of goals, sync read of
+    states.
 
     ``return_delay_s`` is the sum over the servos.
     """

@@ -1,15 +1,15 @@
-"""Arms of Feetech STS3215 bus servos (SO-100, SO-101 and home-made ones) on a serial port, over pyserial.
+"""Driver for arms of Feetech STS3215 bus servos (SO-100, SO-101 and home-made ones) on a serial port, with pyserial.
 
-The servos take goal positions only, so this driver owns the motion: a loop of its own turns expiring twists into joint
-setpoints (``touchcell.drivers.core.joint_setpoint``) and sends the servos one small step per cycle, each with the speed
-that it needs; the same loop reads them.
+The servos accept goal positions only, so motion control runs on the host: a loop converts expiring twists into joint
+setpoints (``touchcell.drivers.core.joint_setpoint``), sends the servos one small step per cycle, each with the speed
+that it needs, and reads them.
 
-What stops the arm: an expired twist, by slowing down in the loop; a dead host process, by there being no next step. The
-bus has **no watchdog**: each servo goes on to its last goal, which lies at most ``tracking_error_deg`` and three steps
-from where it was last seen, and holds there until somebody switches it off. Without power the arm sinks.
+Stop mechanisms: when a twist expires, the loop decelerates; when the host process dies, no next step follows. The bus
+has **no watchdog**: each servo continues to its last goal, which is at most ``tracking_error_deg`` and three steps from
+its last measured position, and holds there until it is switched off. Without power the arm sinks.
 
-Five joints cannot follow every twist. The tip's velocity comes first, rotation as far as it is left; what is lost
-stands in the adjustments of ``Sent`` and in ``health``.
+Five joints cannot follow every twist. The tip's velocity has priority over rotation; the lost part is reported in the
+adjustments of ``Sent`` and in ``health``.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ _MOVED_BY_HAND_TICKS = 20
 class ServoConfig(BaseModel):
     """Calibration of one joint's servo: joint angle = ``direction`` times (ticks - ``zero_ticks``).
 
-    ``min_ticks`` and ``max_ticks`` are where the joint may go, within one turn: a servo takes the long way round
-    between 4095 and 0. ``homing_offset_ticks`` is what the servo had in its memory when it was calibrated.
+    ``min_ticks`` and ``max_ticks`` limit the joint's range, within one turn: a servo turns the long way round between
+    4095 and 0. ``homing_offset_ticks`` is the value stored in the servo when it was calibrated.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -82,23 +82,23 @@ class ServoConfig(BaseModel):
         if self.min_ticks >= self.max_ticks:
             raise ValueError(
                 f"servo {self.id}: min_ticks {self.min_ticks} is not below max_ticks {self.max_ticks}; "
-                "if the joint passes 4095 on its way, move its homing offset"
+                "if the joint passes 4095 within its range, change its homing offset"
             )
         return self
 
     def angle(self, ticks: float) -> float:
-        """Joint angle in rad."""
+        """Return the joint angle in rad."""
         return self.direction * (ticks - self.zero_ticks) * codec.RAD_PER_TICK
 
     def ticks(self, angle: float) -> int:
-        """Nearest goal within the calibrated range."""
+        """Return the nearest goal within the calibrated range."""
         wanted = self.zero_ticks + round(self.direction * angle / codec.RAD_PER_TICK)
         return min(max(wanted, self.min_ticks), self.max_ticks)
 
 
 class FeetechSerialConfig(BusArmConfig):
-    """Configuration of one arm. ``servos`` are in the order of the joints; the chain's joint ranges are narrowed to the
-    calibrated ones."""
+    """Configuration of a Feetech arm. ``servos`` are in the order of the joints; the chain's joint ranges are narrowed
+    to the calibrated ones."""
 
     port: str
     baudrate: int = Field(default=1_000_000, gt=0)
@@ -113,7 +113,7 @@ class FeetechSerialConfig(BusArmConfig):
 
     @property
     def joint_count(self) -> int:
-        """How many servos are listed."""
+        """Number of configured servos."""
         return len(self.servos)
 
     @model_validator(mode="after")
@@ -124,7 +124,7 @@ class FeetechSerialConfig(BusArmConfig):
         if self.max_silence_s * self.rate_hz > len(codec.STATE_STARTS):
             raise ValueError(
                 f"max_silence_s {self.max_silence_s:g} is more than {len(codec.STATE_STARTS)} cycles of "
-                f"{self.rate_hz:g} Hz, within which a late answer can be told from a fresh one"
+                f"{self.rate_hz:g} Hz, within which a late reply can be distinguished from a fresh one"
             )
         if self.max_silence_s * self.rate_hz < _ASKED_IN_VAIN:
             raise ValueError(f"max_silence_s {self.max_silence_s:g} is less than three cycles of {self.rate_hz:g} Hz")
@@ -132,16 +132,16 @@ class FeetechSerialConfig(BusArmConfig):
 
     @property
     def calibration_hash(self) -> str:
-        """Twelve hexadecimal digits that change with any number of the calibration."""
+        """Return twelve hexadecimal digits that change with any number of the calibration."""
         told = "\n".join(servo.model_dump_json() for servo in self.servos)
         return hashlib.sha256(told.encode()).hexdigest()[:12]
 
     def describe(self) -> ChainDescription:
-        """The arm, with its joints' ranges narrowed to the calibrated ones.
+        """Return the chain description, with joint ranges narrowed to the calibrated ones.
 
         Raises:
-            ConfigError: there is no such arm, it has another number of joints, a joint has no range left, or the park
-                pose is outside it.
+            ConfigError: unknown chain, wrong number of joints, a joint without remaining range, or a park pose outside
+                the ranges.
         """
         found = self.named_chain("servos")
         joints = []
@@ -150,8 +150,8 @@ class FeetechSerialConfig(BusArmConfig):
             lower, upper = max(joint.lower_deg, float(ends[0])), min(joint.upper_deg, float(ends[1]))
             if upper - lower < np.rad2deg(_SHORTEST_RANGE_RAD):
                 raise ConfigError(
-                    f"joint {joint.name} goes from {joint.lower_deg:g} to {joint.upper_deg:g} deg, its calibration "
-                    f"from {ends[0]:.0f} to {ends[1]:.0f} deg: they hardly overlap",
+                    f"joint {joint.name} has a range of {joint.lower_deg:g} to {joint.upper_deg:g} deg, "
+                    f"its calibration {ends[0]:.0f} to {ends[1]:.0f} deg: they hardly overlap",
                     key=f"servos[{index}]",
                     hint="correct zero_ticks, direction, min_ticks and max_ticks",
                 )
@@ -162,7 +162,7 @@ class FeetechSerialConfig(BusArmConfig):
 
 
 class FeetechSerialArm(BusArm):
-    """One arm; see the module for what stops it and what then happens.
+    """Driver for a Feetech arm; see the module for its stop mechanisms.
 
     Args:
         name: the device's name in the cell.
@@ -186,7 +186,7 @@ class FeetechSerialArm(BusArm):
         self._lost: tuple[Adjustment, ...] = ()
 
     def health(self) -> dict[str, float | int | str | bool]:
-        """Counters of the line and the loop, the calibration's hash, and what each servo tells of itself."""
+        """Return counters of the bus and the loop, the calibration's hash, and the state of each servo."""
         readings: dict[str, float | int | str | bool] = dict(self._bus.counters.as_dict())
         readings |= super().health()
         readings |= {
@@ -234,7 +234,7 @@ class FeetechSerialArm(BusArm):
             states = [answer.state for _, answer in self._fresh_answers()]
             for index, state in enumerate(states):
                 self._check_state(index, state)
-            # A servo that still holds keeps its goal: at the measured position the arm's weight would move it.
+            # An enabled servo keeps its goal: at the measured position the arm's weight would move it.
             goals = [state.goal if on else state.position for on, state in zip(self._enabled, states, strict=True)]
             if not all(self._enabled):
                 self._enable(goals)
@@ -273,19 +273,19 @@ class FeetechSerialArm(BusArm):
 
     @property
     def _torque_limit(self) -> int:
-        """As the servos count it. A loss of power makes them forget it."""
+        """Return the torque limit in the servos' unit. They lose it on power loss."""
         return round(self._config.torque_limit_percent * 10.0)
 
     def _speed(self, index: int, dq: float) -> int:
-        """How fast a servo may turn to its goal, in its own unit: no faster than the motion asks for, lest every step
-        become a jerk and a wrong one a blow."""
+        """Return the speed limit of a servo in its own unit: no faster than the motion requires, so that steps are
+        smooth and a wrong one has little energy."""
         unit = self._bus.identity(self._ids[index]).speed_unit_ticks_s * codec.RAD_PER_TICK
         return int(np.ceil(max(_SPEED_MARGIN * abs(dq), _SLOWEST_RAD_S) / unit))
 
     def _check_servo(self, index: int) -> None:
         servo, told = self._config.servos[index], self._bus.identity(self._ids[index])
         for key, found, wanted, hint in (
-            ("model", told.model, codec.STS3215, "only STS3215 servos have been looked into"),
+            ("model", told.model, codec.STS3215, "this driver supports STS3215 servos only"),
             ("id", told.servo, servo.id, "two servos on one line may share an id"),
             ("mode", told.mode, codec.POSITION_MODE, "set register 33 to 0; a driver does not change modes"),
             ("multi_turn", told.multi_turn, False, "clear bit 4 of register 18: counted turns are lost with power"),
@@ -304,14 +304,14 @@ class FeetechSerialArm(BusArm):
         ends = [servo.ticks(float(end[index])) for end in (self._chain.lower, self._chain.upper)]
         if min(ends) < told.min_ticks or max(ends) > told.max_ticks:
             raise ConfigError(
-                f"servo {servo.id} stops by itself at {told.min_ticks} and {told.max_ticks} ticks, "
-                f"its joint goes from {min(ends)} to {max(ends)}",
+                f"servo {servo.id} limits itself to {told.min_ticks} and {told.max_ticks} ticks, "
+                f"its joint range is {min(ends)} to {max(ends)}",
                 key=f"servos[{index}]",
                 hint="narrow min_ticks and max_ticks to registers 9 and 11",
             )
 
     def _check_state(self, index: int, state: ServoState) -> None:
-        """Refuse to energise a servo that is unwell, has forgotten its settings, or is where it cannot be."""
+        """Refuse to enable a servo that is faulty, has lost its settings, or is outside its range."""
         servo = self._ids[index]
         if found := codec.faults(state.status):
             raise _servo_fault(self.name, servo, state.status, found[0])
@@ -328,12 +328,12 @@ class FeetechSerialArm(BusArm):
             )
 
     def _angle(self, index: int, position: int) -> float:
-        """Joint angle; beyond 4095 and 0 the count goes on, as far as that is nearer to the joint's range."""
+        """Return the joint angle; the count continues beyond 4095 and 0 where that is nearer to the joint's range."""
         servo = self._config.servos[index]
         return servo.angle(codec.unwrap(position, (servo.min_ticks + servo.max_ticks) / 2))
 
     def _enable(self, goals: list[int]) -> None:
-        """Give every servo its goal, see that it has it and is there, then switch on; undone if anything fails."""
+        """Send every servo its goal, verify goal and position, then enable torque; undone if anything fails."""
         self._bus.write_goals({s: (goals[i], self._speed(i, 0.0)) for i, s in enumerate(self._ids)})
         for (servo, answer), goal in zip(self._fresh_answers(), goals, strict=True):
             on = self._enabled[self._ids.index(servo)]
@@ -358,7 +358,7 @@ class FeetechSerialArm(BusArm):
             self._enabled[index] = False
 
     def _fresh_answers(self) -> list[tuple[int, Answer]]:
-        """Every servo with its state, asked for now. Raises TransportTimeout."""
+        """Request the state of every servo now; return servo ids and states. Raises TransportTimeout."""
         silent = list(self._ids)
         for _ in range(_TRIES):
             answers = self._bus.read_states(self._clock.now_ns() + round(_ANSWER_TIMEOUT_S * 1e9))
@@ -374,7 +374,7 @@ class FeetechSerialArm(BusArm):
         due = self._setpoint.q
         if self._driving and any(self._enabled):
             q, dq = due, np.zeros_like(due)
-            # One lost answer must not jerk the arm, but no further step goes into the dark.
+            # One lost reply must not jerk the arm, but no further step is sent without feedback.
             if max(self._in_vain) < _UNSEEN_CYCLES:
                 q, dq = self._setpoint.step(now_ns, dt_s)
             self._bus.write_goals(
@@ -399,12 +399,12 @@ class FeetechSerialArm(BusArm):
         self._check_silence()
         if len(complete) == len(good):
             q = self._publish(complete)
-            # The goals of the cycle before: those the servos have had time to reach.
+            # The goals of the previous cycle: those the servos have had time to reach.
             if self._driving:
                 self._check_tracking(q, due)
 
     def _plausible(self, index: int, answer: Answer | None) -> Answer | None:
-        """The answer, unless the servo cannot have turned that far since the last one."""
+        """Return the reply, or None if the servo cannot have turned that far since the last one."""
         before = self._answers[index]
         if answer is None or before is None:
             return answer
@@ -445,9 +445,9 @@ class FeetechSerialArm(BusArm):
         now_ns = self._clock.now_ns()
         limit_s = self._config.max_silence_s
         for servo, answer, asked in zip(self._ids, self._answers, self._in_vain, strict=True):
-            # A host that was busy elsewhere has heard nothing either: it must have asked.
+            # A host that was busy elsewhere has received nothing either: it must have requested.
             if answer is not None and asked >= _ASKED_IN_VAIN and (now_ns - answer.t_ns) * 1e-9 > limit_s:
-                self._latch(TransportTimeout(self.name, f"answer of servo {servo}", limit_s))
+                self._latch(TransportTimeout(self.name, f"reply of servo {servo}", limit_s))
         self._check_missed()
 
 
@@ -462,7 +462,7 @@ def _open_port(device: str, config: FeetechSerialConfig) -> Any:
         raise ConnectError(
             device,
             f"cannot open {config.port} at {config.baudrate}: {error}",
-            hint="is it plugged in, are you in the group dialout, and does nobody else use it?",
+            hint="is it plugged in, are you in the group dialout, and is the port not in use elsewhere?",
         ) from None
 
 

@@ -1,8 +1,9 @@
-"""Feetech STS3215 servos on a pseudo-terminal: registers, position control with a speed limit, protection, faults.
+"""Emulator of Feetech STS3215 servos on a pseudo-terminal: registers, position control, protection, faults.
 
-Each servo turns towards its goal with a speed in proportion to what is left, up to its goal speed. Loads and gravity
-are not modelled, and a servo without torque stays where it is: this proves protocol and fault handling, not dynamics.
-A real brown-out lets an arm sink.
+Each servo turns towards its goal at a speed proportional to the remaining angle, up to its goal speed. Loads and
+gravity
+are not modelled, and a servo without torque stays where it is: this tests protocol and fault handling, not dynamics. A
+real brown-out lets an arm sink.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class Servo:
 
     Args:
         number: its id.
-        ticks: what its encoder reads, within one turn.
+        ticks: encoder reading, within one turn.
     """
 
     def __init__(self, number: int, ticks: float) -> None:
@@ -76,7 +77,7 @@ class Servo:
         self.power_up()
 
     def power_up(self) -> None:
-        """As after switching on: what was saved, no torque, goals and limits of the factory."""
+        """Reset to the state after switching on: saved registers, no torque, factory goals and limits."""
         self._table[:_EEPROM_LENGTH] = self._saved
         self._table[_EEPROM_LENGTH:] = bytes(_TABLE_LENGTH - _EEPROM_LENGTH)
         self._table[Register.LOCK] = 1
@@ -88,17 +89,17 @@ class Servo:
 
     @property
     def number(self) -> int:
-        """Id."""
+        """Id of the servo."""
         return self._table[Register.ID]
 
     @property
     def torque(self) -> bool:
-        """Whether it holds."""
+        """True if torque is enabled."""
         return self._table[Register.TORQUE_ENABLE] == codec.TORQUE_ON
 
     @property
     def status(self) -> int:
-        """Status register, which is also the error byte of every answer."""
+        """Status register, which is also the error byte of every reply."""
         return self._table[Register.STATUS]
 
     @status.setter
@@ -112,30 +113,30 @@ class Servo:
 
     @property
     def position(self) -> float:
-        """What it would tell with an infinitely fine scale."""
+        """Exact position in ticks, before quantisation."""
         offset = codec.from_signed_word(self.get(Register.HOMING_OFFSET, 2), 11)
         return (self.encoder - offset) % codec.TICKS_PER_TURN
 
     @property
     def acknowledges(self) -> bool:
-        """Whether it answers writes."""
+        """True if the servo replies to writes."""
         return self._table[Register.RESPONSE_LEVEL] != 0
 
     @property
     def return_delay_s(self) -> float:
-        """How long it waits before it answers."""
+        """Delay before a reply, s."""
         return self._table[Register.RETURN_DELAY] * 2e-6
 
     def get(self, register: int, length: int) -> bytes:
-        """Registers as the bus sees them."""
+        """Return registers as visible on the bus."""
         return bytes(self._table[register : register + length]).ljust(length, b"\0")
 
     def put(self, register: int, data: bytes) -> None:
-        """Overwrite registers, whatever they are."""
+        """Overwrite registers, including read-only ones."""
         self._table[register : register + len(data)] = data
 
     def write(self, register: int, data: bytes) -> None:
-        """Write from the bus: values that are measured stay as they are."""
+        """Write from the bus: measured values stay unchanged."""
         if register + len(data) > Register.POSITION:
             return
         was_on = self.torque
@@ -153,7 +154,7 @@ class Servo:
             self._strained_s = 0.0
 
     def step(self, dt_s: float) -> None:
-        """Let time pass."""
+        """Advance by ``dt_s``."""
         lowest, highest = (int.from_bytes(self.get(r, 2), "little") for r in (Register.MIN_TICKS, Register.MAX_TICKS))
         left = min(max(self.goal, lowest), highest) - self.position
         speed = codec.from_signed_word(self.get(_GOAL_SPEED, 2)) or _FASTEST_TICKS_S
@@ -174,36 +175,36 @@ class Servo:
 
 
 class FeetechArm(Emulator):
-    """Emulates an arm; at 2048 ticks of servo i joint i of the chain is at zero, unless ``zero_ticks`` says otherwise.
+    """Emulator of an arm; joint i is at zero at 2048 ticks of servo i, unless ``zero_ticks`` says otherwise.
 
     Args:
-        link: symbolic link that will lead to the pseudo-terminal.
-        chain: the arm, for the tool's true position.
-        start_deg: angles at the start.
-        zero_ticks: what each servo tells at joint angle zero.
+        link: symbolic link to create to the pseudo-terminal.
+        chain: kinematic chain, for the tool's true position.
+        start_deg: initial angles.
+        zero_ticks: ticks of each servo at joint angle zero.
         direction: 1 or -1 per servo.
-        echo: the adapter hears what it is sent.
-        protection_time_s: how long a servo strains before it lets go.
+        echo: the adapter echoes transmitted bytes.
+        protection_time_s: time of overload before a servo disables itself.
     """
 
     faults: ClassVar[Mapping[str, str]] = {
-        "pause": "no servo listens or answers",
-        "silent": "this servo (index from 0) neither listens nor answers",
-        "drop": "lose this many answers",
-        "delay": "answers come this many seconds late",
-        "corrupt": "one bit of this many answers is wrong",
-        "short": "this many answers lack their last bytes",
-        "wild": "this many answers tell an impossible position, with a right checksum",
-        "jump": "this many answers tell a position half a turn away, with a right checksum",
-        "out_of_order": "this many answers are overtaken by the same servo's next one",
-        "foreign": "this many answers carry an id that nobody asked for",
+        "pause": "no servo receives or replies",
+        "silent": "this servo (index from 0) neither receives nor replies",
+        "drop": "lose this many replies",
+        "delay": "replies arrive this many seconds late",
+        "corrupt": "one bit of this many replies is wrong",
+        "short": "this many replies lack their last bytes",
+        "wild": "this many replies contain an impossible position, with a valid checksum",
+        "jump": "this many replies contain a position half a turn away, with a valid checksum",
+        "out_of_order": "this many replies are overtaken by the same servo's next one",
+        "foreign": "this many replies carry an id that was not requested",
         "unplug": "the adapter vanishes",
         "fault_bits": "[servo index, status bits]: the servo reports them; bits 3 and 5 until its torque is off",
         "block": "this servo (index) cannot turn",
-        "carry": "[servo index, ticks]: somebody turns that servo's shaft by so much at once",
-        "registers": "[servo index, address, hexadecimal bytes]: what that servo has in its memory",
+        "carry": "[servo index, ticks]: turn that servo's shaft by hand by so much at once",
+        "registers": "[servo index, address, hexadecimal bytes]: overwrite that servo's registers",
         "restart": "the servos lose power for a moment; or only that one, if the value is an index",
-        "reset": "everything is as it was when the emulator started",
+        "reset": "return to the state at the start of the emulator",
     }
 
     def __init__(
@@ -247,7 +248,7 @@ class FeetechArm(Emulator):
         self._log: deque[str] = deque(maxlen=_LOG_LENGTH)
 
     async def start(self) -> None:
-        """Open the pseudo-terminal and let time run."""
+        """Open the pseudo-terminal and start the simulated time."""
         self._plug_in()
         self._ticker = asyncio.create_task(self._tick())
 
@@ -258,7 +259,7 @@ class FeetechArm(Emulator):
         self._unplug()
 
     def state(self) -> dict[str, Any]:
-        """The truth: angles, tool position, what is energised, what was received."""
+        """Return the ground truth: angles, tool position, enabled servos, received packets."""
         self._integrate()
         q = self._q()
         T_base_tcp = self._chain.forward(q)
@@ -284,7 +285,7 @@ class FeetechArm(Emulator):
         }
 
     def on_fault(self, fault: str, value: Any) -> None:
-        """Faults that act at once."""
+        """Apply faults that act at once."""
         if fault == "unplug":
             self._unplug()
         elif fault == "fault_bits":
@@ -310,7 +311,7 @@ class FeetechArm(Emulator):
             self._plug_in()
 
     def on_clear(self, fault: str) -> None:
-        """Plug in again; let the servos turn; end the faults that are not latched."""
+        """Reconnect the adapter, unblock the servos, and end the faults that are not latched."""
         if fault == "unplug" and self._master is None:
             self._plug_in()
         elif fault == "block":
@@ -413,7 +414,7 @@ class FeetechArm(Emulator):
         registers = set(range(register, register + len(data)))
         if servo.get(register, len(data)) != data:
             self._log.append(f"{servo.number}:{register}={data.hex()}")
-        # Some servos switch on when they are given a goal.
+        # Some servos enable their torque when they receive a goal.
         may_switch_on = Register.GOAL_POSITION in registers and not servo.torque
         self._energising += may_switch_on or bool(registers & _CHANGES_POWER_MODE_OR_ZERO)
         if Register.GOAL_POSITION in registers:
@@ -465,24 +466,24 @@ class FeetechArm(Emulator):
         try:
             os.write(self._master, data)
         except OSError:
-            # Nobody reads and the terminal is full: on a wire these bytes would be gone too.
+            # The terminal is full because nothing reads it: on a wire these bytes would be lost too.
             return
 
 
 def add_arguments(parser: Any) -> None:
-    """Command line of ``touchcell emulate feetech``."""
+    """Add the command-line arguments of ``touchcell emulate feetech``."""
     parser.add_argument("--link", type=Path, required=True, help="symbolic link to make; clients open it as a port")
     parser.add_argument("--chain", default="so101_5r", help="shipped chain description, or a YAML file")
     parser.add_argument("--tool", help="tool as JSON, e.g. '{\"origin_mm\": [0, 0, 40]}'")
     parser.add_argument("--start-deg", type=float, nargs="+", default=[0.0, 10.0, 90.0, 80.0, 0.0])
-    parser.add_argument("--zero-ticks", type=int, nargs="+", help="what each servo tells at joint angle zero")
+    parser.add_argument("--zero-ticks", type=int, nargs="+", help="ticks of each servo at joint angle zero")
     parser.add_argument("--direction", type=int, nargs="+", help="1 or -1 per servo")
-    parser.add_argument("--echo", action="store_true", help="the adapter hears what it is sent")
-    parser.add_argument("--protection-time-s", type=float, default=2.0, help="how long a servo strains, up to 2.5 s")
+    parser.add_argument("--echo", action="store_true", help="the adapter echoes transmitted bytes")
+    parser.add_argument("--protection-time-s", type=float, default=2.0, help="overload time of a servo, up to 2.5 s")
 
 
 def build(arguments: Any) -> FeetechArm:
-    """Make the emulator from its command line."""
+    """Build the emulator from its command-line arguments."""
     is_file = Path(arguments.chain).suffix == ".yaml"
     read = ChainDescription.read(Path(arguments.chain)) if is_file else ChainDescription.shipped(arguments.chain)
     tool = Tool.model_validate_json(arguments.tool) if arguments.tool else None

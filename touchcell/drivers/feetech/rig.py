@@ -1,4 +1,4 @@
-"""The ``feetech_serial`` driver on five emulated servos."""
+"""Test fixture: the ``feetech_serial`` driver with five emulated servos."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DIRECTION = (1, -1, 1, 1, -1)
 
 
 def config(port: Path, **changes: object) -> feetech_serial.FeetechSerialConfig:
-    """Five servos at ``port``; slow and patient enough for a busy machine."""
+    """Return a configuration of five servos at ``port``, with rates and timeouts for a busy machine."""
     servos = [
         {"id": number, "zero_ticks": zero, "direction": direction}
         for number, (zero, direction) in enumerate(zip(ZERO_TICKS, DIRECTION, strict=True), start=1)
@@ -32,7 +32,7 @@ def config(port: Path, **changes: object) -> feetech_serial.FeetechSerialConfig:
 
 
 def emulator(port: Path, *arguments: str) -> EmulatorProcess:
-    """The servos that ``config`` describes, not yet started."""
+    """Build an emulator of the servos that ``config`` describes; it is not started yet."""
     return EmulatorProcess(
         "feetech",
         *("--link", str(port), "--tool", config(port).tool.model_dump_json()),
@@ -42,7 +42,7 @@ def emulator(port: Path, *arguments: str) -> EmulatorProcess:
 
 
 def rig(folder: Path, address: int) -> DeviceFixture:
-    """One arm on a pseudo-terminal of its own, linked in ``folder``; ``address`` tells several apart."""
+    """Build one arm on a pseudo-terminal of its own, linked in ``folder``; ``address`` keeps several apart."""
     port = folder / f"servos-{address}"
     return DeviceFixture(
         spec=feetech_serial.SPEC,
@@ -69,7 +69,7 @@ def rig(folder: Path, address: int) -> DeviceFixture:
         },
         notes=(
             "an overloaded servo reports it until its torque is switched off",
-            "a servo that loses power for a moment comes back without torque and with the factory's limits",
-            "reading further registers in the same sync read does no harm",
+            "a servo that loses power for a moment restarts without torque and with the factory's limits",
+            "reading further registers in the same sync read is harmless",
         ),
     )

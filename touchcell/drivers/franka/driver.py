@@ -1,9 +1,9 @@
-"""Franka arms (FR3, Research 3) over franky, which keeps libfranka's 1 kHz loop in a thread outside the GIL.
+"""Driver for Franka arms (FR3, Research 3) with franky, which keeps libfranka's 1 kHz loop in a thread outside the GIL.
 
 A twist becomes a Cartesian velocity motion that lasts as long as its time-to-live: libfranka's thread counts that time
 and brakes the arm even if Python hangs. If the whole process dies, the controller misses 20 command packets and stops
 the arm with a communication reflex. The Franka Control Interface cannot release or close the brakes; Desk does. So
-``activate`` sends nothing: it only makes sure that the arm rests, obeys and reports no error.
+``activate`` sends nothing: it only checks that the arm is at rest, accepts commands and reports no error.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from pydantic import Field
 from touchcell.drivers.core.arm import Arm, JointLimitsConfig, LimitsConfig
 from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.command_checks import finite_array
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
     CommandRejected,
@@ -77,7 +78,7 @@ _FIRST_STATE_S = 2.0
 _SILENCE_S = 0.5
 _FRESH_S = 0.25
 _RECOVERY_S = 5.0
-# franky's motions are smooth already, and libfranka's filter assumes that no state is ever lost: after one it jumps.
+# franky's motions are smooth already, and libfranka's filter assumes that no state is ever lost: after a loss it jumps.
 _NO_FILTER_HZ = 1000.0
 _POLL_NS = 2_000_000
 _JOINT_TORQUE_NM = 20.0
@@ -90,15 +91,16 @@ _REALTIME_KERNEL = Path("/sys/kernel/realtime")
 
 
 class FrankaConfig(DriverConfig):
-    """One arm.
+    """Configuration of a Franka arm.
 
     Attributes:
         host: address of the controller.
-        limits: of the tool centre point.
-        joint_limits: margins to the joint limits, which the controller tells, and to singularities.
+        limits: speed and acceleration limits of the tool centre point.
+        joint_limits: margins to the joint limits, which the controller reports, and to singularities.
         enforce_realtime: refuse to run without a PREEMPT_RT kernel; without one expect communication reflexes.
-        dynamics_factor: share of the arm's largest acceleration and jerk (and speed, for goals) that motions may use.
-        stop_dynamics_factor: the same for stopping, at the end of a time-to-live as well.
+        dynamics_factor: fraction of the arm's largest acceleration and jerk (and speed, for goals) that motions may
+            use.
+        stop_dynamics_factor: the same for stopping, also at the end of a time-to-live.
         contact_force_limit_n: external force at which libfranka's thread brakes the arm, within a millisecond.
         contact_torque_limit_nm: external torque at which the controller itself stops the arm with a reflex.
         flange_to_tcp_mm_deg: tool centre point in the flange frame, [x y z alpha beta gamma]; None leaves the end
@@ -130,12 +132,12 @@ class _Scheduling:
 
 
 class FrankaArm(Arm):
-    """One Franka arm.
+    """Driver for a Franka arm.
 
     Args:
         name: the device's name in the cell.
         config: checked configuration.
-        clock: injected time.
+        clock: injected clock.
     """
 
     def __init__(self, name: str, config: FrankaConfig, clock: Clock) -> None:
@@ -151,24 +153,24 @@ class FrankaArm(Arm):
         self._ik = self._kinematics_of(SerialChain(ChainDescription.shipped("fr3")))
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """Newest state. Raises StaleData if it is older than ``max_age_s``, and the fault that makes it FAULTED."""
-        reading = self._reading("tell its pose", max_age_s)
-        # The controller's rotation is one to about 1e-6 only.
+        """Return the newest state. Raises StaleData if older than ``max_age_s``, or the fault of the arm."""
+        reading = self._reading("read its pose", max_age_s)
+        # The controller's rotation matrix is orthonormal to about 1e-6 only.
         return _stamped(TcpState(se3.project(reading.T_base_tcp), reading.twist), reading)
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
-        """Newest joint state. Raises as ``tcp``."""
-        reading = self._reading("tell its joints", max_age_s)
+        """Return the newest joint state. Raises as ``tcp``."""
+        reading = self._reading("read its joints", max_age_s)
         return _stamped(JointState(reading.q, reading.dq, reading.tau), reading)
 
     def wrench(self, max_age_s: float | None = None) -> Stamped[Array]:
-        """(6,) wrench of the world on the tool centre point along base axes, the controller's estimate. As ``tcp``."""
-        reading = self._reading("tell its wrench", max_age_s)
+        """Return the estimated external wrench (6,) at the tool centre point along base axes. Raises as ``tcp``."""
+        reading = self._reading("read its wrench", max_age_s)
         return _stamped(reading.wrench, reading)
 
     def at_rest(self) -> bool:
-        """Whether a fresh state shows it standing still and no motion is running. Raises what ended a motion."""
-        self._require("tell whether it is at rest", *_READABLE)
+        """Return whether the arm stands still and no motion runs. Raises the error that ended a motion."""
+        self._require("check for standstill", *_READABLE)
         self._surface()
         reader, reading = self._open_reader(), self._newest()
         if self._age_s(reading) > _FRESH_S:
@@ -178,7 +180,7 @@ class FrankaArm(Arm):
         return bool(np.abs(reading.dq).max() < _REST_SPEED_RAD_S)
 
     def go_to_joints(self, q: Array, lease: Lease, *, speed_fraction: float = 0.1) -> None:
-        """Start moving to ``q`` (7,) rad by franky's planner; ``at_rest`` tells when it has arrived.
+        """Start moving to ``q`` (7,) rad by franky's planner; ``at_rest`` reports arrival.
 
         ``speed_fraction`` is of the arm's largest speed; ``dynamics_factor`` of the configuration caps it.
 
@@ -198,15 +200,15 @@ class FrankaArm(Arm):
         self._start(motion, franky.JointStopMotion, franky.ControlSignalType.JointPositions)
 
     def go_to_pose(self, T_base_tcp: Array, lease: Lease, *, speed_fraction: float = 0.1) -> None:
-        """Start moving in a straight line to ``T_base_tcp`` (4, 4); otherwise as ``go_to_joints``.
+        """Start moving in a straight line to ``T_base_tcp`` (4, 4); otherwise like ``go_to_joints``.
 
-        The speed limits of the tool centre point hold here too.
+        The speed limits of the tool centre point apply too.
         """
         target = self._checked_goal("T_base_tcp", T_base_tcp, (4, 4), lease)
         R = target[:3, :3]
         is_rigid = np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0
         if not is_rigid or (target[3] != (0.0, 0.0, 0.0, 1.0)).any():
-            raise CommandRejected(self.name, Rejection.SHAPE, "T_base_tcp is no rigid transform", value=target)
+            raise CommandRejected(self.name, Rejection.SHAPE, "T_base_tcp is not a rigid transform", value=target)
         factor = min(
             self._goal_factor(speed_fraction),
             self.limits.speed_m_s / self._robot.translation_velocity_limit.max,
@@ -217,8 +219,8 @@ class FrankaArm(Arm):
         self._start(motion, franky.CartesianStopMotion, franky.ControlSignalType.CartesianPose)
 
     def health(self) -> dict[str, float | int | str | bool]:
-        """Mode, errors and packet counters."""
-        self._require("tell its health", *_READABLE)
+        """Return mode, errors and packet counters."""
+        self._require("read its health", *_READABLE)
         reader, reading = self._open_reader(), self._newest()
         return {
             "mode": reading.mode,
@@ -232,11 +234,11 @@ class FrankaArm(Arm):
         }
 
     def kinematics(self) -> DifferentialIk:
-        """Of its joints, with the tool that the controller has since ``configure``."""
+        """Return the differential inverse kinematics, with the tool set in the controller by ``configure``."""
         return self._ik
 
     def watchdog_s(self) -> float:
-        """Silence after which the controller stops the arm: 20 command packets at 1 kHz, fixed by Franka."""
+        """Return the silence after which the controller stops the arm: 20 command packets at 1 kHz, fixed by Franka."""
         return _WATCHDOG_S
 
     def _open(self) -> None:
@@ -250,8 +252,9 @@ class FrankaArm(Arm):
         franky = self._franky = _import_franky(self.name)
         realtime = franky.RealtimeConfig.Enforce if config.enforce_realtime else franky.RealtimeConfig.Ignore
         try:
-            # libfranka makes whoever connects a real-time thread, where it may, and its control threads inherit that.
-            # Python must not starve the machine, so it keeps its own scheduling and lends theirs only to them.
+            # libfranka makes the connecting thread a real-time thread, where permitted, and its control threads inherit
+            # that. Python must not starve the machine, so it keeps its own scheduling and lends real-time only to those
+            # threads.
             with _scheduled():
                 self._robot = franky.Robot(config.host, realtime_config=realtime)
                 self._control_scheduling = _Scheduling.of_this_thread()
@@ -262,7 +265,7 @@ class FrankaArm(Arm):
                 [error],
                 hint="check the cable, activate FCI in Desk, and close other clients: there can be one only",
             ) from None
-        # Every motion names its own factor; the robot's would multiply it.
+        # Every motion has its own factor; the robot's would multiply it.
         self._robot.relative_dynamics_factor = 1.0
         self._joint_limits = _joint_limits(self.name, self._robot.model_urdf)
         self._contact.clear()
@@ -278,13 +281,13 @@ class FrankaArm(Arm):
 
     def _configure(self) -> None:
         config = self._config
-        # Twice the limit for forces: libfranka's thread should brake the arm gently before the controller does it hard.
+        # Twice the limit for forces: libfranka's thread should brake the arm gently before the controller's hard stop.
         force, torque = 2.0 * config.contact_force_limit_n, config.contact_torque_limit_nm
         try:
             self._robot.set_collision_behavior([_JOINT_TORQUE_NM] * 7, [force] * 3 + [torque] * 3)
             self._set_frames()
             self._ik = self._modelled()
-            # A reading from before would have another tool centre point.
+            # An earlier reading would have another tool centre point.
             self._await_reading(_FIRST_STATE_S, "state", after_ms=self._robot.state.time.to_msec())
         except (self._franky.Exception, RuntimeError) as error:
             raise DeviceFault(
@@ -302,13 +305,13 @@ class FrankaArm(Arm):
             NE_T_tcp = np.linalg.solve(state.F_T_NE.matrix, F_T_tcp)
             self._robot.set_ee(NE_T_tcp.T.ravel())
             self._verify_frame("F_T_EE", F_T_tcp)
-        # The wrench is measured at the stiffness frame: put it on the tool centre point.
+        # The wrench is measured at the stiffness frame: place it at the tool centre point.
         if np.abs(state.EE_T_K.matrix - np.eye(4)).max() > _FRAME_TOLERANCE:
             self._robot.set_k(np.eye(4).ravel())
             self._verify_frame("EE_T_K", np.eye(4))
 
     def _modelled(self) -> DifferentialIk:
-        """Kinematics with the joint limits that the controller tells and the tool that it has now."""
+        """Return the kinematics with the joint limits that the controller reports and its present tool."""
         state = self._robot.state
         tool = se3.to_euler_mm_deg(np.asarray(state.F_T_EE.matrix)).tolist()
         chain = SerialChain(
@@ -326,7 +329,7 @@ class FrankaArm(Arm):
         if np.abs(actual - wanted).max() > _FRAME_TOLERANCE:
             raise DeviceFault(
                 self.name,
-                f"{name} did not change as asked",
+                f"{name} did not change as requested",
                 fault_class=FaultClass.CONFIGURATION,
                 needs=Remedy.OPERATOR,
                 hint="check the end effector settings in Desk",
@@ -356,7 +359,7 @@ class FrankaArm(Arm):
             raise self._fault(reading)
         force = float(np.linalg.norm(reading.wrench[:3]))
         if force > self._config.contact_force_limit_n:
-            raise self._contact_fault(f"still pushed with {force:.1f} N")
+            raise self._contact_fault(f"still in contact with {force:.1f} N")
         try:
             self._robot.recover_from_errors()
         except (self._franky.Exception, RuntimeError) as error:
@@ -372,7 +375,7 @@ class FrankaArm(Arm):
         self._reading("move", _FRESH_S)
         franky, config = self._franky, self._config
         linear, angular = twist_base[:3], twist_base[3:]
-        # Of the whole time-to-live, the ramp to the target included; a second waypoint brakes harder than the first.
+        # For the whole time-to-live, including the ramp to the target; a second waypoint brakes harder than the first.
         lives = franky.Duration(max(1, int(ttl_s * 1e3)))
         motion = franky.CartesianVelocityWaypointMotion(
             [
@@ -393,7 +396,7 @@ class FrankaArm(Arm):
         return self._ik_at(self._ik, self.joints(self._max_state_age_s).value.q)
 
     def _begin_stop(self, category: StopCategory) -> None:
-        # While a silent arm rests, franky would wait for it.
+        # franky would wait for the next packet of a silent arm at rest.
         if not self._open_reader().in_motion and self._age_s(self._newest()) > _FRESH_S:
             return
         franky = self._franky
@@ -440,11 +443,7 @@ class FrankaArm(Arm):
             self._robot.move(motion, asynchronous=True, cutoff_frequency=_NO_FILTER_HZ)
 
     def _checked_goal(self, what: str, goal: Array, shape: tuple[int, ...], lease: Lease) -> Array:
-        target = np.asarray(goal, dtype=np.float64)
-        if not np.isfinite(target).all():
-            raise CommandRejected(self.name, Rejection.NON_FINITE, f"{what} is not finite", value=goal)
-        if target.shape != shape:
-            raise CommandRejected(self.name, Rejection.SHAPE, f"{what} has shape {target.shape}", limit=shape)
+        target = finite_array(self.name, what, goal, shape)
         self._desk.check(lease)
         if self.state is not Lifecycle.ACTIVE:
             raise CommandRejected(self.name, Rejection.MODE, f"device is {self.state.value}, not active")
@@ -464,7 +463,7 @@ class FrankaArm(Arm):
 
     def _newest(self) -> Reading:
         reading = self._open_reader().newest
-        assert reading is not None, "connecting waits for the first one"
+        assert reading is not None, "connect waits for the first reading"
         return reading
 
     def _age_s(self, reading: Reading) -> float:
@@ -480,7 +479,7 @@ class FrankaArm(Arm):
         return reading
 
     def _surface(self) -> None:
-        """Raise, and latch, whatever has gone wrong since the last call; FAULTED already stays as it is."""
+        """Raise and latch a failure since the last call; a FAULTED arm stays FAULTED."""
         if self.state is Lifecycle.FAULTED:
             return
         reader, reading = self._open_reader(), self._newest()
@@ -496,7 +495,7 @@ class FrankaArm(Arm):
             raise self._to_faulted(self._contact_fault("contact force limit reached"))
 
     def _fault(self, reading: Reading, said: str | None = None) -> DeviceFault:
-        """What the controller says is wrong; ``said`` by franky when a motion died."""
+        """Return the fault that the controller reports; ``said``: franky's message when a motion aborted."""
         if reading.mode in _NEEDS_A_PERSON:
             return self._by_table(MODES[reading.mode], reading.mode)
         if names := reading.errors or (reading.last_errors if said else ()):
@@ -535,11 +534,11 @@ class FrankaArm(Arm):
         return DeviceGone(self.name, f"lost the controller: {error}", hint="disconnect and connect again")
 
     def _await_reading(self, timeout_s: float, what: str, after_ms: int | None = None) -> Reading:
-        """A reading later than ``after_ms`` of the controller's time, or than the newest one.
+        """Return a reading later than ``after_ms`` of the controller's time, or than the newest one.
 
         Raises:
-            TransportTimeout: there is none in time.
-            DeviceError: what ended the reader.
+            TransportTimeout: none arrived in time.
+            DeviceError: the error that ended the reader.
         """
         reader = self._open_reader()
         if after_ms is None:
@@ -560,18 +559,18 @@ def _stamped(value: Any, reading: Reading) -> Stamped[Any]:
 
 
 def _joint_limits(device: str, urdf: str) -> Array:
-    """(7, 2) lower and upper limits in rad that the arm's own model declares."""
+    """Return (7, 2) lower and upper limits in rad from the URDF that the controller provides."""
     try:
         joints = [joint for joint in ElementTree.fromstring(urdf).iter("joint") if joint.get("type") == "revolute"]
         limits = [next(joint.iter("limit")).attrib for joint in joints[:7]]
         return np.array([[float(limit["lower"]), float(limit["upper"])] for limit in limits]).reshape(7, 2)
     except (ElementTree.ParseError, StopIteration, KeyError, ValueError) as error:
-        raise ConnectError(device, "the controller's model of the arm cannot be read", [error]) from None
+        raise ConnectError(device, "the controller's URDF cannot be parsed", [error]) from None
 
 
 @contextmanager
 def _scheduled(policy: _Scheduling | None = None) -> Iterator[None]:
-    """Run as ``policy`` for a while, and be again what this thread was."""
+    """Run with scheduling ``policy``, then restore that of this thread."""
     before = _Scheduling.of_this_thread()
     (policy or before).apply()
     try:

@@ -1,6 +1,6 @@
-"""The 41 errors that a Franka controller reports, in the order of its error flags, and what each one asks for.
+"""The 41 errors that a Franka controller reports, in the order of its error flags, with class, remedy and hint.
 
-Names and meaning: Franka's documentation of ``franka::Errors`` (libfranka 0.21); class, remedy and hint are ours.
+Names and meaning: Franka's documentation of ``franka::Errors`` (libfranka 0.21); class, remedy and hint are our own.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ class VendorError(NamedTuple):
 _GUIDE_BACK = "unlock in Desk and guide the arm back by hand"
 _SMOOTHER = "the command stream jumped: check the command rate and the load of the host"
 _SLOWER = "lower the speed limits of the arm"
-_START = "the motion did not start where the arm is: stop, wait for rest, and start again"
+_START = "the motion did not start at the arm's present state: stop, wait for standstill, and start again"
 _AWAY = "move the arm away from this posture first"
-_DESK = "belongs to motions started from Desk, not from here"
-_PUSHED = "clear what the arm touches, then recover; raise contact limits only with care"
+_DESK = "concerns motions started from Desk, not from here"
+_PUSHED = "remove the contact, then recover; raise contact limits only with care"
 
 _MOTION, _CONTACT, _CONFIG = FaultClass.MOTION, FaultClass.CONTACT, FaultClass.CONFIGURATION
 _RECOVER, _OPERATOR, _SERVICE = Remedy.RECOVER, Remedy.OPERATOR, Remedy.SERVICE
@@ -45,7 +45,7 @@ ERRORS: tuple[VendorError, ...] = (
         "max_goal_pose_deviation_violation",
         _MOTION,
         _RECOVER,
-        "the arm was kept from its goal: check for contact and load",
+        "the arm could not reach its goal: check for contact and load",
     ),
     VendorError(
         "max_path_pose_deviation_violation",
@@ -89,7 +89,7 @@ ERRORS: tuple[VendorError, ...] = (
         "cartesian_position_motion_generator_invalid_frame",
         _CONFIG,
         _RECOVER,
-        "the commanded pose was no rigid transform",
+        "the commanded pose was not a rigid transform",
     ),
     VendorError("controller_torque_discontinuity", _MOTION, _RECOVER, _SMOOTHER),
     VendorError("joint_p2p_insufficient_torque_for_planning", FaultClass.OVERLOAD, _RECOVER, _DESK),
@@ -115,7 +115,7 @@ ERRORS: tuple[VendorError, ...] = (
         "base_acceleration_invalid_reading", FaultClass.INTERNAL, _SERVICE, "the base must stand still and upright"
     ),
 )
-"""By wire index."""
+"""Errors by wire index."""
 
 BY_NAME: dict[str, VendorError] = {error.name: error for error in ERRORS}
 
@@ -127,8 +127,8 @@ MODES: dict[str, VendorError] = {
         "unlock the joints and activate FCI in Desk",
     ),
     "Guiding": VendorError("guided by hand", FaultClass.SAFETY_STOP, _OPERATOR, "let go of the guiding buttons"),
-    "Reflex": VendorError("stopped by a reflex", _MOTION, _RECOVER, "look at the arm, then recover"),
+    "Reflex": VendorError("stopped by a reflex", _MOTION, _RECOVER, "inspect the arm, then recover"),
     "UserStopped": VendorError("user stop", FaultClass.SAFETY_STOP, _OPERATOR, "release the stop button, then recover"),
     "AutomaticErrorRecovery": VendorError("recovering", FaultClass.INTERNAL, _RECOVER, "wait until it has recovered"),
 }
-"""Robot modes (franky's names) in which the arm does not obey; "Idle" and "Move" are the good ones."""
+"""Robot modes (franky's names) in which the arm executes no commands; "Idle" and "Move" are the normal ones."""

@@ -1,7 +1,8 @@
-"""Reads a Franka arm in a thread of its own.
+"""Read the state of a Franka arm in a thread.
 
-franky's ``state`` waits for the next packet while the arm rests, for a whole second if the arm is frozen; nobody who
-controls a second arm can wait for that. And a motion that dies while nobody asks is silent: the thread asks.
+franky's ``state`` waits for the next packet while the arm is at rest, for a whole second if the arm is frozen; a
+program that controls a second arm cannot wait for that. And a motion that aborts is silent until polled: the thread
+polls.
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ _JOIN_S = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What one state packet says, in SI units along base axes.
+    """Content of one state packet, in SI units along base axes.
 
     Attributes:
-        t_ns: start of the read before the one that found it: it cannot have come earlier, so no age is understated.
+        t_ns: start of the read before the one that found it: it cannot have arrived earlier, so no age is understated.
         device_ms: the controller's own time.
         T_base_tcp: (4, 4).
         twist: (6,) of the tool centre point, from measured joint velocities.
         q, dq, tau: joints (7,).
-        wrench: (6,) what the world exerts on the tool centre point.
+        wrench: (6,) external wrench on the tool centre point.
         mode: franky's name of the robot mode.
-        errors: names of the errors that are present.
-        last_errors: names of those that ended the last motion.
-        success_rate: share of the last 100 command packets that arrived in time.
+        errors: names of the present errors.
+        last_errors: names of the errors that ended the last motion.
+        success_rate: fraction of the last 100 command packets that arrived in time.
     """
 
     t_ns: int
@@ -53,19 +54,19 @@ class Reading:
     success_rate: float
 
     def is_finite(self) -> bool:
-        """Whether every number is one."""
+        """Return whether every number is finite."""
         arrays = (self.T_base_tcp, self.twist, self.q, self.dq, self.tau, self.wrench)
         return all(bool(np.isfinite(array).all()) for array in arrays)
 
 
 class StateReader:
-    """Keeps the newest good reading and whatever went wrong.
+    """Hold the newest good reading and the last failure.
 
     Args:
         device: name for errors.
         franky: the vendor's module.
         robot: franky's robot, connected.
-        clock: injected time.
+        clock: injected clock.
     """
 
     def __init__(self, device: str, franky: Any, robot: Any, clock: Clock) -> None:
@@ -88,52 +89,52 @@ class StateReader:
 
     @property
     def newest(self) -> Reading | None:
-        """Newest reading whose numbers are all finite."""
+        """The newest reading whose numbers are all finite."""
         return self._newest
 
     @property
     def failure(self) -> DeviceError | None:
-        """Why the thread has ended, if it has."""
+        """The error that ended the thread, or None."""
         return self._failure
 
     @property
     def aborted(self) -> str | None:
-        """What franky said when a motion died, until ``forget``."""
+        """The message with which franky aborted a motion, until ``forget``."""
         return self._aborted
 
     @property
     def in_motion(self) -> bool:
-        """Whether a motion was running when it last looked."""
+        """Whether a motion was running at the last poll."""
         return self._in_motion
 
     @property
     def looked_ns(self) -> int:
-        """When it last looked whether a motion was running."""
+        """Time of the last poll for a running motion."""
         return self._looked_ns
 
     @property
     def bad(self) -> int:
-        """States that were not readable or not finite."""
+        """Number of states that were unreadable or not finite."""
         return self._bad
 
     @property
     def states(self) -> int:
-        """Different states seen."""
+        """Number of distinct states received."""
         return self._states
 
     def start(self) -> None:
-        """Begin to read."""
+        """Start the thread."""
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread, wait for it and let go of the robot, which disconnects when nobody holds it."""
+        """Join the thread and release the robot, which disconnects when its last reference is dropped."""
         self._halt.set()
         if self._thread.is_alive():
             self._thread.join(_JOIN_S)
         self._robot = None
 
     def forget(self) -> None:
-        """Forget a motion that died."""
+        """Discard an aborted motion."""
         self._aborted = None
 
     def _run(self) -> None:
@@ -145,7 +146,7 @@ class StateReader:
             self._failure = error
         except Exception as error:
             self._failure = DeviceGone(
-                self._device, f"reading has ended: {error!r}", hint="disconnect and connect again"
+                self._device, f"reader thread failed: {error!r}", hint="disconnect and connect again"
             )
 
     def _read(self) -> None:
@@ -163,7 +164,7 @@ class StateReader:
             self._take(self._robot.state, last_ns)
         except franky.ProtocolException as error:
             self._count_bad(str(error))
-        # Only now, so that the newest reading tells why the motion died.
+        # Only now, so that the newest reading includes the reason of the abort.
         if said is not None:
             self._aborted = said
 
@@ -175,7 +176,7 @@ class StateReader:
         self._states += 1
         reading = self._convert(state, t_ns, device_ms)
         if not reading.is_finite():
-            self._count_bad("state with numbers that are not finite")
+            self._count_bad("state with non-finite numbers")
             return
         self._bad_in_a_row = 0
         self._newest = reading
@@ -191,7 +192,7 @@ class StateReader:
             q=np.asarray(state.q),
             dq=dq,
             tau=np.asarray(state.tau_J),
-            # Franka counts what the arm exerts on the world as positive.
+            # Franka counts the wrench of the arm on the world as positive.
             wrench=-np.asarray(state.O_F_ext_hat_K),
             mode=state.robot_mode.name,
             errors=_present(state.current_errors),
@@ -203,7 +204,7 @@ class StateReader:
         self._bad += 1
         self._bad_in_a_row += 1
         if self._bad_in_a_row >= _BAD_IN_A_ROW:
-            raise CorruptMessage(self._device, f"{_BAD_IN_A_ROW} bad states in a row, the last: {what}")
+            raise CorruptMessage(self._device, f"{_BAD_IN_A_ROW} consecutive bad states, the last: {what}")
 
 
 def _present(errors: Any) -> tuple[str, ...]:

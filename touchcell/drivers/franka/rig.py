@@ -1,4 +1,4 @@
-"""The Franka driver beside an emulated controller."""
+"""Test fixture: the Franka driver with an emulated controller."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from touchcell.testing.emulation.rig import DeviceFixture
 
 
 def host_of(address: int) -> str:
-    """The loopback address of emulator ``address``: libfranka's port is fixed, so each needs its own."""
+    """Return the loopback address of emulator ``address``: libfranka's port is fixed, so each needs its own."""
     return str(IPv4Address("127.96.0.1") + address)
 
 
 def rig(folder: Path, address: int) -> DeviceFixture:
-    """An arm at a loopback address of its own; it keeps nothing in ``folder``."""
+    """Build an arm at a loopback address of its own; it stores nothing in ``folder``."""
     host = host_of(address)
-    # Emulators run where no real-time kernel is.
+    # Emulators also run without a real-time kernel.
     config = FrankaConfig(host=host, enforce_realtime=False)
 
     def start() -> EmulatorProcess:
@@ -46,8 +46,8 @@ def rig(folder: Path, address: int) -> DeviceFixture:
             "user_stop": (True, "fault"),
         },
         notes=(
-            "reflex thresholds, modes and recovery are as Franka documents them; a real arm brakes, this one stops",
-            "a state packet cut short is counted while the arm rests, but ends a motion: libfranka gives up",
+            "reflex thresholds, modes and recovery are as Franka documents them; a real arm brakes, the emulator stops",
+            "a truncated state packet is counted while the arm is at rest, but ends a motion: libfranka aborts it",
             "20 lost command packets stop the arm, as Franka documents it",
         ),
     )

@@ -1,1 +1,1 @@
-"""Devices in processes of their own, and who watches whom; see docs/safety-processes.md."""
+"""Devices in processes of their own, and the watchdog chain; see docs/explanation/safety-processes.md."""

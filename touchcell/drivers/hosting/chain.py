@@ -1,4 +1,4 @@
-"""The task's side of all processes of a cell: starts and ends them, beats, and tells what the watchdog has found."""
+"""Watchdog chain of a cell, on the task's side: start and end all processes, send heartbeats, report alarms."""
 
 from __future__ import annotations
 
@@ -43,21 +43,21 @@ if TYPE_CHECKING:
 
 _GUARD_S: Final = 1.0
 _UNGUARDED_SILENCE_S: Final = 2.0
-"""Silence that counts while nothing moves and nobody guards."""
+"""Allowed silence while nothing moves and the watchdog does not guard."""
 
 
 class Chain:
-    """Hosts and watchdog of one cell. As a context manager it starts them and ends them, however it is left.
+    """Device hosts and watchdog of one cell. A context manager that starts them and always ends them.
 
     Args:
-        groups: which devices live together.
+        groups: devices of each host.
         control_hz: control cycles per second.
-        seed: of simulated devices.
+        seed: seed of simulated devices.
         clock: CLOCK_MONOTONIC.
 
     Attributes:
-        devices: proxies of all hosted devices, by name, there from the beginning.
-        scene: the scene that lives in a host, as far as it can be looked into; None for none.
+        devices: proxies of all hosted devices, by name, available from the beginning.
+        scene: proxy of the scene in a host; None if there is no scene.
         state_fds: descriptors of the arms' state blocks, by name, while it runs.
     """
 
@@ -75,7 +75,7 @@ class Chain:
 
     @property
     def silence_s(self) -> float:
-        """Silence after which anybody is taken for dead."""
+        """Silence after which a process is considered dead."""
         return silence_s(self.period_s)
 
     @property
@@ -91,7 +91,7 @@ class Chain:
 
     @property
     def hosts(self) -> Sequence[HostLink]:
-        """The hosts' processes, one for each group."""
+        """Processes of the hosts, one per group."""
         return self._links
 
     def __enter__(self) -> Self:
@@ -107,15 +107,15 @@ class Chain:
         self._links, self._watchdog = [], None
 
     def begin(self) -> None:
-        """Beat, have the watchdog guard, and wait until it does. Raises DeviceFault if it does not."""
-        # What went before was no period of the loop.
+        """Send a heartbeat, make the watchdog guard, and wait until it does. Raises DeviceFault if it does not."""
+        # The time before was not a period of the loop.
         self.beat()
         self._task.value["guard"] = True
         self.beat()
         deadline_ns = self._clock.now_ns() + round(1e9 * _GUARD_S)
         while not self.guarding:
             if self.watchdog.end_words() or self._clock.now_ns() > deadline_ns:
-                words = self.watchdog.end_words() or f"does not answer within {_GUARD_S:g} s"
+                words = self.watchdog.end_words() or f"does not reply within {_GUARD_S:g} s"
                 raise DeviceFault("watchdog", words, fault_class=FaultClass.COMMUNICATION, needs=Remedy.OPERATOR)
             self.sleep(self.period_s / 10)
             self.beat()
@@ -123,7 +123,7 @@ class Chain:
             link.judged = True
 
     def beat(self) -> None:
-        """Say that the loop goes on; once in each of its cycles."""
+        """Send a heartbeat; once per cycle of the loop."""
         value = self._task.value
         now_ns = self._clock.now_ns()
         period_ns = now_ns - int(value["t_ns"])
@@ -135,14 +135,14 @@ class Chain:
         self._task.publish()
 
     def end(self) -> None:
-        """Have nobody guarded any more: every arm has been told to stop, and hosts refuse motion from here on."""
+        """End guarding: all arms have been ordered to stop, and hosts refuse motion from here on."""
         for link in self._links:
             link.judged = False
         self._task.value["guard"] = False
         self.beat()
 
     def now_ns(self) -> int:
-        """Time on the clock that all processes share."""
+        """Return the time on the clock that all processes share."""
         return self._clock.now_ns()
 
     def sleep(self, seconds: float) -> None:
@@ -150,7 +150,7 @@ class Chain:
         self._clock.sleep_until_ns(self._clock.now_ns() + round(1e9 * seconds))
 
     def alarm(self) -> Cause | None:
-        """Why all arms have been stopped, or None. Once nobody is guarded: what keeps them from being guarded again."""
+        """Return why all arms have been stopped, or None. Without guarding: why guarding cannot begin."""
         if not self._task.value["guard"]:
             return self._trouble(max(self.silence_s, _UNGUARDED_SILENCE_S))
         watch = self._watch.read()
@@ -167,7 +167,7 @@ class Chain:
         return self._watchdog_silent(self.silence_s)
 
     def _trouble(self, longest_s: float) -> Cause | None:
-        """A process that has gone, or has been silent for longer than ``longest_s``; None if all live."""
+        """Return a process that has ended or has been silent for longer than ``longest_s``; None if all run."""
         for number, link in enumerate(self._links):
             now_ns = self._clock.now_ns()
             if link.end_words():
@@ -183,18 +183,18 @@ class Chain:
 
     @property
     def guarding(self) -> bool:
-        """Whether the watchdog guards; hosts obey no motion otherwise."""
+        """Return whether the watchdog guards; otherwise hosts execute no motion."""
         return bool(self._watch.read()["guarding"])
 
     def clear(self) -> None:
-        """Clear a stop after ``end``, with all arms at rest and nobody's. Moves nothing.
+        """Clear a stop after ``end``, with all arms at rest and all leases released. Moves nothing.
 
         Raises:
-            LifecycleError: an arm moves, or somebody holds its lease.
-            DeviceFault: a process has gone or is silent.
+            LifecycleError: an arm moves, or its lease is held.
+            DeviceFault: a process has ended or is silent.
         """
         deadline_ns = self._clock.now_ns() + round(1e9 * _GUARD_S)
-        # Calls to those that do not answer would wait for long.
+        # Calls to processes that do not reply would wait for long.
         while (cause := self._trouble(self.silence_s)) is not None or self.guarding:
             if self._clock.now_ns() > deadline_ns:
                 words = "the watchdog still guards" if cause is None else cause.reason.words
@@ -205,11 +205,11 @@ class Chain:
             link.call("clear")
 
     def note_to(self, path: Path) -> None:
-        """Have the watchdog write there what it found and how the arms stopped, also when this process is gone."""
+        """Have the watchdog write causes and stop records to ``path``, even if this process has died."""
         self.watchdog.call("notes", path=str(path.absolute()))
 
     def hold_watchdog(self, held: bool) -> None:
-        """Stop the watchdog's process or let it go on: for the self-test."""
+        """Suspend or resume the watchdog's process: for the self-test."""
         os.kill(self.watchdog.pid, signal.SIGSTOP if held else signal.SIGCONT)
 
     def _start(self) -> None:
@@ -305,7 +305,7 @@ def _proxy(device: HostedDevice, clock: Clock) -> RemoteDevice:
         return RemoteCamera(device.name, clock)
     if "JointSource" not in device.spec.capabilities.abilities:
         return RemoteArm(device.name, clock)
-    # Never connected: it knows the arm's links by its configuration.
+    # Never connected: it provides the arm's links from its configuration.
     twin = device.spec.build(device.name, device.config, DriverContext(clock))
     return RemoteJointArm(device.name, clock, twin.kinematics() if isinstance(twin, Arm) else None)
 
@@ -317,7 +317,7 @@ def _remote_scene(section: Mapping[str, Any]) -> RemoteScene:
 
 
 def _numbers(fds: Any) -> tuple[int, ...]:
-    """All descriptors in nested dictionaries and lists."""
+    """Return all descriptors in nested dictionaries and lists."""
     if isinstance(fds, int):
         return (fds,)
     values = fds.values() if isinstance(fds, Mapping) else fds

@@ -1,4 +1,4 @@
-"""Which devices live in a process together."""
+"""Grouping of devices into processes."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from typing import Any, Final
 from touchcell.drivers.core.spec import DriverConfig, DriverSpec
 
 FASTEST_HZ: Final = 500.0
-"""Device cycles per second of a host at most: a process in Python holds no more beside others."""
+"""Highest rate of device cycles of a host: a process in Python sustains no more beside others."""
 
 REMOTE_ABILITIES: Final = frozenset(
     {"TcpSource", "TwistSink", "Stoppable", "JointSource", "FrameSource", "HealthSource"}
 )
-"""What devices can do for a task in another process."""
+"""Capabilities of devices that are available to a task in another process."""
 
 
 @dataclass(frozen=True, slots=True)
 class HostedDevice:
-    """A device that lives in a host.
+    """A device in a host.
 
     Attributes:
-        name: in the cell.
-        spec, config: of its driver.
-        category: by which an arm stops when something is wrong; 0 for a camera.
-        policy: what an arm does when it is given back; empty for a camera.
+        name: name in the cell.
+        spec, config: spec and configuration of its driver.
+        category: stop category of an arm after a failure; 0 for a camera.
+        policy: policy of an arm on deactivation; empty for a camera.
     """
 
     name: str
@@ -36,18 +36,18 @@ class HostedDevice:
 
     @property
     def is_arm(self) -> bool:
-        """Whether it is an arm."""
+        """True for an arm."""
         return self.spec.capabilities.kind == "arm"
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Devices that share a host, and why.
+    """Devices that share a host, and the reason.
 
     Attributes:
-        name: of the host.
+        name: name of the host.
         devices: arms before the sensors that they carry.
-        why: in words.
+        why: reason, for operators.
         scene: the simulated scene's section, if they share one.
     """
 
@@ -57,6 +57,6 @@ class Group:
     scene: Mapping[str, Any] | None = None
 
     def rate_hz(self, control_hz: float) -> float:
-        """Device cycles per second: as often as its arms tell something new, and twice in a control period at least."""
+        """Return the device cycles per second: the state rate of its arms, and at least twice the control rate."""
         told = max((each.spec.capabilities.state_rate_hz for each in self.devices if each.is_arm), default=0.0)
         return max(2.0 * control_hz, min(told, FASTEST_HZ))

@@ -1,6 +1,7 @@
-"""A device host: a process that owns driver objects, obeys commands through their gates, and stops when nobody watches.
+"""Device host: a process that owns drivers, executes commands through their gates, and stops when not guarded.
 
-One thread. In each device cycle: what the watchdog says, then commands, then the state of every device.
+Single-threaded. Each device cycle handles the watchdog's record, then commands, then publishes the state of every
+device.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from touchcell.drivers.core import spec as registry
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.clock import Clock, MonotonicClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
@@ -29,7 +29,7 @@ from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.protocols import FrameSource, HealthSource, JointSource, StopCategory
 from touchcell.drivers.core.samples import Frame, JointState, Quality, Stamped
 from touchcell.drivers.core.scene import scene_section
-from touchcell.drivers.core.spec import DriverContext
+from touchcell.drivers.core.spec import DRIVERS, DriverContext
 from touchcell.drivers.hosting.layouts import (
     ANSWER,
     ARM,
@@ -55,17 +55,17 @@ if TYPE_CHECKING:
 
 LIFECYCLES: Final = tuple(Lifecycle)
 REST_MARGIN_S: Final = 0.1
-"""What a stop may take beyond the deceleration itself."""
+"""Time allowed for a stop beyond the deceleration itself."""
 
 _LAST_REST_NS: Final = 2_000_000_000
 
 
 class HostedArm:
-    """One arm in its host: the driver object, its blocks, and the record of what it obeyed and how it stopped.
+    """One arm in its host: the driver, its blocks, and the record of executed commands and stops.
 
     Args:
-        arm: the driver object.
-        category: by which it stops when something is wrong.
+        arm: driver of the arm.
+        category: stop category after a failure.
         fds: descriptors of its blocks.
     """
 
@@ -88,17 +88,17 @@ class HostedArm:
         return {"epoch": lease.epoch}
 
     def release(self, epoch: int) -> dict[str, Any]:
-        """Give it back and stop."""
+        """Release the lease and stop."""
         if (lease := self._leases.pop(epoch, None)) is not None:
             self.arm.release(lease)
         return {}
 
     def obey(self, refuse: str, now_ns: int) -> bool:
-        """Do what the newest command says; returns whether there is an answer for the task to read.
+        """Execute the newest command; return whether there is a reply for the task to read.
 
         Args:
-            refuse: why no motion is allowed; empty if it is. Stops are always obeyed.
-            now_ns: for the record.
+            refuse: why no motion is allowed; empty if it is. Stops are always executed.
+            now_ns: time for the record.
         """
         command = self._commands.read()
         stop, number = int(command["stop"]), int(command["number"])
@@ -106,7 +106,7 @@ class HostedArm:
             self._stop_seen = stop
             if not self._state.value["at_rest"]:
                 self._state.value["asked_ns"] = now_ns
-            # A driver that cannot stop its arm has latched its fault, which the state tells.
+            # A driver that cannot stop its arm has latched its fault, which the state reports.
             with suppress(DeviceError):
                 self.arm.stop(StopCategory(int(command["category"])))
         if number <= max(self._twist_seen, stop):
@@ -132,17 +132,17 @@ class HostedArm:
         self._state.value["obeyed_ns"] = sent.t_ns
 
     def _lease(self, epoch: int) -> Lease:
-        # One that was never given passes no gate.
+        # A lease that was never granted passes no gate.
         return self._leases.get(epoch) or Lease(self.arm.name, "a process without the lease", epoch)
 
     def stop(self) -> None:
-        """Stop as if the work were done."""
+        """Stop as at the end of a task."""
         with suppress(DeviceError):
             self.arm.stop()
 
     def latch(self, now_ns: int) -> None:
-        """Stop because something is wrong, and keep a record of it."""
-        # A driver that cannot stop its arm has latched its fault; the deadline stands all the same.
+        """Stop because of a failure, and keep a record of it."""
+        # A driver that cannot stop its arm has latched its fault; the deadline applies all the same.
         with suppress(DeviceError):
             self.arm.stop(self._category)
         state, limits = self._state.value, self.arm.limits
@@ -153,20 +153,20 @@ class HostedArm:
         self._deadline_ns = now_ns + round(1e9 * (braking_s + REST_MARGIN_S))
 
     def clear(self) -> None:
-        """Forget the stop, and be ready for the next."""
+        """Discard the record of the stop and prepare for the next."""
         self._deadline_ns = 0
         self._state.value["stop_ns"] = self._state.value["rest_ns"] = 0
 
     def stands(self) -> bool:
-        """Whether it was at rest when it was looked at; what is not connected does not move by us."""
+        """Return whether the last reading showed it at rest; a disconnected arm counts as at rest."""
         return self.arm.state is Lifecycle.DISCONNECTED or bool(self._state.value["at_rest"])
 
     def free(self) -> bool:
-        """Whether it stands and nobody holds its lease."""
+        """Return whether it is at rest and its lease is released."""
         return self.arm.owner is None and self.stands()
 
     def look(self, now_ns: int) -> None:
-        """Publish its state, and see that a stop comes to its end."""
+        """Publish its state, and monitor the progress of a stop."""
         value, note = self._state.value, b""
         value["lifecycle"], value["told_ns"] = LIFECYCLES.index(self.arm.state), now_ns
         if self.arm.state is not Lifecycle.DISCONNECTED:
@@ -213,7 +213,7 @@ class HostedArm:
 
 
 class HostedCamera:
-    """One camera in its host. A camera that fails shows by the age of its newest frame."""
+    """One camera in its host. A failed camera shows by the age of its newest frame."""
 
     def __init__(self, camera: Device, fd: int) -> None:
         assert isinstance(camera, FrameSource)
@@ -246,10 +246,10 @@ class HostedCamera:
 
 
 class Host:
-    """The loop of a device host.
+    """Main loop of a device host.
 
     Args:
-        spec: what ``link.HostLink`` writes.
+        spec: specification written by ``link.HostLink``.
         control: socket to the task's process.
         clock: CLOCK_MONOTONIC, which all processes share.
     """
@@ -289,7 +289,7 @@ class Host:
         self.ending = False
 
     def run(self) -> None:
-        """Until the task's process has gone or says so; the arms stand then."""
+        """Run until the task's process has ended or requests the end; the arms are at rest then."""
         while not self.ending:
             wait_s = max(0.0, (self._due_ns - self._clock.now_ns()) * 1e-9)
             ready = select.select([self._wake, self._control.fileno()], [], [], wait_s)[0]
@@ -301,7 +301,7 @@ class Host:
         self._come_to_rest()
 
     def cycle(self) -> None:
-        """Heed the watchdog and the task now, and tell the state of all devices when it is time to."""
+        """Poll the watchdog and the task, and publish the state of all devices when due."""
         now_ns = self._clock.now_ns()
         self._heed_watchdog(now_ns)
         self._obey(now_ns)
@@ -332,7 +332,7 @@ class Host:
         self._tell(now_ns)
 
     def _obey(self, now_ns: int) -> None:
-        refuse = "" if self._guarded else "no watchdog guards it"
+        refuse = "" if self._guarded else "not guarded by a watchdog"
         if self._cause is not None:
             refuse = f"stopped, {self._cause.reason.words}"
         answers = [seat.obey(refuse, now_ns) for seat in self._arms.values()]
@@ -345,7 +345,7 @@ class Host:
         if self._truth is not None:
             self._truth.look()
         if self._cameras:
-            # One in each cycle: drawing or decoding a picture takes as long as many cycles.
+            # One per cycle: rendering or decoding an image takes as long as many cycles.
             self._turn = (self._turn + 1) % len(self._cameras)
             self._cameras[self._turn].look()
         beat = self._beat.value
@@ -364,7 +364,7 @@ class Host:
             answer = {"ok": True, **self._call(message)}
         except TouchcellError as error:
             answer = {"ok": False, "error": encode_error(error)}
-        # So that who asked finds what has become of it.
+        # So that the caller sees the outcome.
         self._tell(self._clock.now_ns())
         with suppress(OSError):
             send(self._control, {**answer, "number": message["number"]})
@@ -395,7 +395,7 @@ class Host:
 
     def _configure(self, device: Device) -> dict[str, Any]:
         device.configure()
-        # Only now do some controllers tell their tool.
+        # Some controllers report their tool only now.
         ik = device.kinematics() if isinstance(device, Arm) else None
         if ik is None:
             return {}
@@ -410,7 +410,7 @@ class Host:
         watch = self._watch.read()
         free = all(seat.free() for seat in self._arms.values())
         if watch["stop"] or watch["guarding"] or not free:
-            raise LifecycleError("host", "clear its latch", "stopped", ["at rest, without lease and stop word"])
+            raise LifecycleError("host", "clear its latch", "stopped", ["at rest, without lease and stop flag"])
         self._cause = None
         self._beat.value["latched"] = False
         for seat in self._arms.values():
@@ -418,7 +418,7 @@ class Host:
         return {}
 
     def _come_to_rest(self) -> None:
-        """Stop the arms, watch them until they stand or have had their time, then deactivate what is active."""
+        """Stop the arms, wait until they are at rest or their time has passed, then deactivate the active ones."""
         for seat in self._arms.values():
             seat.stop()
         self._tell(self._clock.now_ns())
@@ -440,13 +440,13 @@ def _build(spec: Mapping[str, Any], clock: Clock) -> tuple[dict[str, Device], Sc
     devices: dict[str, Device] = {}
     context = DriverContext(clock, devices, scene, spec["seed"])
     for each in spec["devices"]:
-        driver = registry.spec(each["driver"])
+        driver = DRIVERS.load(each["driver"])
         devices[each["name"]] = driver.build(each["name"], driver.config.model_validate(each["config"]), context)
     return devices, scene
 
 
 def _recover(device: Device, token: OperatorToken) -> None:
-    """FAULTED -> READY. What the task has given up while it went on here is only given back."""
+    """FAULTED -> READY. A device that is still active here after the task dropped it is only disconnected."""
     if device.state is Lifecycle.ACTIVE:
         device.deactivate()
     elif device.state is not Lifecycle.READY:
@@ -464,7 +464,7 @@ def _twist_command(command: Any) -> TwistCommand:
 
 
 def main() -> None:
-    """Run as ``python -m touchcell.drivers.hosting.host SPEC``, with the descriptors that SPEC names inherited."""
+    """Run as ``python -m touchcell.drivers.hosting.host SPEC``, with the descriptors named in SPEC inherited."""
     spec = json.loads(sys.argv[1])
     control = socket.socket(fileno=spec["fds"]["socket"])
     try:
@@ -478,7 +478,7 @@ def main() -> None:
         for device in host.devices.values():
             exits.callback(device.disconnect)
         realtime = ask_for_realtime()
-        # The first beat: from now on silence means something.
+        # The first heartbeat: from now on silence counts.
         host.cycle()
         send(control, {"ok": True, "number": 0, "realtime": realtime})
         host.run()

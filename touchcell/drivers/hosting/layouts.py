@@ -1,4 +1,4 @@
-"""What the blocks of shared memory say: one structured dtype for each, and text or a picture behind some."""
+"""Layouts of the shared memory blocks: one structured dtype each, some followed by text or an image."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from touchcell.drivers.hosting.memory import BlockReader, BlockWriter, create
 VERSION: Final = 1
 
 MAX_IMAGE_BYTES: Final = 1920 * 1080 * 3
-"""Largest picture that a frame block holds; what is not used costs no memory."""
+"""Largest image that a frame block holds; unused pages take no memory."""
 
 MAX_JOINTS: Final = 16
 
 MAX_NOTE_BYTES: Final = 2048
-"""Longest JSON text behind a record."""
+"""Longest JSON text after a record."""
 
 
 class Reason(IntEnum):
-    """Why everything was stopped."""
+    """Reason of a stop of all arms."""
 
     NONE = 0
     TASK_SILENT = 1
@@ -38,31 +38,31 @@ class Reason(IntEnum):
 
     @property
     def words(self) -> str:
-        """For people."""
+        """Description for operators."""
         return _WORDS[self]
 
 
 _WORDS: Final = {
     Reason.NONE: "nothing",
-    Reason.TASK_SILENT: "the task's loop has missed two beats",
+    Reason.TASK_SILENT: "the task's loop has missed two heartbeats",
     Reason.TASK_SLOW: "the task's loop is too slow",
-    Reason.HOST_SILENT: "a device host has missed two beats",
+    Reason.HOST_SILENT: "a device host has missed two heartbeats",
     Reason.HOST_LATCHED: "a device host has stopped its arms by itself",
-    Reason.WATCHDOG_SILENT: "the watchdog has missed two beats",
-    Reason.TASK_GONE: "the task's process has gone",
-    Reason.HOST_GONE: "the process of a device host has gone",
+    Reason.WATCHDOG_SILENT: "the watchdog has missed two heartbeats",
+    Reason.TASK_GONE: "the task's process has ended",
+    Reason.HOST_GONE: "the process of a device host has ended",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Why everything was stopped.
+    """Cause of a stop of all arms.
 
     Attributes:
-        reason: in one word.
-        t_ns: when it was found.
-        value_s, limit_s: what was found, and what is allowed.
-        host: number of the host that it is about, -1 for none.
+        reason: kind of cause.
+        t_ns: time of detection.
+        value_s, limit_s: measured time and its limit.
+        host: number of the host concerned, -1 for none.
     """
 
     reason: Reason
@@ -79,7 +79,7 @@ TASK: Final = np.dtype(
     [
         *_BEAT,
         ("guard", "u8"),
-        ("late", "u8"),  # how many periods were late, and how long the newest of these was
+        ("late", "u8"),  # number of late periods, and duration of the newest of them
         ("late_ns", "i8"),
     ]
 )
@@ -87,7 +87,7 @@ WATCH: Final = np.dtype([*_BEAT, ("guarding", "u8"), ("stop", "u8"), ("cause", _
 HOST: Final = np.dtype([*_BEAT, ("latched", "u8"), ("cause", _CAUSE)])
 COMMAND: Final = np.dtype(
     [
-        ("stop", "u8"),  # number of the newest stop; a twist that is older is dropped
+        ("stop", "u8"),  # number of the newest stop; an older twist is dropped
         ("category", "u8"),
         ("number", "u8"),  # of the newest twist
         ("lease", "u8"),
@@ -103,7 +103,7 @@ ANSWER: Final = np.dtype([("number", "u8"), ("refused", "u8"), ("twist", "f8", (
 ARM: Final = np.dtype(
     [
         ("lifecycle", "u8"),
-        ("failed", "u8"),  # reading it raised what the note says
+        ("failed", "u8"),  # reading it raised the error in the note
         ("t_ns", "i8"),
         ("seq", "i8"),
         ("suspect", "u8"),
@@ -117,12 +117,12 @@ ARM: Final = np.dtype(
         ("dq", "f8", (MAX_JOINTS,)),
         ("tau", "f8", (MAX_JOINTS,)),
         ("at_rest", "u8"),
-        ("told_ns", "i8"),  # when the host looked
-        # The host's own record, for whoever asks afterwards what happened.
+        ("told_ns", "i8"),  # time of the host's reading
+        # The host's own record, for analysis after a stop.
         ("moved_ns", "i8"),  # when it was last seen moving
         ("obeyed", "u8"),
         ("obeyed_ns", "i8"),
-        ("asked_ns", "i8"),  # when the task last asked it to stop while it moved
+        ("asked_ns", "i8"),  # when the task last requested a stop while it moved
         ("stop_ns", "i8"),
         ("rest_ns", "i8"),
         ("stop_speed_m_s", "f8"),
@@ -147,7 +147,7 @@ FRAME: Final = np.dtype(
 )
 
 MAX_OBJECTS: Final = 16
-"""Free objects of a scene that its host tells of."""
+"""Largest number of free objects of a scene."""
 
 TRUTH: Final = np.dtype(
     [
@@ -167,28 +167,28 @@ _TAILS = {id(ANSWER): MAX_NOTE_BYTES, id(ARM): MAX_NOTE_BYTES, id(FRAME): MAX_IM
 
 
 def layout_number(dtype: np.dtype[Any]) -> int:
-    """The number by which both sides know that they mean the same."""
+    """Return a hash of the layout, by which both sides check that they agree."""
     return VERSION << 32 | zlib.crc32(repr(dtype.descr).encode())
 
 
 def new_block(name: str, dtype: np.dtype[Any]) -> int:
-    """A block for records of ``dtype``; returns its file descriptor."""
+    """Create a block for records of ``dtype``; return its file descriptor."""
     return create(name, layout_number(dtype), dtype.itemsize + _TAILS.get(id(dtype), 0))
 
 
 class RecordWriter:
-    """Writes records of one dtype. ``value`` is filled in by name, then published."""
+    """Write records of one dtype: fill ``value`` by field name, then publish."""
 
     def __init__(self, fd: int, dtype: np.dtype[Any]) -> None:
         self._block = BlockWriter(fd, layout_number(dtype))
         self.value: Any = np.zeros((), dtype)
 
     def publish(self, tail: bytes = b"") -> None:
-        """Publish ``value`` with a ``tail`` behind it."""
+        """Publish ``value`` followed by ``tail``."""
         self._block.write(self.value.tobytes() + tail)
 
     def close(self) -> None:
-        """Let go of the memory."""
+        """Unmap the memory."""
         self._block.close()
 
     def __enter__(self) -> Self:
@@ -201,7 +201,7 @@ class RecordWriter:
 
 
 class RecordReader:
-    """Reads records of one dtype."""
+    """Read records of one dtype."""
 
     def __init__(self, fd: int, dtype: np.dtype[Any]) -> None:
         self._block = BlockReader(fd, layout_number(dtype))
@@ -209,11 +209,11 @@ class RecordReader:
         self._newest: tuple[int, Any, bytes] = (0, np.zeros((), dtype), b"")
 
     def read(self) -> Any:
-        """The newest record, all zero before the first; not to be written to."""
+        """Return the newest record, all zero before the first; read-only."""
         return self.read_all()[1]
 
     def read_all(self) -> tuple[int, Any, bytes]:
-        """Number of the newest record, the record, and the tail behind it. Raises CorruptMessage."""
+        """Return the number of the newest record, the record, and its tail. Raises CorruptMessage."""
         if self._block.newest != self._newest[0] and (found := self._block.read()) is not None:
             number, record = found
             value = np.frombuffer(record, self._dtype, 1)[0]
@@ -221,7 +221,7 @@ class RecordReader:
         return self._newest
 
     def close(self) -> None:
-        """Let go of the memory."""
+        """Unmap the memory."""
         self._block.close()
 
     def __enter__(self) -> Self:
@@ -239,7 +239,7 @@ def put_cause(record: Any, cause: Cause) -> None:
 
 
 def cause_of(record: Any) -> Cause:
-    """The cause that a record tells."""
+    """Return the cause in a record."""
     found = record["cause"]
     return Cause(
         Reason(int(found["reason"])),

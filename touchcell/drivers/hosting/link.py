@@ -1,4 +1,4 @@
-"""The task's side of one child process: started, spoken to, watched, and ended, whatever state it is in."""
+"""Parent side of a child process: start it, call it, monitor it, and end it in any state."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from touchcell.drivers.hosting.wire import decode_error, receive, send
 
 _START_S: Final = 30.0
 _CALL_S: Final = 60.0
-"""Parking an arm takes its time."""
+"""Parking an arm takes long."""
 
 _END_S: Final = 5.0
 _HANGING_S: Final = 2.0
 
 
 class Child:
-    """A child process with a socket to it. When this process dies, the kernel closes the socket and the child knows.
+    """A child process with a socket to it. When this process dies, the kernel closes the socket and the child notices.
 
     Args:
-        name: for people and errors.
-        module: what ``python -m`` runs.
+        name: name for operators and errors.
+        module: module that ``python -m`` runs.
         spec: its argument, to which the socket is added.
-        fds: descriptors that it inherits.
+        fds: descriptors to inherit.
 
     Attributes:
-        realtime: what scheduling and memory it got.
+        realtime: scheduling and memory locking that it obtained.
     """
 
     def __init__(self, name: str, module: str, spec: Mapping[str, Any], fds: Sequence[int]) -> None:
@@ -50,27 +50,27 @@ class Child:
                 [sys.executable, "-m", module, json.dumps(spec)],
                 stdin=subprocess.DEVNULL,
                 pass_fds=(*fds, theirs.fileno()),
-                # A Ctrl-C is for the task, which stops the arms in an orderly way; one thread is all that a child has.
+                # A Ctrl-C is for the task, which stops the arms in an orderly way; a child is single-threaded.
                 start_new_session=True,
                 env=os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
             )
 
     @property
     def pid(self) -> int:
-        """Number of the process."""
+        """Process id."""
         return self.process.pid
 
     def await_ready(self) -> None:
-        """Wait until it has built what it owns. Raises the error that it met, or DeviceGone."""
+        """Wait until it has built its devices. Raises the error that it reported, or DeviceGone."""
         self.realtime = self._answer(_START_S)["realtime"]
 
     def call(self, call: str, **arguments: Any) -> dict[str, Any]:
-        """Have it do something and wait until it is done.
+        """Call a function of the child and wait for its reply.
 
         Raises:
             DeviceGone: the process has died.
-            TransportTimeout: it does not answer.
-            TouchcellError: what it raised.
+            TransportTimeout: it does not reply.
+            TouchcellError: error that it raised.
         """
         self._calls += 1
         try:
@@ -82,31 +82,31 @@ class Child:
     def _answer(self, wait_s: float) -> dict[str, Any]:
         self._socket.settimeout(wait_s)
         try:
-            # What answers a call that was given up is not for this one.
+            # A reply to a call that timed out is not for this one.
             while (message := receive(self._socket)) is not None and message["number"] != self._calls:
                 continue
         except TimeoutError:
-            raise TransportTimeout(self.name, "answer of its process", wait_s) from None
+            raise TransportTimeout(self.name, "reply of its process", wait_s) from None
         if message is None:
             raise self._gone()
         if not message["ok"]:
             if "error" in message:
                 raise decode_error(message["error"], self.name)
-            raise LifecycleError(self.name, "do what was asked", "guarding", ["nobody is guarded"])
+            raise LifecycleError(self.name, "execute the call", "guarding", ["not guarded"])
         return message
 
     def _gone(self) -> DeviceGone:
         return DeviceGone(self.name, f"its process {self.pid} {self.end_words() or 'has closed its socket'}")
 
     def end_words(self) -> str:
-        """How it ended, in words; empty while it lives."""
+        """Describe how it ended; empty while it runs."""
         code = self.process.poll()
         if code is None:
             return ""
         return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"has ended with code {code}"
 
     def close(self) -> None:
-        """End it: by a message and by closing the socket, also if it was stopped; one that does not end is killed."""
+        """End it by a message and by closing the socket, also if it is suspended; kill it if it does not end."""
         with suppress(OSError):
             send(self._socket, {"call": "end"})
         self._socket.close()
@@ -119,18 +119,18 @@ class Child:
 
 
 class HostLink(Child):
-    """A device host, with what its proxies need.
+    """A device host, with the state that its proxies need.
 
     Args:
-        name: of the group.
-        spec: what the host builds.
-        fds: what it inherits.
-        beats: reader of its beat.
-        silence_s: silence after which it is taken for dead.
+        name: name of the group.
+        spec: specification of the devices to build.
+        fds: descriptors to inherit.
+        beats: reader of its heartbeat.
+        silence_s: silence after which it is considered dead.
         clock: CLOCK_MONOTONIC.
 
     Attributes:
-        judged: whether silence counts: not while it is busy with what it was called for.
+        judged: whether silence counts: not while it executes a call.
     """
 
     def __init__(
@@ -160,32 +160,32 @@ class HostLink(Child):
                 f"its process {ended}" if ended else f"its process has been silent for {too_long_s:.3f} s",
                 fault_class=FaultClass.COMMUNICATION,
                 needs=Remedy.OPERATOR,
-                hint="see that the arm stands, then start the run again",
+                hint="check that the arm is at rest, then start the run again",
             )
 
     def silent_too_long(self) -> float:
-        """How long (s) it has been silent, if that is too long; 0 while its arms are not guarded."""
+        """Return the silence in s if it is too long; 0 while its arms are not guarded."""
         silent_s = self.silent_s()
         return silent_s if self.judged and silent_s > self._silence_s else 0.0
 
     def silent_s(self) -> float:
-        """How long (s) ago it gave its last beat."""
+        """Return the seconds since its last heartbeat."""
         return (self._clock.now_ns() - int(self.beats.read()["t_ns"])) * 1e-9
 
     def hangs(self) -> bool:
-        """Whether a call would wait in vain; a host beats also while nobody judges it."""
+        """Return whether a call would time out; a host also sends heartbeats while its silence does not count."""
         return self.silent_s() > _HANGING_S
 
     def latched(self) -> Cause | None:
-        """Why it has stopped its arms, or None."""
+        """Return the cause for which it has stopped its arms, or None."""
         beat = self.beats.read()
         return cause_of(beat) if beat["latched"] else None
 
     def wake(self) -> None:
-        """Let the host look for a command now."""
+        """Make the host poll for a command now."""
         os.eventfd_write(self._wake, 1)
 
     def await_answer(self, seconds: float) -> None:
-        """Wait until the host has answered something, or for ``seconds``."""
+        """Wait for a reply of the host, at most ``seconds``."""
         if select.select([self._answered], [], [], seconds)[0]:
             os.eventfd_read(self._answered)

@@ -1,10 +1,10 @@
-"""Blocks of shared memory with one writer and many readers, without names and without locks.
+"""Blocks of shared memory with one writer and many readers, unnamed and lock-free.
 
 A block is a ring of numbered slots behind a header. The writer fills the slot after the newest and then publishes its
-number; it never waits. A reader copies the newest slot and believes the copy only if number and checksum still fit, so
-a torn record is never returned, whatever the processor's memory order, and a writer that was killed halfway through
-one leaves the last complete record to be read. (A sequence lock for each slot: Lameter, "Effective synchronization on
-Linux/NUMA systems", 2005, with several slots so that a dead writer blocks nobody.)
+number; it never waits. A reader copies the newest slot and accepts the copy only if number and checksum still match, so
+a torn record is never returned, whatever the processor's memory order, and a writer that was killed halfway through a
+record leaves the last complete one readable. (A sequence lock for each slot: Lameter, "Effective synchronization on
+Linux/NUMA systems", 2005, with several slots so that a dead writer blocks no reader.)
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ _ATTEMPTS = 64
 
 
 class BlockMismatch(CodecError):
-    """The memory holds no block of the layout that is expected: two versions of the program have met."""
+    """The memory is not a block of the expected layout: two versions of the program are mixed."""
 
 
 def create(name: str, layout: int, capacity: int) -> int:
-    """A new block of shared memory; returns its file descriptor, which children may inherit.
+    """Create a block of shared memory; return its file descriptor, which children may inherit.
 
     Args:
-        name: what is shown in /proc; it need not be unique.
-        layout: number that writer and readers have to agree on.
+        name: name shown in /proc; need not be unique.
+        layout: layout number on which writer and readers agree.
         capacity: bytes of the longest record.
     """
     stride = -(-capacity // _WORD) + _SLOT_WORDS
     size = _WORD * (_HEADER_WORDS + SLOTS * stride)
     fd = os.memfd_create(f"touchcell-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     os.ftruncate(fd, size)
-    # Nobody can cut the memory off under somebody who has mapped it.
+    # Sealed, so that the memory cannot be truncated while it is mapped.
     fcntl.fcntl(fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
     with mmap.mmap(fd, size) as memory:
         words = memoryview(memory).cast("Q")
@@ -56,7 +56,7 @@ def create(name: str, layout: int, capacity: int) -> int:
 
 
 class _Mapped:
-    """A block that is mapped into this process; the descriptor may be closed then."""
+    """A block mapped into this process; the descriptor may be closed afterwards."""
 
     def __init__(self, fd: int, layout: int, *, writable: bool) -> None:
         size = os.fstat(fd).st_size
@@ -74,11 +74,11 @@ class _Mapped:
         self._stride = -(-self.capacity // _WORD) + _SLOT_WORDS
 
     def _slot(self, number: int) -> int:
-        """Index of the first word of the slot of record ``number``."""
+        """Return the index of the first word of the slot of record ``number``."""
         return _HEADER_WORDS + (number % SLOTS) * self._stride
 
     def close(self) -> None:
-        """Let go of the memory."""
+        """Unmap the memory."""
         self._words.release()
         self._bytes.release()
         self._map.close()
@@ -93,17 +93,17 @@ class _Mapped:
 
 
 class BlockWriter(_Mapped):
-    """The one writer of a block.
+    """Writer of a block; each block has one.
 
     Raises:
-        BlockMismatch: the memory behind ``fd`` is no block of this ``layout``.
+        BlockMismatch: the memory behind ``fd`` is not a block of this ``layout``.
     """
 
     def __init__(self, fd: int, layout: int) -> None:
         super().__init__(fd, layout, writable=True)
 
     def write(self, record: bytes) -> int:
-        """Publish ``record``, at most ``capacity`` bytes; returns its number, counted from 1."""
+        """Publish ``record``, at most ``capacity`` bytes; return its number, counted from 1."""
         if len(record) > self.capacity:
             raise CodecError("record", len(record), f"is longer than the block's {self.capacity} bytes")
         number = self._words[_NEWEST_AT] + 1
@@ -118,10 +118,10 @@ class BlockWriter(_Mapped):
 
 
 class BlockReader(_Mapped):
-    """A reader of a block; it cannot write, for its memory is mapped read-only.
+    """A reader of a block, mapped read-only.
 
     Raises:
-        BlockMismatch: the memory behind ``fd`` is no block of this ``layout``.
+        BlockMismatch: the memory behind ``fd`` is not a block of this ``layout``.
     """
 
     def __init__(self, fd: int, layout: int) -> None:
@@ -129,14 +129,14 @@ class BlockReader(_Mapped):
 
     @property
     def newest(self) -> int:
-        """Number of the newest record; 0 before the first."""
+        """Return the number of the newest record; 0 before the first."""
         return self._words[_NEWEST_AT]
 
     def read(self) -> tuple[int, bytes] | None:
-        """Number and copy of the newest record; None before the first. Never waits for the writer.
+        """Return number and copy of the newest record; None before the first. Never waits for the writer.
 
         Raises:
-            CorruptMessage: the writer overtook every attempt, or somebody else wrote into the block.
+            CorruptMessage: the writer overtook every attempt, or another process wrote into the block.
         """
         for _ in range(_ATTEMPTS):
             number = self._words[_NEWEST_AT]

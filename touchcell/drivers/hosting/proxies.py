@@ -1,4 +1,4 @@
-"""Devices of another process, with the abilities that they have there: a run loop does not see the difference."""
+"""Proxies of devices in another process, with the same interface: a run loop sees no difference."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any, Final
 import numpy as np
 
 from touchcell.drivers.core.clock import Clock
-from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
+from touchcell.drivers.core.command_checks import checked_twist_command
+from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame, read_only
 from touchcell.drivers.core.device import DeactivatePolicy, Device, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
     CommandRejected,
@@ -38,7 +39,7 @@ _FIRST_FRAME_S: Final = 5.0
 
 
 class RemoteDevice(Device):
-    """The lifecycle of a device in another process.
+    """Lifecycle of a device in another process.
 
     Args:
         name: the device's name in the cell.
@@ -50,17 +51,17 @@ class RemoteDevice(Device):
         self._link: HostLink | None = None
 
     def attach(self, link: HostLink, fds: dict[str, int]) -> None:
-        """Meet the host, which has been started, and map the blocks of this device."""
+        """Connect to the started host and map the blocks of this device."""
         self._link = link
         self._map(fds)
 
     def detach(self) -> None:
-        """Let go of the blocks."""
+        """Unmap the blocks."""
         self._link = None
         self._unmap()
 
     def health(self) -> dict[str, float | int | str | bool]:
-        """What the device tells of itself; takes a while."""
+        """Return the device's health; a round trip to the host."""
         health: dict[str, float | int | str | bool] = self._call("health")["health"]
         return health
 
@@ -72,7 +73,7 @@ class RemoteDevice(Device):
         try:
             return self._link.call(call, device=self.name, **arguments)
         except TransportError as error:
-            # What its host cannot be reached for is no answer of the device.
+            # An unreachable host is not a reply of the device.
             if error.device == self._link.name:
                 raise self._to_faulted(DeviceFault(self.name, error.message)) from error
             raise
@@ -102,7 +103,7 @@ class RemoteDevice(Device):
         self._call("recover", operator=token.operator, t_ns=token.t_ns)
 
     def _close(self) -> None:
-        # A host that has gone has disconnected; what hangs is ended by the chain.
+        # A host that has ended has disconnected; the chain kills one that hangs.
         if self._link is not None and not self._link.end_words() and not self._link.hangs():
             try:
                 self._link.call("disconnect", device=self.name)
@@ -117,7 +118,7 @@ class RemoteDevice(Device):
 
 
 class RemoteArm(RemoteDevice):
-    """An arm in another process. Its gate, lease and time-to-live are checked there."""
+    """Proxy of an arm in another process. Gate, lease and time-to-live are checked there."""
 
     def __init__(self, name: str, clock: Clock) -> None:
         super().__init__(name, clock)
@@ -138,18 +139,18 @@ class RemoteArm(RemoteDevice):
 
     @property
     def limits(self) -> TwistLimits:
-        """What the gate in the host allows; known from ``connect`` on."""
+        """Limits of the gate in the host; known from ``connect`` on."""
         assert self._limits is not None, "connect first"
         return self._limits
 
     @property
     def stop_categories(self) -> frozenset[StopCategory]:
-        """Stop categories that the driver offers in software; known from ``connect`` on."""
+        """Stop categories supported in software; known from ``connect`` on."""
         return self._categories
 
     @property
     def owner(self) -> str | None:
-        """Who of this process holds the command lease."""
+        """Holder of the command lease within this process."""
         return self._lease.owner if self._lease else None
 
     def acquire(self, owner: str) -> Lease:
@@ -158,18 +159,18 @@ class RemoteArm(RemoteDevice):
         return self._lease
 
     def release(self, lease: Lease) -> None:
-        """Give the lease back and stop. A lease that is no longer held changes nothing."""
+        """Release the lease and stop. Does nothing for a lease that is no longer held."""
         if lease is self._lease:
             self._lease = None
             self._call("release", epoch=lease.epoch)
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """Newest state that the host has told.
+        """Return the newest state published by the host.
 
         Raises:
             StaleData: it is older than ``max_age_s``.
             DeviceFault: the host has died or is silent; the arm is FAULTED.
-            DeviceError: what the driver raised in the host.
+            DeviceError: error raised by the driver in the host.
         """
         record, note = self._look()
         if record["failed"]:
@@ -183,55 +184,52 @@ class RemoteArm(RemoteDevice):
         return sample
 
     def at_rest(self) -> bool:
-        """Whether it stood when the host looked, if that was after the last command or stop."""
+        """Return whether the host saw it at rest after the last command or stop."""
         record, _ = self._look()
         return bool(record["at_rest"]) and int(record["told_ns"]) > self._written_ns
 
     def rested_ns(self) -> int | None:
-        """When its host saw it at rest after the latest stop by the chain; None as long as it has not."""
+        """Time at which its host saw it at rest after the latest stop by the chain; None before."""
         record, _ = self._look()
         return int(record["rest_ns"]) or None
 
     def kinematics(self) -> DifferentialIk | None:
-        """None: it tells no joints."""
+        """Return None: it publishes no joint angles."""
         return None
 
     def send_twist(self, command: TwistCommand, lease: Lease) -> Sent[TwistCommand]:
-        """Have the host follow ``command`` until it expires; returns what its gate let pass.
+        """Have the host follow ``command`` until it expires; return the command that its gate let pass.
 
-        Waits for the answer, for as long as the command lives.
+        Waits for the reply at most until the command expires.
 
         Raises:
-            CommandRejected: nothing was sent; ``reason`` tells why.
-            TransportTimeout: the host has not answered in time; it drops the command when it has expired.
+            CommandRejected: nothing was sent; see ``reason``.
+            TransportTimeout: the host has not replied in time; it drops the expired command.
             DeviceFault: the host has died or is silent; the arm is FAULTED.
         """
         link = self._check_host()
-        twist = np.asarray(command.twist, dtype=np.float64)
-        # The gate would say the same, but the block has no room for another shape.
-        if twist.shape != (6,):
-            reason = f"twist has shape {twist.shape}, not (6,)"
-            raise CommandRejected(self.name, Rejection.SHAPE, reason, value=twist.shape, limit=(6,))
-        if not isinstance(command.frame, TwistFrame):
-            raise CommandRejected(self.name, Rejection.FRAME, f"unknown frame {command.frame!r}", value=command.frame)
+        # The gate would say the same, but the block has no room for anything else.
+        command = checked_twist_command(self.name, command)
+        if abs(command.t_ns) >= 2**62:
+            raise CommandRejected(self.name, Rejection.EXPIRED, "its time stamp is no time", value=command.t_ns)
         value = self._commands.value
         value["number"] = self._next()
-        value["lease"] = lease.epoch if lease is self._lease else 0
-        value["twist"], value["tcp_frame"] = twist, command.frame is TwistFrame.TCP
+        value["lease"] = lease.epoch if self._lease is not None and lease is self._lease else 0
+        value["twist"], value["tcp_frame"] = command.twist, command.frame is TwistFrame.TCP
         value["t_ns"], value["ttl_s"] = command.t_ns, command.ttl_s
         value["has_cause"], value["t_cause_ns"] = command.t_cause_ns is not None, command.t_cause_ns or 0
         self._write(link)
         answer, note = self._await_answer(link, command.ttl_s)
         if answer["refused"]:
             raise decode_note(note, self.name)
-        sent = replace(command, twist=answer["twist"].copy(), frame=TwistFrame.BASE)
+        sent = replace(command, twist=read_only(answer["twist"]), frame=TwistFrame.BASE)
         return Sent(sent, int(answer["t_ns"]), decode_adjustments(note))
 
     def stop(self, category: StopCategory = StopCategory.STOP_AND_HOLD) -> None:
-        """Tell the host to begin to stop at once. Waits for nothing, so a host that hangs does not delay other arms.
+        """Order the host to stop at once. Does not wait, so that a hanging host does not delay the stop of other arms.
 
         Raises:
-            LifecycleError: the driver does not offer ``category``.
+            LifecycleError: the driver does not support ``category``.
         """
         if category not in self._categories:
             offered = [f"category {offer}" for offer in sorted(self._categories)]
@@ -261,14 +259,14 @@ class RemoteArm(RemoteDevice):
             left_s = (deadline_ns - self._clock.now_ns()) * 1e-9
             if left_s <= 0.0:
                 self._check_host()
-                raise TransportTimeout(self.name, "answer of its host", seconds)
+                raise TransportTimeout(self.name, "reply of its host", seconds)
             link.await_answer(left_s)
 
     def _look(self) -> tuple[Any, bytes]:
         self._check_host()
         _, record, note = self._arm.read_all()
         if self._state is Lifecycle.DISCONNECTED:
-            raise LifecycleError(self.name, "tell its pose", self._state.value, ["passive"])
+            raise LifecycleError(self.name, "read its pose", self._state.value, ["passive"])
         # A stop that removes power ends in READY, and a driver may fault on its own.
         found = LIFECYCLES[int(record["lifecycle"])]
         if found is Lifecycle.FAULTED and self._state is not Lifecycle.FAULTED and note:
@@ -284,12 +282,12 @@ class RemoteArm(RemoteDevice):
 
 
 class RemoteJointArm(RemoteArm):
-    """An arm in another process that also tells its joints.
+    """Proxy of an arm in another process that also publishes its joints.
 
     Args:
         name: the device's name in the cell.
         clock: CLOCK_MONOTONIC.
-        ik: kinematics as the driver knows them before it is connected.
+        ik: kinematics known to the driver before it is connected.
     """
 
     def __init__(self, name: str, clock: Clock, ik: DifferentialIk | None) -> None:
@@ -297,11 +295,11 @@ class RemoteJointArm(RemoteArm):
         self._ik = ik
 
     def kinematics(self) -> DifferentialIk | None:
-        """Of its joints; from ``configure`` on with the tool that the device has."""
+        """Return the differential inverse kinematics; from ``configure`` on with the tool of the device."""
         return self._ik
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
-        """Newest joint state that the host has told. Raises as ``tcp``."""
+        """Return the newest joint state published by the host. Raises as ``tcp``."""
         record, note = self._look()
         if record["failed"]:
             raise decode_note(note, self.name)
@@ -322,7 +320,7 @@ class RemoteJointArm(RemoteArm):
 
 
 class RemoteCamera(RemoteDevice):
-    """A camera in another process: the newest of its frames."""
+    """Proxy of a camera in another process: the newest of its frames."""
 
     def _map(self, fds: dict[str, int]) -> None:
         self._frames = RecordReader(fds["frame"], FRAME)
@@ -333,7 +331,7 @@ class RemoteCamera(RemoteDevice):
         self._newest = None
 
     def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
-        """Newest frame; waits for the very first. Raises StaleData if it is older than ``max_age_s``, DeviceFault."""
+        """Return the newest frame; waits for the very first. Raises StaleData, DeviceFault."""
         frame = self._read() or self.next(-1, _FIRST_FRAME_S)
         age_s = frame.age_s(self._clock.now_ns())
         if max_age_s is not None and age_s > max_age_s:
@@ -341,7 +339,7 @@ class RemoteCamera(RemoteDevice):
         return frame
 
     def next(self, after_seq: int, timeout_s: float) -> Stamped[Frame]:
-        """First available frame with ``seq > after_seq``. Raises TransportTimeout, DeviceFault."""
+        """Return the first available frame with ``seq > after_seq``. Raises TransportTimeout, DeviceFault."""
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         while (frame := self._read()) is None or frame.seq <= after_seq:
             now_ns = self._clock.now_ns()

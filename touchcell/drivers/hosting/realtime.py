@@ -1,4 +1,4 @@
-"""Asking the kernel for real-time scheduling and locked memory, and telling what was given."""
+"""Request real-time scheduling and locked memory from the kernel, and report what was granted."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import signal
 from typing import Any, Final
 
 PRIORITY: Final = 40
-"""Below the kernel's own interrupt threads (50), above everything ordinary."""
+"""Below the kernel's own interrupt threads (50), above all ordinary processes."""
 
 LONGEST_US: Final = 200_000
-"""Computing for so long without a pause, a process falls back to ordinary scheduling: nobody else could run."""
+"""A process that computes this long without a pause falls back to ordinary scheduling, so that others can run."""
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
 def ask_for_realtime() -> str:
-    """Ask for SCHED_FIFO and mlockall for this process; returns in words what it got. Never fails."""
+    """Request SCHED_FIFO and mlockall for this process; return a description of what was granted. Never fails."""
     return f"{_scheduling()}, {_memory()}"
 
 

@@ -1,6 +1,6 @@
-"""The self-test of the watchdog chain: arms that move slowly have to stop when beats are withheld.
+"""Self-test of the watchdog chain: slowly moving arms have to stop when heartbeats are withheld.
 
-Commands go on through both parts, so that it is the chain that stops the arms and not their expiry.
+Commands continue during both parts, so that the chain stops the arms, not the expiry of commands.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from touchcell.geometry.types import Array
 
 SPEED_M_S: Final = 1e-3
 MARGIN_S: Final = 0.2
-"""What a stop may take beyond silence, cycles and deceleration: a vendor's controller rounds its corners, and takes its
-time to say that the arm stands (0.13 s for Franka's)."""
+"""Time allowed for a stop beyond silence, cycles and deceleration: a vendor's controller smooths its motion, and
+reports standstill with a delay (0.13 s for Franka's)."""
 
 _SEEN_M: Final = 5e-5
 _SEEN_WITHIN_S: Final = 2.0
@@ -33,19 +33,19 @@ _TTL_PERIODS: Final = 3
 
 
 class SelfTestFailed(DeviceError):
-    """The chain did not stop an arm as it has to; the cell is not activated.
+    """The chain did not stop an arm as required; the cell is not activated.
 
     Attributes:
-        link: what was withheld.
-        declared_s: time within which all arms had to stand.
-        measured_s: when the last one stood; None if one did not, or did not move in the first place.
+        link: the heartbeat that was withheld.
+        declared_s: time within which all arms had to be at rest.
+        measured_s: time at which the last one was at rest; None if one was not, or did not move in the first place.
     """
 
     def __init__(self, device: str, link: str, reason: str, declared_s: float, measured_s: float | None) -> None:
         super().__init__(
             device,
             f"self-test, {link} withheld: {reason}",
-            hint="do not use this cell; docs/safety-processes.md tells what was tested",
+            hint="do not use this cell; docs/explanation/safety-processes.md describes the test",
         )
         self.link = link
         self.declared_s = declared_s
@@ -54,12 +54,12 @@ class SelfTestFailed(DeviceError):
 
 @dataclass(frozen=True, slots=True)
 class Proof:
-    """One part of the self-test that was passed.
+    """Passed part of the self-test.
 
     Attributes:
-        link: what was withheld.
-        time_s: from the last beat until the last arm stood.
-        declared_s: what that may take.
+        link: the heartbeat that was withheld.
+        time_s: from the last heartbeat until the last arm was at rest.
+        declared_s: allowed time.
     """
 
     link: str
@@ -71,9 +71,9 @@ class Proof:
 
 
 def self_test(chain: Chain) -> tuple[Proof, ...]:
-    """Withhold the task's beats, then the watchdog's, while every arm of an active chain moves at 1 mm/s.
+    """Withhold the task's heartbeats, then the watchdog's, while every arm of an active chain moves at 1 mm/s.
 
-    Afterwards the stop is cleared, nothing moves and nobody holds a lease. A chain without arms proves nothing.
+    Afterwards the stop is cleared, nothing moves and all leases are released. Without arms nothing is tested.
 
     Raises:
         SelfTestFailed: an arm did not move, did not stop in time, or stopped for another reason.
@@ -93,7 +93,7 @@ def self_test(chain: Chain) -> tuple[Proof, ...]:
 
 
 def declared_s(chain: Chain) -> float:
-    """Longest time (s) from the last beat until every arm stands from 1 mm/s."""
+    """Return the longest time (s) from the last heartbeat until every arm is at rest from 1 mm/s."""
     cycles_s = chain.period_s / 4 + max(1.0 / group.rate_hz(1.0 / chain.period_s) for group in chain.groups)
     braking_s = max(SPEED_M_S / arm.limits.accel_m_s2 for arm in chain.arms.values())
     return chain.silence_s + cycles_s + braking_s + MARGIN_S
@@ -105,7 +105,7 @@ def _part(chain: Chain, link: str, reason: Reason, withhold: Callable[[], None] 
     chain.begin()
     try:
         _until_all_move(chain, leases, link, within_s)
-        # The last beat: what is withheld is silent from here on.
+        # The last heartbeat: the withheld process is silent from here on.
         chain.beat()
         last_ns = chain.now_ns()
         if withhold is not None:
@@ -125,10 +125,10 @@ def _part(chain: Chain, link: str, reason: Reason, withhold: Callable[[], None] 
     time_s = (max(t_ns for t_ns in standing.values() if t_ns is not None) - last_ns) * 1e-9
     if cause is None or cause.reason is not reason:
         found = "nothing" if cause is None else cause.reason.words
-        raise SelfTestFailed("chain", link, f"it stopped for {found}, not {reason.words}", within_s, time_s)
+        raise SelfTestFailed("chain", link, f"it stopped because of {found}, not {reason.words}", within_s, time_s)
     chain.clear()
     for arm in arms.values():
-        # A stop of a category that removes power ends there.
+        # A stop category that removes power ends in READY.
         if arm.state is Lifecycle.READY:
             arm.activate()
     return Proof(link, time_s, within_s)
@@ -152,19 +152,19 @@ def _until_all_move(chain: Chain, leases: Mapping[str, Lease], link: str, within
 
 
 def _until_stopped(chain: Chain, leases: Mapping[str, Lease], within_s: float, *, beats: bool) -> Cause | None:
-    """Go on commanding until somebody has stopped the arms; returns who, or None after the time."""
+    """Continue commanding until the arms have been stopped; return the cause, or None after the time."""
     deadline_ns = chain.now_ns() + round(1e9 * within_s)
     while chain.now_ns() < deadline_ns:
         if (cause := _host_cause(chain)) is not None:
             return cause
-        # Once the hosts have latched they refuse, which is what is wanted.
+        # Latched hosts refuse commands, as intended.
         with suppress(CommandRejected):
             _cycle(chain, leases, beats=beats)
     return _host_cause(chain)
 
 
 def _host_cause(chain: Chain) -> Cause | None:
-    """Why the hosts have latched, when all have."""
+    """Return the cause for which the hosts have latched, once all have."""
     causes = [link.latched() for link in chain.hosts]
     return None if None in causes else causes[0]
 
@@ -181,7 +181,7 @@ def _cycle(chain: Chain, leases: Mapping[str, Lease], *, beats: bool) -> None:
 
 
 def _retreat(chain: Chain, name: str) -> Array:
-    """Slowly backwards along the tool's axis, or along the first axis that the arm can follow."""
+    """Return a slow twist backwards along the tool's axis, or along the first axis that the arm can follow."""
     able = next(each.spec.capabilities.twist_axes for g in chain.groups for each in g.devices if each.name == name)
     axis = 2 if able[2] else able.index(True)
     twist = np.zeros(6)
@@ -194,7 +194,7 @@ def _position(arm: RemoteArm) -> Array:
 
 
 def _rested_ns(chain: Chain, arm: RemoteArm, deadline_ns: int) -> int | None:
-    """When the host saw the arm at rest after the stop; None if not by the deadline."""
+    """Return when the host saw the arm at rest after the stop; None if not by the deadline."""
     while True:
         rested_ns = arm.rested_ns()
         if rested_ns is not None:

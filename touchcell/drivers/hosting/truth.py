@@ -1,4 +1,4 @@
-"""What a simulated scene in a host knows to be true, told to the task's process: contacts, and where objects are."""
+"""Publish the ground truth of a simulated scene to the task's process: contacts and poses of objects."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 
 class HostedScene:
-    """The scene in its host: publishes the truth of every sensor that has been mounted, and of every object.
+    """A scene in its host: publishes the truth of every mounted sensor and of every object.
 
     Args:
-        scene: which it is.
+        scene: the scene.
         fds: descriptors of the blocks, by name of the sensor.
         objects_fd: descriptor of the objects' block.
     """
@@ -35,7 +35,7 @@ class HostedScene:
         self._objects = RecordWriter(objects_fd, OBJECTS)
 
     def look(self) -> None:
-        """Publish what is true now."""
+        """Publish the present truth."""
         for name, record in self._sensors.items():
             if self._scene.has(name):
                 contact = self._scene.contact(name)
@@ -51,13 +51,13 @@ class HostedScene:
 
 
 class RemoteScene:
-    """A scene in another process, as far as it can be looked into: the newest truth that its host has told.
+    """Proxy of a scene in another process: the newest truth published by its host.
 
     Args:
         objects: names of the free objects, in the order of the scene's section.
 
     Raises:
-        ConfigError: there are more objects than a block holds.
+        ConfigError: more objects than a block holds.
     """
 
     def __init__(self, objects: Sequence[str]) -> None:
@@ -73,15 +73,15 @@ class RemoteScene:
         self._objects = self._exit.enter_context(RecordReader(objects_fd, OBJECTS))
 
     def detach(self) -> None:
-        """Let go of them."""
+        """Unmap the blocks."""
         self._exit.close()
         self._sensors = {}
 
     def contact(self, sensor: str, t_ns: int | None = None) -> Stamped[ContactState]:
-        """The newest contact that the host has told, whatever ``t_ns`` is. Raises StaleData before the first."""
+        """Return the newest published contact, whatever ``t_ns`` is. Raises StaleData before the first."""
         record = self._sensors[sensor].read()
         if not record["t_ns"]:
-            raise StaleData(sensor, float("inf"), 0.0, 0, hint="its host has told no contact yet")
+            raise StaleData(sensor, float("inf"), 0.0, 0, hint="its host has published no contact yet")
         shear_x_n, shear_y_n = record["shear_force_n"].tolist()
         state = ContactState(
             record["T_f_s"].copy(),
@@ -94,7 +94,7 @@ class RemoteScene:
         return Stamped(state, int(record["t_ns"]), int(record["seq"]))
 
     def objects(self) -> Stamped[Mapping[str, Array]]:
-        """T_world_object (4, 4) of every free object, as the host has told last."""
+        """Return T_world_object (4, 4) of every free object, as last published."""
         record = self._objects.read()
         poses = [np.array(T) for T in record["T_world_object"][: len(self._names)]] if record["t_ns"] else []
         return Stamped(dict(zip(self._names, poses, strict=False)), int(record["t_ns"]), int(record["seq"]))

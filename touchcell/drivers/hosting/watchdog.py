@@ -1,6 +1,6 @@
-"""The watchdog: a process that does nothing but look at the beats of all others, and stop all arms when one is missing.
+"""Watchdog process: monitors the heartbeats of task and device hosts, and stops all arms when one is missing.
 
-``Judge`` is the whole of its judgement, on given times; ``main`` is the loop around it.
+``Judge`` contains all decisions, as a function of given times; ``main`` is the loop around it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from touchcell.drivers.hosting.realtime import ask_for_realtime
 from touchcell.drivers.hosting.wire import receive, send
 
 MISSED_BEATS: Final = 2.5
-"""Control periods of silence after which somebody has missed two beats."""
+"""Control periods of silence that count as two missed heartbeats."""
 
 SLOW_PERIODS: Final = 1.5
 """A period of the task is late when it takes this many control periods."""
@@ -46,20 +46,20 @@ _LINGER_S: Final = 10.0
 
 
 def silence_s(period_s: float) -> float:
-    """Longest silence that is allowed to task, hosts and watchdog alike."""
+    """Return the longest silence that is allowed to task, hosts and watchdog."""
     return MISSED_BEATS * period_s
 
 
 @dataclass(frozen=True, slots=True)
 class Beat:
-    """The newest sign of life of a process.
+    """Newest heartbeat of a process.
 
     Attributes:
-        count: how many it gave.
-        t_ns: when it gave this one.
-        latched: whether it has stopped its arms, for a host.
-        late: how many periods were late, for the task; two beats may come between two looks of the watchdog.
-        late_ns: how long the newest of these was.
+        count: number of heartbeats so far.
+        t_ns: time of this one.
+        latched: for a host: whether it has stopped its arms.
+        late: for the task: number of late periods, since two heartbeats may fall between two polls of the watchdog.
+        late_ns: duration of the newest late period.
     """
 
     count: int
@@ -70,7 +70,7 @@ class Beat:
 
 
 class Judge:
-    """Decides whether all arms have to be stopped. Knows no clock.
+    """Decide whether all arms have to be stopped. Holds no clock.
 
     Args:
         period_s: control period of the task.
@@ -82,12 +82,12 @@ class Judge:
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
-        """Everybody starts afresh: only what happens from now on counts."""
+        """Reset: only events from now on count."""
         self._begun_ns = now_ns
         self._beats: deque[Beat] = deque()
 
     def update(self, now_ns: int, task: Beat, hosts: Sequence[Beat]) -> Cause | None:
-        """The first cause to stop, or None; to be asked several times in a control period."""
+        """Return the first cause to stop, or None; call several times per control period."""
         if (silent_ns := now_ns - max(task.t_ns, self._begun_ns)) > self._silence_ns:
             return Cause(Reason.TASK_SILENT, now_ns, silent_ns * 1e-9, self._silence_ns * 1e-9)
         for number, host in enumerate(hosts):
@@ -131,7 +131,7 @@ class _Watchdog:
     def run(self) -> None:
         step_s = self._period_s / 4
         while not self._over():
-            # Answering nobody: the lifeline is looked at only when there is time.
+            # No reply is sent: the lifeline is polled only when there is time.
             waiting = [] if self._task_gone_ns else [self._lifeline]
             if select.select(waiting, [], [], step_s)[0]:
                 self._hear()
@@ -183,7 +183,7 @@ class _Watchdog:
             send(self._lifeline, {"ok": self._cause is None, "number": message["number"]})
 
     def _settled(self, now_ns: int) -> bool:
-        """Whether all arms stand, or have had their time."""
+        """Return whether all arms are at rest, or their time to stop has passed."""
         assert self._cause is not None
         if now_ns - self._cause.t_ns > _REPORT_AFTER_S * 1e9:
             return True
@@ -199,7 +199,7 @@ class _Watchdog:
             "host": cause.host,
             "arms": {name: stop_record(arm.read()) for name, arm in self._arms.items()},
         }
-        # The arms stand; a disk that is full changes nothing about that.
+        # The arms are at rest; a full disk does not change that.
         with suppress(OSError):
             path.write_text(json.dumps(record, indent=1) + "\n")
 
@@ -212,7 +212,7 @@ class _Watchdog:
 
 
 def stop_record(arm: Any) -> dict[str, Any]:
-    """What a host's own record of one arm says of its stop, as plain data."""
+    """Return a host's record of the stop of one arm, as plain data."""
     stopped, rested = int(arm["stop_ns"]), int(arm["rest_ns"])
     return {
         "stopped_ns": stopped,
@@ -234,7 +234,7 @@ def _host_beat(record: Any) -> Beat:
 
 
 def main() -> None:
-    """Run as ``python -m touchcell.drivers.hosting.watchdog SPEC``, with the descriptors that SPEC names inherited."""
+    """Run as ``python -m touchcell.drivers.hosting.watchdog SPEC``, with the descriptors named in SPEC inherited."""
     watchdog = _Watchdog(json.loads(sys.argv[1]))
     send(watchdog._lifeline, {"ok": True, "number": 0, "realtime": ask_for_realtime()})
     watchdog.run()

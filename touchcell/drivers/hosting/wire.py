@@ -1,4 +1,4 @@
-"""Typed errors and requests between processes, as JSON: type and attributes, never text to be matched, never pickle."""
+"""Typed errors and requests between processes as JSON: type and attributes, no text to match, no pickle."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _ENUMS: Final[dict[str, type[Enum]]] = {each.__name__: each for each in (Rejecti
 
 
 def encode_error(error: BaseException) -> dict[str, Any]:
-    """``error`` as plain data: the nearest type of the tree that every process knows, and all attributes."""
+    """Encode ``error`` as plain data: the nearest type of the tree that every process knows, and all attributes."""
     known = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in _ERRORS), "")
     if not known or not isinstance(error, TouchcellError):
         return {"type": "DeviceError", "attributes": {"message": f"{type(error).__name__}: {error}", "hint": ""}}
@@ -36,28 +36,28 @@ def encode_error(error: BaseException) -> dict[str, Any]:
 
 
 def decode_error(data: dict[str, Any], device: str) -> TouchcellError:
-    """The error that was encoded, with ``device`` in place of a missing name."""
+    """Decode an error, with ``device`` in place of a missing name."""
     kind = _ERRORS.get(data["type"], DeviceError)
     error = kind.__new__(kind)
     attributes = {name: _living(value) for name, value in data["attributes"].items()}
     Exception.__init__(error, attributes.get("message", ""))
-    # As it was, word for word: a constructor would write its message anew.
+    # Restored verbatim: a constructor would compose its message again.
     error.__dict__.update({"device": device, **attributes} if issubclass(kind, DeviceError) else attributes)
     return error
 
 
 def encode_adjustments(adjustments: tuple[Adjustment, ...]) -> bytes:
-    """Why what was sent differs from what was asked for; nothing for nothing."""
+    """Encode the adjustments of a command; empty for none."""
     return json.dumps([[a.limit, a.asked, a.allowed] for a in adjustments]).encode() if adjustments else b""
 
 
 def decode_adjustments(note: bytes) -> tuple[Adjustment, ...]:
-    """The reverse."""
+    """Decode adjustments."""
     return tuple(Adjustment(*each) for each in json.loads(note)) if note else ()
 
 
 def error_note(error: BaseException, longest: int) -> bytes:
-    """``error`` as text of at most ``longest`` bytes; what is too long loses its values, then its words."""
+    """Encode ``error`` in at most ``longest`` bytes; if too long it loses its values, then its message."""
     data = encode_error(error)
     for shorten in (None, "value", "limit", "causes", "message"):
         if shorten is not None and shorten in data["attributes"]:
@@ -69,17 +69,17 @@ def error_note(error: BaseException, longest: int) -> bytes:
 
 
 def decode_note(note: bytes, device: str) -> TouchcellError:
-    """The error of such a text."""
+    """Decode the error of ``error_note``."""
     return decode_error(json.loads(note), device)
 
 
 def send(connection: socket.socket, message: dict[str, Any]) -> None:
-    """Send one message over a SOCK_SEQPACKET socket. Raises OSError if the other side has gone."""
+    """Send one message over a SOCK_SEQPACKET socket. Raises OSError if the other side has closed."""
     connection.sendall(json.dumps(message).encode())
 
 
 def receive(connection: socket.socket) -> dict[str, Any] | None:
-    """The next message; None when the other side has closed. Raises CorruptMessage, and TimeoutError by its timeout."""
+    """Return the next message; None when the other side has closed. Raises CorruptMessage, TimeoutError."""
     try:
         data = connection.recv(MAX_MESSAGE_BYTES)
     except ConnectionError:
@@ -89,7 +89,7 @@ def receive(connection: socket.socket) -> dict[str, Any] | None:
     try:
         message: dict[str, Any] = json.loads(data)
     except ValueError:
-        raise CorruptMessage("process", "a message between processes is damaged") from None
+        raise CorruptMessage("process", "corrupt message between processes") from None
     return message
 
 

@@ -1,4 +1,4 @@
-"""Why a command was changed on its way to a device."""
+"""Adjustments of a command on its way to a device."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Adjustment:
-    """One reason why what was sent is not what was asked for."""
+    """One limit that made the sent command differ from the requested one."""
 
     limit: str
     asked: float

@@ -1,8 +1,8 @@
-"""Kinematics of serial arms whose makers give none: forward, differential inverse, and the torques of gravity.
+"""Kinematics of serial arms without a vendor model: forward and differential inverse kinematics, gravity torques.
 
-A chain is described in YAML (``touchcell/drivers/kinematics/chains``): per joint its placement in the link before it,
-its axis, its limits, and the mass and centre of mass of the link that it moves. All joints turn (no slides). Numpy
-only.
+A chain is described in YAML (``touchcell/drivers/kinematics/chains``): per joint its placement in the previous link,
+its axis, its limits, and the mass and centre of mass of the link that it moves. All joints are revolute. Depends on
+numpy only.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 
 GRAVITY_M_S2 = (0.0, 0.0, -9.80665)
-"""Standard gravity (ISO 80000-3) along the axes of a base that stands upright."""
+"""Standard gravity (ISO 80000-3) along the axes of an upright base."""
 
 
 class _Description(BaseModel):
@@ -40,13 +40,13 @@ class _Description(BaseModel):
 
 
 class Placement(_Description):
-    """Pose of a frame in the one before it; the angles are extrinsic xyz, R = Rz Ry Rx."""
+    """Pose of a frame in the previous one; the angles are extrinsic xyz, R = Rz Ry Rx."""
 
     origin_mm: Vector3 = (0.0, 0.0, 0.0)
     rotation_deg: Vector3 = (0.0, 0.0, 0.0)
 
     def pose(self) -> Array:
-        """As a (4, 4) pose."""
+        """Return the pose as (4, 4)."""
         T = np.eye(4)
         for axis, angle_deg in zip(np.eye(3), self.rotation_deg, strict=True):
             T[:3, :3] = _rotation(axis, np.deg2rad(angle_deg)) @ T[:3, :3]
@@ -55,7 +55,7 @@ class Placement(_Description):
 
 
 class CapsuleShape(_Description):
-    """A part of a link as a capsule: all that lies within a radius of a segment, in the frame that it is fixed to."""
+    """Capsule of a link for collision distances: all points within a radius of a segment, in the link's frame."""
 
     from_mm: Vector3
     to_mm: Vector3
@@ -65,8 +65,8 @@ class CapsuleShape(_Description):
 class Joint(Placement):
     """A revolute joint and the link that it moves.
 
-    The joint frame sits at ``origin_mm`` and ``rotation_deg`` in the link before it when the joint is at zero;
-    ``axis``, ``com_mm`` and ``capsules`` are given in the joint frame.
+    At zero, the joint frame is at ``origin_mm`` and ``rotation_deg`` in the previous link; ``axis``, ``com_mm`` and
+    ``capsules`` are given in the joint frame.
     """
 
     name: str
@@ -90,7 +90,7 @@ class Joint(Placement):
 
 
 class Tool(Placement):
-    """What is screwed to the flange: pose of the tool centre point, and mass and centre of mass in the flange frame."""
+    """Tool on the flange: pose of the tool centre point, and mass and centre of mass in the flange frame."""
 
     mass_kg: NotNegative = 0.0
     com_mm: Vector3 = (0.0, 0.0, 0.0)
@@ -106,15 +106,15 @@ class ChainDescription(_Description):
 
     @classmethod
     def read(cls, path: Path) -> ChainDescription:
-        """Read a YAML file. Raises ConfigError with the file and what is wrong in it."""
+        """Read a YAML file. Raises ConfigError with the file and the invalid entry."""
         try:
             return cls.model_validate(yaml.safe_load(path.read_text()))
         except (OSError, yaml.YAMLError, ValidationError) as error:
-            raise ConfigError(f"is no chain description: {error}", file=str(path)) from None
+            raise ConfigError(f"is not a valid chain description: {error}", file=str(path)) from None
 
     @classmethod
     def shipped(cls, name: str) -> ChainDescription:
-        """One of the descriptions that come with touchcell. Raises ConfigError for an unknown name."""
+        """Return a description shipped with touchcell. Raises ConfigError for an unknown name."""
         folder = Path(__file__).parent / "chains"
         known = sorted(path.stem for path in folder.glob("*.yaml"))
         if name not in known:
@@ -123,11 +123,11 @@ class ChainDescription(_Description):
 
     @classmethod
     def named(cls, chain: str) -> ChainDescription:
-        """A YAML file, or one that ships, as a cell file says it. Raises ConfigError."""
+        """Return a shipped description, or read it if ``chain`` is the path of a YAML file. Raises ConfigError."""
         return cls.read(Path(chain)) if Path(chain).suffix in (".yaml", ".yml") else cls.shipped(chain)
 
     def narrowed(self, ranges_deg: Array) -> ChainDescription:
-        """The same arm with each joint's range narrowed to ``ranges_deg`` (n, 2), lower and upper."""
+        """Return the same arm with each joint's range narrowed to ``ranges_deg`` (n, 2), lower and upper."""
         joints = [
             joint.model_copy(
                 update={
@@ -141,15 +141,15 @@ class ChainDescription(_Description):
 
 
 class SerialChain:
-    """Kinematics of one described arm with one tool.
+    """Kinematics of a described arm with one tool.
 
     Args:
         description: the arm.
-        tool: what its flange carries; without one the tool centre point is the flange.
-        gravity_m_s2: (3,) along base axes, for arms that hang or stand on a wall.
+        tool: tool on the flange; without one the tool centre point is the flange.
+        gravity_m_s2: (3,) along base axes, for ceiling- and wall-mounted arms.
 
     Attributes:
-        description, tool: the arm, and what its flange carries.
+        description, tool: description of the arm and its tool.
         joint_names, lower, upper, speed, accel, torque: (n,) per joint, rad, rad, rad/s, rad/s2, N m.
     """
 
@@ -183,19 +183,19 @@ class SerialChain:
         return len(self.joint_names)
 
     def forward(self, q: Array) -> Array:
-        """Pose ``T_base_tcp`` (4, 4) at joint angles ``q`` (n,) rad. Raises GeometryError for a wrong shape or NaN."""
+        """Return the pose ``T_base_tcp`` (4, 4) at ``q`` (n,) rad. Raises GeometryError for a wrong shape or NaN."""
         return self._place(q)[1]
 
     def link_poses(self, q: Array) -> Array:
-        """Poses (n, 4, 4) of the joint frames along base axes, each turned by its joint. Raises GeometryError."""
+        """Return the poses (n, 4, 4) of the joint frames in the base, after rotation. Raises GeometryError."""
         return self._place(q)[0]
 
     def jacobian(self, q: Array) -> Array:
-        """Geometric Jacobian (6, n): [v, w] of the tool centre point along base axes per joint velocity."""
+        """Return the geometric Jacobian (6, n): [v, w] of the tool centre point along base axes per joint velocity."""
         return self.forward_and_jacobian(q)[1]
 
     def forward_and_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """Both at once, for control loops."""
+        """Return pose and Jacobian from one pass, for control loops."""
         T_base_joint, T_base_tcp = self._place(q)
         axes = self._axes_in_base(T_base_joint)
         J = np.empty((6, len(axes)))
@@ -204,7 +204,7 @@ class SerialChain:
         return T_base_tcp, J
 
     def gravity_torques(self, q: Array) -> Array:
-        """Motor torques (n,) N m that hold the arm and its tool still at ``q``."""
+        """Return the motor torques (n,) N m that hold arm and tool still at ``q``."""
         T_base_joint, _ = self._place(q)
         origins = T_base_joint[:, :3, 3]
         moments = self._mass[:, None] * (np.einsum("nij,nj->ni", T_base_joint[:, :3, :3], self._com) + origins)
@@ -235,14 +235,14 @@ class SerialChain:
 
 @dataclass(frozen=True, slots=True)
 class JointMotion:
-    """Joint velocities for a twist, and how well they follow it.
+    """Joint velocities for a twist, and the twist that they achieve.
 
     Attributes:
         dq: (n,) rad/s, within every limit.
-        twist: (6,) what the tool centre point will really do, along base axes.
-        scale: share of the motion that the limits left.
-        smallest_singular_value: of the Jacobian with its angular rows times the characteristic length, m.
-        adjustments: which limits made ``twist`` differ from what was asked for.
+        twist: (6,) achieved twist of the tool centre point, along base axes.
+        scale: fraction of the motion left by the limits.
+        smallest_singular_value: of the Jacobian with its angular rows multiplied by the characteristic length, m.
+        adjustments: limits that made ``twist`` differ from the requested one.
     """
 
     dq: Array
@@ -253,16 +253,16 @@ class JointMotion:
 
 
 class DifferentialIk:
-    """Twists of the tool centre point to joint velocities, by damped least squares.
+    """Convert twists of the tool centre point into joint velocities, by damped least squares.
 
-    Each direction is damped by its own singular value (numerical filtering, after Maciejewski & Klein 1988), so that
-    directions far from singular are followed exactly. A redundant arm moves a joint that meets a limit as fast as it
-    may and makes up for it with the others (saturation in the null space, Flacco et al. 2012); what still exceeds a
-    limit slows the whole motion, so that the tool keeps its direction instead of being pushed off its path.
+    Each direction is damped by its own singular value (numerical filtering, Maciejewski & Klein 1988), so directions
+    far from singular are followed exactly. When a joint of a redundant arm reaches a limit, it moves at that limit and
+    the other joints compensate (saturation in the null space, Flacco et al. 2012); what still exceeds a limit slows the
+    whole motion, so that the tool keeps its direction instead of leaving its path.
 
     Args:
-        chain: the arm.
-        settings: treatment of limits.
+        chain: kinematic chain of the arm.
+        settings: handling of limits.
     """
 
     def __init__(self, chain: SerialChain, settings: IkSettings | None = None) -> None:
@@ -271,7 +271,7 @@ class DifferentialIk:
         self._weights = np.array([1.0, 1.0, 1.0, *[self.settings.characteristic_length_m] * 3])
 
     def solve(self, q: Array, twist: Array) -> JointMotion:
-        """Joint velocities at ``q`` (n,) rad for ``twist`` (6,) [v, w] along base axes.
+        """Return the joint velocities at ``q`` (n,) rad for ``twist`` (6,) [v, w] along base axes.
 
         Raises:
             GeometryError: an argument has the wrong shape or is not finite.
@@ -282,17 +282,17 @@ class DifferentialIk:
         return self.at(q).motion(twist)
 
     def at(self, q: Array) -> LocalIk:
-        """The same for several twists at one ``q`` (n,) rad. Raises GeometryError for a wrong shape or NaN."""
+        """Return a solver for several twists at one ``q`` (n,) rad. Raises GeometryError for a wrong shape or NaN."""
         return LocalIk(self, q, self._weights)
 
 
 class LocalIk:
-    """Differential inverse kinematics at one place.
+    """Differential inverse kinematics at one joint configuration.
 
     Args:
         ik: arm and settings.
         q: (n,) rad.
-        weights: (6,) of a twist's components.
+        weights: (6,) weights of a twist's components.
     """
 
     def __init__(self, ik: DifferentialIk, q: Array, weights: Array) -> None:
@@ -306,24 +306,24 @@ class LocalIk:
         self._bounds = speed_bounds(q, chain.lower, chain.upper, chain.speed, margin_rad)
 
     def acceleration_scale(self, step: Array, dt_s: float) -> tuple[float, tuple[Adjustment, ...]]:
-        """Share of the change of twist ``step`` (6,) within ``dt_s`` that no joint is too slow for, and why."""
+        """Return the fraction of the twist change ``step`` (6,) in ``dt_s`` within all joint accelerations, and why."""
         ddq = self._inverse @ (self._weights * step) / dt_s
         return within_acceleration(ddq, self._chain.accel, self._chain.joint_names)
 
     def motion(self, twist: Array) -> JointMotion:
-        """Joint velocities for ``twist`` (6,), within every limit."""
+        """Return the joint velocities for ``twist`` (6,), within every limit."""
         dq, scale, adjustments = self.limited(twist)
         return JointMotion(dq, (self._J @ dq) / self._weights, scale, self._smallest, adjustments)
 
     def limited(self, twist: Array) -> tuple[Array, float, tuple[Adjustment, ...]]:
-        """Joint velocities (n,) for ``twist`` (6,), within every limit, what share of it that is, and why."""
+        """Return joint velocities (n,) for ``twist`` (6,) within every limit, the achieved fraction of it, and why."""
         chain, settings = self._chain, self._settings
         lowest, highest = self._bounds
         dq = self._inverse @ (self._weights * twist)
         if settings.goes_round and len(dq) > 6:
             dq = self._saturated(dq, self._weights * twist, lowest, highest)
         scale, adjustments = within_bounds(dq, lowest, highest, chain.joint_names)
-        # Rounding must not lead beyond a limit either.
+        # Rounding must not exceed a limit either.
         dq = np.clip(dq * scale, lowest, highest)
         if self._smallest < settings.singular_value_m and dq.any():
             left, why = self._off_singularity(dq)
@@ -336,7 +336,7 @@ class LocalIk:
         return J
 
     def _inverted(self, J: Array) -> tuple[Array, float]:
-        """Damped inverse (n, 6) of ``J`` (6, n), and its smallest singular value."""
+        """Return the damped inverse (n, 6) of ``J`` (6, n) and its smallest singular value."""
         settings = self._settings
         U, s, Vt = np.linalg.svd(J, full_matrices=False)
         short = np.maximum(1.0 - (s / settings.singular_value_m) ** 2, 0.0)
@@ -364,7 +364,7 @@ class LocalIk:
 
 
 def _links(joints: tuple[Joint, ...], T_joint_flange: Array, tool: Tool) -> tuple[Array, Array]:
-    """Masses (n,) kg and centres of mass (n, 3) m in joint frames, the tool counted with the last link."""
+    """Return masses (n,) kg and centres of mass (n, 3) m in joint frames; the tool is part of the last link."""
     mass = np.array([joint.mass_kg for joint in joints])
     com = np.array([joint.com_mm for joint in joints]) * 1e-3
     tool_com = T_joint_flange[:3, :3] @ (np.array(tool.com_mm) * 1e-3) + T_joint_flange[:3, 3]
@@ -385,7 +385,7 @@ def _rotation(axis: Array, angle: float) -> Array:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Row-wise cross products (n, 3); np.cross takes five times as long on arrays this small."""
+    """Return row-wise cross products (n, 3); np.cross takes five times as long on arrays this small."""
     product: Array = a[:, _YZX] * b[:, _ZXY] - a[:, _ZXY] * b[:, _YZX]
     return product
 

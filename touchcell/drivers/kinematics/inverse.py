@@ -1,4 +1,4 @@
-"""Joint angles for a pose of the tool, found from a posture nearby."""
+"""Numerical inverse kinematics for a tool pose, from a nearby joint configuration."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _MARGIN_RAD = 0.02
 
 
 def joints_for_pose(chain: SerialChain, T_base_tcp: Array, q_near: Array) -> Array:
-    """Joint angles (n,) rad within the limits at which the tool is at ``T_base_tcp`` (4, 4).
+    """Return joint angles (n,) rad within the limits at which the tool is at ``T_base_tcp`` (4, 4).
 
-    Damped Gauss-Newton steps (Levenberg) from ``q_near`` (n,); angles beyond a limit are put back on it. It finds the
-    solution into whose basin ``q_near`` falls, if any.
+    Damped Gauss-Newton steps (Levenberg) from ``q_near`` (n,); angles beyond a limit are clamped to it. Converges to
+    the solution in whose basin of attraction ``q_near`` lies, if any.
 
     Raises:
-        ConfigError: none was found.
+        ConfigError: no solution was found.
     """
     q = np.clip(q_near, chain.lower + _MARGIN_RAD, chain.upper - _MARGIN_RAD)
     for _ in range(_STEPS):
@@ -37,15 +37,15 @@ def joints_for_pose(chain: SerialChain, T_base_tcp: Array, q_near: Array) -> Arr
         q = q + step * min(1.0, _LARGEST_STEP_RAD / largest)
         q = np.clip(q, chain.lower + _MARGIN_RAD, chain.upper - _MARGIN_RAD)
     raise ConfigError(
-        f"found no joint angles: {1e3 * float(np.linalg.norm(error[:3])):.1f} mm and "
-        f"{float(np.degrees(np.linalg.norm(error[3:]))):.1f} deg are left",
+        f"no inverse kinematics solution: {1e3 * float(np.linalg.norm(error[:3])):.1f} mm and "
+        f"{float(np.degrees(np.linalg.norm(error[3:]))):.1f} deg remain",
         value=se3.to_euler_mm_deg(T_base_tcp).round(1).tolist(),
-        hint="move the pose closer to the base, or give near_joints_deg of a posture like the wanted one",
+        hint="move the pose closer to the base, or set near_joints_deg to a configuration closer to the solution",
     )
 
 
 def _turn(T_from: Array, T_to: Array) -> Array:
-    """The rotation from one to the other along base axes, as a pose."""
+    """Return the rotation from one pose to the other along base axes, as a pose."""
     T = np.eye(4)
     T[:3, :3] = T_to[:3, :3] @ T_from[:3, :3].T
     return T

@@ -1,8 +1,7 @@
-"""Limits of joints, as pure functions: position and speed, acceleration, and nearness to a singularity.
+"""Joint limits as pure functions: position and speed, acceleration, and distance to a singularity.
 
-Each is directional: it holds back what makes things worse and lets through what makes them better. They are used for
-what an arm's gate lets through (``touchcell.drivers.core.gate``) and for the setpoints of arms that we drive joint by
-joint.
+Each limit is directional: it slows motion towards the limit and leaves motion away from it free. The command gate
+(``touchcell.drivers.core.gate``) and the setpoints of joint-controlled arms use them.
 """
 
 from __future__ import annotations
@@ -15,24 +14,25 @@ from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.geometry.types import Array
 
 NEGLIGIBLE = 1e-6
-"""Rounding, in rad/s or m/s: what points outwards at a limit by no more must not stop a whole arm."""
+"""Numerical tolerance, in rad/s or m/s: a smaller outward velocity at a limit must not stop the whole arm."""
 
 
 @dataclass(frozen=True, slots=True)
 class IkSettings:
-    """How twists become joint velocities, and where joints have to slow down.
+    """Settings of differential inverse kinematics and of the slow-down near joint limits and singularities.
 
     Attributes:
-        characteristic_length_m: one radian weighs as much as this many metres; about half the arm's reach makes the
+        characteristic_length_m: length that makes one radian comparable to metres; about half the arm's reach makes the
             singular values comparable.
         singular_value_m: directions with a smaller singular value are damped, and approached slowly.
-        singular_floor_m: motion that would bring the smallest singular value below this is refused.
-        leaving_fraction: below the floor, motion away from the singularity may take this share of the joints' speeds.
+        singular_floor_m: motion that would reduce the smallest singular value below this is refused.
+        leaving_fraction: below the floor, motion away from the singularity may use this fraction of the joint speeds.
         damping_m: largest damping, reached at a singular value of zero; it bounds the joint speed per tool speed. Zero
             for arms whose own controller inverts the twist exactly.
         singular_gain_hz: the distance to the floor shrinks by at most this fraction per second.
-        limit_margin_rad: over this last stretch a joint's outward speed falls linearly to zero; inward it is free.
-        goes_round: whether a redundant arm makes up for a joint at its limit with the others.
+        limit_margin_rad: within this distance of a limit the outward speed falls linearly to zero; inward motion is
+            free.
+        goes_round: whether a redundant arm compensates with other joints when one reaches its limit.
     """
 
     characteristic_length_m: float = 0.25
@@ -46,7 +46,7 @@ class IkSettings:
 
 
 def speed_bounds(q: Array, lower: Array, upper: Array, speed: Array, margin_rad: float) -> tuple[Array, Array]:
-    """Slowest and fastest joint speeds (n,) rad/s allowed at ``q`` (n,) rad; standing still always is.
+    """Return the lowest and highest joint speeds (n,) rad/s allowed at ``q`` (n,) rad; zero is always allowed.
 
     Over the last ``margin_rad`` before a limit the speed towards it falls linearly to zero; beyond it only the way back
     is allowed.
@@ -60,7 +60,7 @@ def speed_bounds(q: Array, lower: Array, upper: Array, speed: Array, margin_rad:
 def within_bounds(
     dq: Array, lowest: Array, highest: Array, names: tuple[str, ...]
 ) -> tuple[float, tuple[Adjustment, ...]]:
-    """Share of the joint velocities ``dq`` (n,) rad/s that keeps each in its bounds, and which joint asked for it."""
+    """Return the fraction of the joint velocities ``dq`` (n,) rad/s that keeps each in its bounds, and the limit."""
     allowed = np.clip(dq, lowest, highest)
     over = np.abs(allowed - dq) > NEGLIGIBLE
     if not over.any():
@@ -71,7 +71,7 @@ def within_bounds(
 
 
 def within_acceleration(ddq: Array, accel: Array, names: tuple[str, ...]) -> tuple[float, tuple[Adjustment, ...]]:
-    """Share of the joint accelerations ``ddq`` (n,) rad/s2 that keeps each within ``accel`` (n,), and why."""
+    """Return the fraction of the joint accelerations ``ddq`` (n,) rad/s2 within ``accel`` (n,), and the limit."""
     excess = np.abs(ddq) / accel
     worst = int(np.argmax(excess))
     if excess[worst] <= 1.0:
@@ -83,12 +83,12 @@ def within_acceleration(ddq: Array, accel: Array, names: tuple[str, ...]) -> tup
 def off_singularity(
     smallest_m: float, closing_m_s: float, fastest: float, settings: IkSettings
 ) -> tuple[float, tuple[Adjustment, ...]]:
-    """Share of a motion that may be done near a singularity, and why.
+    """Return the fraction of a motion that is allowed near a singularity, and the limit.
 
     Args:
         smallest_m: smallest singular value of the Jacobian with its angular rows times the characteristic length.
-        closing_m_s: how fast the motion makes it smaller.
-        fastest: largest joint speed of the motion as a share of that joint's limit.
+        closing_m_s: rate at which the motion decreases it.
+        fastest: largest joint speed of the motion as a fraction of that joint's limit.
         settings: thresholds.
     """
     allowed_m_s = settings.singular_gain_hz * max(smallest_m - settings.singular_floor_m, 0.0)

@@ -1,8 +1,8 @@
-"""What an arm with fewer than six joints can follow of a twist: the linear part first, then rotation if any is left.
+"""Project twists to the feasible motions of arms with fewer than six joints: linear part first, then rotation.
 
-A least-squares compromise would push the tip off its path for the sake of a rotation that the arm cannot make. So the
-joints give the linear velocity, and only motion that leaves the tip where it is serves the angular one (task priority,
-after Nakamura, Hanafusa & Yoshikawa 1987).
+A least-squares compromise would push the tip off its path for a rotation that the arm cannot make. So the joints follow
+the linear velocity, and only motion in the null space of the tip position serves the angular one (task priority, after
+Nakamura, Hanafusa & Yoshikawa 1987).
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ _NEGLIGIBLE_RAD_S = 1e-4
 
 
 def followable(J: Array, twist: Array) -> tuple[Array, tuple[Adjustment, ...]]:
-    """Project ``twist`` (6,) on what the joints can do.
+    """Project ``twist`` (6,) onto the feasible motions of the joints.
 
     Args:
         J: (6, n) geometric Jacobian along base axes.
         twist: (6,) [v, w] along base axes.
 
     Returns:
-        The twist that can be followed, and one adjustment per part (linear, angular) that differs, with the norms of
-        that part. The arm may rotate although it was not asked to, where the tip cannot move otherwise.
+        The feasible twist, and one adjustment per part (linear, angular) that differs, with the norms of that part. The
+        arm may rotate without being commanded to, where the tip cannot move otherwise.
     """
     linear, angular = J[:3], J[3:]
     push = np.linalg.pinv(linear, rcond=_relative(linear, _SHORTEST_LEVER_M))
@@ -47,5 +47,5 @@ def followable(J: Array, twist: Array) -> tuple[Array, tuple[Adjustment, ...]]:
 
 
 def _relative(matrix: Array, smallest: float) -> float:
-    """``smallest`` as a fraction of the largest singular value."""
+    """Return ``smallest`` as a fraction of the largest singular value."""
     return smallest / max(float(np.linalg.norm(matrix, 2)), smallest)

@@ -1,6 +1,6 @@
-"""Fallback for cameras that only OpenCV can open: no sequence numbers, settings as far as OpenCV tells.
+"""Fallback driver for cameras that only OpenCV can open: no sequence numbers, settings as far as OpenCV reports them.
 
-Prefer the driver ``v4l2``: OpenCV hides the kernel's frame counter, damaged-frame flag and error numbers.
+Prefer the driver ``v4l2``: OpenCV hides the kernel's frame counter, corrupt-frame flag and error numbers.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ _RATE_TOLERANCE = 0.01
 
 
 class OpencvCameraConfig(CameraConfig):
-    """Settings of a camera behind OpenCV; see ``CameraConfig``."""
+    """Settings of an OpenCV camera; see ``CameraConfig``."""
 
 
 class _Reader(threading.Thread):
-    """Empties OpenCV's queue without pause, since OpenCV has no call that asks whether a frame waits."""
+    """Drain OpenCV's queue continuously, since OpenCV has no call to test whether a frame is waiting."""
 
     def __init__(self, name: str, capture: cv2.VideoCapture, clock: Clock) -> None:
         super().__init__(name=f"{name} reader", daemon=True)
@@ -42,7 +42,7 @@ class _Reader(threading.Thread):
         self._stop_asked = threading.Event()
 
     def run(self) -> None:
-        """Read until told to stop or until the camera fails."""
+        """Read until stopped or until the camera fails."""
         import cv2
 
         while not self._stop_asked.is_set() and self._capture.grab():
@@ -57,16 +57,16 @@ class _Reader(threading.Thread):
             self.arrived.notify_all()
 
     def finish(self) -> None:
-        """Stop and wait for the end: at most OpenCV's own timeout for a frame, 10 s."""
+        """Stop and join the thread: takes at most OpenCV's own timeout for a frame, 10 s."""
         self._stop_asked.set()
         self.join()
 
 
 class OpencvCamera(Camera):
-    """A camera behind cv2.VideoCapture with its V4L2 backend.
+    """Driver for a camera with cv2.VideoCapture and its V4L2 backend.
 
-    A thread of its own reads without pause from ``configure`` to ``disconnect``; its end by itself is DeviceGone.
-    Frames are numbered on arrival, and lost ones are guessed from gaps between stamps.
+    A thread reads continuously from ``configure`` to ``disconnect``; if it ends by itself, that is DeviceGone. Frames
+    are numbered on arrival, and losses are estimated from gaps between timestamps.
     """
 
     def __init__(self, name: str, clock: Clock, config: OpencvCameraConfig) -> None:
@@ -86,7 +86,7 @@ class OpencvCamera(Camera):
             raise ConnectError(
                 self.name,
                 f"OpenCV cannot open {self._config.device}",
-                hint="OpenCV does not say why; the driver v4l2 would, and so does `touchcell devices`",
+                hint="OpenCV reports no reason; the driver v4l2 would, and so does `touchcell devices`",
             )
 
     def _close(self) -> None:
@@ -118,7 +118,7 @@ class OpencvCamera(Camera):
         import cv2
 
         config = self._config
-        # Undecoded bytes, so that a damaged frame is seen as such and decoding waits until somebody reads.
+        # Undecoded bytes, so that corrupt frames are detected and frames are decoded only on demand.
         capture.set(cv2.CAP_PROP_CONVERT_RGB, 0.0)
         capture.set(cv2.CAP_PROP_FOURCC, float(codec.fourcc(config.pixel_format)))
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, config.width_px)
@@ -169,8 +169,8 @@ class OpencvCamera(Camera):
         for position, (data, stamp_ns, received_ns) in enumerate(waiting):
             self._examine(data, stamp_ns, received_ns, overrun=position == 0 and len(waiting) == _QUEUE_FRAMES)
         if ended:
-            raise DeviceGone(self.name, "OpenCV gets no more frames", hint="OpenCV does not say why; recover to reopen")
-        # The reader's queue drops its oldest, so the newest is always the last that came.
+            raise DeviceGone(self.name, "OpenCV receives no frames", hint="OpenCV reports no reason; recover to reopen")
+        # The reader's queue drops its oldest, so the newest is always the last one received.
         return False
 
     def _examine(self, data: bytes, stamp_ns: int, received_ns: int, *, overrun: bool) -> None:
@@ -215,7 +215,7 @@ class OpencvCamera(Camera):
 
 
 def build(name: str, config: Any, context: DriverContext) -> Device:
-    """Make a DISCONNECTED camera."""
+    """Build a DISCONNECTED camera."""
     return OpencvCamera(name, context.clock, config)
 
 

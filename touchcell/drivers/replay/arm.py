@@ -1,4 +1,4 @@
-"""An arm that is only remembered: the poses at which a labelled data set was collected, beside a replay camera."""
+"""Arm that replays the poses at which a labelled data set was collected, in step with a replay camera."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from touchcell.geometry.types import Array
 
 
 class ReplayArmConfig(DriverConfig):
-    """Which data set, and how fast; the same as those of the camera beside it."""
+    """Data set and rate; equal to those of the replay camera."""
 
     data: Path
     split: str
@@ -28,15 +28,15 @@ class ReplayArmConfig(DriverConfig):
 
 
 class ReplayArm(Device):
-    """Tells where the sensor was for each labelled image: ``T_f_s`` of the label, so its base is the surface frame.
+    """Replay the sensor pose of each labelled image: ``T_f_s`` of the label, so its base is the surface frame.
 
-    Pose k is reached k periods after ``connect``, in natural order of the images' names, like the replay camera's; the
+    Pose k is reached k periods after ``connect``, in natural order of the images' names like in the replay camera; the
     arm stays at the last.
 
     Args:
         name: the device's name in the cell.
         config: checked configuration.
-        clock: injected time.
+        clock: injected clock.
     """
 
     def __init__(self, name: str, config: ReplayArmConfig, clock: Clock) -> None:
@@ -47,8 +47,8 @@ class ReplayArm(Device):
         self._poses: Array = np.empty((0, 4, 4))
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """Pose of the newest image. Raises StaleData."""
-        self._require("tell its pose", Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
+        """Return the pose of the newest image. Raises StaleData."""
+        self._require("read its pose", Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
         now_ns = self._clock.now_ns()
         seq = min((now_ns - self._start_ns) // self._period_ns, len(self._poses) - 1)
         t_ns = self._start_ns + seq * self._period_ns
@@ -75,7 +75,7 @@ def _build(name: str, config: Any, context: DriverContext) -> ReplayArm:
 
 SPEC = DriverSpec(
     name="replay_arm",
-    summary="remembers the poses at which a labelled data set was collected",
+    summary="replays the poses at which a labelled data set was collected",
     config=ReplayArmConfig,
     capabilities=Capabilities(kind="arm", abilities=frozenset({"TcpSource"}), state_rate_hz=30.0, virtual_time=True),
     build=_build,

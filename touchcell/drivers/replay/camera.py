@@ -1,4 +1,4 @@
-"""A camera that plays a folder of images, on the injected clock: for recorded and for public data."""
+"""Camera that plays a folder of images on the injected clock, for recorded and public data."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ CAPABILITIES = Capabilities(
 )
 
 _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
-# How a complete file ends: decoders fill what a truncated one lacks with grey and say nothing.
+# End markers of complete files: decoders silently fill the missing part of a truncated one with grey.
 _ENDINGS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
 
 class ReplayCameraConfig(DriverConfig):
-    """Which images, and how fast.
+    """Images to play, and their rate.
 
     Attributes:
         data: a folder of images, or with ``split`` the root of a data set in the public layout.
@@ -53,13 +53,13 @@ class ReplayCameraConfig(DriverConfig):
 class ReplayCamera(Device):
     """Plays PNG and JPEG images in natural name order, image_2 before image_10.
 
-    Image k is exposed k periods after ``connect``. Like a camera's, images that nobody reads in time are lost; they are
-    not even opened. All images have to be of one size.
+    Image k is exposed k periods after ``connect``. As with a live camera, images that are not read in time are lost;
+    they are not even opened. All images must have the same size.
 
     Args:
         name: the device's name in the cell.
         config: checked configuration.
-        clock: injected time.
+        clock: injected clock.
     """
 
     def __init__(self, name: str, config: ReplayCameraConfig, clock: Clock) -> None:
@@ -73,7 +73,7 @@ class ReplayCamera(Device):
         self._read = 0
 
     def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
-        """Newest image. Raises StaleData, EndOfStream a period after the last image, CorruptMessage, DeviceGone."""
+        """Return the newest image. Raises StaleData, CorruptMessage, DeviceGone, EndOfStream after the last."""
         self._require("deliver frames", *_READABLE)
         now_ns = self._clock.now_ns()
         seq = (now_ns - self._start_ns) // self._period_ns
@@ -84,13 +84,13 @@ class ReplayCamera(Device):
         return self._load(seq)
 
     def next(self, after_seq: int, timeout_s: float) -> Stamped[Frame]:
-        """Newest image if its ``seq > after_seq``, else the first that is.
+        """Return the newest image if its ``seq > after_seq``, else wait for the first that is.
 
         Raises:
             TransportTimeout: it is not due within ``timeout_s``.
             EndOfStream: there are no more.
-            CorruptMessage: the file is no whole image, or of another size than the ones before.
-            DeviceGone: the file has disappeared.
+            CorruptMessage: the file is not a complete image, or differs in size from the previous ones.
+            DeviceGone: the file no longer exists.
         """
         self._require("deliver frames", *_READABLE)
         now_ns = self._clock.now_ns()
@@ -104,7 +104,7 @@ class ReplayCamera(Device):
         return self._load(seq)
 
     def health(self) -> dict[str, float | int | str | bool]:
-        """How many images there are and how many were read."""
+        """Return the number of images and the number that were read."""
         return {"images": len(self._files), "images_read": self._read}
 
     def _exposed_ns(self, seq: int) -> int:
@@ -122,7 +122,7 @@ class ReplayCamera(Device):
             if image.shape != self._size:
                 raise CorruptMessage(
                     self.name,
-                    f"{self._files[seq].name} has shape {image.shape}, the images before it {self._size}",
+                    f"{self._files[seq].name} has shape {image.shape}, the previous images {self._size}",
                     hint="a camera does not change its image size; sort the images into folders",
                 )
             self._newest = Stamped(Frame(image), self._exposed_ns(seq), seq)
@@ -135,23 +135,23 @@ class ReplayCamera(Device):
         except OSError as error:
             raise DeviceGone(self.name, f"cannot read {file}: {error.strerror}") from None
         if not data.rstrip(b"\0").endswith(_ENDINGS[file.suffix.lower()]):
-            raise CorruptMessage(self.name, f"{file} is truncated or no {file.suffix} image", hint="copy it again")
+            raise CorruptMessage(self.name, f"{file} is truncated or not a {file.suffix} image", hint="copy it again")
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR)
         if image is None:
-            raise CorruptMessage(self.name, f"{file} is no readable image")
+            raise CorruptMessage(self.name, f"{file} is not a readable image")
         return np.asarray(image, dtype=np.uint8)
 
     def _open(self) -> None:
         if not self._folder.is_dir():
             raise ConnectError(
                 self.name,
-                f"{self._folder} is no folder",
-                hint="give the folder that holds the images, or the data set and its split",
+                f"{self._folder} is not a folder",
+                hint="give the folder that contains the images, or the data set and its split",
             )
         files = (file for file in self._folder.iterdir() if file.suffix.lower() in _ENDINGS)
         self._files = sorted(files, key=natural_order)
         if not self._files:
-            raise ConnectError(self.name, f"{self._folder} holds no PNG or JPEG images")
+            raise ConnectError(self.name, f"{self._folder} contains no PNG or JPEG images")
         self._start_ns = self._clock.now_ns()
 
     def _close(self) -> None:

@@ -1,7 +1,7 @@
 """Labelled tactile images on disk, in the layout of the public TacTip releases.
 
 ``ROOT/SPLIT/processed_images/*.png`` and ``ROOT/SPLIT/targets_images.csv`` (or ``targets.csv``), SPLIT one of train,
-val, test. The six labels of SPEC part 2 are found by column name; other columns, and images without a row, are ignored.
+val, test. The six labels are found by column name; other columns, and images without a row, are ignored.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ LABEL_FILES = ("targets_images.csv", "targets.csv")
 IMAGE_FOLDER = "processed_images"
 IMAGE_COLUMN = "sensor_image"
 REST_IMAGE = "rest.png"
-"""Beside the splits, where there is one: what the sensor sees out of contact."""
+"""File beside the splits, if present: the image out of contact."""
 LABEL_COLUMNS = ("shear_x", "shear_y", "pose_z", "pose_Rx", "pose_Ry", "shear_Rz")
 """Columns that hold x, y, z, alpha, beta, gamma of ``T_f_s``, mm and degrees."""
 
 
 @dataclass(frozen=True)
 class Split:
-    """One split of a data set, images not yet read.
+    """One split of a data set; images are not read yet.
 
     Attributes:
-        folder: where it lies.
+        folder: folder of the split.
         images: n image files in the order of the label file.
         contact_mm_deg: (n, 6) labels x, y, z, alpha, beta, gamma of ``T_f_s``, mm and degrees.
         unlabelled: images in the folder that have no row.
@@ -48,7 +48,7 @@ class Split:
     unlabelled: int
 
     def read(self) -> Iterator[ImageArray]:
-        """Images in order, decoded one by one, uint8 grey (height, width).
+        """Yield the images in order, decoded one by one, uint8 grey (height, width).
 
         Raises:
             DataError: an image is unreadable or truncated, or its size differs from the first one's.
@@ -62,24 +62,24 @@ class Split:
                 raise DataError(
                     path,
                     f"image of {image.shape[1]}x{image.shape[0]} among images of {size[1]}x{size[0]}",
-                    hint="one data set holds images of one size; collect or crop these again",
+                    hint="all images of a data set have one size; collect or crop these again",
                 )
             yield image
 
     def deeper_than(self, depth_mm: float) -> Split:
-        """The contacts of this split that are pressed further in. Raises DataError if there are none."""
+        """Return the contacts of this split with a larger indentation. Raises DataError if there are none."""
         kept = np.flatnonzero(self.contact_mm_deg[:, 2] > depth_mm)
         if not len(kept):
-            raise DataError(self.folder, f"holds no contact deeper than {depth_mm:g} mm")
+            raise DataError(self.folder, f"contains no contact deeper than {depth_mm:g} mm")
         return replace(self, images=tuple(self.images[i] for i in kept), contact_mm_deg=self.contact_mm_deg[kept])
 
 
 def read_split(root: Path, split: str) -> Split:
-    """The labels of one split and the files of its images.
+    """Read the labels of one split and the names of its images.
 
     Raises:
         DataError: the folder, the split, the label file, a column or an image is missing; the split is empty; a label
-            is no finite number; two rows name one image.
+            is not a finite number; two rows name one image.
     """
     folder = root / split
     if not folder.is_dir():
@@ -91,7 +91,7 @@ def read_split(root: Path, split: str) -> Split:
         raise DataError(folder, f"no label file {' or '.join(LABEL_FILES)}")
     image_folder = folder / IMAGE_FOLDER
     if not image_folder.is_dir():
-        raise DataError(image_folder, "no such folder", hint="the images of a split lie there")
+        raise DataError(image_folder, "no such folder", hint="this folder holds the images of a split")
     present = {path.name for path in image_folder.iterdir() if path.suffix.lower() == ".png"}
 
     names: list[str] = []
@@ -124,33 +124,33 @@ def read_split(root: Path, split: str) -> Split:
 
 
 def read_rest(root: Path) -> ImageArray | None:
-    """The image out of contact, uint8 grey (height, width); None where the data set has none. Raises DataError."""
+    """Read the image out of contact, uint8 grey (height, width); None if the data set has none. Raises DataError."""
     path = root / REST_IMAGE
     return read_image(path) if path.exists() else None
 
 
 def read_image(path: Path) -> ImageArray:
-    """A PNG as uint8 grey (height, width).
+    """Read a PNG as uint8 grey (height, width).
 
     Raises:
-        DataError: the file is missing, no image, or ends early.
+        DataError: the file is missing, not an image, or truncated.
     """
     try:
         encoded = path.read_bytes()
     except OSError as error:
         raise DataError(path, f"cannot be read: {error.strerror}") from error
-    # OpenCV decodes what there is of a truncated PNG and leaves the rest black, so the end is looked for first.
+    # OpenCV decodes the part of a truncated PNG that exists and leaves the rest black, so the end is checked first.
     if not encoded.startswith(b"\x89PNG\r\n\x1a\n") or encoded[-8:-4] != b"IEND":
-        raise DataError(path, "no complete PNG image", hint="copy the data set again")
+        raise DataError(path, "not a complete PNG image", hint="copy the data set again")
     image = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
     width, height = struct.unpack(">II", encoded[16:24])
     if image is None or image.shape != (height, width):
-        raise DataError(path, "damaged PNG image", hint="copy the data set again")
+        raise DataError(path, "corrupt PNG image", hint="copy the data set again")
     return cast(ImageArray, image)
 
 
 def natural_order(path: Path) -> list[tuple[int, str]]:
-    """Sort key under which numbers within names count as numbers: image_2 before image_10."""
+    """Return a sort key that orders numbers within names numerically: image_2 before image_10."""
     parts = re.split(r"(\d+)", path.name)
     return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
 
@@ -168,7 +168,7 @@ def _number(text: str | None, table: Path, row: int, column: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise DataError(table, f"{text!r} is no finite number", row=row, column=column)
+        raise DataError(table, f"{text!r} is not a finite number", row=row, column=column)
     return value
 
 

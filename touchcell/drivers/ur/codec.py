@@ -1,8 +1,8 @@
-"""The wire format of Universal Robots' Real-Time Data Exchange (RTDE), version 2: pure functions, no input or output.
+"""Wire format of Universal Robots' Real-Time Data Exchange (RTDE), version 2: pure functions, no I/O.
 
-Every packet is ``u16 size, u8 type, payload``, big-endian, size counting itself. A client agrees on the version, names
-the variables it wants to read (one output recipe) and to write (input recipes), then starts the stream of data
-packets, each ``u8 recipe, values``. There is no checksum, since TCP has one: a damaged packet can only show as a wrong
+Every packet is ``u16 size, u8 type, payload``, big-endian, size counting itself. A client negotiates the version, sets
+up the variables it wants to read (one output recipe) and to write (input recipes), then starts the stream of data
+packets, each ``u8 recipe, values``. RTDE has no checksum of its own (TCP has): a corrupt packet is detected only by its
 size, type, recipe or value. Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", for e-Series PolyScope 5.
 """
 
@@ -38,6 +38,7 @@ _FORMATS = {
 
 TYPE_NAMES = frozenset(_FORMATS)
 """Data types that a recipe may name."""
+"""Data types of RTDE variables."""
 
 
 class PacketType(IntEnum):
@@ -62,7 +63,7 @@ class Packet:
 
 
 def encode(packet: Packet) -> bytes:
-    """The bytes of ``packet``. Raises CorruptMessage if it is too long for its size field."""
+    """Return the bytes of ``packet``. Raises CorruptMessage if it is too long for its size field."""
     size = HEADER_SIZE + len(packet.payload)
     if size > 0xFFFF:
         raise CorruptMessage("rtde", f"packet of {size} bytes does not fit")
@@ -70,7 +71,7 @@ def encode(packet: Packet) -> bytes:
 
 
 def split(stream: bytes) -> tuple[list[Packet], bytes]:
-    """Whole packets at the front of ``stream``, and the bytes left over.
+    """Return the complete packets at the front of ``stream`` and the remaining bytes.
 
     Raises:
         CorruptMessage: a size below the header's or an unknown type; the stream cannot be resynchronised.
@@ -94,12 +95,12 @@ def split(stream: bytes) -> tuple[list[Packet], bytes]:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """Variables that travel together in one data packet.
+    """Variables transmitted together in one data packet.
 
     Attributes:
-        number: recipe number, 1 to 255; 0 stands for a refused recipe.
-        names: the variables.
-        types: their data types, as many.
+        number: recipe number, 1 to 255; 0 marks a rejected recipe.
+        names: names of the variables.
+        types: data types, one per name.
     """
 
     number: int
@@ -110,11 +111,11 @@ class Recipe:
     def __post_init__(self) -> None:
         unknown = [name for name in self.types if name not in TYPE_NAMES]
         if unknown or len(self.names) != len(self.types) or not 0 < self.number <= 0xFF:
-            raise CorruptMessage("rtde", f"no recipe: number {self.number}, {len(self.names)} names, types {unknown}")
+            raise CorruptMessage("rtde", f"bad recipe: number {self.number}, {len(self.names)} names, types {unknown}")
         object.__setattr__(self, "_layout", struct.Struct(">B" + "".join(_FORMATS[name] for name in self.types)))
 
     def pack(self, values: Mapping[str, Value]) -> bytes:
-        """A data packet's payload. Raises CorruptMessage for a missing variable or one that does not fit."""
+        """Encode a data packet's payload. Raises CorruptMessage for a missing variable or a value out of range."""
         flat: list[float | int | bool] = [self.number]
         try:
             for name in self.names:
@@ -128,9 +129,9 @@ class Recipe:
             raise CorruptMessage("rtde", f"recipe {self.number} does not fit: {error}") from None
 
     def unpack(self, payload: bytes) -> dict[str, Value]:
-        """Values of a data packet by name. Raises CorruptMessage for another recipe or another size."""
+        """Decode a data packet into values by name. Raises CorruptMessage for another recipe or size."""
         if len(payload) != self._layout.size or payload[0] != self.number:
-            raise CorruptMessage("rtde", f"{len(payload)} bytes are no data of recipe {self.number}")
+            raise CorruptMessage("rtde", f"{len(payload)} bytes do not match recipe {self.number}")
         flat = self._layout.unpack(payload)[1:]
         values: dict[str, Value] = {}
         at = 0
@@ -143,43 +144,43 @@ class Recipe:
 
 
 def version_request() -> Packet:
-    """Ask for version 2."""
+    """Request protocol version 2."""
     return Packet(PacketType.REQUEST_PROTOCOL_VERSION, struct.pack(">H", PROTOCOL_VERSION))
 
 
 def parse_version_request(payload: bytes) -> int:
-    """Version asked for. Raises CorruptMessage."""
+    """Return the requested version. Raises CorruptMessage."""
     return int(_unpack(">H", payload, "version request")[0])
 
 
 def accepted(kind: PacketType, yes: bool) -> Packet:
-    """Answer to a version request, a start or a pause."""
+    """Build the reply to a version request, a start or a pause."""
     return Packet(kind, bytes([yes]))
 
 
 def parse_accepted(payload: bytes) -> bool:
-    """Whether the answer says yes. Raises CorruptMessage."""
+    """Return whether the request was accepted. Raises CorruptMessage."""
     return bool(_unpack(">?", payload, "answer")[0])
 
 
 def controller_version(major: int, minor: int, bugfix: int, build: int) -> Packet:
-    """Version of the controller's software."""
+    """Build the packet with the version of the controller's software."""
     return Packet(PacketType.GET_URCONTROL_VERSION, struct.pack(">4I", major, minor, bugfix, build))
 
 
 def parse_controller_version(payload: bytes) -> tuple[int, int, int, int]:
-    """Major, minor, bugfix, build. Raises CorruptMessage."""
+    """Return major, minor, bugfix, build. Raises CorruptMessage."""
     major, minor, bugfix, build = _unpack(">4I", payload, "controller version")
     return int(major), int(minor), int(bugfix), int(build)
 
 
 def setup_outputs(rate_hz: float, names: Sequence[str]) -> Packet:
-    """Ask for ``names`` at ``rate_hz``."""
+    """Request the output variables ``names`` at ``rate_hz``."""
     return Packet(PacketType.SETUP_OUTPUTS, struct.pack(">d", rate_hz) + ",".join(names).encode())
 
 
 def parse_setup_outputs(payload: bytes) -> tuple[float, tuple[str, ...]]:
-    """Rate in Hz and names. Raises CorruptMessage for a rate outside [1, 500] (NaN too) or undecodable names."""
+    """Return rate in Hz and names. Raises CorruptMessage for a rate outside [1, 500] (NaN too) or undecodable names."""
     if len(payload) < 8:
         raise CorruptMessage("rtde", "output setup without a rate")
     (rate_hz,) = struct.unpack_from(">d", payload)
@@ -189,12 +190,12 @@ def parse_setup_outputs(payload: bytes) -> tuple[float, tuple[str, ...]]:
 
 
 def setup_inputs(names: Sequence[str]) -> Packet:
-    """Announce that ``names`` will be written together."""
+    """Declare the input variables ``names``, which will be written together."""
     return Packet(PacketType.SETUP_INPUTS, ",".join(names).encode())
 
 
 def parse_names(payload: bytes) -> tuple[str, ...]:
-    """Comma-separated names; a trailing comma is customary. Raises CorruptMessage."""
+    """Return comma-separated names; a trailing comma is customary. Raises CorruptMessage."""
     try:
         return tuple(name for name in payload.decode("ascii").split(",") if name)
     except UnicodeDecodeError:
@@ -202,14 +203,14 @@ def parse_names(payload: bytes) -> tuple[str, ...]:
 
 
 def recipe_answer(kind: PacketType, number: int, types: Sequence[str]) -> Packet:
-    """Answer to a setup: the recipe's number, and each variable's type, NOT_FOUND or IN_USE."""
+    """Build the reply to a setup: the recipe's number, and each variable's type, NOT_FOUND or IN_USE."""
     return Packet(kind, bytes([number]) + ",".join(types).encode())
 
 
 def parse_recipe_answer(payload: bytes, names: Sequence[str]) -> Recipe:
-    """The recipe that was granted for ``names``. Raises CorruptMessage if any variable was refused."""
+    """Return the recipe granted for ``names``. Raises CorruptMessage if any variable was rejected."""
     if not payload:
-        raise CorruptMessage("rtde", "empty answer to a setup")
+        raise CorruptMessage("rtde", "empty reply to a setup")
     return Recipe(payload[0], tuple(names), parse_names(payload[1:]))
 
 

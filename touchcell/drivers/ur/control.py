@@ -1,13 +1,14 @@
-"""Commands to ur-rtde's control program, which runs on the controller, by its registers.
+"""Send commands to ur-rtde's control program, which runs on the controller, through its registers.
 
-Facts of ur-rtde 1.6.5 that shape this module (its program and client, read and run against the emulator):
+Facts about ur-rtde 1.6.5 that shape this module (its program and client, read and run against the emulator):
 
-- A command stands in ``input_int_register_0``, its arguments in the double registers. Streamed ones (speedL) are obeyed
-  in every cycle; the others once, answered by 2 in ``output_int_register_0``, and by 1 when the command is cleared.
-- speedL does not expire: the program calls ``speedl(xd, a, t=time)`` again and again until it is told otherwise.
-  ``time`` only says how soon it takes up a newer twist, so it is one control period here.
-- setWatchdog stops the whole program when ``input_int_register_0`` is not written often enough. It is therefore set
-  always, and proven once per activation by keeping silent until the program has stopped.
+- A command is written to ``input_int_register_0``, its arguments to the double registers. Streamed ones (speedL) are
+  executed in every cycle; the others once, answered by 2 in ``output_int_register_0``, and by 1 when the command is
+  cleared.
+- speedL does not expire: the program calls ``speedl(xd, a, t=time)`` again and again until another command arrives.
+  ``time`` only sets how soon it reads a newer twist, so it is one control period here.
+- setWatchdog stops the whole program when ``input_int_register_0`` is not written often enough. It is therefore always
+  set, and tested once per activation by staying silent until the program has stopped.
 - Two threads of the program may not drive the arm: its speed thread has to be ended by speedStop before a move.
 """
 
@@ -51,17 +52,17 @@ _OPERATION_RUNNING = 0x8000
 
 
 class ControlLink:
-    """One run of the control program on one controller; ``open`` starts it, ``close`` ends it, and it is used once.
+    """One run of the control program on one controller; ``open`` starts it, ``close`` ends it. Not reusable.
 
     Args:
         device: name for errors.
         host: address of the controller.
         clock: the host's clock.
-        watchdog_hz: slowest rate of register writes that the controller tolerates.
+        watchdog_hz: lowest rate of register writes that the controller tolerates.
 
     Attributes:
-        ttl_stops: motions that ended because their time-to-live had passed.
-        trip_s: how long the watchdog took to stop the silent program when it was proven.
+        ttl_stops: motions that ended because their time-to-live had expired.
+        trip_s: time the watchdog took to stop the silent program in its test.
     """
 
     def __init__(self, device: str, host: str, clock: Clock, watchdog_hz: float) -> None:
@@ -82,14 +83,14 @@ class ControlLink:
         self.trip_s = 0.0
 
     def open(self, flange_to_tcp: Array) -> None:
-        """Upload the program, prove its watchdog, set the tool and read it back.
+        """Upload the program, test its watchdog, set the tool and read it back.
 
         Args:
             flange_to_tcp: pose [x y z rx ry rz], m and rotation vector.
 
         Raises:
-            TransportError: the controller does not answer, or its registers belong to somebody else.
-            DeviceFault: it does not start the program, stop it by its watchdog, or take the tool.
+            TransportError: the controller does not reply, or another client owns its registers.
+            DeviceFault: it does not start the program, stop it by its watchdog, or apply the tool.
         """
         with self._lock:
             registers = self._start_program()
@@ -111,17 +112,17 @@ class ControlLink:
             self._armed = True
 
     def speed(self, twist_base: Array, accel: float, stop_accel: float, expires_ns: int) -> None:
-        """Follow a twist until ``expires_ns``, then slow down with ``stop_accel``.
+        """Follow a twist until ``expires_ns``, then decelerate with ``stop_accel``.
 
         Raises:
-            CommandRejected: a joint goal is still under way, or the link has been closed.
-            DeviceGone: it could not be sent.
+            CommandRejected: a joint goal is still running, or the link is closed.
+            DeviceGone: sending failed.
         """
         with self._lock:
             registers = self._usable()
             if self.goal_running():
                 raise CommandRejected(
-                    self._device, Rejection.MODE, "a joint goal is under way", hint="stop, or wait until it is at rest"
+                    self._device, Rejection.MODE, "a joint goal is running", hint="stop, or wait until it is at rest"
                 )
             self._stop_accel = stop_accel
             self._expires_ns = expires_ns
@@ -129,7 +130,7 @@ class ControlLink:
             self._stream_speed(registers, twist_base.tolist(), accel)
 
     def halt(self, stop_accel: float) -> None:
-        """Begin to slow down with ``stop_accel``, whatever is going on."""
+        """Begin to decelerate with ``stop_accel``, whatever motion is running."""
         with self._lock:
             registers = self._registers
             if not self._armed or registers is None:
@@ -142,7 +143,7 @@ class ControlLink:
                 self._stream_speed(registers, [0.0] * 6, stop_accel)
 
     def move_joints(self, q: Array, speed: float, accel: float, stop_accel: float) -> None:
-        """Start towards joint angles (6,) with ``speed`` rad/s and ``accel`` rad/s2; the arm must be at rest."""
+        """Start towards joint angles (6,) at ``speed`` rad/s and ``accel`` rad/s2; the arm must be at rest."""
         with self._lock:
             registers = self._usable()
             if self._speeding:
@@ -152,7 +153,7 @@ class ControlLink:
             self._execute(registers, "moveJ", MOVEJ, [*q.tolist(), speed, accel], asynchronous=True)
 
     def goal_running(self) -> bool:
-        """Whether a joint goal, or the stop of one, is still under way."""
+        """Return whether a joint goal, or the stop of one, is still running."""
         with self._lock:
             if self._operation_before is None or self._registers is None:
                 return False
@@ -162,8 +163,8 @@ class ControlLink:
             return self._operation_before is not None
 
     def tick(self) -> None:
-        """Stop what has expired and keep the watchdog quiet; to be called every few milliseconds."""
-        # Whoever holds the lock is writing, which keeps the watchdog quiet just as well.
+        """Stop expired motions and feed the watchdog; call every few milliseconds."""
+        # A thread that holds the lock is writing, which feeds the watchdog too.
         if not self._lock.acquire(blocking=False):
             return
         try:
@@ -181,7 +182,7 @@ class ControlLink:
             self._lock.release()
 
     def close(self) -> None:
-        """End the program, so that nothing can resume it, and the connection. Never raises."""
+        """End the program, so that it cannot be resumed, and the connection. Never raises."""
         with self._lock:
             registers, self._registers = self._registers, None
             self._armed = False
@@ -221,20 +222,20 @@ class ControlLink:
             lambda state: state.get("runtime_state") == RuntimeState.STOPPED,
             1.0 / self._watchdog_hz + _TRIP_SLACK_S,
             f"the watchdog of {self._watchdog_hz:g} Hz does not stop a silent program",
-            "do not use this controller: the arm would go on if the host died",
+            "do not use this controller: the arm would keep moving if the host died",
         )
         self.trip_s = (self._clock.now_ns() - silent_ns) * 1e-9
 
     def _execute(
         self, registers: Registers, what: str, command: int, doubles: list[float], *, asynchronous: bool = False
     ) -> list[float]:
-        """Have a command obeyed once; returns the first six output doubles."""
+        """Execute a command once; return the first six output doubles."""
         self._await_answer(registers, READY, what)
         registers.command(command, doubles, asynchronous)
         state = self._await_answer(registers, DONE, what)
         registers.kick()
         self._written_ns = self._clock.now_ns()
-        # Only then is the next streamed command sure to be obeyed, and no older DONE taken for its answer.
+        # Only then is the next streamed command sure to be executed, and no older DONE mistaken for its reply.
         self._await_answer(registers, READY, what)
         return [float(_scalar(state, f"output_double_register_{i}")) for i in range(6)]
 
@@ -245,14 +246,14 @@ class ControlLink:
             if state and state["runtime_state"] != RuntimeState.PLAYING:
                 raise DeviceFault(
                     self._device,
-                    f"{what} was not taken",
+                    f"{what} was not executed",
                     vendor_code=f"runtime_state {state['runtime_state']}",
                     fault_class=FaultClass.MOTION,
                     needs=Remedy.RECOVER,
                     hint="the control program is not playing; see the pendant",
                 )
             if self._clock.now_ns() > deadline_ns:
-                raise TransportTimeout(self._device, f"answer to {what}", _ANSWER_S)
+                raise TransportTimeout(self._device, f"reply to {what}", _ANSWER_S)
             state = registers.read(_READ_S)
         return state
 
@@ -276,13 +277,13 @@ class ControlLink:
         self._written_ns = self._clock.now_ns()
 
     def _operation(self, registers: Registers) -> tuple[int, bool]:
-        """Number of the newest asynchronous operation (it counts to 127 and starts anew), and whether it is running."""
+        """Return the number of the newest asynchronous operation (wraps at 127), and whether it is running."""
         word = int(_scalar(registers.read(), "output_int_register_2"))
         return word >> 24 & 0x7F, bool(word & _OPERATION_RUNNING)
 
     def _usable(self) -> Registers:
         if not self._armed or self._registers is None:
-            raise CommandRejected(self._device, Rejection.MODE, "the control program has been given up")
+            raise CommandRejected(self._device, Rejection.MODE, "the control program has been closed")
         return self._registers
 
 

@@ -1,8 +1,8 @@
-"""Universal Robots e-Series arms (PolyScope 5) over ur-rtde: twists of the tool, joint goals, state, wrench.
+"""Driver for Universal Robots e-Series arms (PolyScope 5) with ur-rtde: twists, joint goals, state, wrench.
 
-What stops the arm, from the fastest: a zero twist from whoever calls ``stop``; the device's own thread once a twist's
-time-to-live has passed; the controller's watchdog once this process has been silent for ``1 / watchdog_hz``; the safety
-system and the buttons of the robot, which alone are rated for it. ``docs/devices/ur.md`` has the bench side.
+Stop mechanisms, fastest first: a zero twist from the caller of ``stop``; the driver's supervision thread once the
+time-to-live of a twist has expired; the controller's watchdog after ``1 / watchdog_hz`` of silence; the robot's safety
+system and buttons, which alone are safety-rated. ``docs/devices/ur.md`` describes setup and commissioning.
 """
 
 from __future__ import annotations
@@ -70,19 +70,19 @@ Positive = Annotated[float, Field(gt=0.0)]
 
 
 class UrConfig(DriverConfig):
-    """Configuration of one arm.
+    """Configuration of a UR arm.
 
     Attributes:
         host: address of the controller.
-        chain: the model: ``ur3e``, ``ur5e``, ``ur10e`` or a YAML file; checked against the arm when it is activated.
+        chain: robot model, ``ur3e``, ``ur5e``, ``ur10e`` or a YAML file; checked against the arm on activation.
         flange_to_tcp_mm_deg: [x y z alpha beta gamma] of the tool centre point in the flange's frame, extrinsic xyz.
-        limits: of the tool centre point.
+        limits: speed and acceleration limits of the tool centre point.
         joint_limits: margins to the chain's joint limits and to singularities.
-        stop_accel_m_s2: how hard it brakes, m/s2 and rad/s2; no gentler than the accelerations above.
+        stop_accel_m_s2: stopping deceleration, m/s2 and rad/s2; at least the accelerations above.
         joint_speed_deg_s, joint_accel_deg_s2: of a joint goal at ``speed_fraction`` 1.
-        watchdog_hz: the controller stops the program after silence of ``1 / watchdog_hz``.
+        watchdog_hz: the controller stops the program after ``1 / watchdog_hz`` of silence.
         state_timeout_s: silence of the state stream that is a fault.
-        connect_timeout_s: for the first answer of the controller.
+        connect_timeout_s: timeout of the controller's first reply.
     """
 
     host: str = Field(min_length=1)
@@ -101,30 +101,30 @@ class UrConfig(DriverConfig):
     def _brakes_hard_enough(self) -> Self:
         if self.stop_accel_m_s2 < self.accel:
             raise ValueError(
-                f"stop_accel_m_s2 {self.stop_accel_m_s2:g} is gentler than the acceleration allowed, {self.accel:g}"
+                f"stop_accel_m_s2 {self.stop_accel_m_s2:g} is less than the acceleration allowed, {self.accel:g}"
             )
         return self
 
     @property
     def accel(self) -> float:
-        """The one acceleration that speedL takes, m/s2 and rad/s2: large enough for both limits of the gate."""
+        """Acceleration parameter of speedL, m/s2 and rad/s2: the larger of both gate limits."""
         return max(self.limits.tcp_accel_m_s2, self.limits.tcp_rot_accel_rad_s2)
 
 
 class UrArm(Arm):
-    """A UR arm.
+    """Driver for a UR arm.
 
-    Until it is activated, ``tcp`` tells the pose of the tool centre point that is set on the pendant, because only a
-    running program may set another; from then on that of ``flange_to_tcp_mm_deg``, read back.
+    Before activation, ``tcp`` reports the pose of the tool centre point that is set on the pendant, because only a
+    running program may set another; afterwards that of ``flange_to_tcp_mm_deg``, read back.
 
-    One thread, started by ``connect`` and joined by ``disconnect``, checks the state every 4 ms, ends expired twists,
-    keeps the watchdog quiet and latches faults. It cannot run while another thread holds the interpreter's lock; then
-    the watchdog stops the arm.
+    One supervision thread, started by ``connect`` and joined by ``disconnect``, checks the state every 4 ms, ends
+    expired twists, feeds the watchdog and latches faults. It cannot run while another thread holds the GIL; then the
+    watchdog stops the arm.
 
     Args:
         name: the device's name in the cell.
-        config: its configuration.
-        clock: injected time.
+        config: configuration of the arm.
+        clock: injected clock.
     """
 
     def __init__(self, name: str, config: UrConfig, clock: Clock) -> None:
@@ -151,24 +151,24 @@ class UrArm(Arm):
         self._program_is_ours = False
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """Pose and twist of the tool centre point. Raises StaleData if it is older than ``max_age_s``."""
+        """Return pose and twist of the tool centre point. Raises StaleData if older than ``max_age_s``."""
         snapshot = self._newest(max_age_s)
         state = TcpState(_pose(snapshot.tcp_pose), snapshot.tcp_speed.copy())
         return Stamped(state, snapshot.t_ns, snapshot.seq, snapshot.t_device_ns)
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
-        """Joint angles and speeds. Raises StaleData if they are older than ``max_age_s``."""
+        """Return joint angles and speeds. Raises StaleData if older than ``max_age_s``."""
         snapshot = self._newest(max_age_s)
         state = JointState(snapshot.q.copy(), snapshot.qd.copy())
         return Stamped(state, snapshot.t_ns, snapshot.seq, snapshot.t_device_ns)
 
     def wrench(self, max_age_s: float | None = None) -> Stamped[Array]:
-        """(6,) [force N, torque N m] on the tool centre point along base axes, as the controller compensates it."""
+        """Return (6,) [force N, torque N m] at the tool centre point along base axes, compensated by the controller."""
         snapshot = self._newest(max_age_s)
         return Stamped(snapshot.tcp_force.copy(), snapshot.t_ns, snapshot.seq, snapshot.t_device_ns)
 
     def at_rest(self) -> bool:
-        """Whether no joint is asked to move and none does. Raises TransportError when the state is too old to tell."""
+        """Return whether measured and target joint speeds are zero. Raises TransportError if the state is stale."""
         snapshot = self._newest(None)
         age_s = snapshot.age_s(self._clock.now_ns())
         if age_s > self._config.state_timeout_s:
@@ -183,15 +183,15 @@ class UrArm(Arm):
     def go_to_joints(self, q: Array, lease: Lease, *, speed_fraction: float = 0.1) -> None:
         """Start moving to ``q`` (6,) rad in a straight line in joint space; the arm must be at rest.
 
-        The goal has no time-to-live, but ends like everything else when the host falls silent.
+        The goal has no time-to-live, but ends with everything else when the host is silent.
 
         Raises:
-            CommandRejected: nothing was sent.
+            CommandRejected: the goal was rejected; nothing was sent.
         """
         target = self._admitted_joint_goal(q, lease, speed_fraction, -_MAX_JOINT_GOAL_RAD, _MAX_JOINT_GOAL_RAD, JOINTS)
         link = self._link
         if link is None:
-            raise CommandRejected(self.name, Rejection.MODE, "the control program is gone")
+            raise CommandRejected(self.name, Rejection.MODE, "the control program is not running")
         if not self.at_rest():
             raise CommandRejected(self.name, Rejection.MODE, "the arm is moving", hint="stop it first")
         speed = math.radians(self._config.joint_speed_deg_s) * speed_fraction
@@ -199,17 +199,17 @@ class UrArm(Arm):
         self._attempt(lambda: link.move_joints(target, speed, accel, self._config.stop_accel_m_s2))
 
     def kinematics(self) -> DifferentialIk:
-        """Of its joints."""
+        """Return the differential inverse kinematics of the arm."""
         return self._ik
 
     def watchdog_s(self) -> float:
-        """Silence after which the controller stops the arm, proven at activation. Raises LifecycleError before it."""
+        """Return the controller's watchdog period, tested at activation. Raises LifecycleError before activation."""
         if self._proven_watchdog_s is None:
-            raise LifecycleError(self.name, "tell the watchdog's period", self.state.value, [Lifecycle.ACTIVE.value])
+            raise LifecycleError(self.name, "read the watchdog's period", self.state.value, [Lifecycle.ACTIVE.value])
         return self._proven_watchdog_s
 
     def health(self) -> dict[str, float | int | str | bool]:
-        """Modes, age of the state, dropped packets, temperatures, speed slider, watchdog."""
+        """Return modes, age of the state, dropped packets, temperatures, speed slider, watchdog."""
         snapshot = self._newest(None)
         reader = self._opened()
         link = self._link
@@ -309,7 +309,7 @@ class UrArm(Arm):
         self._drop_program()
         if not self._opened().connected:
             _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
-            # The old reader serves the thread until the new one has its first state.
+            # The old reader serves the supervision thread until the new one has received a state.
             self._start_receiving()
         self._opened().forget()
         if self._program_is_ours:
@@ -322,7 +322,7 @@ class UrArm(Arm):
         link = self._link
         try:
             if link is None or self.state is not Lifecycle.ACTIVE:
-                raise CommandRejected(self.name, Rejection.MODE, "the arm has just been given up")
+                raise CommandRejected(self.name, Rejection.MODE, "the arm has just been powered off or disconnected")
             expires_ns = now_ns + round(ttl_s * 1e9)
             link.speed(twist_base, self._config.accel, self._config.stop_accel_m_s2, expires_ns)
         except CommandRejected:
@@ -350,7 +350,7 @@ class UrArm(Arm):
             self._to_faulted(
                 DeviceFault(
                     self.name,
-                    f"its own thread died: {error!r}",
+                    f"supervision thread failed: {error!r}",
                     fault_class=FaultClass.INTERNAL,
                     needs=Remedy.POWER_CYCLE,
                     hint="the watchdog stops the arm; disconnect and report this",
@@ -358,7 +358,7 @@ class UrArm(Arm):
             )
 
     def _keep_once(self) -> None:
-        # The state before the flag: a program that was seen stopped after the flag was raised is a fault.
+        # Read the state before the flag: a program seen stopped after the flag was raised is a fault.
         snapshot = self._newest(None)
         supervised_from_seq = self._supervised_from_seq
         trouble = self._trouble(snapshot, supervised_from_seq)
@@ -393,7 +393,7 @@ class UrArm(Arm):
         return None
 
     def _explained(self, error: DeviceError) -> DeviceError:
-        """The state's own word for why a command was not taken, which may be a packet behind; else ``error``."""
+        """Return the fault in the state that explains a rejected command, up to one packet late; else ``error``."""
         deadline_ns = self._clock.now_ns() + _EXPLANATION_NS
         while (trouble := self._trouble(self._newest(None), self._supervised_from_seq)) is None:
             if self._clock.now_ns() > deadline_ns:
@@ -408,7 +408,7 @@ class UrArm(Arm):
                 self.name, "good state", self._config.state_timeout_s, hint="the controller or the network hangs"
             )
         else:
-            error = DeviceGone(self.name, "the state connection is gone", hint="check the cable and the controller")
+            error = DeviceGone(self.name, "lost the RTDE state connection", hint="check the cable and the controller")
         error.__cause__ = StaleData(self.name, age_s, self._config.state_timeout_s, snapshot.seq)
         return error
 
@@ -447,7 +447,7 @@ class UrArm(Arm):
         self._reader = reader
 
     def _stop_receiving(self) -> None:
-        # Dropping the last reference closes the connection. Its own ``disconnect`` would leave descriptors behind.
+        # Dropping the last reference closes the connection. Its own ``disconnect`` leaks file descriptors.
         self._reader = None
         self._receive = None
 
@@ -458,7 +458,7 @@ class UrArm(Arm):
 
     def _newest(self, max_age_s: float | None) -> Snapshot:
         snapshot = self._opened().poll()
-        assert snapshot is not None, "connect waits for the first"
+        assert snapshot is not None, "connect waits for the first state"
         if max_age_s is not None:
             age_s = snapshot.age_s(self._clock.now_ns())
             if age_s > max_age_s:
@@ -480,7 +480,7 @@ class UrArm(Arm):
         if snapshot.speed_fraction <= 0.0:
             raise DeviceFault(
                 self.name,
-                "the speed slider stands at zero",
+                "the speed slider is at zero",
                 fault_class=FaultClass.CONFIGURATION,
                 needs=Remedy.OPERATOR,
                 hint="move the slider on the pendant; twists are scaled by it",
@@ -506,7 +506,7 @@ class UrArm(Arm):
                 vendor_code=f"runtime_state {int(snapshot.runtime_state)}",
                 fault_class=FaultClass.CONFIGURATION,
                 needs=Remedy.OPERATOR,
-                hint="stop it on the pendant; this driver does not end other people's programs",
+                hint="stop it on the pendant; this driver does not end foreign programs",
             )
 
     def _power_on(self) -> None:
@@ -524,7 +524,7 @@ class UrArm(Arm):
         self._await(lambda state: state.robot_mode is RobotMode.POWER_OFF, _MODE_CHANGE_S, "power-off")
 
     def _end_program(self) -> None:
-        # It may have survived the fault if nobody could be reached then.
+        # It may have survived the fault if the controller was unreachable then.
         if self._fresh().runtime_state is not RuntimeState.STOPPED:
             with dashboard(self.name, self._config.host) as client:
                 client.stop()
@@ -538,10 +538,10 @@ class UrArm(Arm):
             except RuntimeError as error:
                 raise DeviceFault(
                     self.name,
-                    f"the protective stop stays: {error}",
+                    f"the protective stop remains: {error}",
                     fault_class=FaultClass.CONTACT,
                     needs=Remedy.RECOVER,
-                    hint="wait until 5 s after the stop, and look at the arm first",
+                    hint="inspect the arm, and wait until 5 s after the stop",
                 ) from error
         self._await(
             lambda state: state.safety_mode is not SafetyMode.PROTECTIVE_STOP,
@@ -559,12 +559,12 @@ class UrArm(Arm):
 
 
 def _ask_version(device: str, host: str, timeout_s: float) -> tuple[int, int, int, int]:
-    """The controller's version by a connection of our own: ur-rtde's constructors wait for ever on a frozen one."""
+    """Read the controller's version by a separate connection: ur-rtde's constructors block on a frozen controller."""
     try:
         wire = RtdeWire(device, host, timeout_s)
         try:
             if not ur_codec.parse_accepted(wire.ask(ur_codec.version_request()).payload):
-                raise ConnectError(device, f"RTDE of {host} does not speak version {ur_codec.PROTOCOL_VERSION}")
+                raise ConnectError(device, f"RTDE of {host} does not support version {ur_codec.PROTOCOL_VERSION}")
             answer = wire.ask(ur_codec.Packet(ur_codec.PacketType.GET_URCONTROL_VERSION))
             return ur_codec.parse_controller_version(answer.payload)
         finally:
@@ -579,12 +579,12 @@ def _ask_version(device: str, host: str, timeout_s: float) -> tuple[int, int, in
 
 
 def _pose_vector(T: Array) -> Array:
-    """Universal Robots' pose (6,) [x y z rx ry rz] of a pose (4, 4): metres and a rotation vector."""
+    """Return Universal Robots' pose (6,) [x y z rx ry rz] of a pose (4, 4): metres and a rotation vector."""
     return np.concatenate([T[:3, 3], se3.log(T)[3:]])
 
 
 def _pose(vector: Array) -> Array:
-    """Pose (4, 4) of Universal Robots' [x y z rx ry rz]."""
+    """Return pose (4, 4) of Universal Robots' [x y z rx ry rz]."""
     T = se3.exp(np.concatenate([np.zeros(3), vector[3:]]))
     T[:3, 3] = vector[:3]
     return T

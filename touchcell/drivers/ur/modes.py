@@ -1,4 +1,4 @@
-"""What the modes of a Universal Robots controller mean, and which of them are faults.
+"""Modes of a Universal Robots controller, and the faults among them.
 
 Numbers and names: Universal Robots, "Real-Time Data Exchange (RTDE) Guide" (robot_mode, safety_mode, runtime_state,
 safety_status_bits) and "Remote Control via TCP/IP" (client interface of PolyScope 5).
@@ -58,7 +58,7 @@ class SafetyMode(IntEnum):
 
 
 class SafetyBits(IntFlag):
-    """``safety_status_bits``; says the same as the mode, and is read beside it because either may be late."""
+    """``safety_status_bits``: same content as the mode; both are read, because either may be late."""
 
     NORMAL_MODE = 1 << 0
     REDUCED_MODE = 1 << 1
@@ -75,7 +75,7 @@ class SafetyBits(IntFlag):
 
 @dataclass(frozen=True, slots=True)
 class FaultEntry:
-    """How touchcell names one vendor state that is a fault."""
+    """Fault class, remedy and hint of a vendor state that is a fault."""
 
     name: str
     fault_class: FaultClass
@@ -90,7 +90,7 @@ SAFETY_FAULTS: Mapping[SafetyMode, FaultEntry] = {
         "protective stop",
         FaultClass.CONTACT,
         Remedy.RECOVER,
-        "look for what the arm hit or why it went too fast; recover unlocks it, not before 5 s have passed",
+        "check what the arm hit or why it was too fast; recover unlocks it, at least 5 s after the stop",
     ),
     SafetyMode.RECOVERY: FaultEntry(
         "recovery mode",
@@ -132,7 +132,7 @@ SAFETY_FAULTS: Mapping[SafetyMode, FaultEntry] = {
         "hold the enabling device, then recover",
     ),
 }
-"""Every safety mode but NORMAL and REDUCED, in which the arm may move."""
+"""Every safety mode except NORMAL and REDUCED, in which the arm may move."""
 
 _MODE_OF_BIT: Mapping[SafetyBits, SafetyMode] = {
     SafetyBits.FAULT: SafetyMode.FAULT,
@@ -148,7 +148,7 @@ _MODE_OF_BIT: Mapping[SafetyBits, SafetyMode] = {
 
 
 def safety_fault(device: str, mode: SafetyMode, bits: int) -> DeviceFault | None:
-    """The fault that the safety system reports, or None while the arm may move. The mode is asked before the bits."""
+    """Return the fault that the safety system reports, or None while the arm may move. The mode is checked first."""
     entry = SAFETY_FAULTS.get(mode)
     if entry is None:
         mode = next((found for bit, found in _MODE_OF_BIT.items() if bits & bit), mode)
@@ -166,7 +166,7 @@ def safety_fault(device: str, mode: SafetyMode, bits: int) -> DeviceFault | None
 
 
 def power_fault(device: str, mode: RobotMode) -> DeviceFault | None:
-    """The fault of an arm that should be powered with its brakes off but is in ``mode``; None if it is."""
+    """Return the fault of an arm in ``mode``, or None if it is powered with its brakes released."""
     if mode is RobotMode.RUNNING:
         return None
     return DeviceFault(
@@ -180,7 +180,7 @@ def power_fault(device: str, mode: RobotMode) -> DeviceFault | None:
 
 
 def program_fault(device: str, state: RuntimeState) -> DeviceFault | None:
-    """The fault of a control program that should be playing but is in ``state``; None if it plays."""
+    """Return the fault of a control program in ``state``, or None if it is playing."""
     if state in (RuntimeState.PLAYING, RuntimeState.RESUMING):
         return None
     return DeviceFault(
@@ -189,5 +189,5 @@ def program_fault(device: str, state: RuntimeState) -> DeviceFault | None:
         vendor_code=f"runtime_state {int(state)}",
         fault_class=FaultClass.MOTION,
         needs=Remedy.RECOVER,
-        hint="stopped from the pendant, by the safety system, or by its watchdog after silence of the host",
+        hint="stopped from the pendant, by the safety system, or by its watchdog because the host was silent",
     )

@@ -1,4 +1,4 @@
-"""A connection to the registers through which a UR controller and its control program talk. No threads, no retries."""
+"""Connection to the RTDE registers shared by a UR controller and its control program. No threads, no retries."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _LARGEST_READ = 1 << 16
 
 
 class RtdeWire:
-    """One RTDE connection: request and answer while it is being set up.
+    """One RTDE connection, with request and reply during setup.
 
     Args:
         device: name for errors.
         host: address of the controller.
-        timeout_s: for the connection and for each answer.
+        timeout_s: timeout of the connection and of each reply.
 
     Raises:
-        OSError: it cannot be reached.
+        OSError: the controller cannot be reached.
     """
 
     def __init__(self, device: str, host: str, timeout_s: float) -> None:
@@ -43,21 +43,21 @@ class RtdeWire:
         self._socket.setblocking(False)
 
     def close(self) -> None:
-        """End the connection; may be called again."""
+        """Close the connection; idempotent."""
         self._socket.close()
 
     def ask(self, request: Packet) -> Packet:
-        """The answer to ``request``. Raises TransportTimeout, DeviceGone, CorruptMessage."""
+        """Send ``request`` and return the reply. Raises TransportTimeout, DeviceGone, CorruptMessage."""
         self.send(request)
         deadline_s = time.monotonic() + self._timeout_s
         while (left_s := deadline_s - time.monotonic()) > 0.0:
             for packet in self.receive(left_s):
                 if packet.kind is request.kind:
                     return packet
-        raise TransportTimeout(self._device, f"answer to {request.kind.name}", self._timeout_s)
+        raise TransportTimeout(self._device, f"reply to {request.kind.name}", self._timeout_s)
 
     def send(self, packet: Packet) -> None:
-        """Send at once or raise DeviceGone: a controller that does not read is as good as gone."""
+        """Send at once or raise DeviceGone: a controller that does not read counts as lost."""
         data = ur_codec.encode(packet)
         try:
             sent = self._socket.send(data)
@@ -67,7 +67,7 @@ class RtdeWire:
             raise DeviceGone(self._device, "RTDE connection: the controller does not read")
 
     def receive(self, timeout_s: float) -> list[Packet]:
-        """Packets that have come, waiting for the first up to ``timeout_s``. Raises DeviceGone, CorruptMessage."""
+        """Return received packets, waiting for the first up to ``timeout_s``. Raises DeviceGone, CorruptMessage."""
         if timeout_s > 0.0:
             with selectors.DefaultSelector() as selector:
                 selector.register(self._socket, selectors.EVENT_READ)
@@ -85,12 +85,12 @@ class RtdeWire:
 
 
 class Registers:
-    """The control program's registers, claimed for us.
+    """The control program's registers, claimed by this client.
 
     Raises on construction:
         DeviceGone: unreachable, or closed.
-        TransportTimeout: no answer.
-        CorruptMessage: the registers are not there, or belong to somebody else.
+        TransportTimeout: no reply.
+        CorruptMessage: the registers do not exist, or another client owns them.
     """
 
     def __init__(self, device: str, host: str, timeout_s: float) -> None:
@@ -111,7 +111,7 @@ class Registers:
         self._values: dict[str, Value] = {}
 
     def close(self) -> None:
-        """Give the registers back; may be called again."""
+        """Release the registers; idempotent."""
         self._wire.close()
 
     def command(self, number: int, doubles: list[float], asynchronous: bool = False) -> None:
@@ -121,14 +121,14 @@ class Registers:
         self._wire.send(Packet(PacketType.DATA, self._command.pack(values)))
 
     def kick(self) -> None:
-        """Write "no command", which tells the watchdog that we live. Raises DeviceGone."""
+        """Write "no command", which feeds the watchdog. Raises DeviceGone."""
         self._wire.send(Packet(PacketType.DATA, self._kick.pack({KICK[0]: 0})))
 
     def read(self, timeout_s: float = 0.0) -> dict[str, Value]:
-        """Newest outputs by name, waiting up to ``timeout_s`` for newer ones; empty before the first.
+        """Return the newest outputs by name, waiting up to ``timeout_s`` for newer ones; empty before the first.
 
         Raises:
-            DeviceGone, CorruptMessage: the connection is of no more use.
+            DeviceGone, CorruptMessage: the connection is no longer usable.
         """
         for packet in self._wire.receive(timeout_s):
             if packet.kind is PacketType.DATA:

@@ -1,4 +1,4 @@
-"""The ``ur`` driver beside its emulated controller."""
+"""Test fixture: the ``ur`` driver with an emulated controller."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
 UNLOCK_AFTER_S = 0.1
-"""A real controller keeps a protective stop locked for 5 s; nobody wants to wait for that in a test."""
+"""A real controller keeps a protective stop locked for 5 s; too long for a test."""
 
 
 def host_of(address: int) -> str:
-    """The loopback address of emulator ``address``, below 11 000 000: its ports are fixed, so each needs its own."""
+    """Return the loopback address of emulator ``address``, below 11 000 000: its ports are fixed, so each needs one."""
     high, low = divmod(address, 250)
     return f"127.{64 + high // 250}.{high % 250}.{low + 1}"
 
 
 def config_of(address: int) -> UrConfig:
-    """The configuration with which the rig's driver finds emulator ``address``.
+    """Return the configuration with which the fixture's driver finds emulator ``address``.
 
-    Patient, because test machines are busy: whoever cannot run for a tenth of a second loses the arm by default.
+    Timeouts are long, because test machines are busy: with the defaults, a pause of a tenth of a second is a fault.
     """
     return UrConfig(
         host=host_of(address),
@@ -35,7 +35,7 @@ def config_of(address: int) -> UrConfig:
 
 
 def rig(folder: Path, address: int) -> DeviceFixture:
-    """The rig on its own loopback address; it keeps nothing in ``folder``."""
+    """Build the fixture on its own loopback address; it stores nothing in ``folder``."""
     host = host_of(address)
 
     def start() -> EmulatorProcess:
@@ -66,8 +66,8 @@ def rig(folder: Path, address: int) -> DeviceFixture:
             "power_off": (True, "fault"),
         },
         notes=(
-            "how fast the controller stops the arm after its watchdog has stopped the program",
-            "that speedl's time argument only says when it returns",
+            "stopping distance after the controller's watchdog has stopped the program",
+            "that speedl's time argument only sets when it returns",
             "that registers keep their values when a program or a client ends",
         ),
     )

@@ -1,7 +1,7 @@
-"""What touchcell calls in ur-rtde 1.6.5 besides its state stream, and how it is kept from doing harm.
+"""Calls to ur-rtde 1.6.5 besides its state stream, with its blocking contained.
 
-Its constructors and destructors hold the interpreter's lock: call a constructor only right after the controller has
-answered, and let a destructor run only when no arm moves, because it sleeps 0.5 s.
+Its constructors and destructors hold the GIL: call a constructor only right after the controller has replied, and let a
+destructor run only when no arm moves, because it sleeps 0.5 s.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _UPLOAD_S = 10.0
 
 @contextmanager
 def dashboard(device: str, host: str) -> Iterator[Any]:
-    """ur-rtde's dashboard client, connected. Raises DeviceGone when the dashboard does not answer."""
+    """Connect ur-rtde's dashboard client. Raises DeviceGone when the dashboard does not reply."""
     from dashboard_client import DashboardClient
 
     client = DashboardClient(host)
@@ -34,10 +34,10 @@ def dashboard(device: str, host: str) -> Iterator[Any]:
 
 
 def upload_control_program(device: str, host: str) -> None:
-    """Send ur-rtde's control program to a controller on which none is playing, through ``touchcell.drivers.ur.upload``.
+    """Upload ur-rtde's control program to a controller with none playing, through ``touchcell.drivers.ur.upload``.
 
     Raises:
-        DeviceGone: the controller did not take it, or another client owns the registers.
+        DeviceGone: the controller did not accept it, or another client owns the registers.
     """
     command = [sys.executable, "-m", "touchcell.drivers.ur.upload", host]
     try:
@@ -45,7 +45,7 @@ def upload_control_program(device: str, host: str) -> None:
             command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_UPLOAD_S, check=False
         )
     except subprocess.TimeoutExpired:
-        raise DeviceGone(device, f"upload to {host}: no end within {_UPLOAD_S:g} s") from None
+        raise DeviceGone(device, f"upload to {host}: not finished within {_UPLOAD_S:g} s") from None
     if done.returncode != 0:
         reason = done.stderr.strip().rpartition("\n")[2] or f"ended with {done.returncode}"
         raise DeviceGone(device, f"upload to {host}: {reason}")

@@ -1,9 +1,9 @@
-"""What a UR controller says about itself, checked before anyone may believe it.
+"""Validated state of a UR controller.
 
-ur-rtde's receive thread keeps the newest packet and nothing else: no reception time, no queue, and values of different
-packets where it overtakes the reader. So the reader takes a packet only whole (its timestamp is the same before and
-after), places it in time by the controller's own clock, and drops whatever is not finite, out of range, or older than
-what it has. RTDE has no checksum: a wrong value within the ranges below cannot be told from a right one.
+ur-rtde's receive thread keeps only the newest packet: no reception time, no queue, and values of different packets
+where it overtakes the reader. So the reader accepts only whole packets (same timestamp before and after), maps them to
+host time by the controller's own clock, and drops values that are not finite, out of range, or older than the newest.
+RTDE has no checksum: a wrong value within the ranges below cannot be detected.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ VARIABLES = (
 )
 
 _MAX_JOINT_SPEED_RAD_S = 2.0 * math.pi
-# Largest magnitudes that can be true, in the order in which StateReader reads: far beyond what the arm can do.
+# Largest plausible magnitudes, in the order in which StateReader reads: far beyond what the arm can reach.
 _BOUNDS = np.array(
     [
         1e9,  # timestamp, s
@@ -65,7 +65,7 @@ class Snapshot:
     """One packet of state: SI units, base axes.
 
     Attributes:
-        t_ns: when it was true, on the host's clock.
+        t_ns: time of the sample on the host's clock.
         t_device_ns: the controller's clock.
         seq: number of its control period.
         q, qd, qd_target: joint angles and speeds (6,).
@@ -93,20 +93,20 @@ class Snapshot:
     speed_fraction: float
 
     def age_s(self, now_ns: int) -> float:
-        """Seconds since it was true."""
+        """Return the seconds since the sample."""
         return (now_ns - self.t_ns) * 1e-9
 
 
 class StateReader:
-    """Turns ur-rtde's receive interface into checked snapshots. Any thread may poll.
+    """Turn ur-rtde's receive interface into validated snapshots. Any thread may poll.
 
     Args:
         receive: ``RTDEReceiveInterface`` that streams ``VARIABLES``.
         clock: the host's clock.
 
     Attributes:
-        corrupt: packets dropped because of their values.
-        out_of_order: packets dropped because a newer one had been seen.
+        corrupt: packets dropped because of implausible values.
+        out_of_order: packets dropped because a newer one had been received.
     """
 
     def __init__(self, receive: Any, clock: Clock) -> None:
@@ -123,22 +123,22 @@ class StateReader:
 
     @property
     def connected(self) -> bool:
-        """Whether the connection stands."""
+        """Return whether the connection is up."""
         return bool(self._receive.isConnected())
 
     @property
     def over_budget(self) -> bool:
-        """Whether more packets are being dropped than a healthy link explains: over 10 of the last 50."""
+        """Return whether more packets are dropped than on a healthy link: over 10 of the last 50."""
         return sum(self._misses) > _BUDGET_MISSES
 
     def forget(self) -> None:
-        """Start the budget and the comparison of the clocks anew, after a person has looked at the fault."""
+        """Reset the drop counter and the clock offset, after an operator has acknowledged the fault."""
         with self._lock:
             self._misses.clear()
             self._offset_ns = None
 
     def poll(self) -> Snapshot | None:
-        """Newest good snapshot, or None before the first."""
+        """Return the newest good snapshot, or None before the first."""
         with self._lock:
             for _ in range(_ATTEMPTS):
                 timestamp_s = self._receive.getTimestamp()
@@ -218,8 +218,8 @@ class StateReader:
         self._misses.append(True)
 
     def _place(self, t_device_ns: int) -> int:
-        # The smallest delay ever seen is the best guess of the clocks' offset. Letting it grow as fast as clocks may
-        # drift apart keeps it true for days, and a packet that was read late never looks fresh.
+        # The smallest delay seen so far is the best estimate of the clocks' offset. Letting it grow as fast as clocks
+        # may drift apart keeps it valid for days, and a packet that was read late never looks fresh.
         now_ns = self._clock.now_ns()
         offset_ns = float(now_ns - t_device_ns)
         if self._offset_ns is not None:

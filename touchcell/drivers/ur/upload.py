@@ -1,7 +1,7 @@
 """``python -m touchcell.drivers.ur.upload HOST``: send ur-rtde's control program to a controller, then exit.
 
-ur-rtde's control interface reconnects by itself and races its own threads, and its destructor sleeps half a second with
-the interpreter's lock held. Here the kernel takes its threads and sockets away when the upload is done.
+ur-rtde's control interface reconnects by itself and has races between its threads, and its destructor sleeps half a
+second with the GIL held. In a process of its own the kernel cleans up its threads and sockets after the upload.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import sys
 
 
 def main(host: str) -> None:
-    """Clear the command register, upload, and end; what went wrong goes to standard error with exit code 1.
+    """Clear the command register, upload, and exit; an error goes to standard error with exit code 1.
 
-    The register is cleared first, for it outlives programs and clients: a program that starts while it still says
-    speedL would move at once. ur-rtde's control interface does that on construction.
+    The register is cleared first, because it outlives programs and clients: a program that starts while it still holds
+    speedL would move at once. ur-rtde's control interface clears it on construction.
     """
     from rtde_control import RTDEControlInterface
 

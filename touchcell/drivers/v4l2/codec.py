@@ -1,4 +1,4 @@
-"""Video4Linux2 on the wire: request numbers, structures and what makes a captured frame whole. Pure, no I/O.
+"""Video4Linux2 ABI: request numbers, structures and checks of captured frames. Pure functions, no I/O.
 
 Layouts are those of 64-bit Linux. Source: the kernel's userspace interface documentation, "Video for Linux API"
 (https://www.kernel.org/doc/html/latest/userspace-api/media/v4l/), and for request numbers "ioctl numbers"
@@ -48,7 +48,7 @@ CID_EXPOSURE_ABSOLUTE = 0x009A0902
 CID_EXPOSURE_AUTO_PRIORITY = 0x009A0903
 EXPOSURE_MANUAL = 1
 EXPOSURE_UNIT_US = 100
-"""V4L2_CID_EXPOSURE_ABSOLUTE counts units of 100 microseconds."""
+"""Nanoseconds per unit of V4L2_CID_EXPOSURE_ABSOLUTE (100 microseconds)."""
 
 
 class Capability(ctypes.Structure):
@@ -347,27 +347,27 @@ QUERY_EXT_CTRL = _request(_READ | _WRITE, 103, QueryExtendedControl)
 
 
 def fourcc(text: str) -> int:
-    """The number of a four-character pixel format, e.g. "MJPG"."""
+    """Return the number of a four-character pixel format, e.g. "MJPG"."""
     return int.from_bytes(text.encode("ascii"), "little")
 
 
 def fourcc_text(number: int) -> str:
-    """The four characters of a pixel format number; what is not printable shows as "?"."""
+    """Return the four characters of a pixel format number, with "?" for unprintable ones."""
     return "".join(chr(b) if 32 <= b < 127 else "?" for b in number.to_bytes(4, "little"))
 
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """What the kernel says about one filled buffer.
+    """Metadata of one filled buffer from the kernel.
 
     Attributes:
-        index: which buffer.
+        index: index of the buffer.
         bytes_used: bytes of the frame in it.
         sequence: 32-bit frame counter of the device; a gap means lost frames.
-        stamp_ns: kernel stamp, ns, on the clock that ``monotonic`` tells.
-        monotonic: whether the stamp is on CLOCK_MONOTONIC.
+        stamp_ns: kernel timestamp, ns, on the clock given by ``monotonic``.
+        monotonic: whether the timestamp is on CLOCK_MONOTONIC.
         start_of_exposure: whether it marks the start of exposure rather than the end of the frame.
-        damaged: whether the driver itself marks the data as damaged (V4L2_BUF_FLAG_ERROR).
+        damaged: whether the kernel driver marks the data as corrupt (V4L2_BUF_FLAG_ERROR).
     """
 
     index: int
@@ -380,7 +380,7 @@ class Arrival:
 
 
 def arrival(buffer: Buffer) -> Arrival:
-    """Read a buffer that DQBUF returned."""
+    """Decode a buffer returned by DQBUF."""
     return Arrival(
         index=buffer.index,
         bytes_used=buffer.bytesused,
@@ -393,16 +393,16 @@ def arrival(buffer: Buffer) -> Arrival:
 
 
 def sequence_step(before: int, now: int) -> int:
-    """Signed difference of two 32-bit frame counters, so that the wrap at 2**32 is a step of one."""
+    """Return the signed difference of two 32-bit frame counters; the wrap at 2**32 is a step of one."""
     return (now - before + 2**31) % 2**32 - 2**31
 
 
 def damage(data: bytes, pixel_format: str, width: int, height: int) -> str:
-    """Why ``data`` is no whole frame, or "" if it looks whole.
+    """Return why ``data`` is not a complete frame, or "" if it looks complete.
 
-    Raw formats carry no check but their length. For MJPG the markers are walked up to the scan (ITU-T T.81 part B):
-    start of image, a frame header with the expected size, and an end of image at the end. Damage inside the scan
-    cannot be seen, as JPEG has no checksum.
+    Raw formats can only be checked by their length. For MJPG the markers are walked up to the scan (ITU-T T.81 part B):
+    start of image, a frame header with the expected size, and an end of image at the end. Corruption inside the scan is
+    not detectable, as JPEG has no checksum.
     """
     if pixel_format == "MJPG":
         return _jpeg_damage(data, width, height)
@@ -415,7 +415,7 @@ def _jpeg_damage(data: bytes, width: int, height: int) -> str:
         return "no start of image"
     # Cameras pad the last USB packet with zeros.
     if data[-2:] != b"\xff\xd9" and not data.rstrip(b"\0").endswith(b"\xff\xd9"):
-        return f"cut short at {len(data)} bytes"
+        return f"truncated at {len(data)} bytes"
     at = 2
     size: tuple[int, int] | None = None
     while at + 4 <= len(data):
@@ -427,7 +427,7 @@ def _jpeg_damage(data: bytes, width: int, height: int) -> str:
             continue
         length = int.from_bytes(data[at + 2 : at + 4], "big")
         if marker == 0xDA:
-            return "" if size == (width, height) else f"frame header says {size} instead of {(width, height)}"
+            return "" if size == (width, height) else f"size in frame header is {size} instead of {(width, height)}"
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             size = (int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big"))
         if length < 2:

@@ -1,4 +1,4 @@
-"""TacTip cameras through Video4Linux2: kernel stamps, sequence numbers, settings that are read back.
+"""Driver for TacTip cameras with Video4Linux2: kernel timestamps, sequence numbers, settings read back.
 
 Source: the kernel's "Video for Linux API", chapters "Streaming I/O (Memory Mapping)" and "User Controls".
 """
@@ -31,16 +31,16 @@ class V4l2Config(CameraConfig):
 
 
 class V4l2Camera(Camera):
-    """A camera behind a video node.
+    """Driver for the camera of a video node.
 
-    The queue holds half a second of frames (at most 32, the kernel's limit), so any control loop that reads more often
-    than that gets the newest frame without a reader thread.
+    The queue holds half a second of frames (at most 32, the kernel's limit), so any control loop that reads at least
+    that often gets the newest frame without a reader thread.
 
     Args:
         name: the device's name in the cell.
-        clock: injected time; must run on CLOCK_MONOTONIC, as the kernel's stamps do.
+        clock: injected clock; must be CLOCK_MONOTONIC, as the kernel's timestamps are.
         config: settings.
-        calls: system calls; the kernel's unless an emulator stands in.
+        calls: system calls; the kernel's by default.
     """
 
     def __init__(self, name: str, clock: Clock, config: V4l2Config, calls: SystemCalls | None = None) -> None:
@@ -60,7 +60,7 @@ class V4l2Camera(Camera):
         if abs(self._clock.now_ns() - time.monotonic_ns()) > _CLOCK_TOLERANCE_NS:
             raise ConnectError(
                 self.name,
-                "the kernel stamps frames on CLOCK_MONOTONIC, the cell's clock is another",
+                "the kernel stamps frames on CLOCK_MONOTONIC, but the cell's clock is another",
                 hint="use a simulated or replayed camera with a virtual clock",
             )
         self._node = VideoNode(self.name, self._config.device, self._calls)
@@ -141,14 +141,14 @@ class V4l2Camera(Camera):
     def _collect(self) -> bool:
         node = self._opened()
         taken = 0
-        # Bounded: a camera that is faster than this loop must not keep the caller for ever.
+        # Bounded: a camera that is faster than this loop must not block the caller for ever.
         while taken < 2 * self._buffers:
             try:
                 arrival = node.take()
             except DeviceGone:
                 raise
             except TransportError:
-                # DQBUF may fail with EIO for one frame (signal lost) and go on with the next.
+                # DQBUF may fail with EIO for one frame (signal lost) and continue with the next.
                 self._watch.refuse("unreadable")
                 break
             if arrival is None:
@@ -186,7 +186,7 @@ class V4l2Camera(Camera):
     def _stamped(self, arrival: codec.Arrival, data: bytes) -> RawFrame:
         if arrival.monotonic:
             return RawFrame(data, arrival.stamp_ns, self._number)
-        # All that is known of its age is that it was not there when the queue was last empty.
+        # Its age is unknown, except that the frame was not there when the queue was last empty.
         return RawFrame(data, self._queue_empty_ns, self._number, arrival.stamp_ns, Quality.SUSPECT)
 
     def _wait(self, timeout_s: float) -> None:
@@ -217,17 +217,17 @@ class V4l2Camera(Camera):
         return readings
 
     def _opened(self) -> VideoNode:
-        assert self._node is not None, "the lifecycle lets nobody read a closed camera"
+        assert self._node is not None, "the lifecycle prevents reading a closed camera"
         return self._node
 
 
 def is_stable_name(path: str) -> bool:
-    """Whether a node's name stays with the camera (by-id) or the socket (by-path) over restarts."""
+    """Return whether a node's name identifies the camera (by-id) or the socket (by-path) across restarts."""
     return path.startswith(("/dev/v4l/by-id/", "/dev/v4l/by-path/"))
 
 
 def build(name: str, config: Any, context: DriverContext) -> Device:
-    """Make a DISCONNECTED camera."""
+    """Build a DISCONNECTED camera."""
     return V4l2Camera(name, context.clock, config)
 
 

@@ -1,4 +1,4 @@
-"""One open video node: the system calls of a camera, with errors as types. No policy, no threads."""
+"""System calls on one open video node, with typed errors. No policy, no threads."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ _GONE = (errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN, errno.EPIPE)
 
 
 class SystemCalls(Protocol):
-    """The five calls that a camera needs. Real cameras use ``KernelCalls``; an emulator may stand in its own."""
+    """System calls that a camera needs. Real cameras use ``KernelCalls``; an emulator may provide its own."""
 
     def open(self, path: str) -> int:
-        """File descriptor, read-write and non-blocking."""
+        """Return a file descriptor, read-write and non-blocking."""
         ...
 
     def ioctl(self, fd: int, request: int, argument: ctypes.Structure | ctypes.c_int32) -> None:
-        """Control request, changing ``argument`` in place. Raises OSError."""
+        """Issue a control request, changing ``argument`` in place. Raises OSError."""
         ...
 
     def map(self, fd: int, length: int, offset: int) -> mmap.mmap:
-        """Shared mapping of a buffer."""
+        """Map a buffer into memory, shared."""
         ...
 
     def poll(self, fd: int, timeout_s: float) -> int:
-        """Bits of poll(2) among POLLIN, POLLERR, POLLHUP; 0 after the timeout."""
+        """Return the bits of poll(2) among POLLIN, POLLERR, POLLHUP; 0 after the timeout."""
         ...
 
     def close(self, fd: int) -> None:
-        """Close it."""
+        """Close the file descriptor."""
         ...
 
 
 class KernelCalls:
-    """The kernel's."""
+    """System calls of the kernel."""
 
     def open(self, path: str) -> int:
         return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -67,7 +67,7 @@ class KernelCalls:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """Format that a device really uses.
+    """Image format applied by a device.
 
     Attributes:
         pixel_format: four characters.
@@ -90,7 +90,7 @@ class VideoNode:
         calls: system calls.
 
     Raises:
-        ConnectError: there is no such node, it may not be opened, or it is no streaming camera.
+        ConnectError: no such node, no permission, or not a streaming camera.
     """
 
     def __init__(self, device: str, path: str, calls: SystemCalls) -> None:
@@ -111,16 +111,16 @@ class VideoNode:
 
     @property
     def card(self) -> str:
-        """Product name as the device tells it."""
+        """Product name reported by the device."""
         return bytes(self._capability.card).decode("utf-8", "replace")
 
     @property
     def bus(self) -> str:
-        """Where it is plugged in, as the driver tells it."""
+        """Bus address reported by the kernel driver."""
         return bytes(self._capability.bus_info).decode("utf-8", "replace")
 
     def pixel_formats(self) -> list[str]:
-        """Four-character names of what it can deliver. Raises TransportError, DeviceGone."""
+        """Return the four-character names of supported formats. Raises TransportError, DeviceGone."""
         names: list[str] = []
         while True:
             description = codec.FormatDescription(index=len(names), type=codec.VIDEO_CAPTURE)
@@ -129,20 +129,20 @@ class VideoNode:
             except OSError as error:
                 if error.errno == errno.EINVAL:
                     return names
-                raise self._error(error, "list the picture formats") from None
+                raise self._error(error, "list the image formats") from None
             names.append(codec.fourcc_text(description.pixelformat))
 
     def set_format(self, pixel_format: str, width_px: int, height_px: int) -> Picture:
-        """Ask for a format and return what the device chose. Raises TransportError, DeviceGone."""
+        """Request a format and return the one that the device chose. Raises TransportError, DeviceGone."""
         request = codec.Format(type=codec.VIDEO_CAPTURE)
         request.pix.width, request.pix.height = width_px, height_px
         request.pix.pixelformat, request.pix.field = codec.fourcc(pixel_format), codec.FIELD_NONE
-        self._ask(codec.S_FMT, request, "set the picture format")
+        self._ask(codec.S_FMT, request, "set the image format")
         pix = request.pix
         return Picture(codec.fourcc_text(pix.pixelformat), pix.width, pix.height, pix.bytesperline)
 
     def set_rate(self, rate_hz: float) -> float:
-        """Ask for a frame rate and return what the device chose, Hz. Raises TransportError, DeviceGone."""
+        """Request a frame rate and return the one that the device chose, Hz. Raises TransportError, DeviceGone."""
         request = codec.StreamParameters(type=codec.VIDEO_CAPTURE)
         request.timeperframe = codec.Fraction(1000, round(rate_hz * 1000))
         self._ask(codec.S_PARM, request, "set the frame rate")
@@ -150,7 +150,7 @@ class VideoNode:
         return period.denominator / period.numerator if period.numerator else 0.0
 
     def has_control(self, identity: int) -> bool:
-        """Whether the device has a usable control of that number. Raises TransportError, DeviceGone."""
+        """Return whether the device has a usable control of that number. Raises TransportError, DeviceGone."""
         query = codec.QueryControl(id=identity)
         try:
             self._calls.ioctl(self._fd, codec.QUERYCTRL, query)
@@ -161,16 +161,16 @@ class VideoNode:
         return not query.flags & codec.CTRL_DISABLED
 
     def control(self, identity: int) -> int:
-        """Present value of a control. Raises TransportError, DeviceGone."""
+        """Return the present value of a control. Raises TransportError, DeviceGone."""
         request = codec.Control(id=identity)
         self._ask(codec.G_CTRL, request, "read a control")
         return int(request.value)
 
     def set_control(self, identity: int, value: int) -> int:
-        """Set a control and return what reads back afterwards; the device may refuse silently.
+        """Set a control and return the value read back; the device may refuse silently.
 
         Raises:
-            TransportError, DeviceGone: the device failed for another reason than the value.
+            TransportError, DeviceGone: the device failed for a reason other than the value.
         """
         try:
             self._calls.ioctl(self._fd, codec.S_CTRL, codec.Control(id=identity, value=value))
@@ -180,53 +180,53 @@ class VideoNode:
         return self.control(identity)
 
     def start(self, buffers: int) -> int:
-        """Map and queue buffers and start to stream; returns how many the device granted.
+        """Map and queue buffers and start streaming; return the number of buffers that the device granted.
 
         Raises:
             ConnectError: another program streams from it.
-            TransportError, DeviceGone: it failed.
+            TransportError, DeviceGone: the device failed.
         """
         request = codec.RequestBuffers(count=buffers, type=codec.VIDEO_CAPTURE, memory=codec.MEMORY_MMAP)
-        self._ask(codec.REQBUFS, request, "ask for buffers")
+        self._ask(codec.REQBUFS, request, "request buffers")
         for index in range(request.count):
             buffer = codec.Buffer(index=index, type=codec.VIDEO_CAPTURE, memory=codec.MEMORY_MMAP)
             self._ask(codec.QUERYBUF, buffer, "query a buffer")
             self._buffers.append(self._calls.map(self._fd, buffer.length, buffer.offset))
             self.give_back(index)
-        self._ask(codec.STREAMON, ctypes.c_int32(codec.VIDEO_CAPTURE), "start to stream")
+        self._ask(codec.STREAMON, ctypes.c_int32(codec.VIDEO_CAPTURE), "start streaming")
         return int(request.count)
 
     def wait(self, timeout_s: float) -> bool:
-        """Whether a frame is there, waiting for it at most ``timeout_s``. Raises DeviceGone."""
+        """Wait up to ``timeout_s`` for a frame; return whether one is available. Raises DeviceGone."""
         bits = self._calls.poll(self._fd, timeout_s)
         if bits & (select.POLLERR | select.POLLHUP | select.POLLNVAL):
-            raise DeviceGone(self._device, "the camera has gone", hint="plug it in and recover")
+            raise DeviceGone(self._device, "the camera is disconnected", hint="plug it in and recover")
         return bool(bits & select.POLLIN)
 
     def take(self) -> codec.Arrival | None:
-        """Next filled buffer, to be given back, or None if none is waiting. Raises TransportError, DeviceGone."""
+        """Dequeue the next filled buffer, or None if none is waiting. Raises TransportError, DeviceGone."""
         buffer = codec.Buffer(type=codec.VIDEO_CAPTURE, memory=codec.MEMORY_MMAP)
         try:
             self._calls.ioctl(self._fd, codec.DQBUF, buffer)
         except OSError as error:
             if error.errno == errno.EAGAIN:
                 return None
-            raise self._error(error, "take a frame") from None
+            raise self._error(error, "dequeue a frame") from None
         if buffer.index >= len(self._buffers) or buffer.bytesused > len(self._buffers[buffer.index]):
             raise TransportError(self._device, f"{buffer.bytesused} bytes in buffer {buffer.index} are impossible")
         return codec.arrival(buffer)
 
     def data(self, arrival: codec.Arrival) -> bytes:
-        """Copy of a taken frame's bytes; only valid until the buffer is given back."""
+        """Copy the bytes of a dequeued frame; valid only until the buffer is queued again."""
         return self._buffers[arrival.index][: arrival.bytes_used]
 
     def give_back(self, index: int) -> None:
         """Queue a buffer for the next frame. Raises TransportError, DeviceGone."""
         buffer = codec.Buffer(index=index, type=codec.VIDEO_CAPTURE, memory=codec.MEMORY_MMAP)
-        self._ask(codec.QBUF, buffer, "give a buffer back")
+        self._ask(codec.QBUF, buffer, "queue a buffer")
 
     def stop(self) -> None:
-        """Stop streaming and free the buffers; never raises, as a camera that has gone has stopped."""
+        """Stop streaming and free the buffers; never raises, as a disconnected camera has stopped."""
         for buffer in self._buffers:
             buffer.close()
         self._buffers.clear()
@@ -245,7 +245,7 @@ class VideoNode:
         try:
             self._calls.ioctl(self._fd, codec.QUERYCAP, capability)
         except OSError as error:
-            raise ConnectError(self._device, f"{path} is no video device: {error.strerror}", [error]) from None
+            raise ConnectError(self._device, f"{path} is not a video device: {error.strerror}", [error]) from None
         able = capability.device_caps if capability.capabilities & codec.CAP_DEVICE_CAPS else capability.capabilities
         missing = [
             word
@@ -255,8 +255,8 @@ class VideoNode:
         if missing:
             raise ConnectError(
                 self._device,
-                f"{path} offers no {' and no '.join(missing)}",
-                hint="many cameras have a second node for metadata; take the one whose by-id name ends in index0",
+                f"{path} has no {' and no '.join(missing)}",
+                hint="many cameras have a second node for metadata; use the one whose by-id name ends in index0",
             )
         return capability
 
@@ -268,7 +268,9 @@ class VideoNode:
 
     def _error(self, error: OSError, what: str) -> DeviceError:
         if error.errno in _GONE:
-            return DeviceGone(self._device, f"the camera has gone (cannot {what})", hint="plug it in and recover")
+            return DeviceGone(
+                self._device, f"the camera is disconnected (cannot {what})", hint="plug it in and recover"
+            )
         if error.errno == errno.EBUSY:
             return ConnectError(self._device, f"cannot {what}: busy", [error], hint="close the program that uses it")
         return TransportError(self._device, f"cannot {what}: {error.strerror}")

@@ -1,4 +1,4 @@
-"""The V4L2 driver beside an emulated camera."""
+"""Test fixture: the V4L2 driver with an emulated camera."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _RATE_HZ = 60.0
 
 
 def rig(folder: Path, address: int) -> DeviceFixture:
-    """A camera at /dev/video``address`` whose sockets live in ``folder``."""
+    """Build a camera at /dev/video``address`` whose sockets are in ``folder``."""
     config = V4l2Config(
         device=f"/dev/v4l/by-id/usb-TacTip_{address:04d}-video-index0", rate_hz=_RATE_HZ, exposure_us=15700, gain=10
     )

@@ -1,4 +1,4 @@
-"""The C shim before an emulated camera: compiled when first needed, preloaded into programs or called from Python."""
+"""The C shim of emulated cameras: compiled on first use, preloaded into programs or called from Python."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _SOURCE = Path(__file__).with_name("shim.c")
 
 
 def library() -> Path:
-    """Path of the compiled shim, from the cache folder ($XDG_CACHE_HOME or ~/.cache).
+    """Return the path of the compiled shim in the cache folder ($XDG_CACHE_HOME or ~/.cache), compiling it if needed.
 
     Raises:
-        ConnectError: there is no C compiler, or it failed.
+        ConnectError: no C compiler, or it failed.
     """
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "touchcell"
     path = cache / f"v4l2_shim-{hashlib.sha256(_SOURCE.read_bytes()).hexdigest()[:16]}.so"
@@ -29,9 +29,9 @@ def library() -> Path:
         return path
     compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
-        raise ConnectError("v4l2 emulator", "there is no C compiler", hint="install gcc or clang")
+        raise ConnectError("v4l2 emulator", "no C compiler found", hint="install gcc or clang")
     cache.mkdir(parents=True, exist_ok=True)
-    # Renamed into place, so that two tests compiling at once never load half a file.
+    # Renamed into place, so that two tests compiling at once never load a partial file.
     with tempfile.TemporaryDirectory(dir=cache) as folder:
         built = Path(folder) / path.name
         made = subprocess.run(
@@ -47,12 +47,12 @@ def library() -> Path:
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Variables with which an unmodified program sees the cameras of ``folder``. Raises ConnectError."""
+    """Return the variables that make the cameras of ``folder`` visible to any program. Raises ConnectError."""
     return {"LD_PRELOAD": str(library()), "TOUCHCELL_V4L2": str(folder)}
 
 
 class ShimCalls(KernelCalls):
-    """System calls on the cameras of ``folder`` from within this process. Raises ConnectError like ``library``."""
+    """System calls on the cameras of ``folder`` within this process. Raises ConnectError like ``library``."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = str(folder).encode()

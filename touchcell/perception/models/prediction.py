@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from touchcell.geometry import se3
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.models.model_file import Header
 
@@ -35,6 +36,17 @@ class Prediction:
     def sigma(self) -> Array:
         """(6,) standard deviation of each component of xi, m and rad."""
         return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def pose_mm_deg(self) -> Array:
+        """(6,) mean contact T_f_s: shear x, y and depth in mm, tilts alpha, beta and torsion gamma in degrees."""
+        return se3.to_euler_mm_deg(se3.inverse(se3.exp(self.xi)))
+
+    @property
+    def sigma_mm_deg(self) -> Array:
+        """(6,) standard deviation of each component of xi, mm and degrees: along and about the sensor's axes."""
+        sigma: Array = self.sigma * np.array([1e3] * 3 + [180.0 / np.pi] * 3)
+        return sigma
 
 
 class ContactEstimator(Protocol):

@@ -9,13 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from types import FunctionType
-from typing import cast
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from touchcell import registry
 from touchcell.geometry.types import Array
 from touchcell.perception.errors import TrainingError
 from touchcell.perception.markers.detection import Discs, lattice, ring_numbers
@@ -28,6 +26,7 @@ from touchcell.perception.markers.matching import (
     pair,
     quality,
 )
+from touchcell.registry import Registry
 
 GRID = 32
 GUESS_HIDDEN = 256
@@ -124,15 +123,17 @@ def find_reference(frames: Sequence[Discs], rings: int) -> Array:
     return points
 
 
-GROUP = "touchcell.displacement_priors"
+@runtime_checkable
+class DisplacementPrior(Protocol):
+    """Where learning begins before any image has been matched."""
 
-DisplacementPrior = Callable[[Array, int, int], Array]
-"""(n, m, 2) px displacements of markers in random contacts, from a lattice (m, 2) px, its rings and a seed."""
+    def __call__(self, lattice: Array, rings: int, seed: int, /) -> Array:
+        """(n, m, 2) px displacements of markers in random contacts, from a lattice (m, 2) px and its rings."""
+        ...
 
 
-def displacement_prior() -> DisplacementPrior:
-    """Where learning begins before any image has been matched: a simulated tip, by its entry point."""
-    return cast(DisplacementPrior, registry.load(GROUP, "displacement prior", "simulated", FunctionType))
+DISPLACEMENT_PRIORS: Final = Registry("touchcell.displacement_priors", "displacement prior", DisplacementPrior)
+"""All installed displacement priors."""
 
 
 def learn_markers(
@@ -165,7 +166,7 @@ def learn_markers(
     """
     if reference is None:
         reference = find_reference(frames, rings)
-    displacements = displacement_prior()(reference, rings, seed)
+    displacements = DISPLACEMENT_PRIORS.load("simulated")(reference, rings, seed)
     everything = np.ones(displacements.shape[:2], bool)
     model = DisplacementModel.fit(reference, displacements, everything, modes)
     coefficients = (displacements.reshape(len(displacements), -1) - model.mean) @ model.basis.T

@@ -1,1 +1,1 @@
-"""One suite of checks for every driver, ours and other people's; ``docs/drivers.md`` says how to certify one."""
+"""One suite of checks for every driver; ``docs/how-to/write-a-driver.md`` explains how to certify one."""

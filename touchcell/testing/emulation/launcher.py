@@ -8,15 +8,14 @@ from __future__ import annotations
 import argparse
 import asyncio
 from collections.abc import Sequence
-from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Final, Protocol, runtime_checkable
 
+from touchcell.registry import Registry
 from touchcell.testing.emulation.base import Emulator, read_fault_script, serve
 
-GROUP = "touchcell.emulators"
 
-
+@runtime_checkable
 class EmulatorModule(Protocol):
     """What an emulator's module offers."""
 
@@ -29,21 +28,25 @@ class EmulatorModule(Protocol):
         ...
 
 
+EMULATORS: Final = Registry("touchcell.emulators", "emulator", EmulatorModule)
+"""All installed emulators."""
+
+
 def main(arguments: Sequence[str]) -> int:
     """Run the emulator named first in ``arguments`` until it is told to end; returns the exit code."""
-    modules = {point.name: point for point in entry_points(group=GROUP)}
+    names = EMULATORS.names()
     parser = argparse.ArgumentParser("touchcell emulate", description="Emulate a device on the wire.")
-    parsers = parser.add_subparsers(dest="name", required=True, metavar=" | ".join(sorted(modules)))
+    parsers = parser.add_subparsers(dest="name", required=True, metavar=" | ".join(names))
     wanted = arguments[0] if arguments else ""
-    for name, point in modules.items():
+    for name in names:
         child = parsers.add_parser(name)
         child.add_argument("--control", type=Path, help="UNIX socket of the control channel")
         child.add_argument("--fault-script", type=Path, help="YAML list of faults and when they happen")
         child.add_argument("--lifeline", action="store_true", help="end when standard input closes")
         if name == wanted:
-            cast(EmulatorModule, point.load()).add_arguments(child)
+            EMULATORS.load(name).add_arguments(child)
     options = parser.parse_args(arguments)
     script = read_fault_script(options.fault_script) if options.fault_script else ()
-    emulator = cast(EmulatorModule, modules[options.name].load()).build(options)
+    emulator = EMULATORS.load(options.name).build(options)
     asyncio.run(serve(emulator, options.control, script, lifeline=options.lifeline))
     return 0

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FunctionType
-from typing import Any, Protocol, cast
+from typing import Any, Final, Protocol, runtime_checkable
 
-from touchcell import registry
 from touchcell.drivers.core.clock import Clock, MonotonicClock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.spec import DriverConfig, DriverSpec
+from touchcell.registry import Registry
 
 
 class Emulated(Protocol):
@@ -88,12 +87,16 @@ class DeviceFixture:
     notes: tuple[str, ...] = ()
 
 
-FixtureFactory = Callable[[Path, int], DeviceFixture]
-"""Makes a rig that keeps its files in a folder of its own and, by a number of its own, shares no address."""
+@runtime_checkable
+class FixtureFactory(Protocol):
+    """Makes the fixture of one driver."""
 
-GROUP = "touchcell.rigs"
+    __name__: str
+
+    def __call__(self, folder: Path, address: int, /) -> DeviceFixture:
+        """A fixture that keeps its files in ``folder``; fixtures with different ``address`` share no port or bus."""
+        ...
 
 
-def rig_of(driver: str, folder: Path, address: int) -> DeviceFixture:
-    """The registered rig of ``driver``. Raises ConfigError when it has none."""
-    return cast(FixtureFactory, registry.load(GROUP, "rig", driver, FunctionType))(folder, address)
+RIGS: Final = Registry("touchcell.rigs", "rig", FixtureFactory)
+"""Fixtures of all drivers that have an emulator, by the driver's name."""

@@ -1,7 +1,7 @@
-"""The emulated Franka arm itself: kinematics, limits, reflexes. No I/O and no clock: it moves when it is stepped.
+"""Model of a Franka arm: kinematics, limits, reflexes. No I/O and no clock: it moves when it is stepped.
 
 Denavit-Hartenberg table, joint and Cartesian limits of the FR3 from Franka's "Robot and interface specifications".
-There are no dynamics: the arm is where it was commanded to be, and a reflex stops it at once where a real arm brakes.
+There are no dynamics: the arm follows commands exactly, and a reflex stops it at once where a real arm brakes.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def _hand_frame() -> Array:
 
 
 def flange_pose(q: Array) -> tuple[Array, Array, Array]:
-    """T_base_flange (4, 4), joint axes (3, 7) and joint origins (3, 7), all in the base frame."""
+    """Return T_base_flange (4, 4), joint axes (3, 7) and joint origins (3, 7), all in the base frame."""
     T = np.eye(4)
     axes, origins = np.empty((3, 7)), np.empty((3, 7))
     for i, angle in enumerate(q.tolist()):
@@ -64,7 +64,7 @@ def flange_pose(q: Array) -> tuple[Array, Array, Array]:
 
 
 def urdf() -> str:
-    """A model of the arm for clients that ask for one: kinematics and limits as above, link inertias of no meaning."""
+    """Return a URDF of the arm: kinematics and limits as above, placeholder inertias."""
     inertial = (
         '<inertial><origin xyz="0 0 0"/><mass value="1"/>'
         '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>'
@@ -91,7 +91,7 @@ def urdf() -> str:
 
 
 class Reflex(Exception):
-    """The arm refuses to go on; ``name`` is Franka's name of the error, ``detail`` what was seen."""
+    """The arm stops with a reflex; ``name`` is Franka's name of the error, ``detail`` the observation."""
 
     def __init__(self, name: str, detail: str = "") -> None:
         super().__init__(name)
@@ -101,9 +101,9 @@ class Reflex(Exception):
 
 @dataclass(slots=True)
 class _Profile:
-    """Last value, velocity and acceleration of the commanded signal, to see discontinuities.
+    """Last value, velocity and acceleration of the commanded signal, to detect discontinuities.
 
-    ``steady`` tells whether it answered the next state: across lost packets derivatives are means.
+    ``steady``: whether it replied to the next state; across lost packets derivatives are means.
     """
 
     message_id: int
@@ -115,13 +115,13 @@ class _Profile:
 
 @dataclass(slots=True)
 class EmulatedArm:
-    """Where the arm is and how it moves; every array in SI units, base axes.
+    """State and motion of the arm; every array in SI units, base axes.
 
     Attributes:
         q, dq: joints (7,).
         T_base_ee: pose of the end effector frame.
         J: (6, 7) Jacobian of its origin.
-        wrench: (6,) what the world exerts on the end effector, along base axes.
+        wrench: (6,) external wrench on the end effector, along base axes.
         force_threshold: (6,) above which a Cartesian reflex stops the arm.
         contact_threshold: (6,) above which contact is reported.
     """
@@ -146,13 +146,13 @@ class EmulatedArm:
         self.refresh()
 
     def refresh(self) -> None:
-        """Work out pose and Jacobian for the present joints and frames."""
+        """Recompute pose and Jacobian for the present joints and frames."""
         T_base_flange, axes, origins = flange_pose(self.q)
         self.T_base_ee = T_base_flange @ self.F_T_NE @ self.NE_T_EE
         self.J = np.vstack([np.cross(axes, self.T_base_ee[:3, 3:] - origins, axis=0), axes])
 
     def begin(self, generator: Generator, message_id: int = 0) -> bool:
-        """Take up a motion generator at state ``message_id``; False at a pose too singular for a Cartesian one."""
+        """Start a motion generator at state ``message_id``; False if the pose is too singular for a Cartesian one."""
         if generator in (Generator.CARTESIAN_POSITION, Generator.CARTESIAN_VELOCITY):
             smallest = np.linalg.svd(self.J, compute_uv=False)[-1]
             if smallest < _SMALLEST_SINGULAR_VALUE:
@@ -164,12 +164,12 @@ class EmulatedArm:
         return True
 
     def halt(self) -> None:
-        """Stand still."""
+        """Set all velocities to zero."""
         self.dq = np.zeros(7)
         self.twist_c = np.zeros(6)
 
     def step(self, command: MotionCommand | None, dt_s: float) -> None:
-        """Move for ``dt_s`` by the newest command; without one a velocity goes on. Raises Reflex."""
+        """Move for ``dt_s`` by the newest command; without one the velocity continues. Raises Reflex."""
         if self._generator in (Generator.IDLE, Generator.NONE):
             return
         if command is not None:
@@ -221,7 +221,7 @@ class EmulatedArm:
         self.q = self.q + self._inverse(step)
 
     def _check_profile(self, message_id: int, value: Array, *, is_velocity: bool) -> Array:
-        """Compare with the command before, over the time between the states that they answer; returns the velocity."""
+        """Check velocity, acceleration and jerk since the last command; return the velocity. Raises Reflex."""
         last = self._profile or _Profile(
             self._began_id, np.zeros_like(value) if is_velocity else value, np.zeros_like(value), np.zeros_like(value)
         )
@@ -243,7 +243,7 @@ class EmulatedArm:
             speed_ok = bool((np.abs(velocity) <= JOINT_SPEED_RAD_S).all())
             accel_ok = bool((np.abs(acceleration) <= JOINT_ACCEL_RAD_S2).all())
             jerk_ok = bool((np.abs(jerk) <= JOINT_JERK_RAD_S3).all())
-        # Franka's names: a jump of the velocity breaks the acceleration limit, one of the acceleration the jerk limit.
+        # Franka's names: a jump in velocity violates the acceleration limit, a jump in acceleration the jerk limit.
         checks = (
             (speed_ok, "velocity_limits_violation"),
             (accel_ok or not (is_velocity or (steady and last.steady)), "velocity_discontinuity"),
@@ -270,7 +270,7 @@ class EmulatedArm:
 
 
 def _pose_step(T_from: Array, T_to: Array) -> Array:
-    """Small motion from one pose to the other along base axes, (6,)."""
+    """Return the small motion from one pose to the other along base axes, (6,)."""
     R = T_to[:3, :3] @ T_from[:3, :3].T
     turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     return np.concatenate([T_to[:3, 3] - T_from[:3, 3], turn])

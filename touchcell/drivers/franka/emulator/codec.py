@@ -1,10 +1,10 @@
-"""Franka Control Interface, version 10, as bytes: pure functions, no I/O.
+"""Wire format of the Franka Control Interface, version 10: pure functions, no I/O.
 
-Everything is packed and little-endian (libfranka-common, ``service_types.h`` and ``rbk_types.h``). Commands travel over
-TCP port 1337 as ``u32 command, u32 command id, u32 total size`` and a payload; the answer repeats command and id and
-begins with a status byte. A Move is answered twice with the same id: MOTION_STARTED at once, the outcome later. Beside
-it the robot sends its state as a UDP datagram each millisecond and takes a command datagram in return. There are no
-checksums, so sizes and enumerations are all that can be checked.
+Everything is packed and little-endian (libfranka-common, ``service_types.h`` and ``rbk_types.h``). Commands are sent
+over TCP port 1337 as ``u32 command, u32 command id, u32 total size`` and a payload; the reply repeats command and id
+and begins with a status byte. A Move has two replies with the same id: MOTION_STARTED at once, the outcome later. In
+addition the robot sends its state as a UDP datagram each millisecond and receives a command datagram in return. There
+are no checksums, so only sizes and enumerations can be checked.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ PAYLOAD_SIZE: dict[Request, int] = {
 
 
 class MoveStatus(IntEnum):
-    """How a motion begins or ends."""
+    """Status at the start or the end of a motion."""
 
     SUCCESS = 0
     MOTION_STARTED = 1
@@ -140,7 +140,7 @@ class MoveStatus(IntEnum):
 
 
 class SetterStatus(IntEnum):
-    """Answer to a setter."""
+    """Reply to a setter."""
 
     SUCCESS = 0
     NOT_POSSIBLE = 1
@@ -148,7 +148,7 @@ class SetterStatus(IntEnum):
 
 
 class RecoveryStatus(IntEnum):
-    """Answer to an automatic error recovery."""
+    """Reply to an automatic error recovery."""
 
     SUCCESS = 0
     NOT_POSSIBLE = 1
@@ -169,7 +169,7 @@ class Mode(IntEnum):
 
 
 class Generator(IntEnum):
-    """Motion generator in the state; a Move request counts from one less."""
+    """Motion generator in the state; the numbers in a Move request are one less."""
 
     IDLE = 0
     JOINT_POSITION = 1
@@ -189,7 +189,7 @@ class Controller(IntEnum):
 
 
 class RequestMessage(NamedTuple):
-    """One request as it came over TCP."""
+    """One request received over TCP."""
 
     request: Request
     command_id: int
@@ -197,14 +197,14 @@ class RequestMessage(NamedTuple):
 
 
 class MoveRequest(NamedTuple):
-    """What a Move asks for."""
+    """Controller and motion generator requested by a Move."""
 
     controller: Controller
     generator: Generator
 
 
 class MotionCommand(NamedTuple):
-    """One command datagram; only the fields of the running generator mean anything."""
+    """One command datagram; only the fields of the running generator are significant."""
 
     message_id: int
     q: tuple[float, ...]
@@ -220,7 +220,7 @@ class MotionCommand(NamedTuple):
 
 @dataclass(slots=True)
 class RobotState:
-    """One state datagram: its float32 fields by name, and the rest."""
+    """One state datagram: its float32 fields by name, and the other fields."""
 
     message_id: int = 0
     floats: NDArray[np.float32] = field(default_factory=lambda: np.zeros(_FLOATS, np.float32))
@@ -238,7 +238,7 @@ class RobotState:
         self.floats[_SLICES[name]] = value
 
     def encode(self) -> bytes:
-        """The datagram, 1377 bytes."""
+        """Encode the datagram, 1377 bytes."""
         tail = _STATE_TAIL.pack(
             self.generator, self.controller, self.errors, self.reflex_reason, self.mode, self.success_rate
         )
@@ -246,7 +246,7 @@ class RobotState:
 
 
 def decode_state(datagram: bytes) -> RobotState:
-    """Read a state datagram. Raises CorruptMessage for a wrong size or an unknown enumeration."""
+    """Decode a state datagram. Raises CorruptMessage for a wrong size or an unknown enumeration."""
     if len(datagram) != STATE_SIZE:
         raise CorruptMessage(_DEVICE, f"state of {len(datagram)} bytes, not {STATE_SIZE}")
     generator, controller, errors, reflex, mode, rate = _STATE_TAIL.unpack_from(datagram, STATE_SIZE - _STATE_TAIL.size)
@@ -268,7 +268,7 @@ def decode_state(datagram: bytes) -> RobotState:
 
 
 def encode_command(command: MotionCommand) -> bytes:
-    """The command datagram, 371 bytes."""
+    """Encode the command datagram, 371 bytes."""
     return _COMMAND.pack(
         command.message_id,
         *command.q,
@@ -284,7 +284,7 @@ def encode_command(command: MotionCommand) -> bytes:
 
 
 def decode_command(datagram: bytes) -> MotionCommand:
-    """Read a command datagram. Raises CorruptMessage for a wrong size or a flag that is neither 0 nor 1."""
+    """Decode a command datagram. Raises CorruptMessage for a wrong size or a flag that is neither 0 nor 1."""
     if len(datagram) != COMMAND_SIZE:
         raise CorruptMessage(_DEVICE, f"command of {len(datagram)} bytes, not {COMMAND_SIZE}")
     if datagram[312] > 1 or datagram[313] > 1 or datagram[370] > 1:
@@ -294,7 +294,7 @@ def decode_command(datagram: bytes) -> MotionCommand:
 
 
 def split_requests(buffer: bytes) -> tuple[list[RequestMessage], bytes]:
-    """Cut a TCP stream into whole requests and the rest. Raises CorruptMessage when the stream makes no sense."""
+    """Split a TCP stream into complete requests and the rest. Raises CorruptMessage for an invalid stream."""
     messages = []
     while len(buffer) >= _HEADER.size:
         number, command_id, size = _HEADER.unpack_from(buffer)
@@ -312,28 +312,28 @@ def split_requests(buffer: bytes) -> tuple[list[RequestMessage], bytes]:
 
 
 def encode_request(request: Request, command_id: int, payload: bytes = b"") -> bytes:
-    """A request with its header."""
+    """Encode a request with its header."""
     return _HEADER.pack(request, command_id, _HEADER.size + len(payload)) + payload
 
 
 def encode_reply(request: Request, command_id: int, status: int, payload: bytes = b"") -> bytes:
-    """A reply with its header and status byte."""
+    """Encode a reply with its header and status byte."""
     return _HEADER.pack(request, command_id, _HEADER.size + 1 + len(payload)) + bytes([status]) + payload
 
 
 def decode_connect(payload: bytes) -> tuple[int, int]:
-    """(version, UDP port of the client) of a CONNECT payload."""
+    """Return (version, UDP port of the client) of a CONNECT payload."""
     version, port = _CONNECT.unpack(payload)
     return version, port
 
 
 def connect_reply(command_id: int, accepted: bool) -> bytes:
-    """Answer to CONNECT: success, or "incompatible version" with the version that is spoken here."""
+    """Encode the reply to CONNECT: success, or "incompatible version" with the supported version."""
     return encode_reply(Request.CONNECT, command_id, 0 if accepted else 1, struct.pack("<H", VERSION))
 
 
 def decode_move(payload: bytes) -> MoveRequest:
-    """Read a MOVE payload. Raises CorruptMessage for an unknown controller or generator."""
+    """Decode a MOVE payload. Raises CorruptMessage for an unknown controller or generator."""
     controller, generator = _MOVE.unpack(payload)[:2]
     if controller > Controller.EXTERNAL or generator > Generator.NONE - 1:
         raise CorruptMessage(_DEVICE, f"controller {controller} with motion generator {generator}")
@@ -341,5 +341,5 @@ def decode_move(payload: bytes) -> MoveRequest:
 
 
 def doubles(payload: bytes) -> NDArray[np.float64]:
-    """The float64 values of a setter's payload."""
+    """Return the float64 values of a setter's payload."""
     return np.frombuffer(payload, "<f8")

@@ -1,9 +1,10 @@
 """An emulated Franka controller: the Franka Control Interface, version 10, on TCP 1337 and UDP at 1 kHz.
 
-Faithful where libfranka looks: handshake, model, motions and their outcomes, modes, reflexes, recovery, lost packets.
+Faithful in what libfranka checks: handshake, model, motions and their outcomes, modes, reflexes, recovery, lost
+packets.
 Not emulated: dynamics, contact, the braking of a reflex (it stops at once), Desk, the gripper. While this process
-oversleeps its clock stands still, and goes a third faster afterwards: a busy machine slows the robot down for a moment
-and does not make it jump.
+oversleeps its clock stands still, and runs a third faster afterwards: a busy machine slows the robot down for a moment
+but does not make it jump.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ _POWER_OR_MODE = frozenset({Request.MOVE, Request.SET_GUIDING_MODE, Request.AUTO
 
 
 class FrankaEmulator(Emulator):
-    """One arm with its controller.
+    """Emulator of one arm with its controller.
 
     Args:
         host: address to bind; the port is fixed by libfranka.
@@ -62,18 +63,18 @@ class FrankaEmulator(Emulator):
 
     faults: ClassVar[Mapping[str, str]] = {
         "pause": "the controller freezes: nothing is sent, read or moved",
-        "unplug": "the cable is out: nothing passes, the controller lives on",
+        "unplug": "the cable is unplugged: nothing passes, the controller keeps running",
         "drop": "lose the next VALUE command packets; 20 in a row are a communication_constraints_violation",
         "drop_states": "lose the next VALUE state packets",
         "delay": "deliver each state VALUE seconds late",
-        "corrupt": "cut the next VALUE state packets short",
+        "corrupt": "truncate the next VALUE state packets",
         "out_of_order": "send VALUE old states again, each after a newer one",
         "nan": "fill the next VALUE states with NaN",
         "reflex": "stop with the error named by VALUE",
         "user_stop": "the user stop button is pressed",
         "locked": "the joints are locked in Desk",
-        "external_wrench": "the world pushes on the end effector with VALUE [fx fy fz tx ty tz] N, N m along base axes",
-        "restart": "drop the client and come back after a fifth of a second with the clock at zero",
+        "external_wrench": "external wrench VALUE [fx fy fz tx ty tz] N, N m on the end effector along base axes",
+        "restart": "drop the client and return after a fifth of a second with the clock at zero",
     }
 
     def __init__(self, host: str) -> None:
@@ -202,10 +203,10 @@ class FrankaEmulator(Emulator):
     def _accept(self) -> None:
         assert self._listener is not None
         client, _ = self._listener.accept()
-        # The one before may have hung up since the last tick.
+        # The previous client may have disconnected since the last tick.
         self._read_requests()
         if self._client is not None:
-            # The controller speaks to one client at a time.
+            # The controller serves one client at a time.
             client.close()
             return
         client.setblocking(False)
@@ -213,7 +214,7 @@ class FrankaEmulator(Emulator):
         self._client, self._buffer = client, b""
 
     def _drop_client(self) -> None:
-        # A motion goes on until its commands have been missing for long enough.
+        # A motion continues until its commands have been missing for long enough.
         if self._client is not None:
             self._client.close()
             self._client, self._client_udp = None, None
@@ -294,7 +295,7 @@ class FrankaEmulator(Emulator):
 
     def _reply(self, reply: bytes) -> None:
         if self._client is not None:
-            # A client that has gone is noticed by the next read.
+            # The next read notices a client that has disconnected.
             with suppress(OSError):
                 self._client.sendall(reply)
 
@@ -427,7 +428,7 @@ class FrankaEmulator(Emulator):
         state["O_dP_EE_c"] = state["O_dP_EE_d"] = arm.twist_c
         for name in ("elbow", "elbow_d", "elbow_c"):
             state[name] = (arm.q[2], -1.0 if arm.q[3] < 0 else 1.0)
-        # Franka counts what the arm exerts on the world as positive.
+        # Franka counts the wrench of the arm on the world as positive.
         state["O_F_ext_hat_K"] = -arm.wrench
         R = arm.T_base_ee[:3, :3] @ arm.EE_T_K[:3, :3]
         state["K_F_ext_hat_K"] = -np.concatenate([R.T @ arm.wrench[:3], R.T @ arm.wrench[3:]])
@@ -445,10 +446,10 @@ class FrankaEmulator(Emulator):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command line."""
+    """Add the command-line arguments."""
     parser.add_argument("--host", default="127.0.0.1", help="address to bind; the port is 1337")
 
 
 def build(arguments: argparse.Namespace) -> FrankaEmulator:
-    """Make the emulator, not yet started."""
+    """Build the emulator; it is not started yet."""
     return FrankaEmulator(arguments.host)

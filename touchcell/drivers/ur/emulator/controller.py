@@ -1,4 +1,4 @@
-"""The inside of an emulated UR controller: power, safety, the program, the registers and the arm, every 2 ms."""
+"""Model of a UR controller: power, safety, program, registers and arm, stepped every 2 ms."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Controller:
     """State of the controller; ``step`` advances it by one control period.
 
     Args:
-        unlock_after_s: how long a protective stop cannot be unlocked (5 s on the real controller).
+        unlock_after_s: time after a protective stop before it can be unlocked (5 s on the real controller).
     """
 
     def __init__(self, unlock_after_s: float = 5.0) -> None:
@@ -76,21 +76,21 @@ class Controller:
 
     @property
     def energised(self) -> bool:
-        """Whether the brakes are off."""
+        """True if the brakes are released."""
         return self.robot_mode is RobotMode.RUNNING
 
     @property
     def last_input_age_s(self) -> float:
-        """Seconds since input_int_register_0 (or 24) was last written."""
+        """Return the seconds since input_int_register_0 (or 24) was last written."""
         return self.t_s - self._input_s
 
     @property
     def travel_since_input_m(self) -> float:
-        """How far the tool has moved since then."""
+        """Return the distance the tool has moved since then."""
         return self.arm.travel_m - self._input_travel_m
 
     def step(self) -> None:
-        """Let one control period pass."""
+        """Advance by one control period."""
         self.t_s += PERIOD_S
         if self._powering is not None and self.t_s >= self._powering[0]:
             self.robot_mode = self._powering[1]
@@ -128,7 +128,7 @@ class Controller:
             self.stop_program()
 
     def write_inputs(self, values: dict[str, Value]) -> None:
-        """Take over a data packet. Registers keep their values when a program stops or a client goes."""
+        """Apply a data packet. Registers keep their values when a program stops or a client disconnects."""
         self.inputs.update(values)
         speeds = tuple(value for name, value in values.items() if "double" in name)
         if speeds:
@@ -141,11 +141,11 @@ class Controller:
                 self.commands[NAMES.get(command, str(command))] += 1
 
     def start_program(self, text: str) -> None:
-        """Run an uploaded script, if it is ur-rtde's, the arm is powered, safe, and in remote control."""
+        """Run an uploaded script if it is ur-rtde's and the arm is powered, safe, and in remote control."""
         if not (self.remote_control and self.energised and self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED)):
-            self.log("script refused: not in remote control, not powered or not safe")
+            self.log("script rejected: not in remote control, not powered or not safe")
         elif not re.match(r"\s*def rtde_control\(\):", text) or "rtde_set_watchdog" not in text or "$" in text:
-            self.log("script refused: not the control script of ur-rtde, or not made for this version")
+            self.log("script rejected: not the control script of ur-rtde, or not made for this version")
         else:
             self.energising += 1
             self.commands["script"] += 1
@@ -154,12 +154,12 @@ class Controller:
             self._starting = (self.t_s + _START_S, int(offset[1]) if offset else 0)
 
     def play_foreign_program(self) -> None:
-        """Somebody else's program is running."""
+        """Start a program that is not ours."""
         self._foreign_program = True
         self.runtime_state = RuntimeState.PLAYING
 
     def stop_program(self) -> None:
-        """End whatever program runs; the arm slows down and holds."""
+        """End the running program; the arm decelerates and holds."""
         self._program = None
         self._starting = None
         self._foreign_program = False
@@ -169,7 +169,7 @@ class Controller:
             self.motion = Brake(_STOP_PROGRAM_DECEL_RAD_S2, linear=False)
 
     def play(self) -> bool:
-        """Resume a paused program; on a real controller, too, it goes on with what it was doing."""
+        """Resume a paused program; as on a real controller, it continues its interrupted motion."""
         if self.runtime_state is not RuntimeState.PAUSED or self.safety_mode is not SafetyMode.NORMAL:
             return False
         self.energising += 1
@@ -196,7 +196,7 @@ class Controller:
             self._powering = (self.t_s + 0.5, RobotMode.POWER_OFF)
 
     def unlock_protective_stop(self) -> bool:
-        """Leave a protective stop; too early after it, it stays."""
+        """Leave a protective stop; False if it is too early."""
         if self.safety_mode is not SafetyMode.PROTECTIVE_STOP:
             return True
         if self.t_s - self._stopped_s < self._unlock_after_s:
@@ -216,7 +216,7 @@ class Controller:
             self._powering = (self.t_s + _POWER_S, mode)
 
     def restart(self) -> None:
-        """Start the controller anew: its clock from 0, no program, the arm powered off where it stands."""
+        """Restart the controller: its clock from 0, no program, the arm powered off at its present position."""
         self.arm.move_to(self.arm.q, PERIOD_S)
         self._boot(RobotMode.POWER_OFF)
         self.inputs.clear()
@@ -228,16 +228,16 @@ class Controller:
         self.arm.refresh()
 
     def set_watchdog(self, min_hz: float) -> None:
-        """Stop the program when inputs come more slowly than ``min_hz``; 0 switches it off."""
+        """Stop the program when inputs arrive at less than ``min_hz``; 0 disables the watchdog."""
         self.watchdog_hz = min_hz
         self._input_s = self.t_s
 
     def log(self, message: str) -> None:
-        """Note something for whoever reads the state."""
+        """Append a message to the log in the emulator's state."""
         self.messages.append(f"{self.t_s:.3f} {message}")
 
     def values(self) -> dict[str, Value]:
-        """Every variable that RTDE can stream, except registers."""
+        """Return every variable that RTDE can stream, except registers."""
         arm = self.arm
         pose = _six(ur_model.pose_vector(arm.T_base_tcp))
         twist, q, qd = _six(arm.twist), _six(arm.q), _six(arm.qd)

@@ -1,7 +1,7 @@
-"""Kinematics of a UR5e: where the flange is for given joint angles, and how fast it moves.
+"""Kinematics of a UR5e: flange pose and velocity for given joint angles and speeds.
 
 Denavit-Hartenberg parameters: Universal Robots, "DH parameters for calculations of kinematics and dynamics", UR5e. A
-real arm differs by millimetres, because each carries its own calibration.
+real arm differs by millimetres, because each has its own calibration.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _DAMPING = 1e-3
 
 
 def forward(q: Array, T_flange_tcp: Array) -> tuple[Array, Array]:
-    """Pose ``T_base_tcp`` (4, 4), and Jacobian (6, 6) from joint speeds to [v, w] of the TCP along base axes."""
+    """Return pose ``T_base_tcp`` (4, 4), and Jacobian (6, 6) from joint speeds to [v, w] of the TCP along base axes."""
     T = np.eye(4)
     origins = np.empty((JOINTS, 3))
     axes = np.empty((JOINTS, 3))
@@ -46,12 +46,12 @@ def forward(q: Array, T_flange_tcp: Array) -> tuple[Array, Array]:
 
 
 def joint_speeds(J: Array, twist: Array) -> Array:
-    """Joint speeds (6,) for a twist (6,) along base axes; damped, so they stay finite at a singularity."""
+    """Return joint speeds (6,) for a twist (6,) along base axes; damped, so they stay finite at a singularity."""
     return np.asarray(J.T @ np.linalg.solve(J @ J.T + _DAMPING**2 * np.eye(6), twist))
 
 
 def inverse(T_base_tcp: Array, q_near: Array, T_flange_tcp: Array) -> Array | None:
-    """Joint angles (6,) near ``q_near`` that reach the pose to 1 nm and 1 nrad, or None if Newton's steps do not."""
+    """Return joint angles (6,) near ``q_near`` that reach the pose to 1 nm and 1 nrad, or None if Newton fails."""
     q = q_near.copy()
     for _ in range(50):
         T, J = forward(q, T_flange_tcp)
@@ -64,19 +64,19 @@ def inverse(T_base_tcp: Array, q_near: Array, T_flange_tcp: Array) -> Array | No
 
 
 def rotation_vector(R: Array) -> Array:
-    """Rotation vector (3,) of a rotation matrix."""
+    """Return the rotation vector (3,) of a rotation matrix."""
     T = np.eye(4)
     T[:3, :3] = R
     return np.asarray(se3.log(T)[3:])
 
 
 def pose_vector(T: Array) -> Array:
-    """Universal Robots' pose (6,) [x y z rx ry rz]: metres and a rotation vector."""
+    """Return Universal Robots' pose (6,) [x y z rx ry rz]: metres and a rotation vector."""
     return np.concatenate([T[:3, 3], rotation_vector(T[:3, :3])])
 
 
 def from_pose_vector(p: Array) -> Array:
-    """Pose (4, 4) of [x y z rx ry rz]."""
+    """Return the pose (4, 4) of [x y z rx ry rz]."""
     T = np.asarray(se3.exp(np.concatenate([np.zeros(3), p[3:]])))
     T[:3, 3] = p[:3]
     return T

@@ -1,4 +1,4 @@
-"""How the emulated UR arm moves: each motion says where the joints are one control period later."""
+"""Motions of the emulated UR arm: each returns the joint angles one control period later."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from touchcell.geometry.types import Array
 
 
 class ArmState:
-    """Joints and tool of the arm.
+    """State of joints and tool.
 
     Attributes:
         q, qd: joint angles and speeds (6,).
@@ -29,12 +29,12 @@ class ArmState:
         self.refresh()
 
     def refresh(self) -> None:
-        """Recompute the tool from the joints."""
+        """Recompute the tool pose from the joints."""
         self.T_base_tcp, self.J = ur_model.forward(self.q, self.T_flange_tcp)
         self.twist = self.J @ self.qd
 
     def move_to(self, q: Array, dt_s: float) -> None:
-        """Be at ``q`` one period later."""
+        """Move to ``q`` within one period."""
         moved = self.qd.any() or not np.array_equal(q, self.q)
         self.qd = (q - self.q) / dt_s
         self.q = q
@@ -45,17 +45,17 @@ class ArmState:
 
 
 class Motion(Protocol):
-    """Something that moves the arm."""
+    """A motion of the arm."""
 
     done: bool
 
     def advance(self, arm: ArmState, dt_s: float, scaling: float) -> Array:
-        """Joint angles (6,) after ``dt_s``, slowed by the speed slider's ``scaling``."""
+        """Return joint angles (6,) after ``dt_s``, slowed by the speed slider's ``scaling``."""
         ...
 
 
 class SpeedL:
-    """Tool twist along base axes, reached with bounded accelerations; holds it until replaced."""
+    """Tool twist along base axes, reached with bounded acceleration and held until replaced."""
 
     def __init__(self, arm: ArmState) -> None:
         self.done = False
@@ -64,12 +64,12 @@ class SpeedL:
         self.accel = 0.0
 
     def aim(self, target: Array, accel: float) -> None:
-        """Accelerate towards ``target`` with ``accel`` m/s2 and rad/s2."""
+        """Accelerate towards ``target`` at ``accel`` m/s2 and rad/s2."""
         self.target, self.accel = target, accel
 
     @property
     def reached(self) -> bool:
-        """Whether the target twist has been reached."""
+        """Return whether the target twist has been reached."""
         return bool(np.array_equal(self._now, self.target))
 
     def advance(self, arm: ArmState, dt_s: float, scaling: float) -> Array:
@@ -81,7 +81,7 @@ class SpeedL:
 
 
 class SpeedJ:
-    """Joint speeds, reached with a bounded acceleration; holds them until replaced."""
+    """Joint speeds, reached with bounded acceleration and held until replaced."""
 
     def __init__(self, arm: ArmState) -> None:
         self.done = False
@@ -90,12 +90,12 @@ class SpeedJ:
         self.accel = 0.0
 
     def aim(self, target: Array, accel: float) -> None:
-        """Accelerate towards ``target`` with ``accel`` rad/s2."""
+        """Accelerate towards ``target`` at ``accel`` rad/s2."""
         self.target, self.accel = target, accel
 
     @property
     def reached(self) -> bool:
-        """Whether the target speeds have been reached."""
+        """Return whether the target speeds have been reached."""
         return bool(np.array_equal(self._now, self.target))
 
     def advance(self, arm: ArmState, dt_s: float, scaling: float) -> Array:
@@ -104,7 +104,7 @@ class SpeedJ:
 
 
 class ServoJ:
-    """Follows a joint target with a first-order lag; stays there."""
+    """Follow a joint target with a first-order lag, and stay there."""
 
     def __init__(self, target: Array, lag_s: float) -> None:
         self.done = False
@@ -115,7 +115,7 @@ class ServoJ:
 
 
 class Brake:
-    """Slows down along the present direction until it stands.
+    """Decelerate along the present direction to standstill.
 
     Args:
         decel: m/s2 of the tool where ``linear`` (stopl), else rad/s2 of the fastest joint (stopj).
@@ -137,7 +137,7 @@ class Brake:
 
 
 class Trapezoid:
-    """Goes from 0 to ``distance`` with bounded speed and acceleration."""
+    """Profile from 0 to ``distance`` with bounded speed and acceleration."""
 
     def __init__(self, distance: float, speed: float, accel: float) -> None:
         self.distance = distance
@@ -147,7 +147,7 @@ class Trapezoid:
         self.duration_s = 2.0 * self._ramp_s + max(0.0, distance / self._speed - self._ramp_s)
 
     def at(self, t_s: float) -> float:
-        """Distance covered after ``t_s``."""
+        """Return the distance covered after ``t_s``."""
         if t_s >= self.duration_s:
             return self.distance
         left_s = self.duration_s - t_s
@@ -159,7 +159,7 @@ class Trapezoid:
 
 
 class MoveJ:
-    """Straight in joint space, all joints arriving together."""
+    """Move in a straight line in joint space; all joints arrive together."""
 
     def __init__(self, arm: ArmState, target: Array, speed: float, accel: float) -> None:
         self._start, self._target = arm.q.copy(), target
@@ -177,7 +177,7 @@ class MoveJ:
 
 
 class MoveL:
-    """Tool centre point on a straight line, orientation by the shortest turn."""
+    """Move the tool centre point on a straight line, the orientation by the shortest rotation."""
 
     def __init__(self, arm: ArmState, T_target: Array, speed: float, accel: float) -> None:
         self._start = arm.T_base_tcp.copy()
@@ -204,7 +204,7 @@ class MoveL:
 
 
 def approach(now: Array, target: Array, step: float) -> Array:
-    """From ``now`` towards ``target`` by at most ``step`` in norm; arrives exactly."""
+    """Return ``now`` moved towards ``target`` by at most ``step`` in norm; arrives exactly."""
     gap = target - now
     distance = float(np.linalg.norm(gap))
     return target if distance <= step else now + gap * (step / distance)

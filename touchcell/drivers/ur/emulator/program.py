@@ -1,11 +1,11 @@
-"""The control program that ur-rtde uploads, as the register protocol that it speaks.
+"""The control program that ur-rtde uploads, emulated at the level of its register protocol.
 
-No URScript is interpreted. The program's threads are generators, of which each ``yield`` is one ``sync()`` of 2 ms.
-What matters for safety is kept: the speed thread takes up the newest target, hands it to ``speedl`` for ``time``
-seconds, and repeats it for ever, so only another command, a stop of the program or the watchdog ends a motion.
+No URScript is interpreted. The program's threads are generators, in which each ``yield`` is one ``sync()`` of 2 ms.
+What matters for safety is kept: the speed thread takes the newest target, passes it to ``speedl`` for ``time`` seconds,
+and repeats that for ever, so only another command, a stop of the program or the watchdog ends a motion.
 
-Commands arrive in ``input_int_register_0``. Streaming ones are obeyed in every cycle; the others once, until the
-register returns to 0. ``output_int_register_0`` answers 1 (ready) or 2 (done). Source: the program and the client of
+Commands arrive in ``input_int_register_0``. Streaming ones are executed in every cycle; the others once, until the
+register returns to 0. ``output_int_register_0`` replies 1 (ready) or 2 (done). Source: the program and the client of
 ur-rtde 1.6.5 (MIT); for the built-in functions, Universal Robots, "The URScript Programming Language for e-Series".
 """
 
@@ -61,7 +61,7 @@ Thread = Generator[None, None, None]
 
 
 class ProgramHost(Protocol):
-    """What a program needs of the controller that runs it."""
+    """Interface of the controller that runs a program."""
 
     arm: ArmState
     motion: Motion | None
@@ -74,11 +74,11 @@ class ProgramHost(Protocol):
         ...
 
     def set_watchdog(self, min_hz: float) -> None:
-        """Demand a rate of input packets."""
+        """Require a minimum rate of input packets."""
         ...
 
     def protective_stop(self) -> None:
-        """Stop the arm and latch."""
+        """Stop the arm and latch the protective stop."""
         ...
 
     def log(self, message: str) -> None:
@@ -91,11 +91,11 @@ class ProgramError(Exception):
 
 
 class ControlProgram:
-    """One running upload.
+    """One uploaded, running program.
 
     Args:
         controller: the controller that runs it.
-        register_offset: 0, or 24 where the client asked for the upper range of registers.
+        register_offset: 0, or 24 if the client requested the upper range of registers.
     """
 
     def __init__(self, controller: ProgramHost, register_offset: int) -> None:

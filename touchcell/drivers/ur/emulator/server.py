@@ -1,7 +1,7 @@
 """An emulated UR5e e-Series controller (PolyScope 5.11) on its real ports: RTDE, dashboard and script.
 
 The ports are fixed on the robot and in its clients, so each emulator needs a loopback address of its own. The arm is
-kinematic: exact where it is told to go, no mass, no contact. ``docs/devices/ur.md`` says what was read where.
+kinematic: it follows commands exactly, without mass or contact. ``docs/devices/ur.md`` lists the sources.
 """
 
 from __future__ import annotations
@@ -130,27 +130,27 @@ class UrEmulator(Emulator):
 
     Args:
         host: loopback address.
-        unlock_after_s: how long a protective stop cannot be unlocked.
+        unlock_after_s: time after a protective stop before it can be unlocked.
     """
 
     faults: ClassVar[Mapping[str, str]] = {
-        "pause": "the network side hangs: sockets stay open, nothing is read or written; the arm itself goes on",
+        "pause": "the network side hangs: sockets stay open, nothing is read or written; the arm keeps moving",
         "drop": "the next N state packets are not sent",
         "delay": "state packets arrive this many seconds late",
-        "corrupt": "the next N state packets carry absurd numbers",
+        "corrupt": "the next N state packets carry implausible numbers",
         "nan": "the next N state packets carry NaN for joints and pose",
         "out_of_order": "the next N state packets repeat an older one",
-        "unplug": "the cable is pulled: all connections are cut and none accepted until it is cleared",
-        "restart": "the controller starts anew: connections cut, clock at 0, arm powered off",
+        "unplug": "the cable is unplugged: all connections are cut and none accepted until it is cleared",
+        "restart": "the controller restarts: connections cut, clock at 0, arm powered off",
         "protective_stop": "the arm hit something",
         "emergency_stop": "the button on the pendant",
         "fault_bits": "enter the safety mode of this number",
         "local_control": "the pendant is in local mode",
-        "program_stop": "somebody stops the program on the pendant",
-        "other_program": "somebody else's program is running",
+        "program_stop": "the program is stopped from the pendant",
+        "other_program": "a foreign program is running",
         "registers_in_use": "a fieldbus owns the input registers",
         "power_off": "the arm is powered off",
-        "speed_slider": "the speed slider stands at this fraction",
+        "speed_slider": "the speed slider is at this fraction",
         "wrench": "[fx fy fz tx ty tz] N and N m act on the tool",
     }
 
@@ -294,7 +294,7 @@ class UrEmulator(Emulator):
         due_s = loop.time()
         while True:
             # A late process catches up, because a controller's clock does not slow down, but reads its inputs between
-            # any two steps; one that was stopped altogether does not live through the lost time.
+            # any two steps; one that was suspended skips the lost time.
             due_s = max(due_s + PERIOD_S, loop.time() - _MAX_LATE_S)
             await asyncio.sleep(max(0.0, due_s - loop.time()))
             self._controller.step()
@@ -396,7 +396,7 @@ class UrEmulator(Emulator):
         while piece := await reader.read(65536):
             await self._awake.wait()
             text += piece
-            # A program is closed by an `end` in the first column.
+            # An `end` in the first column closes a program.
             if text.endswith(b"\nend\n"):
                 self._controller.start_program(text.decode(errors="replace"))
                 text = b""
@@ -488,13 +488,13 @@ def _is_register(name: str, prefix: str) -> bool:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command line."""
+    """Add the command-line arguments."""
     parser.add_argument("--host", default="127.0.0.1", help="loopback address to listen on")
     parser.add_argument(
-        "--unlock-after", type=float, default=5.0, metavar="S", help="how long a protective stop cannot be unlocked"
+        "--unlock-after", type=float, default=5.0, metavar="S", help="seconds before a protective stop can be unlocked"
     )
 
 
 def build(arguments: argparse.Namespace) -> UrEmulator:
-    """Make the emulator."""
+    """Build the emulator."""
     return UrEmulator(arguments.host, arguments.unlock_after)

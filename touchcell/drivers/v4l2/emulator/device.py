@@ -1,6 +1,6 @@
-"""What an emulated camera answers to each Video4Linux2 request: formats, controls, priorities, buffers. No sockets.
+"""Model of a camera's replies to Video4Linux2 requests: formats, controls, priorities, buffers. No sockets.
 
-Behaviour follows the kernel's V4L2 and videobuf2 cores as far as v4l2-compliance can tell.
+Behaviour follows the kernel's V4L2 and videobuf2 cores as far as v4l2-compliance tests it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FORMATS = {"MJPG": "Motion-JPEG", "YUYV": "YUYV 4:2:2", "GREY": "8-bit Greyscale
 SIZES = ((640, 480), (1280, 720), (320, 240))
 RATES_HZ = (30, 60, 120)
 SLOT_BYTES = 2 << 20
-"""Room for one buffer in the shared memory; also the step of their mmap offsets."""
+"""Size reserved per buffer in the shared memory; also the step of the mmap offsets."""
 
 _INTEGER, _BOOLEAN, _MENU, _CLASS = 1, 2, 3, 6
 _COLORSPACE_SRGB = 8
@@ -49,7 +49,7 @@ _GUARDED = frozenset(
         codec.STREAMOFF,
     }
 )
-"""Requests that a handle of lower priority than another's may not make."""
+"""Requests that are refused while another handle has a higher priority."""
 
 _CHANGING = frozenset({codec.S_FMT, codec.S_PARM, codec.S_CTRL, codec.S_EXT_CTRLS, codec.S_INPUT, codec.STREAMON})
 
@@ -68,13 +68,13 @@ class ControlState:
     value: int = 0
 
     def nearest(self, value: int) -> int:
-        """Clamped and rounded to a step, as the kernel's control framework does."""
+        """Return ``value`` clamped and rounded to a step, as the kernel's control framework does."""
         value = max(self.minimum, min(self.maximum, value))
         return self.minimum + (value - self.minimum + self.step // 2) // self.step * self.step
 
 
 def controls() -> dict[int, ControlState]:
-    """A fresh set of the controls of a typical USB camera, at their defaults."""
+    """Return the controls of a typical USB camera, at their defaults."""
     table = {
         0x00980001: ControlState("User Controls", _CLASS),
         0x00980900: ControlState("Brightness", _INTEGER, -64, 64, 1, 0),
@@ -95,7 +95,7 @@ def controls() -> dict[int, ControlState]:
 
 @dataclass(eq=False, slots=True)
 class Handle:
-    """One open of the camera: its priority and the events that it wants and has not fetched."""
+    """One open file handle: its priority, subscribed and pending events."""
 
     priority: int = _PRIORITY_INTERACTIVE
     subscribed: dict[int, int] = field(default_factory=dict)
@@ -104,7 +104,7 @@ class Handle:
 
 
 class Refused(Exception):
-    """A request is answered with an errno."""
+    """A request fails with an errno."""
 
     def __init__(self, number: int) -> None:
         super().__init__(errno.errorcode[number])
@@ -112,15 +112,15 @@ class Refused(Exception):
 
 
 class CameraModel:
-    """State of one emulated camera and its answers.
+    """State and replies of one emulated camera.
 
     Args:
         card: product name.
         on_stream: called with True when streaming starts and False when it ends.
 
     Attributes:
-        settings_changed: requests that changed anything or started the stream.
-        energising: settings of a control that moves something, which on this camera is the focus.
+        settings_changed: number of requests that changed anything or started the stream.
+        energising: settings of a control with an actuator, which on this camera is the focus.
     """
 
     def __init__(self, card: str, on_stream: Callable[[bool], None]) -> None:
@@ -146,7 +146,7 @@ class CameraModel:
         return self.width * self.height * (1 if self.pixel_format == "GREY" else 2)
 
     def answer(self, handle: Handle, request: int, body: bytearray) -> int:
-        """Carry out ``request`` and change ``body`` in place; returns 0 or an errno."""
+        """Execute ``request``, changing ``body`` in place; return 0 or an errno."""
         handler = _HANDLERS.get(request)
         self.requests[_NAMES.get(request, hex(request))] += 1
         if handler is None:
@@ -163,18 +163,18 @@ class CameraModel:
         return 0
 
     def release(self, handle: Handle) -> None:
-        """The handle has been closed."""
+        """Release a closed handle."""
         self.handles.discard(handle)
         if self.owner is handle:
             self._stop()
             self.owner, self.buffers = None, 0
 
     def next_buffer(self) -> int | None:
-        """Take the buffer for the next frame, or None if the program has left none."""
+        """Take the buffer for the next frame, or None if the program has queued none."""
         return self.queued.popleft() if self.queued else None
 
     def filled(self, index: int, used: int, sequence: int, stamp_ns: int, flags: int) -> codec.Buffer:
-        """The buffer as DQBUF shall return it."""
+        """Return the buffer as DQBUF shall deliver it."""
         buffer = self._buffer(index)
         buffer.bytesused, buffer.sequence, buffer.field = used, sequence, codec.FIELD_NONE
         buffer.seconds, buffer.microseconds = stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000 // 1000
@@ -429,7 +429,7 @@ class CameraModel:
         try:
             _, items = self._extended(body, setting=True)
         except Refused:
-            # Nothing has been set yet, which an index past the end says.
+            # An index past the end means that no control has been set yet.
             header = codec.ExtendedControls.from_buffer(body)
             header.error_idx = header.count
             raise
@@ -509,7 +509,7 @@ class CameraModel:
 
 
 def _fresh(layout: type[S], body: bytearray, *kept: str) -> S:
-    # The kernel zeroes whatever a driver does not fill, so nothing of the caller's but ``kept`` may survive.
+    # The kernel zeroes every field that a driver does not fill, so only ``kept`` fields of the caller may survive.
     asked = layout.from_buffer_copy(body)
     body[:] = bytes(ctypes.sizeof(layout))
     reply = layout.from_buffer(body)

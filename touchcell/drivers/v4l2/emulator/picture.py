@@ -1,4 +1,4 @@
-"""Pictures for an emulated TacTip camera: white pins on a dark skin that sways a little, or a folder of images."""
+"""Images for an emulated TacTip camera: white pins on a dark, slowly swaying skin, or a folder of images."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from touchcell.errors import ConfigError
 from touchcell.geometry.types import ImageArray
 
 PICTURES = 64
-"""Pictures in the cycle; picture k is shown in every frame with sequence number k modulo this."""
+"""Images in the cycle; image k is shown in every frame with sequence number k modulo this."""
 
 _RINGS = 10
 _SWAY = 0.006
@@ -22,7 +22,7 @@ _NOISE_LEVELS = 3
 
 @lru_cache(maxsize=256)
 def synthetic(number: int, width: int, height: int) -> ImageArray:
-    """Picture ``number`` of the cycle, (height, width) grey: 331 pins in 10 hexagonal rings, and sensor noise."""
+    """Render image ``number`` of the cycle, (height, width) grey: 331 pins in 10 hexagonal rings, and sensor noise."""
     import cv2
 
     image = np.full((height, width), 24, np.uint8)
@@ -42,37 +42,37 @@ def synthetic(number: int, width: int, height: int) -> ImageArray:
 
 @lru_cache(maxsize=256)
 def from_file(path: Path, width: int, height: int) -> ImageArray:
-    """An image file as (height, width) grey. Raises ConfigError."""
+    """Read an image file as (height, width) grey. Raises ConfigError."""
     import cv2
 
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if image is None:
-        raise ConfigError("is no image", file=str(path), key="images", value=str(path))
+        raise ConfigError("is not an image", file=str(path), key="images", value=str(path))
     return resized(np.asarray(image, np.uint8), width, height)
 
 
 def resized(image: ImageArray, width: int, height: int) -> ImageArray:
-    """The picture in (height, width)."""
+    """Resize to (height, width)."""
     import cv2
 
     return image if image.shape == (height, width) else np.asarray(cv2.resize(image, (width, height)), np.uint8)
 
 
 def files(folder: Path) -> Sequence[Path]:
-    """Image files of a folder, by name. Raises ConfigError if there are none."""
+    """Return the image files of a folder, by name. Raises ConfigError if there are none."""
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp"))
     if not found:
-        raise ConfigError("holds no images", file=str(folder), key="images", value=str(folder))
+        raise ConfigError("contains no images", file=str(folder), key="images", value=str(folder))
     return found
 
 
 def brightened(image: ImageArray, factor: float) -> ImageArray:
-    """The picture under ``factor`` times the light."""
+    """Scale the brightness by ``factor``."""
     return image if factor == 1.0 else np.asarray(np.clip(image * factor, 0.0, 255.0), np.uint8)
 
 
 def encoded(image: ImageArray, pixel_format: str) -> bytes:
-    """A grey picture as the bytes of a MJPG, YUYV or GREY frame."""
+    """Encode a grey image as a MJPG, YUYV or GREY frame."""
     import cv2
 
     if pixel_format == "GREY":

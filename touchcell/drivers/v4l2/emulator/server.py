@@ -2,7 +2,7 @@
 
     touchcell emulate v4l2 --folder /tmp/cameras
 
-prints the two environment variables with which any program sees the camera.
+prints the two environment variables that make the camera visible to any program.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _LIGHT_STEP = 0.01
 
 
 class _Client:
-    """One open of the camera: its requests, its filled buffers, its memory."""
+    """One open file handle of the camera: its requests, its filled buffers, its memory."""
 
     def __init__(self, control: socket.socket, minor: int) -> None:
         self.control = control
@@ -54,36 +54,35 @@ class _Client:
         os.close(descriptor)
 
     def close(self) -> None:
-        """Hang up: the program sees an unplugged camera."""
+        """Close the connection: the program sees an unplugged camera."""
         self.control.close()
         self.frames.close()
         self.memory.close()
 
 
 class V4l2Emulator(Emulator):
-    """One camera.
+    """Emulator of one camera.
 
     Args:
-        folder: where its sockets and its sysfs entry live.
+        folder: folder of its sockets and its sysfs entry.
         minor: number N of its /dev/videoN.
         images: folder of images to show instead of the synthetic ones.
-        show: gives the grey picture (height, width) of what is before the camera now, for a frame's number, in place of
-            either.
+        show: function from a frame's number to the grey image (height, width) to show; replaces both.
     """
 
     faults: ClassVar = {
         "pause": "the sensor hangs: no frames, requests are still answered",
-        "drop": "count of frames lost on the way; the sequence number goes on",
-        "delay": "seconds by which frames arrive late, with their true stamps",
-        "freeze_frame": "the same picture for ever, under fresh stamps and numbers",
-        "corrupt": "count of frames cut short",
-        "error_flag": "count of frames that the kernel marks as damaged",
+        "drop": "number of frames lost in transport; the sequence number continues",
+        "delay": "seconds by which frames arrive late, with their true timestamps",
+        "freeze_frame": "the same image for ever, with fresh timestamps and numbers",
+        "corrupt": "number of truncated frames",
+        "error_flag": "number of frames that the kernel marks as corrupt",
         "exposure_drift": "change of brightness per second, as a fraction",
         "stuck_controls": "controls accept every value and change nothing",
-        "no_monotonic": "stamps on an unknown clock",
-        "out_of_order": "count of frames with the number and stamp of 100 frames ago",
-        "unplug": "the camera is gone until this is cleared",
-        "restart": "seconds for which the camera is gone before it comes back by itself",
+        "no_monotonic": "timestamps on an unknown clock",
+        "out_of_order": "number of frames with the number and timestamp of 100 frames ago",
+        "unplug": "the camera is disconnected until this is cleared",
+        "restart": "seconds for which the camera is disconnected before it returns by itself",
     }
 
     def __init__(
@@ -126,11 +125,11 @@ class V4l2Emulator(Emulator):
         self._plug()
 
     async def stop(self) -> None:
-        """Unplug the camera for good."""
+        """Unplug the camera and close its socket."""
         self._unplug()
 
     def state(self) -> dict[str, Any]:
-        """Format, controls, counters, and what is plugged in."""
+        """Return format, controls, counters, and whether it is plugged in."""
         model = self.model
         return {
             "plugged": self._listener is not None,
@@ -238,7 +237,7 @@ class V4l2Emulator(Emulator):
             self._stream = asyncio.create_task(self._run_sensor())
 
     def _wake_waiting(self) -> None:
-        # A thread that blocks in DQBUF must return when another ends the stream.
+        # A thread that blocks in DQBUF must return when another thread stops the stream.
         if self.model.owner in self._clients:
             with contextlib.suppress(OSError):
                 self._clients[self.model.owner].frames.send(b"\0")
@@ -331,14 +330,14 @@ def _frame(source: Path | int, width: int, height: int, pixel_format: str, light
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare its command line."""
+    """Add the command-line arguments."""
     parser.add_argument("--folder", type=Path, required=True, help="folder for the camera's sockets")
     parser.add_argument("--minor", type=int, default=0, help="N of /dev/videoN")
     parser.add_argument("--images", type=Path, help="folder of images to show in turn")
 
 
 def build(arguments: argparse.Namespace) -> Emulator:
-    """Make the emulator, not yet started, and tell how a program sees it."""
+    """Build the emulator, not yet started, and print how a program sees it."""
     print(
         " ".join(f"{key}={value}" for key, value in environment(arguments.folder).items()), "PROGRAM", file=sys.stderr
     )

@@ -1,0 +1,1 @@
+"""Short programs that use touchcell on simulated devices; each runs by itself: ``python examples/move_arm.py``."""

@@ -1,0 +1,107 @@
+"""A composed cell: its devices, sensors, task and supervisor, and their life from connection to disconnection."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+from touchcell.cell.config.schema import CellPlan
+from touchcell.cell.recording.dataset_writer import Collection
+from touchcell.cell.runtime.sensor import Sensor
+from touchcell.cell.runtime.watchdog import NullWatchdog, Watchdog
+from touchcell.control.supervisor import Supervisor
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.device import Device, Lifecycle
+from touchcell.drivers.core.protocols import StopCategory
+from touchcell.tasks.interface import Task
+
+if TYPE_CHECKING:
+    from touchcell.drivers.core.scene import SceneTruth
+
+
+@dataclass
+class Cell:
+    """A cell that is built. As a context manager it is connected and activated, and given back at the end.
+
+    Attributes:
+        plan: where it came from.
+        clock: its time.
+        arms: by role in the task, and those that only carry a sensor by their own name.
+        sensors: by role.
+        task: what the cell does.
+        new_task: makes it anew, in its first state, after a trip.
+        stop_categories: by which each arm stops when something is wrong, by role.
+        holding: roles of arms that keep their power when another's fault stops them.
+        watched_joints: roles of arms whose joint angles an interlock looks at.
+        scene: what is simulated around the arms, as far as it can be looked into; None in a cell of real devices.
+        collection: where labelled frames go, None where the task labels none.
+        watchdog: stops the arms when the loop falls silent.
+    """
+
+    plan: CellPlan
+    clock: Clock
+    arms: Mapping[str, Any]
+    cameras: Mapping[str, Device]
+    sensors: Mapping[str, Sensor]
+    supervisor: Supervisor
+    task: Task
+    new_task: Callable[[], Task]
+    stop_categories: Mapping[str, StopCategory] = field(default_factory=dict)
+    holding: frozenset[str] = frozenset()
+    watched_joints: frozenset[str] = frozenset()
+    scene: SceneTruth | None = None
+    collection: Collection | None = None
+    watchdog: Watchdog = field(default_factory=NullWatchdog)
+    start_ns: int = 0
+    _exit: ExitStack = field(default_factory=ExitStack, init=False)
+
+    def __repr__(self) -> str:
+        devices = ", ".join(repr(device) for device in self._devices())
+        return f"<Cell {self.plan.cell.name!r}: task {self.task_name} in {self.task.state!r}, {devices}>"
+
+    @property
+    def rate_hz(self) -> float:
+        """Control cycles per second."""
+        return self.plan.cell.rate_hz
+
+    @property
+    def max_duration_s(self) -> float:
+        """Longest run."""
+        return self.plan.cell.max_duration_s
+
+    @property
+    def task_name(self) -> str:
+        """The task's name, which owns the arms' leases."""
+        return self.plan.task.name
+
+    def __enter__(self) -> Self:
+        with self._exit:
+            self._exit.enter_context(self.watchdog)
+            for device in self._devices():
+                self._exit.enter_context(device)
+                device.configure()
+            # Every device must answer before the first one is energised.
+            for device in self._devices():
+                device.activate()
+                self._exit.callback(self._deactivate, device)
+            self.watchdog.self_test()
+            self.start_ns = self.clock.now_ns()
+            self._exit = self._exit.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._exit.close()
+
+    def _devices(self) -> list[Device]:
+        unique = {id(device): device for device in [*self.arms.values(), *self.cameras.values()]}
+        return list(unique.values())
+
+    def _deactivate(self, device: Device) -> None:
+        section = self.plan.cell.arms.get(device.name)
+        if device.state is Lifecycle.ACTIVE:
+            device.deactivate(section.deactivate) if section is not None else device.deactivate()
