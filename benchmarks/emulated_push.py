@@ -32,7 +32,8 @@ from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.experiments.push_measures import off_normal_mm, target_mm
 from touchcell.cell.recording.mcap import RECORDING, Recorder
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, RunLoop
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import Outcome
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.v4l2.shim import environment
 from touchcell.geometry import se3

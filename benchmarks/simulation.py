@@ -26,7 +26,9 @@ from benchmarks.simulation_scripts import SCRIPTS, Script, Trace, perform
 from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Progress, RunLoop, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import Progress
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.geometry import se3
 from touchcell.paths import CONFIGS
 from touchcell.simulation.devices.tactip import SimTactip

@@ -12,8 +12,9 @@ import numpy as np
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
+from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.lease import Lease
-from touchcell.drivers.core.spec import DriverContext
+from touchcell.drivers.core.spec import AnyDriver, DriverContext
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.simulation.devices import arm as sim_arm
@@ -159,12 +160,12 @@ class _Hand:
             "base_pose_mm_deg": base,
             "start_pose_mm_deg": tuple(se3.to_euler_mm_deg(T_base_tip)),
         }
-        spec = sim_arm.SPEC
+        spec: AnyDriver = sim_arm.SPEC
         if self.joints:
             spec = sim_joint_arm.SPEC
             config |= {"model": "panda", "tool": self.script.tool}
             config |= {"physics_step_ms": self.physics_step_ms}
-        arm = spec.build(self.tip, spec.config(**config), DriverContext(self.clock, {}, self.scene))
+        arm: Device = spec.build(self.tip, spec.config(**config), DriverContext(self.clock, {}, self.scene))
         assert isinstance(arm, SimArm | SimJointArm)
         self.scene.mount(self.tip, arm.T_world_tcp, arm.bear if isinstance(arm, SimJointArm) else None)
         arm.connect()

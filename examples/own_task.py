@@ -6,6 +6,7 @@ import numpy as np
 
 import touchcell as tc
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.tasks.interface import Action, Observation, TaskConfig, TaskContext, TaskSpec, TransitionRecord
 
 
@@ -43,6 +44,6 @@ class Press:
         self.state, self.finished, self.succeeded = state, True, state == "done"
 
 
-SPEC = TaskSpec("press", "press down", PressConfig, {"arm": frozenset({"TwistSink"})}, frozenset({"sensor"}), Press)
+SPEC = TaskSpec("press", "press down", PressConfig, {"arm": frozenset({TwistSink})}, frozenset({"sensor"}), Press)
 cell = tc.load_cell("surface_follow_sim")  # with an entry point for SPEC its file could say `task: {name: press}`
 print(tc.run(replace(cell, task=SPEC, task_config=PressConfig(depth_mm=1.5))))

@@ -19,7 +19,7 @@ def sockets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield folder
 
 
-def test_a_camera_goes_by_its_stable_name(tmp_path: Path, sockets: Path) -> None:
+def test_a_camera_is_listed_by_its_stable_name(tmp_path: Path, sockets: Path) -> None:
     (tmp_path / "video2").touch()
     links = tmp_path / "v4l" / "by-id"
     links.mkdir(parents=True)
@@ -71,7 +71,7 @@ def _interface(sys: Path, name: str, kind: int, flags: str, queue: int) -> None:
     (folder / "tx_queue_len").write_text(f"{queue}\n")
 
 
-def test_can_interfaces_are_told_from_others_and_say_what_they_lack(tmp_path: Path) -> None:
+def test_can_interfaces_are_recognised_and_report_missing_settings(tmp_path: Path) -> None:
     _interface(tmp_path, "eth0", 1, "0x1003", 1000)
     _interface(tmp_path, "can0", 280, "0x40080", 10)
     _interface(tmp_path, "vcan0", 280, "0x40081", 1000)

@@ -33,7 +33,7 @@ def cell_of(path: Path, **arm: object) -> Path:
     return path
 
 
-def test_probe_tells_state_and_health_of_every_device(capsys: pytest.CaptureFixture[str]) -> None:
+def test_probe_reports_state_and_health_of_every_device(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["probe", str(CONFIGS / "surface_follow_sim.yaml")]) == EXIT_OK
     told = capsys.readouterr().out
     assert "arm (sim_arm): passive, answers" in told
@@ -41,7 +41,7 @@ def test_probe_tells_state_and_health_of_every_device(capsys: pytest.CaptureFixt
     assert "sensor (sim_tactip): passive, answers" in told
 
 
-def test_probe_energises_nothing_and_goes_on_after_a_device_that_is_missing(
+def test_probe_energises_nothing_and_continues_after_a_missing_device(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = damiao_can.rig(tmp_path, 1)

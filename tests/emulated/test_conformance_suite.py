@@ -14,7 +14,7 @@ import numpy as np
 from touchcell.testing.conformance.suite import suite
 from touchcell.simulation.devices.rig import sim_arm_rig
 from touchcell.simulation.devices.arm import SimArm
-from touchcell.testing.emulation.rig import DeviceFixture
+from touchcell.drivers.core import protocols
 
 {change}
 
@@ -96,21 +96,21 @@ def test_a_record_that_promises_too_much_is_found(pytester: pytest.Pytester) -> 
 def broken(rig):
     capabilities = dataclasses.replace(
         rig.spec.capabilities,
-        abilities=rig.spec.capabilities.abilities | {"NativeWatchdog"},
+        provides=rig.spec.capabilities.provides | {protocols.NativeWatchdog},
         stop_categories=frozenset({0, 1, 2}),
     )
     return dataclasses.replace(rig, spec=dataclasses.replace(rig.spec, capabilities=capabilities))
 """
     found = failures(pytester, change)
     assert {
-        "abilities_are_those_of_the_record",
+        "protocols_are_those_of_the_record",
         "record_of_the_watchdog_is_consistent",
         "stop_categories_are_those_of_the_record",
         "watchdog_is_read_back",
     } == found
 
 
-def test_a_failure_that_is_known_by_name_is_told_apart(pytester: pytest.Pytester) -> None:
+def test_a_failure_known_by_name_is_reported_separately(pytester: pytest.Pytester) -> None:
     change = """
 def broken(rig):
     capabilities = dataclasses.replace(rig.spec.capabilities, max_watchdog_s=0.1)

@@ -98,7 +98,7 @@ def faulted(arm: DamiaoCanArm) -> bool:
     return arm.state is Lifecycle.FAULTED
 
 
-def test_it_is_registered_and_says_that_it_falls() -> None:
+def test_it_is_registered_and_declares_that_it_falls() -> None:
     spec = DRIVERS.load("damiao_can")
     assert spec.capabilities.falls_on_power_loss
     assert not spec.capabilities.has_brakes
@@ -190,7 +190,7 @@ def test_a_few_losses_are_counted_and_survived(
     np.testing.assert_allclose(arm.joints(0.5).value.q, emulator.state()["q_rad"], atol=0.02)
 
 
-def test_late_answers_are_not_taken_for_fresh_ones(arm: DamiaoCanArm, emulator: EmulatorProcess) -> None:
+def test_late_replies_are_not_mistaken_for_fresh_ones(arm: DamiaoCanArm, emulator: EmulatorProcess) -> None:
     activate(arm)
     emulator.fault("delay", 0.05)
     seq = arm.joints().seq
@@ -214,7 +214,7 @@ def test_a_silent_motor_is_a_fault_and_the_others_hold(arm: DamiaoCanArm, emulat
         arm.joints(0.1)
     with pytest.raises(CommandRejected):
         arm.send_twist(TwistCommand(UP, TwistFrame.BASE, CLOCK.now_ns(), 0.2), lease)
-    # The silent motor's own timeout has disabled it; the others still hear from us.
+    # The silent motor's own timeout has disabled it; the others still receive commands.
     emulator.wait_for(status=[1, 1, 1, 1, 1, 13])
     with pytest.raises(TransportTimeout):
         arm.recover(TOKEN)
@@ -263,7 +263,7 @@ def test_a_motor_s_fault_is_decoded_and_only_recovered_on_request(
     assert emulator.state()["status"][value[0]] == 0
 
 
-def test_pushing_the_arm_off_its_setpoint_is_a_fault_and_it_gives_way(
+def test_pushing_the_arm_off_its_setpoint_is_a_fault_and_it_yields(
     arm: DamiaoCanArm, emulator: EmulatorProcess
 ) -> None:
     activate(arm)
@@ -287,19 +287,19 @@ def test_a_frozen_bus_is_stale_then_a_fault(arm: DamiaoCanArm, emulator: Emulato
     emulator.thaw()
 
 
-def test_an_unplugged_adapter_is_gone_until_connected_again(arm: DamiaoCanArm, emulator: EmulatorProcess) -> None:
+def test_an_unplugged_adapter_is_lost_until_reconnected(arm: DamiaoCanArm, emulator: EmulatorProcess) -> None:
     activate(arm)
     emulator.fault("unplug")
     wait(lambda: faulted(arm))
     assert isinstance(arm.fault, DeviceGone)
-    # Without the host each motor lets go by its own timeout.
+    # Without the host each motor disables itself by its own timeout.
     emulator.wait_for(status=[13] * 6)
     with pytest.raises(DeviceGone):
         arm.recover(TOKEN)
     arm.disconnect()
     emulator.clear("unplug")
     arm.connect()
-    # The motors tell that they lost the host: a person must look before they are used again.
+    # The motors report that they lost the host: an operator must inspect them before they are used again.
     wait(lambda: faulted(arm))
     assert isinstance(arm.fault, DeviceFault)
     assert arm.fault.vendor_code == 13
@@ -369,12 +369,12 @@ def check_deactivation(arm: DamiaoCanArm, emulator: EmulatorProcess, park_deg: l
     arm.deactivate(DeactivatePolicy.PARK_THEN_OFF)
     state = emulator.state()
     assert state["enabled"] == 0
-    # Where it was let go; from there it sinks.
+    # The position when it was disabled; from there it sinks.
     np.testing.assert_allclose(np.rad2deg(state["target_rad"]), park_deg, atol=0.1)
     assert arm.state is Lifecycle.READY
 
 
-def test_it_goes_to_joint_angles_and_refuses_impossible_ones(arm: DamiaoCanArm, emulator: EmulatorProcess) -> None:
+def test_it_moves_to_joint_angles_and_refuses_impossible_ones(arm: DamiaoCanArm, emulator: EmulatorProcess) -> None:
     lease = activate(arm)
     goal = np.deg2rad([5.0, 35.0, 95.0, 5.0, 45.0, 10.0])
     arm.go_to_joints(goal, lease, speed_fraction=0.5)
@@ -415,7 +415,7 @@ for k in range(10000):
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_dead_host_moves_the_arm_no_further_and_then_it_lets_go(
+def test_after_a_dead_host_the_arm_stops_and_its_motors_disable_themselves(
     channel: Path, emulator: EmulatorProcess, number: int
 ) -> None:
     client = subprocess.Popen([sys.executable, "-c", CLIENT, str(channel)], stdout=subprocess.PIPE)
@@ -436,7 +436,7 @@ def test_a_dead_host_moves_the_arm_no_further_and_then_it_lets_go(
         client.stdout.close()
 
 
-def test_full_scales_that_are_no_numbers_are_refused(channel: Path, emulator: EmulatorProcess) -> None:
+def test_non_finite_full_scales_are_refused(channel: Path, emulator: EmulatorProcess) -> None:
     emulator.fault("nan")
     arm = DamiaoCanArm("arm", config(channel), CLOCK)
     with pytest.raises(ConnectError) as caught:

@@ -1,4 +1,4 @@
-"""Is the emulator like the real thing? An unmodified third-party client says so: damiao-motor 1.0.6 (MIT)."""
+"""Validate the emulator with an unmodified third-party client: damiao-motor 1.0.6 (MIT)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def emulator(process: EmulatorProcess) -> EmulatorProcess:
 
 @pytest.fixture
 def controller(channel: Path, emulator: EmulatorProcess) -> Iterator[Any]:
-    # The client still says bustype=, which python-can 4 deprecates.
+    # The client still uses bustype=, which python-can 4 deprecates.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         controller = damiao_motor.DaMiaoController(channel=str(channel), bustype="touchcell_hub")
@@ -97,7 +97,7 @@ def test_it_enables_and_moves_the_arm(controller: Any, emulator: EmulatorProcess
     emulator.wait_for(enabled=0)
 
 
-def test_it_sets_the_timeout_and_sees_it_trip(controller: Any, emulator: EmulatorProcess) -> None:
+def test_it_sets_the_timeout_and_detects_its_trip(controller: Any, emulator: EmulatorProcess) -> None:
     motor = controller.get_motor(2)
     controller.enable_all()
     motor.set_can_timeout(50)
@@ -136,6 +136,6 @@ def test_our_bytes_are_its_bytes_within_a_step(controller: Any) -> None:
         ours = codec.decode_mit(codec.encode_mit(codec.MitCommand(*values), ranges), ranges)
         steps = (highest - lowest) / np.array([65535, 4095, 4095, 4095, 4095])
         for field, step, value in zip(("q", "dq", "kp", "kd", "tau"), steps, values, strict=True):
-            # It truncates, we round: its error may be a whole step.
+            # It truncates, we round: its error may be a full step.
             assert abs(getattr(theirs, field) - getattr(ours, field)) <= step * 1.001
             assert abs(getattr(ours, field) - value) <= step * 0.501

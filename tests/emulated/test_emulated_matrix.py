@@ -40,11 +40,11 @@ EMULATORS = {
 
 @pytest.mark.parametrize("driver", [*ARMS, *CAMERAS])
 def test_every_fault_of_the_emulator_is_in_the_matrix(driver: str, tmp_path: Path) -> None:
-    # A reset is no fault: everything is as it was at the start.
+    # A reset is not a fault: it returns everything to the start.
     assert faults_of(driver, tmp_path).keys() == {*EMULATORS[driver].faults, HANG, VANISH} - {"reset"}
 
 
-def test_every_state_of_every_task_is_tried_or_the_same_as_one_that_is(tmp_path: Path) -> None:
+def test_every_state_of_every_task_is_tested_or_equal_to_a_tested_one(tmp_path: Path) -> None:
     found = dict(places("franka", tmp_path))
     assert {(place.task, place.role, place.state) for place in found} == {
         (task, role, state) for task, roles in HURT.items() for role in roles for state in states_of(task)[0]
@@ -84,14 +84,12 @@ def test_an_arm_that_hangs_while_it_follows_a_surface_ends_the_run(driver: str, 
         (Place("v4l2", "unplug", "dual_arm_pushing", "follower_sensor", "run"), "DeviceGone"),
     ],
 )
-def test_what_is_lost_ends_nothing_and_a_camera_that_fails_ends_the_run(
-    place: Place, ended_by: str, tmp_path: Path
-) -> None:
+def test_lost_frames_do_not_end_the_run_but_a_failed_camera_does(place: Place, ended_by: str, tmp_path: Path) -> None:
     case = Bench(tmp_path, 310_000).run(place)
     assert (case.problem, case.ended_by) == ("", ended_by)
 
 
-def test_an_interrupted_run_goes_on_where_it_ended(
+def test_an_interrupted_run_continues_at_its_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked: list[Place] = []

@@ -46,7 +46,7 @@ def push_shortly(data: dict[str, Any]) -> None:
         data["sensors"][sensor]["stall_s"] = 3.0
 
 
-def test_emulated_arms_and_cameras_push_a_prism_that_only_they_know(tmp_path: Path) -> None:
+def test_emulated_arms_and_cameras_push_a_prism_unknown_to_the_cell(tmp_path: Path) -> None:
     pytest.importorskip("franky")
     pytest.importorskip("rtde_receive")
     cell, cameras, out = shipped(tmp_path / "cell.yaml", push_shortly), tmp_path / "cameras", tmp_path / "run"
@@ -72,7 +72,7 @@ def test_emulated_arms_and_cameras_push_a_prism_that_only_they_know(tmp_path: Pa
     np.testing.assert_allclose(1e3 * after[:2], [450, 5], atol=12)
     recording = load_run(out / RECORDING)
     for sensor in SENSORS:
-        # Every frame that was looked at is one that this camera has sent, stamped by the kernel's clock.
+        # Every frame used was sent by this camera, stamped by the kernel's clock.
         measured = recording.series(f"/sensors/{sensor}/measurement")
         assert measured is not None
         numbers = measured.column("seq")
@@ -94,7 +94,9 @@ def test_emulated_arms_and_cameras_push_a_prism_that_only_they_know(tmp_path: Pa
         ("sensors.leader_sensor.driver", lambda data: data["sensors"]["leader_sensor"].update(driver="opencv_camera")),
     ],
 )
-def test_what_cannot_be_emulated_is_named(tmp_path: Path, key: str, change: Callable[[dict[str, Any]], object]) -> None:
+def test_a_device_without_emulator_is_named(
+    tmp_path: Path, key: str, change: Callable[[dict[str, Any]], object]
+) -> None:
     plan = plan_cell(shipped(tmp_path / "cell.yaml", change))
     with pytest.raises(ConfigError) as refused:
         CellEmulator(plan, tmp_path)

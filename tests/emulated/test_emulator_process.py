@@ -1,4 +1,4 @@
-"""An emulator does what its control channel says, and never outlives whoever started it."""
+"""An emulator follows its control channel, and never outlives its parent process."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ def test_an_emulator_dies_with_its_parent(tmp_path: Path) -> None:
 
 def _alive(pid: int) -> bool:
     try:
-        # A zombie has ended; in a container nobody may reap it.
+        # A zombie has ended; in a container it may not be reaped.
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
 
 
-def test_an_emulator_that_cannot_start_says_why() -> None:
+def test_an_emulator_that_cannot_start_reports_the_reason() -> None:
     with pytest.raises(ConnectError, match="did not start"):
         EmulatorProcess("ur", "--no-such-option").start()
 

@@ -101,7 +101,7 @@ def faulted(arm: FeetechSerialArm) -> bool:
     return arm.state is Lifecycle.FAULTED
 
 
-def test_it_is_registered_and_says_what_it_cannot() -> None:
+def test_it_is_registered_and_declares_its_limitations() -> None:
     capabilities = DRIVERS.load("feetech_serial").capabilities
     assert capabilities.falls_on_power_loss
     assert not capabilities.has_brakes
@@ -129,7 +129,9 @@ def test_angles_are_those_of_the_calibration(arm: FeetechSerialArm, servos: Emul
     np.testing.assert_allclose(arm.joints(0.5).value.q, state["q_rad"], atol=TICK_RAD)
 
 
-def test_torque_comes_last_and_with_the_goal_where_the_arm_is(arm: FeetechSerialArm, servos: EmulatorProcess) -> None:
+def test_torque_is_enabled_last_with_the_goal_at_the_measured_position(
+    arm: FeetechSerialArm, servos: EmulatorProcess
+) -> None:
     start = servos.state()
     arm.connect()
     arm.configure()
@@ -160,7 +162,7 @@ def test_a_twist_moves_the_tool_and_its_expiry_stops_it(arm: FeetechSerialArm, s
     assert arm.state is Lifecycle.ACTIVE
 
 
-def test_what_five_joints_cannot_follow_is_told(arm: FeetechSerialArm, servos: EmulatorProcess) -> None:
+def test_motion_infeasible_for_five_joints_is_reported(arm: FeetechSerialArm, servos: EmulatorProcess) -> None:
     lease = activate(arm)
     stream(arm, lease, np.array([0.0, 0.03, 0.0, 0.1, 0.0, 0.0]), 0.5)
     sent = send(arm, lease, np.array([0.0, 0.03, 0.0, 0.1, 0.0, 0.0]))
@@ -171,7 +173,7 @@ def test_what_five_joints_cannot_follow_is_told(arm: FeetechSerialArm, servos: E
     np.testing.assert_allclose(sent.command.twist[:3], [0.0, 0.03, 0.0], atol=1e-9)
     assert "joints: angular" in str(arm.health()["not_followed"])
     assert send(arm, lease, np.array([0.0, 0.03, 0.0, 0.0, 0.0, 0.0])).adjustments != sent.adjustments
-    # The tool stays upright although a tilt was asked for.
+    # The tool stays upright although a tilt was commanded.
     T = arm.tcp(0.5).value.T_base_tcp
     assert T[2, 2] < -np.cos(np.deg2rad(2.0))
 
@@ -219,7 +221,7 @@ def test_a_few_losses_are_counted_and_survived(
     np.testing.assert_allclose(arm.joints(0.5).value.q, servos.state()["q_rad"], atol=2 * TICK_RAD)
 
 
-def test_late_answers_are_not_taken_for_fresh_ones(arm: FeetechSerialArm, servos: EmulatorProcess) -> None:
+def test_late_replies_are_not_mistaken_for_fresh_ones(arm: FeetechSerialArm, servos: EmulatorProcess) -> None:
     activate(arm)
     # Two and a half cycles: every answer arrives while another request is being waited for.
     servos.fault("delay", 0.125)
@@ -252,7 +254,7 @@ def test_a_silent_servo_is_a_fault_and_the_others_hold(arm: FeetechSerialArm, se
     assert (servos.state()["enabled"], servos.state()["energising"]) == (5, energising)
 
 
-def test_no_step_is_sent_while_a_servo_is_not_seen(arm: FeetechSerialArm, servos: EmulatorProcess) -> None:
+def test_no_step_is_sent_while_a_servo_is_silent(arm: FeetechSerialArm, servos: EmulatorProcess) -> None:
     lease = activate(arm)
     sideways = np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.0])
     stream(arm, lease, sideways, 0.5)
@@ -325,7 +327,7 @@ def test_frozen_servos_are_stale_then_a_fault(arm: FeetechSerialArm, servos: Emu
         servos.thaw()
 
 
-def test_an_unplugged_adapter_is_gone_until_connected_again(arm: FeetechSerialArm, servos: EmulatorProcess) -> None:
+def test_an_unplugged_adapter_is_lost_until_reconnected(arm: FeetechSerialArm, servos: EmulatorProcess) -> None:
     activate(arm)
     servos.fault("unplug")
     wait(lambda: faulted(arm))
@@ -385,7 +387,7 @@ def test_a_joint_outside_its_range_is_suspect_and_not_energised(port: Path, serv
 def test_a_range_beside_the_seam_reads_on_beyond_it(port: Path, servos: EmulatorProcess) -> None:
     changes = [servo.model_dump() for servo in config(port).servos]
     changes[0] |= {"min_ticks": 1500, "max_ticks": 4000}
-    # Servo 1 from 2048 to 4150, which it tells as 54: just beyond its range, not a turn away.
+    # Servo 1 from 2048 to 4150, which it reports as 54: just beyond its range, not a turn away.
     servos.fault("carry", [0, 2102])
     with FeetechSerialArm("arm", config(port, servos=changes), CLOCK) as arm:
         assert arm.health()["pan_ticks"] == 54
@@ -430,7 +432,7 @@ def test_disconnecting_holds_and_connecting_again_does_not_drop_it(
     assert (state["enabled"], state["goals"], state["energising"]) == (5, held["goals"], held["energising"])
 
 
-def test_it_goes_to_joint_angles_and_refuses_impossible_ones(arm: FeetechSerialArm, servos: EmulatorProcess) -> None:
+def test_it_moves_to_joint_angles_and_refuses_impossible_ones(arm: FeetechSerialArm, servos: EmulatorProcess) -> None:
     lease = activate(arm)
     goal = np.deg2rad([5.0, 5.0, 95.0, 75.0, 10.0])
     arm.go_to_joints(goal, lease, speed_fraction=0.5)
@@ -447,7 +449,7 @@ def test_it_goes_to_joint_angles_and_refuses_impossible_ones(arm: FeetechSerialA
         assert caught.value.reason is reason
 
 
-def test_nothing_there_and_nobody_answering_are_told_apart(port: Path, servos: EmulatorProcess) -> None:
+def test_a_missing_port_and_a_silent_servo_are_distinguished(port: Path, servos: EmulatorProcess) -> None:
     with pytest.raises(ConnectError, match="cannot open"):
         FeetechSerialArm("arm", config(port.parent / "nowhere"), CLOCK).connect()
     servos.fault("silent", 1)
@@ -544,7 +546,7 @@ def test_impossible_configurations_are_refused(changes: dict[str, Any]) -> None:
 
 def test_a_calibration_that_leaves_a_joint_no_range_is_refused() -> None:
     changes = [servo.model_dump() for servo in config(Path("x")).servos]
-    # The elbow goes from 0 to 155 deg; turned the wrong way its servo would end at 1 deg.
+    # The elbow's range is 0 to 155 deg; turned the wrong way its servo would end at 1 deg.
     changes[2] |= {"direction": -1, "zero_ticks": 0}
     with pytest.raises(ConfigError) as caught:
         FeetechSerialArm("arm", config(Path("x"), servos=changes), CLOCK)
@@ -599,7 +601,7 @@ def test_a_dead_host_leaves_the_arm_at_its_last_step(port: Path, servos: Emulato
         os.kill(client.pid, number)
         killed = position(servos.state())
         stopped = servos.wait_for(still=True)
-        # What is left is the servos' own lag (0.03 s at 0.05 m/s) and one step of 0.025 s, beside what was under way.
+        # The rest is the servos' own lag (0.03 s at 0.05 m/s) and one step of 0.025 s, besides pending motion.
         assert np.linalg.norm(position(stopped) - killed) < 0.01
         assert np.abs(np.array(stopped["goals"]) - stopped["ticks"]).max() <= 1
         assert stopped["enabled"] == 5

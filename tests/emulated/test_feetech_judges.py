@@ -1,4 +1,4 @@
-"""Is the emulator like the real thing? The vendor's client says so, unmodified: feetech-servo-sdk 1.0.0 (Unlicense)."""
+"""Validate the emulator with the vendor's unmodified client: feetech-servo-sdk 1.0.0 (Unlicense)."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def port(link: Path, servos: EmulatorProcess) -> Iterator[Any]:
 
 
 class PatientSdk:
-    """The client gives up after 34 ms and takes a late answer for the next one: purge and try again."""
+    """Retry after a purge: the client times out after 34 ms and mistakes a late reply for the next one."""
 
     def __init__(self) -> None:
         self._handler = scs.PacketHandler(0)
@@ -113,7 +113,7 @@ def test_prepared_writes_wait_for_the_action(port: Any, sdk: Any, servos: Emulat
     servos.wait_for(goals=[2000, 2000, 0, 0, 0])
 
 
-def test_the_error_byte_tells_an_overload(port: Any, sdk: Any, servos: EmulatorProcess) -> None:
+def test_the_error_byte_reports_an_overload(port: Any, sdk: Any, servos: EmulatorProcess) -> None:
     servos.fault("fault_bits", [2, 0x20])
     _, result, error = sdk.read2ByteTxRx(port, 3, POSITION)
     assert result == scs.COMM_SUCCESS
@@ -138,7 +138,7 @@ def test_a_strained_servo_overloads_by_itself(tmp_path: Path, sdk: Any) -> None:
 
 
 @pytest.mark.parametrize("fault", ["corrupt", "short"])
-def test_damage_is_what_the_client_takes_it_for(port: Any, sdk: Any, servos: EmulatorProcess, fault: str) -> None:
+def test_corruption_is_detected_by_the_client(port: Any, sdk: Any, servos: EmulatorProcess, fault: str) -> None:
     servos.fault(fault, 1)
     assert sdk.read2ByteTxRx(port, 1, POSITION)[1] == scs.COMM_RX_CORRUPT
     port.ser.reset_input_buffer()
@@ -150,7 +150,7 @@ def test_a_lost_answer_is_a_timeout(port: Any, servos: EmulatorProcess) -> None:
     assert scs.PacketHandler(0).read2ByteTxRx(port, 1, POSITION)[1] == scs.COMM_RX_TIMEOUT
 
 
-def test_a_power_cycle_forgets_what_was_not_saved(port: Any, sdk: Any, servos: EmulatorProcess) -> None:
+def test_a_power_cycle_loses_unsaved_registers(port: Any, sdk: Any, servos: EmulatorProcess) -> None:
     sdk.write2ByteTxRx(port, 1, OFFSET, 85)
     servos.fault("restart")
     assert sdk.read2ByteTxRx(port, 1, OFFSET)[0] == 0

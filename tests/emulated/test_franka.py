@@ -1,4 +1,4 @@
-"""The Franka driver against the emulated controller, whose inside tells the truth."""
+"""The Franka driver with the emulated controller, which provides the ground truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from tests.helpers.franka_bench import OPERATOR, Bench, eventually
-from touchcell.drivers.core import protocols as abilities
 from touchcell.drivers.core.clock import MonotonicClock
 from touchcell.drivers.core.commands import TwistFrame
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle
@@ -87,7 +86,8 @@ def faulted(bench: Bench) -> DeviceFault:
 
 
 def test_its_spec_needs_no_sdk() -> None:
-    code = "import sys, touchcell.drivers.core.spec as r; r.spec('franka'); assert 'franky' not in sys.modules"
+    code = "from touchcell.drivers.core.spec import DRIVERS; DRIVERS.load('franka')"
+    code += "; import sys; assert 'franky' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
     assert DRIVERS.load("franka").extra == "franka"
 
@@ -132,13 +132,13 @@ def test_connecting_configuring_and_activating_energise_nothing(bench: Bench) ->
     assert os.sched_getscheduler(0) == own
 
 
-def test_it_can_do_what_it_declares(bench: Bench) -> None:
-    for name in CAPABILITIES.abilities:
-        assert isinstance(bench.arm, getattr(abilities, name)), name
+def test_it_has_its_declared_capabilities(bench: Bench) -> None:
+    for protocol in CAPABILITIES.provides:
+        assert isinstance(bench.arm, protocol), protocol
     assert bench.arm.watchdog_s() == bench.truth()["watchdog_s"] == CAPABILITIES.max_watchdog_s
 
 
-def test_nobody_there(bench: Bench) -> None:
+def test_an_unreachable_controller_is_a_connect_error(bench: Bench) -> None:
     bench.emulator.kill()
     with pytest.raises(ConnectError):
         bench.arm.connect()
@@ -172,7 +172,7 @@ def test_pose_and_joints_are_true(benches: Callable[..., Bench]) -> None:
     np.testing.assert_allclose(bench.arm.joints(1.0).value.q, truth["q"], atol=1e-6)
 
 
-def test_a_pure_rotation_leaves_the_tool_centre_point_where_it_is(benches: Callable[..., Bench]) -> None:
+def test_a_pure_rotation_keeps_the_tool_centre_point_in_place(benches: Callable[..., Bench]) -> None:
     bench = benches(flange_to_tcp_mm_deg=TOOL_MM_DEG)
     lease = bench.active()
     T_before = np.array(bench.truth()["T_base_ee"])
@@ -336,7 +336,7 @@ def test_impossible_joint_goals_are_refused(bench: Bench) -> None:
     assert bench.truth()["energising"] == 0
 
 
-def test_every_error_comes_out_by_the_table_and_goes_only_by_request(bench: Bench) -> None:
+def test_every_error_is_reported_by_the_table_and_cleared_only_on_request(bench: Bench) -> None:
     assert len(ERRORS) == len({error.name for error in ERRORS}) == 41
     bench.active()
     for code, error in enumerate(ERRORS):
@@ -361,7 +361,7 @@ def test_a_dead_motion_is_not_silent(bench: Bench) -> None:
     assert fault.fault_class is FaultClass.COMMUNICATION
     with pytest.raises(CommandRejected):
         bench.send([0.03, 0, 0, 0, 0, 0], lease)
-    # Reading goes on.
+    # Reading continues.
     assert bench.arm.tcp(0.5).value.twist[0] == pytest.approx(0, abs=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""The Franka emulator judged by clients that know nothing of touchcell: franky, and libfranka's own Python bindings."""
+"""Validate the Franka emulator with independent clients: franky, and libfranka's own Python bindings."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_franky_moves_it_by_every_generator(emulated: Emulated, robot: franky.Ro
     assert emulated.process.state()["reflexes"] == 0
 
 
-def test_franky_sees_reflexes_and_recovers(emulated: Emulated, robot: franky.Robot) -> None:
+def test_franky_reports_reflexes_and_recovers(emulated: Emulated, robot: franky.Robot) -> None:
     robot.move(
         franky.CartesianVelocityMotion(franky.Twist([0.03, 0, 0]), duration=franky.Duration(2000)), asynchronous=True
     )
@@ -108,7 +108,7 @@ def test_franky_loses_20_packets(emulated: Emulated, robot: franky.Robot) -> Non
         robot.join_motion()
 
 
-def test_franky_is_turned_away_while_somebody_else_is_connected(emulated: Emulated, robot: franky.Robot) -> None:
+def test_franky_is_refused_while_another_client_is_connected(emulated: Emulated, robot: franky.Robot) -> None:
     with pytest.raises(franky.NetworkException):
         franky.Robot(emulated.host, realtime_config=franky.RealtimeConfig.Ignore)
 

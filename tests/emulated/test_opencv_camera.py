@@ -1,6 +1,6 @@
 """The OpenCV fallback driver, in programs that see the emulated camera through the preloaded shim.
 
-A program says what it saw in lines of JSON and waits for a line where the test shall do something to the camera.
+A program reports in lines of JSON and waits for a line where the test changes the state of the camera.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Program:
         return json.loads(self._process.stdout.readline())
 
     def go_on(self) -> None:
-        """Let it go on."""
+        """Let it continue."""
         assert self._process.stdin is not None
         self._process.stdin.write("\n")
         self._process.stdin.flush()
@@ -125,7 +125,7 @@ def test_connecting_changes_no_control(run: Callable[[str], Program], emulator: 
     assert (state["controls"], state["energising"]) == (controls, 0)
 
 
-def test_frames_come_stamped_in_order_and_the_thread_ends_with_the_camera(run: Callable[[str], Program]) -> None:
+def test_frames_are_stamped_in_order_and_the_thread_ends_with_the_camera(run: Callable[[str], Program]) -> None:
     program = run("""
 camera = ready()
 say([[f.seq, f.t_ns, f.value.image.shape, f.quality.value, f.value.gain] for f in read(camera, 10)])

@@ -25,9 +25,11 @@ from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, RunLoop, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest
 from touchcell.cell.runtime.process_watchdog import ProcessWatchdog, hosted_groups
+from touchcell.cell.runtime.run_result import Outcome
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.cell.runtime.watchdog import NOTES
 from touchcell.control.latch import LatchState
 from touchcell.drivers.core.clock import MonotonicClock
@@ -45,7 +47,7 @@ from touchcell.paths import CONFIGS
 from touchcell.simulation.scene import Scene
 
 RATE_HZ = 5.0
-"""Slow, so that a machine that does other things besides is not taken for dead."""
+"""Long enough that a process on a busy machine is not considered dead."""
 
 TRIES = 2
 
@@ -105,7 +107,7 @@ def test_a_remote_arm_is_as_an_arm_is(tmp_path: Path) -> None:
         assert left.owner == "test"
         with pytest.raises(CommandRejected) as caught:
             left.send_twist(twist(cell), lease)
-        assert (caught.value.reason, caught.value.device) == (Rejection.MODE, "left"), "nobody guards yet"
+        assert (caught.value.reason, caught.value.device) == (Rejection.MODE, "left"), "not guarded yet"
         with pytest.raises(CommandRejected) as caught:
             left.acquire("another")
         assert (caught.value.reason, caught.value.value) == (Rejection.LEASE, "another")
@@ -152,7 +154,7 @@ def test_a_remote_arm_is_as_an_arm_is(tmp_path: Path) -> None:
 
 
 def test_the_chain_stops_an_arm_on_the_wire(tmp_path: Path) -> None:
-    """An emulated UR: its host tells its joints, and the self-test stops its controller."""
+    """An emulated UR: its host publishes its joints, and the self-test stops its controller."""
     wired = rig(tmp_path, 4_517_000 + os.getpid() % 1000)
     assert wired.start is not None
     assert wired.config is not None
@@ -226,7 +228,7 @@ def hurt(tmp_path: Path, fault: ProcessFault) -> ProcessCase:
         ("watchdog killed", None),
     ],
 )
-def test_both_arms_stand_in_time_whatever_dies(tmp_path: Path, name: str, told_by: str | None) -> None:
+def test_both_arms_stop_in_time_whichever_process_dies(tmp_path: Path, name: str, told_by: str | None) -> None:
     """The others of ``FAULTS`` are in ``touchcell bench safety -- --processes``."""
     fault = next(fault for fault in FAULTS if fault.name == name)
     case = hurt(tmp_path, fault)
@@ -249,7 +251,7 @@ class ResetProcedure:
         watch = cell.watchdog
         assert isinstance(watch, ProcessWatchdog)
         self.cell, self.chain, self.desk, self.stop = cell, watch.chain, OperatorChannel(), StopRequest()
-        self.loop = RunLoop(cell, None, stop=self.stop, desk=self.desk)
+        self.loop = RunLoop(cell, None, stop=self.stop, channel=self.desk)
         self.loop.begin()
 
     def until(self, done: Callable[[], bool]) -> None:
@@ -274,7 +276,7 @@ class ResetProcedure:
         return all(link.latched() is not None for link in self.chain.hosts)
 
 
-def test_a_stop_by_the_chain_is_reset_when_its_cause_has_gone_and_the_run_goes_on_to_its_end(tmp_path: Path) -> None:
+def test_a_stop_by_the_chain_is_reset_after_its_cause_and_the_run_continues(tmp_path: Path) -> None:
     with compose(two_arm_plan(tmp_path, RATE_HZ, categories={"right": 1}, on_trip="wait_for_reset")) as cell:
         run = ResetProcedure(cell)
         run.until(run.moves)
@@ -341,7 +343,7 @@ def test_a_dead_host_is_a_fault_of_its_devices(tmp_path: Path) -> None:
         assert cell.arms["right"].tcp().age_s(cell.clock.now_ns()) < 1.0
 
 
-def test_a_host_that_hangs_delays_nobody_for_long(tmp_path: Path) -> None:
+def test_a_hanging_host_delays_others_only_briefly(tmp_path: Path) -> None:
     started_s = time.monotonic()
     with compose(two_arm_plan(tmp_path, RATE_HZ)) as cell:
         watch = cell.watchdog
@@ -356,14 +358,14 @@ def test_a_host_that_hangs_delays_nobody_for_long(tmp_path: Path) -> None:
     assert time.monotonic() - started_s < 18.0
 
 
-def test_a_cell_says_what_other_processes_cannot_do(tmp_path: Path) -> None:
+def test_a_cell_reports_capabilities_unavailable_across_processes(tmp_path: Path) -> None:
     with pytest.raises(InvalidCell) as caught:
         plan_cell(separate_cell(tmp_path, time="simulated"))
     assert [problem.key for problem in caught.value.problems] == ["processes"]
 
 
 class Topics:
-    """A black box that remembers what it was told of."""
+    """A flight recorder that stores the events it receives."""
 
     def __init__(self) -> None:
         self.told: set[str] = set()
@@ -372,7 +374,7 @@ class Topics:
         self.told.add(topic)
 
 
-def test_the_truth_of_a_scene_in_a_host_is_told_and_recorded(tmp_path: Path) -> None:
+def test_the_ground_truth_of_a_scene_in_a_host_is_published_and_recorded(tmp_path: Path) -> None:
     """A task runs on it, and objects are on record, though their scene is in another process."""
     data = yaml.safe_load((SHIPPED.parent / "single_push_sim.yaml").read_text())
     data |= {"time": "real", "processes": "separate", "rate_hz": RATE_HZ}
@@ -388,7 +390,7 @@ def test_the_truth_of_a_scene_in_a_host_is_told_and_recorded(tmp_path: Path) -> 
         np.testing.assert_allclose(T_world_prism[:2, 3], [0.0, 0.003], atol=1e-6)
         contact = cell.scene.contact("sensor")
         assert not contact.value.in_contact
-        # The tip stands 5 mm before the prism.
+        # The tip is 5 mm in front of the prism.
         assert contact.value.depth_m == pytest.approx(-0.005, abs=1e-4)
         stop = StopRequest()
         loop = RunLoop(cell, None, box=box, stop=stop)
@@ -402,21 +404,21 @@ def test_the_truth_of_a_scene_in_a_host_is_told_and_recorded(tmp_path: Path) -> 
 
 
 def test_a_scene_without_a_simulated_arm_stays_in_the_tasks_process(tmp_path: Path) -> None:
-    """So that real arms have hosts of their own, and one may die while another goes on."""
+    """So that real arms have hosts of their own, and one may die while another continues."""
     (tmp_path / EMULATORS).write_text(json.dumps({"leader": "127.99.0.2", "follower": "127.99.0.3"}))
     plan = pushing_plan(tmp_path, 12.5)
     assert {group.name: group.scene for group in hosted_groups(plan)} == {"leader": None, "follower": None}
     assert isinstance(compose(plan).scene, Scene)
 
 
-def test_arms_without_a_scene_live_alone(tmp_path: Path) -> None:
+def test_arms_without_a_scene_have_separate_hosts(tmp_path: Path) -> None:
     groups = hosted_groups(two_arm_plan(tmp_path, RATE_HZ))
     assert [group.name for group in groups] == ["left", "right"]
     assert [group.rate_hz(100.0) for group in groups] == [500.0, 500.0]
     assert groups[0].rate_hz(1000.0) == 2000.0
 
 
-def test_a_cell_in_one_process_starts_none(tmp_path: Path) -> None:
+def test_a_cell_in_one_process_starts_no_others(tmp_path: Path) -> None:
     """And does not even import what it would need."""
     script = (
         "import sys, touchcell.cell.runtime.compose, touchcell.cell.cli.run\n"
@@ -426,7 +428,7 @@ def test_a_cell_in_one_process_starts_none(tmp_path: Path) -> None:
     assert run.stdout.strip() == "[]"
 
 
-def test_why_tells_what_the_watchdog_saw_of_a_run_whose_process_died(tmp_path: Path) -> None:
+def test_why_reports_the_watchdogs_record_of_a_run_whose_process_died(tmp_path: Path) -> None:
     stop = {"speed_m_s": 0.03, "time_s": 0.058, "distance_m": 0.001, "escalated": False}
     note = {"words": "the task's process has ended", "value_s": 0.0, "limit_s": 0.0, "arms": {"left": stop}}
     (tmp_path / NOTES).write_text(json.dumps(note))

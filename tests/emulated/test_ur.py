@@ -168,8 +168,8 @@ def test_importing_the_driver_imports_no_sdk() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_abilities_are_those_of_the_record() -> None:
-    protocols = (
+def test_protocols_are_those_of_the_record() -> None:
+    protocols = {
         TcpSource,
         JointSource,
         WrenchSource,
@@ -178,9 +178,9 @@ def test_abilities_are_those_of_the_record() -> None:
         JointGoal,
         HealthSource,
         NativeWatchdog,
-    )
+    }
     arm = UrArm("ur", UrConfig(host="127.0.0.1", flange_to_tcp_mm_deg=TOOL_MM_DEG), VirtualClock())
-    assert {protocol.__name__ for protocol in protocols} == SPEC.capabilities.abilities
+    assert protocols == SPEC.capabilities.provides
     assert all(isinstance(arm, protocol) for protocol in protocols)
 
 
@@ -210,7 +210,7 @@ def test_the_tool_has_no_default() -> None:
 
 
 @pytest.mark.parametrize("mode", SafetyMode)
-def test_every_safety_mode_is_lawful_or_a_named_fault(mode: SafetyMode) -> None:
+def test_every_safety_mode_allows_motion_or_is_a_named_fault(mode: SafetyMode) -> None:
     fault = safety_fault("ur", mode, 0)
     if mode in (SafetyMode.NORMAL, SafetyMode.REDUCED):
         assert fault is None
@@ -222,7 +222,7 @@ def test_every_safety_mode_is_lawful_or_a_named_fault(mode: SafetyMode) -> None:
 
 
 @pytest.mark.parametrize("bit", SafetyBits)
-def test_every_safety_bit_is_lawful_or_a_fault_even_if_the_mode_says_normal(bit: SafetyBits) -> None:
+def test_every_safety_bit_allows_motion_or_is_a_fault_even_in_normal_mode(bit: SafetyBits) -> None:
     fault = safety_fault("ur", SafetyMode.NORMAL, int(bit))
     assert (fault is None) == (bit in (SafetyBits.NORMAL_MODE, SafetyBits.REDUCED_MODE))
 
@@ -236,7 +236,7 @@ def test_only_a_running_arm_may_be_active(mode: RobotMode) -> None:
 
 
 class Receive:
-    """Stands for ur-rtde's receive interface: what it would hold now."""
+    """Fake of ur-rtde's receive interface with the given present values."""
 
     def __init__(self) -> None:
         self.timestamp = 1.0
@@ -303,7 +303,7 @@ def test_ages_stay_true_while_the_clocks_drift_apart(drift: float) -> None:
     assert snapshot.age_s(clock.now_ns()) == pytest.approx(0.0, abs=1e-5)
 
 
-def test_a_packet_that_is_overtaken_while_it_is_read_is_not_taken() -> None:
+def test_a_packet_overwritten_during_its_read_is_discarded() -> None:
     receive = Receive()
     receive.overtakes = True
     assert StateReader(receive, VirtualClock()).poll() is None
@@ -375,7 +375,7 @@ def test_connecting_and_configuring_changes_nothing(arm: UrArm, emulator: Emulat
         arm.watchdog_s()
 
 
-def test_nobody_there(address: int) -> None:
+def test_an_unreachable_controller_is_a_connect_error(address: int) -> None:
     arm = UrArm("ur", UrConfig(host=host_of(address), flange_to_tcp_mm_deg=TOOL_MM_DEG), CLOCK)
     with pytest.raises(ConnectError) as caught:
         arm.connect()
@@ -383,7 +383,7 @@ def test_nobody_there(address: int) -> None:
     assert arm.state is Lifecycle.DISCONNECTED
 
 
-def test_a_frozen_controller_is_no_hang(emulator: EmulatorProcess, address: int) -> None:
+def test_a_frozen_controller_does_not_block(emulator: EmulatorProcess, address: int) -> None:
     emulator.fault("pause")
     config = UrConfig(host=host_of(address), flange_to_tcp_mm_deg=TOOL_MM_DEG, connect_timeout_s=0.2)
     with pytest.raises(ConnectError) as caught:
@@ -433,7 +433,7 @@ def test_activation_is_refused(arm: UrArm, emulator: EmulatorProcess) -> None:
     assert state["runtime_state"] == "STOPPED"
 
 
-def test_somebody_elses_program_is_left_alone(arm: UrArm, emulator: EmulatorProcess) -> None:
+def test_a_foreign_program_is_not_stopped(arm: UrArm, emulator: EmulatorProcess) -> None:
     emulator.fault("other_program")
     wait_until(lambda: arm.health()["runtime_state"] == "PLAYING", "program")
     with pytest.raises(DeviceFault, match="another program"):
@@ -589,7 +589,7 @@ def test_bad_joint_goals_are_not_sent(q: np.ndarray, fraction: float, reason: Re
     assert caught.value.reason in (reason, Rejection.MODE)
 
 
-def test_the_wrench_is_what_acts_on_the_tool(arm: UrArm, emulator: EmulatorProcess) -> None:
+def test_the_wrench_is_the_external_wrench_on_the_tool(arm: UrArm, emulator: EmulatorProcess) -> None:
     wrench = [1.0, -2.0, 3.0, 0.1, 0.2, -0.3]
     emulator.fault("wrench", wrench)
     wait_until(lambda: arm.wrench(0.2).value.tolist() == wrench, "wrench")

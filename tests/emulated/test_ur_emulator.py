@@ -44,7 +44,7 @@ def controller() -> Controller:
 
 
 def test_flange_of_the_stretched_arm() -> None:
-    # All joints zero: the arm lies along -x, so the sheet's lengths add up.
+    # All joints zero: the arm extends along -x, so the datasheet's lengths add up.
     T, _ = ur_model.forward(np.zeros(6), np.eye(4))
     np.testing.assert_allclose(T[:3, 3], [-0.425 - 0.3922, -0.1333 - 0.0996, 0.1625 - 0.0997], atol=1e-12)
 
@@ -60,7 +60,7 @@ def test_jacobian_is_the_derivative_of_the_pose(q: np.ndarray, qd: np.ndarray) -
     np.testing.assert_allclose(spin, twist[3:], atol=1e-7)
 
 
-def test_inverse_reaches_the_pose_or_says_no() -> None:
+def test_inverse_reaches_the_pose_or_returns_none() -> None:
     controller = Controller()
     T = controller.arm.T_base_tcp.copy()
     T[:3, 3] += [0.05, -0.03, 0.04]
@@ -95,7 +95,7 @@ def test_speedl_moves_the_tool_along_base_axes(controller: Controller) -> None:
     np.testing.assert_allclose(controller.arm.twist, [0.05, 0, 0, 0, 0, 0.2], atol=5e-5)
 
 
-def test_the_speed_thread_goes_on_for_ever_whatever_time_says(controller: Controller) -> None:
+def test_the_speed_thread_continues_for_ever_whatever_its_time_argument(controller: Controller) -> None:
     command(controller, ur_program.SPEEDL, [0.05, 0, 0, 0, 0, 0, 1.0, 0.1])
     run(controller, 1.0)
     command(controller, 0)
@@ -103,7 +103,7 @@ def test_the_speed_thread_goes_on_for_ever_whatever_time_says(controller: Contro
     assert controller.arm.twist[0] == pytest.approx(0.05, abs=1e-5)
 
 
-def test_time_is_when_a_newer_target_is_taken_up(controller: Controller) -> None:
+def test_the_time_argument_is_the_delay_of_a_newer_target(controller: Controller) -> None:
     command(controller, ur_program.SPEEDL, [0.05, 0, 0, 0, 0, 0, 10.0, 0.5])
     run(controller, 0.1)
     command(controller, ur_program.SPEEDL, [0.0] * 6 + [10.0, PERIOD_S])
@@ -205,7 +205,7 @@ def test_the_slider_slows_the_tool(controller: Controller) -> None:
 @pytest.mark.parametrize(
     "text", ["def other():\nend\n", "def rtde_control():\nend\n", SCRIPT.replace(" rtde", "$5.0 rtde")]
 )
-def test_only_the_scripts_it_knows_are_played(text: str) -> None:
+def test_only_known_scripts_are_played(text: str) -> None:
     controller = Controller()
     controller.start_program(text)
     run(controller, 0.1)

@@ -109,7 +109,7 @@ def _unlocks(dashboard: object) -> bool:
     return True
 
 
-def test_a_second_client_is_told_that_the_registers_are_in_use(emulator: EmulatorProcess, host: str) -> None:
+def test_a_second_client_is_refused_as_the_registers_are_in_use(emulator: EmulatorProcess, host: str) -> None:
     first = rtde_control.RTDEControlInterface(host)
     with pytest.raises(RuntimeError, match="already in use"):
         rtde_control.RTDEControlInterface(host)

@@ -27,7 +27,7 @@ from touchcell.drivers.core.errors import (
 )
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.drivers.core.samples import Frame, Quality, Stamped
-from touchcell.drivers.core.spec import spec
+from touchcell.drivers.core.spec import DRIVERS
 from touchcell.drivers.v4l2.codec import Arrival
 from touchcell.drivers.v4l2.driver import SPEC, V4l2Camera, V4l2Config
 from touchcell.drivers.v4l2.emulator import picture
@@ -105,9 +105,9 @@ def read_until(camera: V4l2Camera, reading: str, at_least: float) -> None:
     pytest.fail(f"{reading} did not reach {at_least}: {camera.health()}")
 
 
-def test_the_driver_is_found_by_name_and_offers_what_it_says(camera: V4l2Camera) -> None:
-    assert spec("v4l2") is SPEC
-    assert SPEC.capabilities.abilities == {"FrameSource", "HealthSource"}
+def test_the_driver_is_found_by_name_and_has_its_declared_capabilities(camera: V4l2Camera) -> None:
+    assert DRIVERS.load("v4l2") is SPEC
+    assert SPEC.capabilities.provides == {FrameSource, HealthSource}
     assert isinstance(camera, FrameSource)
     assert isinstance(camera, HealthSource)
 
@@ -134,7 +134,7 @@ def test_connecting_changes_nothing_and_configuring_moves_nothing(
     assert state["buffers"] == 0
 
 
-def test_frames_are_stamped_numbered_and_show_what_the_sensor_saw(
+def test_frames_are_stamped_numbered_and_show_the_sensors_image(
     make: Callable[..., V4l2Camera], emulator: EmulatorProcess
 ) -> None:
     began_ns = time.monotonic_ns()
@@ -202,7 +202,7 @@ def test_a_setting_that_the_camera_changes_is_refused(
     assert camera.state is Lifecycle.PASSIVE
 
 
-def test_a_control_that_only_seems_to_obey_is_refused(
+def test_a_control_that_silently_keeps_its_value_is_refused(
     make: Callable[..., V4l2Camera], emulator: EmulatorProcess
 ) -> None:
     ready(make(gain=20)).disconnect()
@@ -236,7 +236,7 @@ def test_latest_never_returns_the_same_frame_as_new_and_next_waits(camera: V4l2C
     assert camera.state is Lifecycle.READY
 
 
-def test_after_a_long_pause_the_newest_frame_comes_and_the_gap_is_the_readers(
+def test_after_a_long_pause_the_newest_frame_is_read_and_the_gap_is_the_readers(
     make: Callable[..., V4l2Camera], emulator: EmulatorProcess
 ) -> None:
     camera = ready(make(rate_hz=30))
@@ -247,7 +247,7 @@ def test_after_a_long_pause_the_newest_frame_comes_and_the_gap_is_the_readers(
     while emulator.state()["overruns"] < overruns + 5:
         assert time.monotonic() < deadline
     filled = time.monotonic_ns()
-    # Only on a machine too busy to make a frame within four periods is there another answer, and an honest one.
+    # Only a machine too busy to produce a frame within four periods gives another result, and it is correct too.
     with contextlib.suppress(StaleData):
         frame = camera.latest(max_age_s=0.25)
         assert frame.t_ns > filled
@@ -435,9 +435,7 @@ def test_an_unplugged_camera_is_a_fault_that_only_a_person_clears(
     assert camera.latest().seq > last.seq
 
 
-def test_a_camera_that_restarts_by_itself_does_not_come_back_by_itself(
-    camera: V4l2Camera, emulator: EmulatorProcess
-) -> None:
+def test_a_camera_that_restarts_by_itself_stays_faulted(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
     emulator.fault("restart", 0.05)
     with pytest.raises(DeviceGone):
         read(camera, 100)
@@ -448,13 +446,13 @@ def test_a_camera_that_restarts_by_itself_does_not_come_back_by_itself(
     assert camera.latest().quality is Quality.GOOD
 
 
-def test_health_alone_notices_that_the_camera_has_gone(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
+def test_health_alone_detects_a_disconnected_camera(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
     emulator.fault("unplug")
     assert camera.health()["state"] == "faulted"
     assert isinstance(camera.fault, DeviceGone)
 
 
-def test_a_second_program_is_turned_away_and_disturbs_nobody(
+def test_a_second_program_is_refused_without_disturbing_the_first(
     make: Callable[..., V4l2Camera], camera: V4l2Camera
 ) -> None:
     second = make()
@@ -465,7 +463,7 @@ def test_a_second_program_is_turned_away_and_disturbs_nobody(
     assert len(read(camera, 5)) == 5
 
 
-def test_a_camera_that_is_not_there_is_named(make: Callable[..., V4l2Camera]) -> None:
+def test_a_missing_camera_is_named(make: Callable[..., V4l2Camera]) -> None:
     camera = make(device="/dev/v4l/by-id/usb-Nobody-video-index0")
     with pytest.raises(ConnectError, match="usb-Nobody"):
         camera.connect()

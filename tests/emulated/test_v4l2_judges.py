@@ -104,7 +104,7 @@ print(json.dumps(answer))
 """
 
 
-def test_opencv_sees_pins_and_kernel_stamps(folder: Path, emulator: EmulatorProcess) -> None:
+def test_opencv_reads_pins_and_kernel_timestamps(folder: Path, emulator: EmulatorProcess) -> None:
     seen = client(folder, OPENCV, NODE)
     assert seen["opened"]
     assert (seen["backend"], seen["fps"], seen["exposure"], seen["gamma"]) == ("V4L2", 60.0, [True, 157.0], False)
@@ -190,7 +190,7 @@ def test_pyav_decodes_it(folder: Path, emulator: EmulatorProcess) -> None:
     assert seen["stamps"] == sorted(set(seen["stamps"]))
 
 
-def test_without_a_compiler_the_shim_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler_the_shim_raises_a_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ConnectError, match="no C compiler"):

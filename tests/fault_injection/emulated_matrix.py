@@ -23,7 +23,9 @@ from tests.fault_injection.sent_commands import SentCommands
 from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, RunLoop, RunResult, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import Outcome, RunResult
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.clock import MonotonicClock
 from touchcell.drivers.core.device import Device

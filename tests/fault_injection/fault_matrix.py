@@ -19,7 +19,9 @@ from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import RunLoop, RunResult, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import RunResult
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.simulation.devices.arm import SimArm
 from touchcell.simulation.devices.tactip import SimTactip
 from touchcell.tasks.state_machine_task import MachineTask

@@ -22,8 +22,10 @@ from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Progress, RunLoop, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.process_watchdog import ProcessWatchdog
+from touchcell.cell.runtime.run_result import Progress
+from touchcell.cell.runtime.stop_request import StopRequest
 
 PLANS: Final = {"sway": two_arm_plan, "push": pushing_plan}
 _MOVING_STATES: Final = ("sway", "run")

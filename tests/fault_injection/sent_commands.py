@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from touchcell.cell.runtime.loop import Box
+from touchcell.cell.runtime.run_record import Box
 
 
 class SentCommands:

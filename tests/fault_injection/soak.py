@@ -27,7 +27,9 @@ from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, RunLoop, RunResult, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import Outcome, RunResult
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.errors import TouchcellError
 from touchcell.paths import CONFIGS
 from touchcell.simulation.devices.arm import SimArm

@@ -21,7 +21,9 @@ from tests.fault_injection.fault_matrix import cells, on_true_contact
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, RunLoop, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import Outcome
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.simulation.devices.arm import SimArm
 

@@ -15,6 +15,7 @@ import yaml
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import CellFile, CellPlan, DevicePlan, plan_cell
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
+from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.tasks.interface import Action, Observation, TaskConfig, TaskContext, TaskSpec, TransitionRecord
 from touchcell.testing.emulation.process import EmulatorProcess
@@ -22,7 +23,6 @@ from touchcell.testing.emulation.process import EmulatorProcess
 SPEED_M_S: Final = 0.03
 PERIOD_S: Final = 2.0
 EMULATORS: Final = "emulators.json"
-_ABILITIES: Final = frozenset({"TcpSource", "TwistSink", "Stoppable"})
 
 
 class Sway:
@@ -60,7 +60,7 @@ SPEC: Final = TaskSpec(
     name="sway",
     summary="two arms to and fro",
     config=TaskConfig,
-    arms={"left": _ABILITIES, "right": _ABILITIES},
+    arms={"left": SERVO_ARM, "right": SERVO_ARM},
     sensors=frozenset(),
     build=Sway,
 )

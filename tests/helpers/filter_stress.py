@@ -1,4 +1,4 @@
-"""Long runs of a filter, in blocks, and a filter in mpmath to compare one with."""
+"""Long runs of a filter, in blocks, and a reference filter in mpmath."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ STEP_NS = 10_000_000
 BLOCK = 10_000
 SIGMA = np.array([3e-4, 3e-4, 1e-4, 0.01, 0.012, 0.02])
 DRIFT_PER_STEP = 0.02
-"""Of the surface's random walk, in units of ``SIGMA``."""
+"""Noise density of the surface's random walk, in units of ``SIGMA``."""
 
 
 @dataclass(frozen=True)
 class LongRun:
-    """What a long run left behind.
+    """Result of a long run.
 
     Attributes:
-        steps: updates made.
+        steps: number of updates.
         nees: mean squared Mahalanobis distance of the truth.
-        worst_nees: the largest of them.
-        orthogonality: the largest entry of R'R - I of the last mean.
-        covariance: the last one.
+        worst_nees: largest of them.
+        orthogonality: largest entry of R'R - I of the last mean.
+        covariance: last covariance.
     """
 
     steps: int
@@ -43,9 +43,9 @@ class LongRun:
 def long_run(
     pose_filter: ContactFilter, steps: int, seed: int, progress: Callable[[int], None] = lambda done: None
 ) -> LongRun:
-    """Feed a filter noisy observations of a surface that drifts slowly, from a sensor all over its workspace.
+    """Feed a filter noisy observations of a slowly drifting surface, from a sensor all over its workspace.
 
-    The sensor's poses are those of an arm, so nothing but the filter's own state accumulates.
+    The sensor's poses are those of an arm, so only the filter's own state accumulates errors.
     """
     total, worst, state, k = 0.0, 0.0, None, 0
     for block in _blocks(seed, -(-steps // BLOCK)):
@@ -72,7 +72,7 @@ def _blocks(seed: int, blocks: int) -> Iterator[Iterator[tuple[Array, Array, Arr
     for _ in range(blocks):
         T_base_s = se3.exp(rng.normal(0.0, [0.01] * 3 + [0.2] * 3, (BLOCK, 6)))
         walk = surface + np.cumsum(rng.normal(size=(BLOCK, 6)) * DRIFT_PER_STEP * SIGMA, axis=0)
-        # Drawn back now and then, so that the surface stays within reach however long the run.
+        # Drawn back now and then, so that the surface stays within reach in any long run.
         surface = 0.5 * walk[-1]
         walk += np.linspace(0.0, 1.0, BLOCK)[:, None] * (surface - walk[-1])
         truth = se3.compose(se3.inverse(T_base_s), se3.exp(walk))
@@ -91,7 +91,7 @@ class ExactFilter:
         self._t_ns = 0
 
     def update(self, mean: Array, covariance: Array, T_base_s: Array, t_ns: int) -> None:
-        """As ``PoseFilter.update``; call within ``mpmath.workdps``."""
+        """Update as ``PoseFilter.update``; call within ``mpmath.workdps``."""
         T2, P2, T_b_s = (mpmath.matrix(array.tolist()) for array in (mean, covariance, T_base_s))
         if self.mean is None:
             self.mean, self.covariance = T2, P2
@@ -116,7 +116,7 @@ class ExactFilter:
         self._T_base_s, self._t_ns = T_b_s, t_ns
 
     def distances(self, belief: PoseGaussian) -> tuple[float, float]:
-        """Distance of a mean in this covariance's standard deviations, and relative error of a covariance, whitened."""
+        """Return the distance of a mean in this covariance's standard deviations, and a covariance's relative error."""
         e = _log(mpmath.matrix(belief.mean.tolist()) * self.mean**-1)
         root = mpmath.cholesky(self.covariance**-1)
         whitened = root.T * mpmath.matrix(belief.covariance.tolist()) * root
@@ -136,7 +136,7 @@ def _hat(xi: Any) -> Any:
 
 
 def _log(T: Any) -> Any:
-    """Mercator's series of the matrix logarithm, for the small innovations of a filter."""
+    """Return Mercator's series of the matrix logarithm, for the small innovations of a filter."""
     X, power, total = T - mpmath.eye(4), mpmath.eye(4), mpmath.zeros(4)
     assert mpmath.norm(X) < 0.2
     for n in range(1, 50):
@@ -154,7 +154,7 @@ def _adjoint(T: Any) -> Any:
 
 
 def _inverse_left_jacobian(xi: Any) -> Any:
-    """Sum of Bernoulli numbers times powers of the small adjoint."""
+    """Return the sum of Bernoulli numbers times powers of the small adjoint."""
     ad = mpmath.zeros(6)
     ad[:3, :3] = ad[3:, 3:] = _cross(xi[3:])
     ad[:3, 3:] = _cross(xi[:3])

@@ -1,4 +1,4 @@
-"""An emulated Franka and the driver at an address of their own, for the tests of the driver and of the emulator."""
+"""An emulated Franka and its driver at a unique address, for the tests of the driver and of the emulator."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ _numbers = itertools.count(1)
 
 
 def fresh_host() -> str:
-    """A loopback address that no other test of this machine uses now."""
+    """Return a loopback address that no other test on this machine uses."""
     return str(IPv4Address("127.16.0.0") + (os.getpid() % 8192) * 512 + next(_numbers))
 
 
 def eventually(true: Callable[[], bool]) -> None:
-    """Wait until ``true()``; fails after the deadline."""
+    """Wait until ``true()``; fail after the deadline."""
     deadline = time.monotonic() + DEADLINE_S
     while not true():
-        assert time.monotonic() < deadline, "it never became true"
+        assert time.monotonic() < deadline, "the condition never became true"
         time.sleep(0.002)
 
 
 class Bench:
-    """One emulator, one driver, and what a task would do with them."""
+    """One emulator, one driver, and the calls of a task."""
 
     def __init__(self, **config: Any) -> None:
         host = fresh_host()
@@ -49,33 +49,33 @@ class Bench:
         self.arm = self.another()
 
     def another(self) -> FrankaArm:
-        """One more driver for the same arm."""
+        """Return one more driver for the same arm."""
         return FrankaArm("arm", self.config, self.clock)
 
     def ready(self) -> FrankaArm:
-        """Connected and configured."""
+        """Connect and configure the arm."""
         self.arm.connect()
         self.arm.configure()
         return self.arm
 
     def active(self) -> Lease:
-        """Active, with the lease in hand."""
+        """Activate the arm and acquire the lease."""
         self.ready().activate()
         return self.arm.acquire("test")
 
     def send(
         self, twist: Any, lease: Lease, ttl_s: float = 0.2, frame: TwistFrame = TwistFrame.BASE
     ) -> Sent[TwistCommand]:
-        """One twist, computed now."""
+        """Send one twist, computed now."""
         command = TwistCommand(np.asarray(twist, dtype=np.float64), frame, self.clock.now_ns(), ttl_s)
         return self.arm.send_twist(command, lease)
 
     def truth(self) -> dict[str, Any]:
-        """What is true inside the emulator."""
+        """Return the ground truth of the emulator."""
         return self.emulator.state()
 
     def position(self) -> np.ndarray[Any, Any]:
-        """Where the tool centre point truly is."""
+        """Return the true position of the tool centre point."""
         return np.array(self.truth()["position_m"])
 
     def moved(self) -> None:
@@ -83,11 +83,11 @@ class Bench:
         self.emulator.wait_for(moving=True)
 
     def rested(self) -> None:
-        """Wait until the driver says that it is at rest."""
+        """Wait until the driver reports rest."""
         eventually(self.arm.at_rest)
 
     def close(self) -> None:
-        """Disconnect and end the emulator; an arm that has gone cannot confirm that it rests."""
+        """Disconnect and end the emulator; a disconnected arm cannot confirm that it is at rest."""
         try:
             with suppress(DeviceError):
                 self.arm.disconnect()

@@ -1,4 +1,4 @@
-"""The least plant that closes the loop: a tool that moves exactly as told, and exact estimates of a flat surface."""
+"""Minimal plant that closes the loop: a tool that moves exactly as commanded, exact estimates of a flat surface."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ UPSIDE_DOWN = se3.from_euler_mm_deg(np.array([0, 0, 0, 180.0, 0, 0]))
 
 
 class KinematicPlant:
-    """A sensor above a plane. The skin sticks where it touches first and never slips.
+    """A sensor above a plane. The skin sticks where it first touches and never slips.
 
     Args:
         gap_mm: distance from the tip to the surface at the start.
@@ -29,13 +29,13 @@ class KinematicPlant:
 
     Attributes:
         velocity: (6,) twist of the surface, along its own axes.
-        frozen: the arm does not move, whatever it is told.
+        frozen: the arm ignores commands.
         frames, states: whether new ones arrive; old ones stay.
         touching: False hides the contact, True leaves it to geometry.
-        in_range: what estimates say of themselves.
-        broken: the arm reports a pose that is none.
-        seen: ``T_f_s`` (4, 4) as the latest cycle found it.
-        operator_stop: whether the person asks for the end.
+        in_range: the ``in_range`` flag of estimates.
+        broken: the arm reports an invalid pose.
+        seen: ``T_f_s`` (4, 4) of the latest cycle.
+        operator_stop: whether the operator requests the end.
     """
 
     def __init__(self, gap_mm: float = 5.0, tilt_deg: tuple[float, float] = (4.0, -3.0)) -> None:
@@ -59,11 +59,11 @@ class KinematicPlant:
         self._state: Stamped[TcpState] | None = None
 
     def sensor_in_surface(self) -> np.ndarray:
-        """True ``T_f_s`` (4, 4)."""
+        """Return the true ``T_f_s`` (4, 4)."""
         return se3.compose(se3.inverse(self.T_w_f), self.T_w_s)
 
     def cycle(self, task: Task) -> Action:
-        """One control cycle: observe, ask the task, move."""
+        """Run one control cycle: observe, call the task, move."""
         self.now_ns += round(DT * 1e9)
         self.seen = self.sensor_in_surface()
         action = task.tick(self._observe())
@@ -75,7 +75,7 @@ class KinematicPlant:
         return action
 
     def run(self, task: Task, until: str | None = None, limit_s: float = 60.0) -> list[Action]:
-        """Cycles until the task is in state ``until``, or has finished."""
+        """Run cycles until the task is in state ``until``, or has finished."""
         actions: list[Action] = []
         for _ in range(round(limit_s * RATE_HZ)):
             if task.finished or task.state == until:
@@ -99,7 +99,7 @@ class KinematicPlant:
             self._anchored = False
             return nothing
         if not self._anchored:
-            # Here the skin takes hold: the surface frame moves to where there is no shear.
+            # First touch: the surface frame moves to where there is no shear.
             labels = se3.to_euler_mm_deg(self.seen)
             shear = np.array([labels[0], labels[1], 0.0, 0.0, 0.0, labels[5]])
             self.T_w_f = se3.compose(self.T_w_f, se3.from_euler_mm_deg(shear))

@@ -1,4 +1,4 @@
-"""Simulated tactile images of which every marker's place is known."""
+"""Simulated tactile images with known marker positions."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ REST = TIP.project(TIP.rest_positions) - CORNER
 
 @dataclass(frozen=True)
 class Simulated:
-    """Images of the public kind with the contacts and the markers in them.
+    """Images of the public kind with their contacts and markers.
 
     Attributes:
         images: black and white (440, 445).
         T_f_s: (n, 4, 4).
-        pixels: (n, 331, 2) of the markers in the images.
+        pixels: (n, 331, 2) px of the markers in the images.
     """
 
     images: list[ImageArray]
@@ -39,7 +39,7 @@ class Simulated:
 
 
 def simulated(n: int, seed: int, depth_mm: tuple[float, float] = (0.5, 6.0)) -> Simulated:
-    """n random contacts of the default sensor over the ranges of the public data, each marker 0.3 px off its place."""
+    """Simulate n random contacts of the default sensor over the ranges of the public data, with 0.3 px marker noise."""
     rng = np.random.default_rng(seed)
     law = ContactLaw()
     T_f_s = np.stack([contact_at(pose, law).T_f_s for pose in random_poses(n, rng, depth_mm)])
@@ -49,7 +49,7 @@ def simulated(n: int, seed: int, depth_mm: tuple[float, float] = (0.5, 6.0)) -> 
 
 
 def write_split(root: Path, split: str, n: int, seed: int) -> None:
-    """Simulated images in the layout of the public data."""
+    """Write simulated images in the layout of the public data."""
     sample = simulated(n, seed)
     folder = root / split
     (folder / "processed_images").mkdir(parents=True)

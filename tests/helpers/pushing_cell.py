@@ -1,4 +1,4 @@
-"""Pushing cells run whole: the cell files that ship, on the true contact, and what is true at the end."""
+"""Complete runs of pushing cells: the shipped cell files with the true contact, and the true final state."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ import yaml
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import RunLoop, RunResult, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import RunResult
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.paths import CONFIGS
 
 
@@ -27,7 +29,7 @@ def _shipped(name: str) -> dict[str, Any]:
 
 
 def cell_file(name: str, **changes: Any) -> dict[str, Any]:
-    """A cell file that ships, on the true contact; ``changes`` by key with ``__`` for the steps down."""
+    """Return a shipped cell file with the true contact; ``changes`` by key, with ``__`` between levels."""
     data = deepcopy(_shipped(name))
     for sensor in data["sensors"].values():
         sensor["estimator"] = {"kind": "true_contact"}
@@ -42,13 +44,13 @@ def cell_file(name: str, **changes: Any) -> dict[str, Any]:
 
 @dataclass
 class Pushed:
-    """What came of a push.
+    """Result of a push.
 
     Attributes:
-        result: of the run.
-        cell: that it ran in.
+        result: result of the run.
+        cell: cell of the run.
         error_mm: distance of the target from the true contact normal when pushing ended, positive to its left.
-        object_mm_deg: x, y and yaw of the object then.
+        object_mm_deg: x, y and yaw of the object at that time.
     """
 
     result: RunResult
@@ -58,7 +60,7 @@ class Pushed:
 
     @property
     def path(self) -> list[tuple[str, str, str]]:
-        """The task's transitions."""
+        """Return the task's transitions."""
         return [(r.source, r.event, r.target) for r in self.cell.task.transitions]
 
 

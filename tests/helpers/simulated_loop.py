@@ -1,4 +1,4 @@
-"""A control loop around the simulated arm, on virtual time, with the true contact in place of perception."""
+"""Control loop around the simulated arm, on virtual time, with the true contact in place of perception."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ COVARIANCE = np.diag([1e-8] * 3 + [1e-6] * 3)
 
 @dataclass
 class Log:
-    """What happened in each cycle while the task was in state ``run``."""
+    """Record of each cycle while the task was in state ``run``."""
 
     t_s: list[float] = field(default_factory=list)
     truth: list[ContactState] = field(default_factory=list)
 
     def labels(self, after_s: float = 0.0) -> Array:
-        """(n, 6) true contact as x, y, z mm and alpha, beta, gamma degrees, from ``after_s`` into the run."""
+        """Return (n, 6) true contacts as x, y, z mm and alpha, beta, gamma degrees, from ``after_s`` into the run."""
         poses = [c.T_f_s for t, c in zip(self.t_s, self.truth, strict=True) if t >= self.t_s[0] + after_s]
         return se3.to_euler_mm_deg(np.array(poses))
 
     def depth_rms_mm(self, depth_mm: float, after_s: float = 0.0) -> float:
-        """Root mean square of the depth error."""
+        """Return the root mean square of the depth error."""
         return float(np.sqrt(np.mean((self.labels(after_s)[:, 2] - depth_mm) ** 2)))
 
     def tilt_rms_deg(self, after_s: float = 0.0) -> float:
-        """Root mean square of the angle between the sensor's axis and the surface normal."""
+        """Return the root mean square of the angle between the sensor's axis and the surface normal."""
         labels = np.radians(self.labels(after_s))
         tilt = np.arccos(np.clip(np.cos(labels[:, 3]) * np.cos(labels[:, 4]), -1.0, 1.0))
         return float(np.degrees(np.sqrt(np.mean(tilt**2))))
@@ -51,8 +51,8 @@ class SimulatedLoop:
     Args:
         surface: settings of the one surface, as in the ``scene:`` section of a cell file.
         start_mm_deg: pose of the sensor at the start.
-        frame_rate_hz: how often there is a new frame.
-        latency_s: from a frame's capture until its estimate is there.
+        frame_rate_hz: frame rate.
+        latency_s: from a frame's capture until its estimate is available.
         noise: standard deviations (6,) of the estimate's [v, w] left perturbation, m and rad.
     """
 
@@ -81,7 +81,7 @@ class SimulatedLoop:
         self._newest: ContactEstimate | None = None
 
     def run(self, task: Task, *, limit_s: float = 60.0, stop_when: Callable[[Observation], bool] | None = None) -> Log:
-        """Run the task until it has finished; ``stop_when`` says when the operator asks for the end."""
+        """Run the task until it has finished; ``stop_when`` is the operator's stop request."""
         log, period_ns = Log(), round(1e9 / self.context.rate_hz)
         stopping = False
         with self.arm:
@@ -103,7 +103,7 @@ class SimulatedLoop:
         return log
 
     def observe(self, operator_stop: bool) -> Observation:
-        """What a cell would know now."""
+        """Return the present observation of a cell."""
         now_ns = self.clock.now_ns()
         seq = (now_ns - self._latency_ns) // self._frame_ns
         if seq >= 0 and (self._newest is None or self._newest.seq != seq):

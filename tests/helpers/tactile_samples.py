@@ -1,4 +1,4 @@
-"""Small data sets for tests: rings of dots that move as a tip's markers do, with the contact that moved them."""
+"""Small data sets for tests: rings of dots that move like a tip's markers, with the contact that moved them."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ CENTRE = np.array([0.0, 0.0, 3.25, 0.0, 0.0, 0.0])
 
 
 def contacts(n: int, seed: int) -> Array:
-    """(n, 6) contacts, mm and degrees, spread evenly."""
+    """Return (n, 6) contacts, mm and degrees, uniformly distributed."""
     return CENTRE + HALF_RANGES * np.random.default_rng(seed).uniform(-1.0, 1.0, (n, 6))
 
 
 def draw(contact: Array, size: tuple[int, int] = SIZE) -> ImageArray:
-    """An image of 19 dots which the contact shifts, spreads, leans and turns."""
+    """Draw an image of 19 dots that the contact shifts, spreads, tilts and rotates."""
     x, y, z, alpha, beta, gamma = (contact - CENTRE) / HALF_RANGES
     image = np.zeros(size, dtype=np.uint8)
     for ring in range(3):
@@ -46,14 +46,14 @@ def preprocessing(output: int = 32) -> Preprocessing:
 
 
 def labelled(n: int, seed: int) -> LabelledImages:
-    """n preprocessed images with their labels."""
+    """Return n preprocessed images with their labels."""
     drawn = contacts(n, seed)
     steps = preprocessing()
     return LabelledImages(np.stack([steps.reduce(draw(contact)) for contact in drawn]), xi_from_contact(drawn))
 
 
 def write_split(root: Path, split: str, n: int, seed: int) -> Path:
-    """A split in the public layout with shuffled columns; returns its folder."""
+    """Write a split in the public layout with shuffled columns; return its folder."""
     folder = root / split
     images = folder / "processed_images"
     images.mkdir(parents=True)
@@ -70,7 +70,7 @@ def write_split(root: Path, split: str, n: int, seed: int) -> Path:
 
 
 def taught(path: Path) -> tuple[dict[str, object], dict[str, bytes]]:
-    """What is in a model file, but for the time that it took to train."""
+    """Return the contents of a model file, without the training time."""
     model = load_model(path)
     header = model.header.model_dump()
     assert header["training"].pop("epochs_cpu_s") >= 0.0

@@ -123,7 +123,7 @@ def test_a_moving_plate_drags_the_skin_the_other_way() -> None:
     np.testing.assert_allclose(state.T_f_s, euler(0, 0, 0.005, 0, 0, 0.1), atol=1e-12)
 
 
-def test_riding_with_the_plate_feels_nothing_new() -> None:
+def test_moving_with_the_plate_leaves_the_contact_unchanged() -> None:
     motion = Periodic(
         np.eye(4),
         np.array([0.07, 0.07, 0.02, 0.3, 0.3, 0.5]),
@@ -187,7 +187,7 @@ def test_sticking_over_a_curved_surface_comes_back_without_drift() -> None:
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_a_sensor_that_lies_on_its_side_above_a_table_is_no_special_case(side: float) -> None:
+def test_a_horizontal_sensor_above_a_table_needs_no_special_case(side: float) -> None:
     lying = euler(0, 0, -0.1, 0, 0, 0)
     # Exactly along an axis, which no product of sines and cosines is.
     lying[:3, :3] = np.array([[0, 0, side], [0, 1, 0], [-side, 0, 0]])

@@ -27,7 +27,7 @@ PRISM = {"shape": {"kind": "box", "size_mm": [80, 80, 60]}, "mass_g": 479}
 BEHIND = (-60.5, 0, 30, 0, 90, 0)
 
 
-def test_what_sticks_is_felt_as_in_the_kinematic_scene() -> None:
+def test_a_sticking_contact_equals_that_of_the_kinematic_scene() -> None:
     script = [((0, 0, 10, 0, 0, 0), 0.45), ((4, 0, 0, 0, 0, 0), 0.4), ((0, 0, 0, 0, 0, 5), 0.5)]
     script += [((0, 0, 0, 20, 0, 0), 0.4), ((0, -5, 0, 0, 0, 0), 0.2), (STILL, 0.2)]
     hands = [Hand(FLOOR, ABOVE, physics) for physics in ("kinematic", "dynamic")]
@@ -40,7 +40,7 @@ def test_what_sticks_is_felt_as_in_the_kinematic_scene() -> None:
         assert not physics.slipping
 
 
-def test_what_slides_keeps_the_shear_that_friction_holds() -> None:
+def test_a_sliding_contact_keeps_the_shear_that_friction_holds() -> None:
     hand = Hand({**FLOOR, "tip": {"friction": 0.5}}, ABOVE)
     hand.move((0, 0, 10, 0, 0, 0), 0.35)
     assert hand.move((20, 0, 0, 0, 0, 0), 0.5).slipping
@@ -57,7 +57,7 @@ def test_what_slides_keeps_the_shear_that_friction_holds() -> None:
 
 
 @pytest.mark.parametrize("kind", ["dome", "ramp"])
-def test_a_tip_slides_over_what_is_not_flat(kind: str) -> None:
+def test_a_tip_slides_over_curved_surfaces(kind: str) -> None:
     shape = {"kind": "dome", "radius_mm": 60} if kind == "dome" else {"kind": "ramp", "bend_radius_mm": 80}
     if kind == "ramp":
         shape["incline_deg"] = 30
@@ -97,7 +97,7 @@ def test_a_pushed_prism_resists_with_the_friction_of_its_weight() -> None:
 
 
 @pytest.mark.parametrize("width_mm", [(80, 80), (80, 140)])
-def test_an_off_centre_push_turns_as_uniform_pressure_says(width_mm: tuple[int, int]) -> None:
+def test_an_off_centre_push_rotates_as_uniform_pressure_predicts(width_mm: tuple[int, int]) -> None:
     block = {"shape": {"kind": "box", "size_mm": [*width_mm, 60]}, "mass_g": 400}
     # A small tip that does not slip is a point that pushes: 10 mm beside the middle.
     point = {"radius_mm": 2, "friction": 1.5}
@@ -138,7 +138,7 @@ def test_two_tips_carry_a_prism_off_the_table() -> None:
         assert abs(parts(state)[0]) == pytest.approx(weight_n / 2.0, abs=0.05)
 
 
-def test_what_sticks_does_not_creep() -> None:
+def test_a_sticking_contact_does_not_creep() -> None:
     hand = Hand(FLOOR, ABOVE)
     hand.move((0, 0, 10, 0, 0, 0), 0.45)
     hand.move((10, 0, 0, 0, 0, 0), 0.4)
@@ -186,7 +186,7 @@ def test_a_snapshot_brings_back_the_very_same_future(physics: str) -> None:
         restore()
 
 
-def test_numbers_that_are_not_finite_are_told_not_computed_with() -> None:
+def test_non_finite_numbers_raise_an_error() -> None:
     from touchcell.simulation.dynamics import PhysicsError
 
     hand = Hand(FLOOR, ABOVE)
@@ -197,8 +197,8 @@ def test_numbers_that_are_not_finite_are_told_not_computed_with() -> None:
     assert error.value.t_s == pytest.approx(0.010)
 
 
-def test_physics_asks_for_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValidationError, match="no multiple of physics_step_ms"):
+def test_dynamic_physics_names_the_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValidationError, match="not a multiple of physics_step_ms"):
         SceneConfig.model_validate({"physics": "dynamic", **FLOOR, "step_ms": 0.5})
     monkeypatch.setitem(sys.modules, "mujoco", None)
     for name in ("touchcell.simulation.dynamics", "touchcell.simulation.dynamics_model"):

@@ -41,7 +41,7 @@ def checkout(root: Path, model: str, *, names: list[str] | None = None, longer_m
     for number, (joint, name) in enumerate(zip(chain.joints, names or JOINTS[model], strict=True)):
         T = joint.pose()
         if number == 0:
-            # In the base that is turned by 90 degrees the same joint lies 90 degrees back.
+            # In a base rotated by 90 degrees the same joint is rotated by -90 degrees.
             T = se3.from_euler_mm_deg((0, 0, 0, 0, 0, -90)) @ T
         quat = np.empty(4)
         mujoco.mju_mat2Quat(quat, np.ascontiguousarray(T[:3, :3]).ravel())
@@ -77,7 +77,7 @@ def build(model: str, **changes: object) -> SimJointArm:
 
 
 @pytest.mark.parametrize("model", ["panda", "ur5e"])
-def test_its_arm_stands_and_moves_as_ours_with_its_own_masses(tmp_path: Path, model: str) -> None:
+def test_its_arm_has_our_kinematics_with_its_own_masses(tmp_path: Path, model: str) -> None:
     arms = [build(model), build(model, menagerie=str(checkout(tmp_path, model)))]
     moved = []
     for arm in arms:
@@ -97,19 +97,21 @@ def test_its_arm_stands_and_moves_as_ours_with_its_own_masses(tmp_path: Path, mo
     assert arms[1]._body._model.ngeom == 0
 
 
-def test_the_environment_names_it_where_the_cell_file_does_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_environment_variable_is_the_fallback_of_the_cell_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("MENAGERIE_ROOT", str(checkout(tmp_path, "panda")))
     assert np.count_nonzero(np.isclose(build("panda")._body._model.body_mass, MASS_KG)) == 7
 
 
-def test_what_is_wrong_with_a_checkout_is_said(tmp_path: Path) -> None:
+def test_an_unusable_checkout_is_reported_with_the_reason(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such file") as missing:
         build("panda", menagerie=str(tmp_path / "empty"))
     assert missing.value.key == "menagerie"
     renamed = checkout(tmp_path / "renamed", "panda", names=[f"axis{i}" for i in range(7)])
     with pytest.raises(ConfigError, match="its joints are axis0"):
         build("panda", menagerie=str(renamed))
-    with pytest.raises(ConfigError, match="moves otherwise"):
+    with pytest.raises(ConfigError, match="differs from"):
         build("panda", menagerie=str(checkout(tmp_path / "longer", "panda", longer_mm=30.0)))
     broken = checkout(tmp_path / "broken", "panda")
     (broken / FILES["panda"]).write_text("<mujoco><worldbody>")

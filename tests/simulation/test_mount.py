@@ -19,7 +19,7 @@ def test_a_perfect_mount_leaves_a_command_that_sticks() -> None:
     )
 
 
-def test_shear_stops_at_what_the_depth_holds() -> None:
+def test_shear_saturates_at_the_limit_of_its_depth() -> None:
     rig = MountModel()
     for depth in (1.0, 2.0, 3.0):
         longest = 0.34 * depth**1.83
@@ -34,7 +34,7 @@ def test_a_tool_point_beside_the_axis_makes_depth_change_with_tilt() -> None:
     np.testing.assert_allclose(depths, 3.0 + 2.5 * np.sin(np.radians([-20.0, 0.0, 20.0])), atol=1e-9)
 
 
-def test_a_surface_that_is_not_level_tilts_what_was_straight() -> None:
+def test_a_surface_that_is_not_level_tilts_straight_contacts() -> None:
     assert left(MountModel(level_rad=(0.02, 0.0)), 0, 0, 3.0, 0, 0, 0)[3] == pytest.approx(np.degrees(0.02))
     assert left(MountModel(press_slant=(0.05, 0.0)), 0, 0, 3.0, 0, 0, 0)[0] == pytest.approx(0.15, rel=1e-3)
 
@@ -47,7 +47,7 @@ def test_shear_along_the_slope_sticks_better_one_way_than_the_other() -> None:
     assert max(one, other) > 1.1 * straight
 
 
-def test_torsion_is_lost_where_shear_slips_and_turns_the_shear_with_it() -> None:
+def test_torsion_is_lost_where_shear_slips_and_rotates_the_shear() -> None:
     rig = MountModel()
     held, slipping = left(rig, 0.1, 0, 3.0, 0, 0, 5.0), left(rig, 5.0, 0, 3.0, 0, 0, 5.0)
     assert held[5] == pytest.approx(5.0, rel=0.01)

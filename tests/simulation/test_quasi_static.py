@@ -84,8 +84,8 @@ def yaw_per_m(shape: dict, offset_mm: float) -> float:
 
 
 @pytest.mark.parametrize("offset_mm", [-10.0, 4.0, 15.0])
-def test_an_off_centre_push_turns_as_the_limit_surface_says(offset_mm):
-    """A sticking tip that does not turn: its centre goes along with the object, its force acts on the face.
+def test_an_off_centre_push_rotates_as_the_limit_surface_predicts(offset_mm):
+    """A sticking tip that does not rotate: its centre moves with the object, its force acts on the face.
 
     Closed form for the ellipsoid; and the uniform pressure integrated over the bottom, within 20 %.
     """
@@ -107,7 +107,7 @@ def test_an_off_centre_push_turns_as_the_limit_surface_says(offset_mm):
 
 
 @pytest.mark.parametrize("shape", [SQUARE, HEXAGON, ROUND])
-def test_what_is_held_below_the_limit_does_not_creep(shape):
+def test_an_object_held_below_the_limit_does_not_creep(shape):
     it, T = world(shape), tip(-60.5, 7.0)
     it.mount("tip", T, 0.0)
     push(it, T, (SPEED_M_S, 0.0), 0.5, 0.0)
@@ -230,7 +230,7 @@ def test_a_snapshot_brings_object_and_contact_back():
 
 @pytest.mark.parametrize("shape", [SQUARE, HEXAGON, ROUND])
 def test_on_a_face_the_normal_is_the_faces(shape):
-    """Where skin is dragged along, the point asked for lies on the surface but for rounding."""
+    """Where skin is dragged along, the anchor is on the surface but for rounding."""
     body = shape_of(ObjectConfig(shape=shape, mass_g=1.0).build(TableConfig()).solid)
     for y in np.linspace(-0.015, 0.015, 61):
         on = body.nearest(np.array([-0.1, y, 0.02])).point

@@ -21,7 +21,7 @@ def centroid(image: np.ndarray) -> np.ndarray:
 
 
 @given(u=st.floats(8, 32), v=st.floats(8, 32))
-def test_a_disc_is_where_it_belongs_to_a_fiftieth_of_a_pixel(u: float, v: float) -> None:
+def test_a_disc_is_centred_to_a_fiftieth_of_a_pixel(u: float, v: float) -> None:
     image = np.zeros((41, 41), np.uint8)
     STAMPS.paint(image, np.array([[u, v]]))
     assert np.linalg.norm(centroid(image) - [u, v]) < 0.02
@@ -30,7 +30,7 @@ def test_a_disc_is_where_it_belongs_to_a_fiftieth_of_a_pixel(u: float, v: float)
 
 # Whole sixteenths: nothing is lost when 40 is added.
 @given(u=st.integers(-320, 960).map(lambda n: n / 16), v=st.integers(-320, 960).map(lambda n: n / 16))
-def test_what_lies_outside_is_cut_off(u: float, v: float) -> None:
+def test_discs_are_clipped_at_the_border(u: float, v: float) -> None:
     image = np.zeros((41, 41), np.uint8)
     STAMPS.paint(image, np.array([[u, v]]))
     framed = np.zeros((121, 121), np.uint8)
@@ -48,7 +48,7 @@ def test_touching_discs_do_not_erase_or_add_up() -> None:
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_compiled_kernels_draw_what_plain_ones_do(seed: int) -> None:
+def test_compiled_kernels_draw_the_same_as_plain_ones(seed: int) -> None:
     compiled = pytest.importorskip("touchcell.simulation._paint")
     rng = np.random.default_rng(seed)
     centres = rng.uniform(-30.0, 110.0, (60, 2))
@@ -65,7 +65,7 @@ def test_compiled_kernels_draw_what_plain_ones_do(seed: int) -> None:
     np.testing.assert_array_equal(compiled.expose(*layers), _plain_paint.expose(*layers))
 
 
-def test_compiled_kernels_refuse_what_they_cannot_read() -> None:
+def test_compiled_kernels_refuse_unsupported_arrays() -> None:
     compiled = pytest.importorskip("touchcell.simulation._paint")
     image = np.zeros((60, 80), np.uint8)
     frozen = image.copy()

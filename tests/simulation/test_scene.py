@@ -185,7 +185,7 @@ def test_senseless_scenes_are_refused(config: dict[str, object]) -> None:
 
 def test_free_objects_are_refused_where_nothing_moves_them() -> None:
     prism = {"shape": {"kind": "box", "size_mm": [80, 80, 60]}, "mass_g": 479}
-    with pytest.raises(ValidationError, match="need another physics"):
+    with pytest.raises(ValidationError, match="need physics other than kinematic"):
         SceneConfig.model_validate({"objects": {"prism": prism}})
     with pytest.raises(ValidationError, match="neither surfaces nor objects"):
         SceneConfig.model_validate({})

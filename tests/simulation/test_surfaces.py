@@ -90,7 +90,7 @@ def test_twist_is_the_derivative_of_the_pose(motion: Motion, t_s: float) -> None
     np.testing.assert_allclose(twist[3:], [spin[2, 1], spin[0, 2], spin[1, 0]], atol=1e-8)
 
 
-def test_glide_goes_the_whole_way_and_rests_at_both_ends() -> None:
+def test_glide_covers_its_displacement_and_rests_at_both_ends() -> None:
     glide = Glide(pose(), np.array([0.2, 0, 0, 0, 0, 0.0]), start_s=1.0, duration_s=4.0)
     assert glide.pose(0.0)[0, 3] == 0.0
     assert glide.pose(3.0)[0, 3] == pytest.approx(0.1)

@@ -24,7 +24,7 @@ def test_ring_k_holds_6k_markers() -> None:
     assert [int((ring == k).sum()) for k in range(11)] == [1, *(6 * k for k in range(1, 11))]
 
 
-def test_undeformed_rings_lie_where_the_public_images_have_them() -> None:
+def test_undeformed_rings_match_the_public_images() -> None:
     pixels = TIP.pixels(contact(0, 0, -1, 0, 0, 0))
     u, v = TIP.parameters.centre_px
     radius = np.hypot(pixels[:, 0] - u, pixels[:, 1] - v)
@@ -99,7 +99,7 @@ def test_pins_amplify_the_turn_of_the_skin() -> None:
 
 
 @pytest.mark.parametrize("sixths", [1, 2, 5])
-def test_turning_the_whole_contact_about_the_sensor_axis_turns_the_field(sixths: int) -> None:
+def test_rotating_the_contact_about_the_sensor_axis_rotates_the_field(sixths: int) -> None:
     Z = contact(0, 0, 0, 0, 0, 60.0 * sixths)[:3, :3]
     T = contact(1.5, -2.0, 4.0, 10.0, -15.0, 0.0)
     R, shear = T[:3, :3], T[:3, :3].T @ np.array([T[0, 3], T[1, 3], 0.0])

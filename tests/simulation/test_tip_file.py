@@ -10,7 +10,7 @@ from touchcell.simulation.tip import Tip, TipParameters
 from touchcell.simulation.tip_file import SHIPPED, TipFile, load_tip, save_tip
 
 
-def test_comes_back_as_it_was_saved(tmp_path: Path) -> None:
+def test_a_saved_tip_loads_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "folder" / "sensor.yaml"
     tip = TipParameters(focal_px=512.5, centre_px=(330.0, 240.5), rings=9)
     saved = TipFile(tip=tip, rig=MountModel(offset_m=(1e-3, 0.0)), measured={"frames": 20})
@@ -25,7 +25,7 @@ def test_comes_back_as_it_was_saved(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in SHIPPED.glob("*.yaml")))
-def test_what_ships_is_a_sensor(name: str) -> None:
+def test_shipped_tip_files_are_valid(name: str) -> None:
     sensor = load_tip(name)
     tip = Tip(sensor.tip)
     rest = tip.project(tip.rest_positions)
@@ -34,7 +34,7 @@ def test_what_ships_is_a_sensor(name: str) -> None:
     assert sensor.measured["train, held out px"] < 2.0
 
 
-def test_what_is_unknown_is_told_with_its_likeliest_name(tmp_path: Path) -> None:
+def test_an_unknown_key_is_reported_with_a_suggestion(tmp_path: Path) -> None:
     path = tmp_path / "sensor.yaml"
     path.write_text(yaml.safe_dump({"schema": 1, "tip": {"focal_pixel": 500.0}}))
     with pytest.raises(ConfigError, match="focal_px"):
@@ -42,7 +42,7 @@ def test_what_is_unknown_is_told_with_its_likeliest_name(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("text", ["tip: [", "schema: 1", "schema: 2\ntip: {}", "schema: 1\ntip: {rings: many}", "7"])
-def test_what_makes_no_sense_is_refused(tmp_path: Path, text: str) -> None:
+def test_invalid_values_are_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "sensor.yaml"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
@@ -50,6 +50,6 @@ def test_what_makes_no_sense_is_refused(tmp_path: Path, text: str) -> None:
     assert caught.value.file == str(path)
 
 
-def test_a_missing_file_says_what_ships() -> None:
+def test_a_missing_file_lists_the_shipped_tips() -> None:
     with pytest.raises(ConfigError, match="franka_tactip_1"):
         load_tip("nobody.yaml")

@@ -39,7 +39,7 @@ def contacts(n: int, seed: int, sensor: Sensor = TRUE) -> MarkedContacts:
     return MarkedContacts(poses, pixels, seen)
 
 
-def test_a_score_of_contacts_tell_camera_mount_and_skin() -> None:
+def test_a_score_of_contacts_identify_camera_mount_and_skin() -> None:
     told: list[tuple[int, int]] = []
     fitted = fit_tip(contacts(24, 1), REFERENCE, 10, told=lambda done, total: told.append((done, total)))
     held_out = contacts(40, 2)
@@ -51,7 +51,7 @@ def test_a_score_of_contacts_tell_camera_mount_and_skin() -> None:
     assert told[-1][0] >= 5
 
 
-def test_a_mirrored_image_is_told() -> None:
+def test_a_mirrored_image_is_reported() -> None:
     made = contacts(24, 3)
     mirrored = se3.to_euler_mm_deg(made.T_f_s) * np.array([-1.0, 1.0, 1.0, -1.0, 1.0, 1.0])
     wrong = MarkedContacts(se3.from_euler_mm_deg(mirrored), made.pixels, made.seen)

@@ -11,7 +11,8 @@ import yaml
 
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, RunLoop, RunResult
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import Outcome, RunResult
 from touchcell.paths import CONFIGS
 
 SHIPPED = CONFIGS / "single_push_sim.yaml"
@@ -28,7 +29,7 @@ TOPPLING = {
 
 
 def pushed(folder: Path, interlock: dict[str, Any] | None) -> tuple[RunResult, float]:
-    """Push a prism of 60 x 60 x 180 mm on foam at a height of 165 mm; returns the result and how far it leant, deg."""
+    """Push a prism of 60 x 60 x 180 mm on foam at a height of 165 mm; return the result and the largest lean, deg."""
     data = yaml.safe_load(SHIPPED.read_text())
     data["scene"] |= {"physics": "dynamic", "table": {"friction": "foam"}}
     data["scene"]["objects"]["prism"]["shape"]["size_mm"] = [60, 60, 180]
@@ -49,7 +50,7 @@ def pushed(folder: Path, interlock: dict[str, Any] | None) -> tuple[RunResult, f
         loop.begin()
         going = True
         after = 50
-        # As long as it works, and half a second longer, unless it lies already.
+        # Until the run ends and half a second longer, unless it has toppled already.
         while leant_deg < 45.0 and after:
             if going:
                 going = loop.step()

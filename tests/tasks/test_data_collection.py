@@ -16,7 +16,9 @@ from tests.helpers.kinematic_plant import CONTEXT, KinematicPlant
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.recording.dataset_writer import Collection
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import Outcome, Progress, RunResult
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.control.reach import Reach, is_there
 from touchcell.drivers.replay.dataset import read_rest, read_split
 from touchcell.errors import ConfigError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.helpers.pushing_cell import cell_file, push
-from touchcell.cell.runtime.loop import StopRequest
+from touchcell.cell.runtime.stop_request import StopRequest
 
 CELL = "dual_push_sim.yaml"
 START = [("prepare", "ready", "approach"), ("approach", "contact", "settle"), ("settle", "settled", "run")]

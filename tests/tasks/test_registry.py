@@ -8,7 +8,6 @@ import sys
 import numpy as np
 import pytest
 
-from touchcell.drivers.core import protocols as abilities
 from touchcell.errors import ConfigError
 from touchcell.tasks import diagrams
 from touchcell.tasks.interface import TASKS, TaskContext, TaskSpec
@@ -21,8 +20,6 @@ def test_specs(name):
     assert isinstance(spec, TaskSpec)
     assert spec.name == name
     assert spec.summary
-    for needed in spec.arms.values():
-        assert all(hasattr(abilities, ability) for ability in needed)
     task = spec.build(spec.config(), TaskContext(100.0, {role: np.eye(4) for role in spec.sensors}))
     assert not task.finished
     assert task.transitions == ()

@@ -63,7 +63,7 @@ fd_messages = st.builds(
 
 
 @given(st.one_of(messages, fd_messages))
-def test_frames_survive_packing(message: can.Message) -> None:
+def test_frames_are_preserved_by_packing(message: can.Message) -> None:
     assert unpack(pack(message)).equals(message, timestamp_delta=None, check_channel=False)
 
 

@@ -1,4 +1,4 @@
-"""The emulators' periodic timer: what is late is made up for, but no two ticks come at once."""
+"""The emulators' periodic timer: late ticks are made up for, but no two ticks coincide."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_ticks_that_were_slept_through_are_made_up_for_but_never_at_once() -> No
     assert sum(made_up) > 20
 
 
-def test_a_process_that_was_gone_for_long_goes_on_from_there() -> None:
+def test_a_long_suspended_process_skips_the_missed_ticks() -> None:
     seen = ticks_of({5: 0.15}, 20)
     # Were the seventy made up for, four would come within three periods.
     assert seen[9][0] - seen[5][0] >= 3.5 * PERIOD_NS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from pathlib import Path
 
 from touchcell.errors import TouchcellError
@@ -17,3 +18,17 @@ class RecordingError(TouchcellError):
     def __init__(self, file: Path, reason: str, *, hint: str = "") -> None:
         super().__init__(f"{file}: {reason}", hint=hint)
         self.file = file
+
+
+class UnexpectedError(TouchcellError):
+    """Code raised what it does not document: a mistake in touchcell or in a plug-in.
+
+    Attributes:
+        cause: what was raised.
+    """
+
+    def __init__(self, cause: BaseException) -> None:
+        frames = traceback.extract_tb(cause.__traceback__)
+        where = f"{frames[-1].filename}:{frames[-1].lineno}: " if frames else ""
+        super().__init__(f"{where}{cause!r}", hint="this is a mistake in the code, not in the cell")
+        self.cause = cause

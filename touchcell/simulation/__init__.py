@@ -1,1 +1,1 @@
-"""What the simulated devices share: surfaces, contact with slip, the tip's marker field and its picture."""
+"""Simulation of surfaces, objects, contact with slip, the tip's marker field and its images."""

@@ -1,4 +1,4 @@
-"""What ``_paint.c`` does, where it is not built, and what it is tested against."""
+"""Python implementation of ``_paint.c``: fallback where it is not built, and reference for its tests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def paint(image: ImageArray, centres: Array, stamps: ImageArray) -> None:
     """Draw into ``image`` (height, width); each pixel becomes as bright as the brightest stamp on it.
 
     Args:
-        image: drawn into; what lies outside is cut off.
+        image: image to draw into, clipped at its border.
         centres: (n, 2) px.
         stamps: (phases, phases, size, size) for sub-pixel offsets along v and u.
     """
@@ -35,7 +35,7 @@ def paint(image: ImageArray, centres: Array, stamps: ImageArray) -> None:
 def expose(
     cover: ImageArray, contrast: ImageArray, background: ImageArray, noise: NDArray[np.int8], top: int, left: int
 ) -> ImageArray:
-    """``background + contrast * cover / 255``, each (height, width), and the window of ``noise`` at (top, left)."""
+    """Return ``background + contrast * cover / 255`` (height, width), plus the window of ``noise`` at (top, left)."""
     height, width = cover.shape
     clean = cv2.add(cv2.multiply(cover, contrast, scale=1.0 / 255.0), background)
     grain: NDArray[np.int8] = np.ascontiguousarray(noise[top : top + height, left : left + width])

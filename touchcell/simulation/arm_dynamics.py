@@ -2,9 +2,9 @@
 
 Links may also come from MuJoCo Menagerie (``menagerie.py``).
 
-The arm is a model of its own, without contacts: what its tool touches is felt as the force that the scene tells it, one
-step of the scene late. That is stable because a tip is soft (1.5 N/mm against some 5 kg at the tool: 3 rad/s per
-step of 2 ms), and lets every arm work in every scene. Imported only where such an arm is asked for.
+The arm is a model of its own, without contacts: contact forces on its tool come from the scene, one step of the scene
+late. That is stable because a tip is soft (1.5 N/mm against some 5 kg at the tool: 3 rad/s per step of 2 ms), and lets
+every arm work in every scene. Imported only for such an arm.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from touchcell.simulation.dynamics_model import cross, quaternion
 _ROD_RADIUS_M = 0.05
 _ROTOR_KG_M2 = 0.1
 _TOOL_RADIUS_M = 0.03
-# Per newton metre of largest torque: full torque at 1.1 deg of error, as stiff as position-controlled arms are.
+# Per newton metre of maximum torque: full torque at 1.1 deg of error, as stiff as position-controlled arms are.
 _GAIN_PER_RAD = 52.0
 _DAMPING_S = 0.1
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 class ArmDynamics:
-    """One arm on a base that stands still.
+    """Dynamics of one arm on a fixed base.
 
     Args:
-        description: its joints and links.
-        tool: what the flange carries.
-        q: (n,) rad where it stands at first.
+        description: joints and links.
+        tool: tool on the flange.
+        q: (n,) rad, initial joint angles.
         step_s: time step of the physics.
-        links: an MjSpec of joints and links without motors, its last link, and where the flange is on that (4, 4); rods
-            along the chain unless given.
+        links: an MjSpec of joints and links without motors, its last link, and the pose (4, 4) of the flange on it;
+            rods along the chain by default.
     """
 
     def __init__(
@@ -58,42 +58,42 @@ class ArmDynamics:
 
     @property
     def q(self) -> Array:
-        """(n,) rad."""
+        """Joint angles (n,) rad."""
         return self._data.qpos.copy()  # type: ignore[no-any-return]
 
     @property
     def dq(self) -> Array:
-        """(n,) rad/s."""
+        """Joint velocities (n,) rad/s."""
         return self._data.qvel.copy()  # type: ignore[no-any-return]
 
     @property
     def torque(self) -> Array:
-        """(n,) N m of the motors beyond what carries the arm's weight."""
+        """Motor torques (n,) N m in addition to gravity compensation."""
         return self._data.qfrc_actuator.copy()  # type: ignore[no-any-return]
 
-    def T_base_tcp(self) -> Array:  # noqa: N802  the field's own name
-        """(4, 4) now."""
+    def T_base_tcp(self) -> Array:  # noqa: N802  standard notation for transforms
+        """Return the present pose (4, 4)."""
         T = np.eye(4)
         T[:3, :3] = self._data.site_xmat[0].reshape(3, 3)
         T[:3, 3] = self._data.site_xpos[0]
         return T
 
     def set_target(self, q: Array, dq: Array) -> None:
-        """Head for ``q`` (n,) rad, moving by ``dq`` (n,) rad/s."""
+        """Set the servo target ``q`` (n,) rad, with velocity feed-forward ``dq`` (n,) rad/s."""
         self._data.ctrl[:] = q + _DAMPING_S * dq
 
     def bear(self, force: Array, point: Array) -> None:
-        """From now on feel ``force`` (3,) N at ``point`` (3,) m on the last link, both in the base frame."""
+        """Apply ``force`` (3,) N at ``point`` (3,) m on the last link from now on, both in the base frame."""
         self._data.xfrc_applied[self._last, :3] = force
         self._data.xfrc_applied[self._last, 3:] = cross(point - self._data.xipos[self._last], force)
 
     def step(self, steps: int) -> None:
-        """Move on by that many time steps."""
+        """Advance by that many time steps."""
         mujoco.mj_step(self._model, self._data, steps)
         mujoco.mj_kinematics(self._model, self._data)
 
     def snapshot(self) -> Callable[[], None]:
-        """What puts joints, target and load back."""
+        """Return a function that restores joints, target and load."""
         state = np.empty(mujoco.mj_stateSize(self._model, _STATE))
         mujoco.mj_getState(self._model, self._data, state, _STATE)
 
@@ -134,7 +134,7 @@ def _rods(description: ChainDescription) -> tuple[Any, Any, Array]:
 
 
 def _build(spec: Any, last: Any, T_last_flange: Array, description: ChainDescription, tool: Tool, step_s: float) -> Any:
-    """The model with motors and tool."""
+    """Compile the model with motors and tool."""
     spec.option.timestep = step_s
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
@@ -168,7 +168,7 @@ def _build(spec: Any, last: Any, T_last_flange: Array, description: ChainDescrip
 
 
 def _rod_inertia(mass_kg: float, end_m: Array) -> Array:
-    """(3,) of a rod from the link's joint to the next, about its middle and along the link's axes; never a thin one."""
+    """Return (3,) of a rod from the link's joint to the next, about its centre, along the link's axes; never thin."""
     length = end_m @ end_m
     across = mass_kg * (3.0 * _ROD_RADIUS_M**2 + length) / 12.0
     along = 0.5 * mass_kg * _ROD_RADIUS_M**2

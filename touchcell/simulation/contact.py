@@ -1,7 +1,7 @@
 """Contact of a soft hemispherical tip with a rigid surface: depth, tilt, shear that sticks, and slip.
 
-Frames are SPEC part 2's. {s} has its origin at the centre of the tip's sphere and z out of the tip. {f} has z along the
-inward normal and its origin one tip radius outside the surface, so that {f} = {s} at a normal contact of zero depth.
+{s} has its origin at the centre of the tip's sphere and z out of the tip. {f} has z along the inward normal and
+its origin one tip radius outside the surface, so that {f} = {s} at a normal contact of zero depth.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ _IDENTITY = np.eye(4)
 
 @dataclass(frozen=True, slots=True)
 class ContactLaw:
-    """How a TacTip gives and slips.
+    """Compliance and slip of a TacTip.
 
     Attributes:
         tip_radius_m: radius of the hemisphere.
         stiffness_n_m: normal force per depth.
         friction: tangential force per normal force with which the skin slips.
-        slip_at_1mm_m: shear that survives at 1 mm depth, measured on public images (SIMULATION part 5).
-        slip_exponent: growth of that shear with depth, measured on the same.
-        torsion_grip: share of the shear that sticks by which the patch may turn before it slips. The same images fit
+        slip_at_1mm_m: shear that survives at 1 mm depth, measured on public images.
+        slip_exponent: growth of that shear with depth, measured on the same images.
+        torsion_grip: fraction of the sticking shear by which the patch may rotate before it slips. The same images fit
             best with 0.08; 0.15 lets 5 deg stick from 4.5 mm on.
     """
 
@@ -42,19 +42,19 @@ class ContactLaw:
     torsion_grip: float = 0.15
 
     def max_shear_m(self, depth_m: float) -> float:
-        """Largest tangential displacement that sticks."""
+        """Return the largest tangential displacement that sticks."""
         return self.slip_at_1mm_m * (1e3 * depth_m) ** self.slip_exponent if depth_m > 0.0 else 0.0
 
     def shear_stiffness_n_m(self, depth_m: float) -> float:
-        """Tangential force per shear at a positive depth: what sticks is used up when friction is."""
+        """Return the tangential force per shear at a positive depth, so that shear and friction limits coincide."""
         return self.friction * self.stiffness_n_m * depth_m / self.max_shear_m(depth_m)
 
     def max_torsion_rad(self, depth_m: float) -> float:
-        """Largest rotation about the normal that sticks.
+        """Return the largest rotation about the normal that sticks.
 
         A uniformly pressed disc of radius a turns against its friction with the mean lever 2a/3; a is the radius of the
-        sphere's cap at that depth. Skin there lets go after ``torsion_grip`` of the displacement that it holds in pure
-        shear. Gives 0.7 deg at 1 mm and 5.4 deg at 4.5 mm. The form is ours.
+        sphere's cap at that depth. Skin there slips after ``torsion_grip`` of the displacement that it holds in pure
+        shear. Gives 0.7 deg at 1 mm and 5.4 deg at 4.5 mm. The form is our own.
         """
         if depth_m <= 0.0:
             return 0.0
@@ -64,10 +64,10 @@ class ContactLaw:
 
 @dataclass(slots=True)
 class _Anchor:
-    """Where the skin holds on to the surface, in the surface's own frame, so that a moving surface drags it.
+    """Point where the skin sticks to the surface, in the surface's own frame, so that a moving surface drags it.
 
     Attributes:
-        surface: what it holds on to.
+        surface: the surface.
         point: (3,) m, on the surface.
         R: (3, 3) axes of {f} at ``point``.
     """
@@ -81,8 +81,8 @@ class _Anchor:
 class ContactModel:
     """One tip's contact over time.
 
-    The shear is not integrated: while the skin sticks it is the way from the anchor to the present nearest point, so
-    nothing drifts. When it exceeds what the depth can hold, the anchor is dragged along the surface, its axes turned
+    The shear is not integrated: while the skin sticks it is the vector from the anchor to the present nearest point, so
+    nothing drifts. When it exceeds what the depth can hold, the anchor is dragged along the surface, its axes rotated
     with the normal by the smallest rotation (parallel transport). Shear and torsion are limited separately.
     """
 
@@ -90,16 +90,16 @@ class ContactModel:
     _anchor: _Anchor | None = None
 
     def held_point(self, surface: Surface) -> Array | None:
-        """(3,) m, where the skin holds on to ``surface``, in its own frame; None where it does not."""
+        """Return (3,) m, the point where the skin sticks to ``surface``, in its own frame; None where it does not."""
         anchor = self._anchor
         return anchor.point if anchor is not None and anchor.surface is surface else None
 
     def step(self, T_world_s: Array, surface: Surface, t_s: float) -> ContactState:
-        """Bring the contact to time ``t_s`` with the sensor at ``T_world_s`` (4, 4)."""
+        """Advance the contact to time ``t_s`` with the sensor at ``T_world_s`` (4, 4)."""
         return self.advance(T_world_s, surface, t_s)()
 
     def advance(self, T_world_s: Array, surface: Surface, t_s: float) -> Callable[[], ContactState]:
-        """The same, with its state worked out only when it is asked for."""
+        """Advance the contact as ``step`` does; return a function that computes its state on demand."""
         T_world_b = surface.motion.pose(t_s)
         R_world_b = T_world_b[:3, :3]
         R_b_s = R_world_b.T @ T_world_s[:3, :3]
@@ -143,7 +143,7 @@ class ContactModel:
         return lambda: self._state(T_world_s, R_world_b @ R_b_f, about_z(torsion) @ R_tilt, position, slipping=slipping)
 
     def snapshot(self) -> Restore:
-        """What brings the contact back as it is now."""
+        """Return a function that restores the present contact."""
         held = self._anchor and replace(self._anchor)
 
         def restore() -> None:
@@ -166,8 +166,9 @@ class ContactModel:
 
 
 def contact_at(T_f_s: Array, law: ContactLaw) -> ContactState:
-    """The contact that a tip pressed and then sheared to ``T_f_s`` (4, 4) ends in: {f} at the world's origin, shear and
-    torsion cut to what its depth holds. What data collection (Algorithm 1 of the paper) does, without the way there."""
+    """Return the contact of a tip pressed and then sheared to ``T_f_s`` (4, 4): {f} at the world's origin, shear and
+    torsion clipped to what its depth holds. Equals the end of Algorithm 1 of the paper (data collection), without the
+    path."""
     depth = float(T_f_s[2, 3])
     R_tilt = tilt_of(T_f_s[2, :3])
     R_gamma = T_f_s[:3, :3] @ R_tilt.T
@@ -183,8 +184,8 @@ def contact_at(T_f_s: Array, law: ContactLaw) -> ContactState:
 
 
 def tilt_of(inward_in_s: Array) -> Array:
-    """Tilt (3, 3) of a sensor: the Ry(beta) Rx(alpha) that takes ``inward_in_s`` (3,), the inward normal in {s}, to the
-    z axis of {f}."""
+    """Return the tilt (3, 3) of a sensor: the Ry(beta) Rx(alpha) that takes ``inward_in_s`` (3,), the inward normal in
+    {s}, to the z axis of {f}."""
     x, y, z = inward_in_s.tolist()
     # The inverse rotation takes z to (-sin beta, sin alpha cos beta, cos alpha cos beta).
     cos_beta = math.hypot(y, z)
@@ -201,19 +202,19 @@ def tilt_of(inward_in_s: Array) -> Array:
 
 
 def about_z(angle: float) -> Array:
-    """Rotation (3, 3) about the z axis."""
+    """Return the rotation (3, 3) about the z axis."""
     sin, cos = math.sin(angle), math.cos(angle)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _transport(R: Array, z: Array) -> Array:
-    """Axes ``R`` (3, 3) turned by the smallest rotation that brings their z axis to the unit vector ``z`` (3,)."""
+    """Rotate axes ``R`` (3, 3) by the smallest rotation that brings their z axis to the unit vector ``z`` (3,)."""
     (x0, _, a0), (x1, _, a1), (x2, _, a2) = R.tolist()
     b0, b1, b2 = z.tolist()
     # x + v x x + v x (v x x) / (1 + a.b) with v = a x b; x is normal to a, so it is x - (a + b) (b.x) / (1 + a.b).
     scale = (b0 * x0 + b1 * x1 + b2 * x2) / (1.0 + a0 * b0 + a1 * b1 + a2 * b2)
     x0, x1, x2 = x0 - (a0 + b0) * scale, x1 - (a1 + b1) * scale, x2 - (a2 + b2) * scale
-    # Rounding would add up over thousands of steps of sliding.
+    # Rounding would accumulate over thousands of steps of sliding.
     along = x0 * b0 + x1 * b1 + x2 * b2
     x0, x1, x2 = x0 - b0 * along, x1 - b1 * along, x2 - b2 * along
     length = math.sqrt(x0 * x0 + x1 * x1 + x2 * x2)

@@ -1,14 +1,14 @@
 """Full dynamics of free objects and soft tips, by MuJoCo: pushing, slipping, toppling, holding.
 
-Between a sensor and what it touches are springs and a rigid sphere (``dynamics_model.TipMechanics``). The springs'
-other end, the carriage, goes from pose to pose at an even speed, whatever pulls. It keeps its z axis along the surface
-normal: tilting about the tip's centre shears nothing, as in SPEC part 2, and the springs' deflection is the contact's
-shear and torsion. MuJoCo is told the carriage's speed for all physics steps of a step of the scene, and the tip's
-coordinates, along the axes that the carriage had at its start, are told anew along those at its end.
+Each sensor is connected to a rigid sphere by springs (``dynamics_model.TipMechanics``). The springs' other end, the
+carriage, moves from pose to pose at constant speed, whatever the load. It keeps its z axis along the surface normal:
+tilting about the tip's centre causes no shear, as in the definition of the contact, and the springs' deflection is the
+contact's shear and torsion. MuJoCo receives the carriage's speed for all physics steps of a step of the scene; the
+tip's coordinates, expressed along the carriage's axes at its start, are then re-expressed along those at its end.
 
-Surfaces that move as they were told are given to each tip as the patch that is tangent before it.
+Surfaces with prescribed motion are presented to each tip as a tangent patch in front of it.
 
-Free objects touch the table, tips and each other, no prescribed surfaces.
+Free objects touch the table, tips and each other, but not prescribed surfaces.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from touchcell.simulation.surfaces import Surface, SurfacePoint
 from touchcell.simulation.timeline import Restore
 from touchcell.simulation.world import Feeling
 
-# A carriage that would turn faster than this in one step has come to another face: it is set there, not swung.
+# A carriage that would rotate faster than this in one step has reached another face: it is placed there, not swung.
 _SWING_RAD = 0.1
-# Friction is regularised: what slides carries a little less than the cone allows.
+# Friction is regularised: sliding contacts carry a little less than the cone allows.
 _SLIDING_SHARE = 0.97
 _IDENTITY = np.eye(4)
 _UP = np.array([0.0, 0.0, 1.0])
@@ -49,8 +49,8 @@ class _Mounted:
         T_world_s: (4, 4) pose of the sensor.
         R_world_c: (3, 3) axes of the carriage.
         R_start: (3, 3) the same before that step.
-        speed: (6,) [v, w] in that step along ``R_start``, where the tip was on it.
-        normal: (3,) outward, of what was nearest.
+        speed: (6,) [v, w] in that step along ``R_start``, at the tip's position.
+        normal: (3,) outward, of the nearest surface.
     """
 
     T_world_s: Array
@@ -62,12 +62,12 @@ class _Mounted:
 
 @dataclass(frozen=True, slots=True)
 class _Coordinates:
-    """A tip's part of MuJoCo's state, to be read and written in place.
+    """A tip's part of MuJoCo's state, read and written in place.
 
     Attributes:
-        q, rate: (6,) how far the springs have given way along and about the carriage's axes, and how fast they do.
+        q, rate: (6,) deflection of the springs along and about the carriage's axes, and its rate.
         applied: (6,) forces along the same.
-        ctrl, act: (4,) speed of the springs' other ends along x, y, z and about z, and how far they have come.
+        ctrl, act: (4,) speed of the springs' other ends along x, y, z and about z, and their displacement.
         position, turn: (3,), (4,) of the carriage in the world.
     """
 
@@ -81,10 +81,10 @@ class _Coordinates:
 
 
 class PhysicsError(TouchcellError, ArithmeticError):
-    """The physics was given, or came to, numbers that are not finite.
+    """The physics received or produced numbers that are not finite.
 
     Attributes:
-        what: where they are.
+        what: the quantity concerned.
         t_s: time of the scene.
     """
 
@@ -98,17 +98,17 @@ class PhysicsError(TouchcellError, ArithmeticError):
 
 
 class DynamicWorld:
-    """A world that MuJoCo moves.
+    """A world with dynamics by MuJoCo.
 
     Args:
-        surfaces: that move as they were told, by name.
-        objects: free ones, by name.
-        table_height_m: of the level plane under them.
-        tip: what every tip is made of.
+        surfaces: surfaces with prescribed motion, by name.
+        objects: free objects by name.
+        table_height_m: height of the level plane under them.
+        tip: mechanics of every tip.
         step_s: time step of the physics; steps of the scene must be multiples of it.
 
     Raises:
-        ConfigError: there is nothing to touch.
+        ConfigError: nothing to touch.
     """
 
     def __init__(
@@ -134,8 +134,8 @@ class DynamicWorld:
         self._build({})
 
     def mount(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
-        """Let ``sensor`` feel; returns what it feels at ``T_world_s`` (4, 4) at ``t_s``. All tips begin undeformed
-        and all objects at rest."""
+        """Add ``sensor``; return its contact at ``T_world_s`` (4, 4) at ``t_s``. All tips start undeformed and all
+        objects at rest."""
         normal = self._nearest(T_world_s[:3, 3], t_s).normal
         R_world_c = _upright(T_world_s, normal)
         self._mounted[sensor] = _Mounted(T_world_s, R_world_c, R_world_c, np.zeros(6), normal)
@@ -144,7 +144,7 @@ class DynamicWorld:
         return self._feel(sensor, T_world_s, t_s)()
 
     def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, Feeling]:
-        """Go on to ``t_s``. Raises PhysicsError."""
+        """Advance to ``t_s``. Raises PhysicsError."""
         span_s = t_s - self._t_s
         for sensor, pose in T_world_s.items():
             self._carry(sensor, pose, span_s)
@@ -158,11 +158,11 @@ class DynamicWorld:
         return {sensor: self._feel(sensor, pose, t_s) for sensor, pose in T_world_s.items()}
 
     def objects(self) -> Mapping[str, Array]:
-        """T_world_object (4, 4) of every free object now."""
+        """Return the present T_world_object (4, 4) of every free object."""
         return self._T_world_object
 
     def snapshot(self) -> Restore:
-        """What puts objects, tips and carriages back."""
+        """Return a function that restores objects, tips and carriages."""
         model, data = self._at.model, self._data
         state = np.empty(mujoco.mj_stateSize(model, _STATE))
         mujoco.mj_getState(model, data, state, _STATE)
@@ -176,11 +176,11 @@ class DynamicWorld:
         return restore
 
     def _look(self) -> None:
-        """See where objects are: anew each time, for what has been told stays as it was."""
+        """Copy the poses of objects, anew each time, so that published ones stay unchanged."""
         self._T_world_object = {name: self._pose(name) for name in self._things}
 
     def _build(self, T_world_object: Mapping[str, Array]) -> None:
-        """Compile the model anew, with objects at ``T_world_object`` (4, 4) or else where they stand at first."""
+        """Compile the model again, with objects at ``T_world_object`` (4, 4) or at their initial poses."""
         self._at = build_model(
             self._things,
             self._table_height_m,
@@ -209,9 +209,9 @@ class DynamicWorld:
         self._look()
 
     def _carry(self, sensor: str, T_world_s: Array, span_s: float) -> None:
-        """Send the carriage from where it is to ``T_world_s``, and put the surface before its tip.
+        """Move the carriage from its pose to ``T_world_s``, and place the surface in front of its tip.
 
-        The normal that keeps it upright is the last step's: what moves is not known yet where it will be.
+        The normal that keeps it upright is that of the last step: the next pose of moving bodies is not known yet.
         """
         if not math.isfinite(float(T_world_s.sum())):
             raise PhysicsError(f"the pose of {sensor!r}", self._t_s)
@@ -225,7 +225,7 @@ class DynamicWorld:
         w = swing @ R_start / span_s
         tip.position[:], tip.turn[:] = position, quaternion(R_start)
         tip.ctrl[:3], tip.ctrl[3] = v, w[2]
-        # Of the carriage where the tip is on it: springs are damped against that, and carrying a tip takes no force.
+        # Of the carriage at the tip's position: springs are damped relative to it, and carrying a tip takes no force.
         speed = np.concatenate([v + cross(w, tip.q[:3]), w])
         tip.rate[:] += speed
         tip.applied[:] = self._damping * speed
@@ -235,7 +235,7 @@ class DynamicWorld:
         mounted.R_start, mounted.speed = R_start, speed
 
     def _settle(self, sensor: str) -> None:
-        """Tell the tip's coordinates, and how they change, along its carriage as it is now."""
+        """Express the tip's coordinates, and their rates, along its carriage's present axes."""
         mounted, tip = self._mounted[sensor], self._tips[sensor]
         turned = mounted.R_world_c.T @ mounted.R_start
         tip.q[:3] = turned @ (tip.q[:3] - tip.act[:3])
@@ -247,7 +247,7 @@ class DynamicWorld:
         tip.rate[3:5] = 0.0
 
     def _place_patch(self, sensor: str, tip_centre: Array) -> None:
-        """Put the tangent of the surface that is nearest to the tip where it is now, moving as the surface does."""
+        """Place the tangent patch of the nearest surface at the tip's present position, moving with the surface."""
         surface, found = self._nearest_surface(tip_centre, self._t_s)
         at = self._at.patches[sensor]
         R = _facing(found.normal)
@@ -268,7 +268,7 @@ class DynamicWorld:
         return lambda: _contact(self.tip, T_world_s, nearest, (dx, dy, dz), turned, rate)
 
     def _nearest(self, point: Array, t_s: float) -> SurfacePoint:
-        """What is nearest to ``point`` (3,): a surface, the table, or an object where it is now."""
+        """Return the nearest point to ``point`` (3,): of a surface, the table, or an object at its present pose."""
         found: SurfacePoint | None = None
         if self._surfaces:
             found = self._nearest_surface(point, t_s)[1]
@@ -308,7 +308,7 @@ def _contact(
     turned: float,
     rate: float,
 ) -> ContactState:
-    """What a tip feels whose springs have given way by ``deflection`` and ``turned``, at ``rate`` along the normal."""
+    """Return the contact of a tip whose springs are deflected by ``deflection`` and ``turned``."""
     R_f_s, depth = tilt_of(-nearest.normal @ T_world_s[:3, :3]), tip.radius_m - nearest.distance_m
     shear = pull = (0.0, 0.0)
     force, slipping = 0.0, False
@@ -336,7 +336,7 @@ def _contact(
 
 
 def _swing(R_start: Array, R_end: Array) -> Array | None:
-    """Rotation vector (3,) along world axes from one to the other; None if it is no small one."""
+    """Return the rotation vector (3,) along world axes from one to the other; None if it is not small."""
     (a, b, c), (d, e, f), (g, h, i) = (R_end @ R_start.T).tolist()
     if a + e + i <= 1.0 + 2.0 * math.cos(_SWING_RAD):
         return None
@@ -344,14 +344,14 @@ def _swing(R_start: Array, R_end: Array) -> Array | None:
 
 
 def _upright(T_world_s: Array, normal: Array) -> Array:
-    """Axes of {s} without its tilt: z along the inward normal, turned about it as the sensor is."""
+    """Return the axes of {s} without its tilt: z along the inward normal, heading as the sensor's."""
     R = T_world_s[:3, :3]
     upright: Array = R @ tilt_of(-normal @ R).T
     return upright
 
 
 def _facing(normal: Array) -> Array:
-    """Axes (3, 3) with z along the unit vector ``normal``."""
+    """Return axes (3, 3) with z along the unit vector ``normal``."""
     x, y, z = normal.tolist()
     # A rotation about an axis normal to both takes the world's z axis, or its opposite, there.
     sign = math.copysign(1.0, z)

@@ -1,6 +1,6 @@
-"""The MuJoCo model behind a dynamic scene: table, free objects, and soft tips on carriages.
+"""MuJoCo model of a dynamic scene: table, free objects, and soft tips on carriages.
 
-Settings and why: docs/explanation/simulation.md. Imported only where ``physics: dynamic`` is asked for.
+Settings and reasons: docs/explanation/simulation.md. Imported only for ``physics: dynamic``.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from touchcell.simulation.solids import friction_radius_m, mass_properties
 
 FEET = 8
 _FOOT_RADIUS_M = 0.002
-# Low enough that an object leans by 0.3 deg before its own edge carries it.
+# Small enough that an object leans by only 0.3 deg before its own edge carries it.
 _FOOT_HEIGHT_M = 0.05e-3
-# So heavy that contact forces do not move it: a lighter one lets friction creep, by 30 um/s at 1000 kg.
+# So heavy that contact forces do not move it: a lighter body lets friction creep, by 30 um/s at 1000 kg.
 _PATCH_KG = 1e6
 _PATCH_KG_M2 = 1e4
-# Likewise against the turning of a tip about axes along the surface.
+# Likewise against rotation of a tip about axes along the surface.
 _SWING_KG_M2 = 1e3
-# What an iteration of the solver must still improve, kg m^2/s^4: MuJoCo's own is relative to the mean inertia.
+# Smallest improvement per solver iteration, kg m^2/s^4: MuJoCo's own is relative to the mean inertia.
 _SOLVER_TOLERANCE = 5e-5
-# Time constant (s) and damping ratio. Contact damping presses those feet harder that slide faster: at a ratio of 1 an
-# object pushed off centre at 20 mm/s turns 12 % too little, at 0.5 it turns as the limit surface says.
+# Time constant (s) and damping ratio. Contact damping loads faster sliding feet more: at a ratio of 1 an object pushed
+# off centre at 20 mm/s turns 12 % too little, at 0.5 it turns as the limit surface predicts.
 _TABLE_SOLREF = (0.004, 0.5)
 _PATCH_HALF_M = (0.1, 0.1, 0.02)
 
@@ -39,11 +39,11 @@ class TipMechanics:
     """A tip as springs between the sensor's body and a rigid sphere; critically damped.
 
     Attributes:
-        radius_m: of the sphere.
+        radius_m: radius of the sphere.
         stiffness_n_m: along the surface normal.
         friction: coefficient of sliding friction against everything.
-        mass_kg: of the sphere. Lighter ones creep where they should stick (SIMULATION part 8).
-        torsion_friction_m: torque that a contact holds about its normal, per normal force.
+        mass_kg: mass of the sphere. Lighter ones creep where they should stick (docs/explanation/simulation.md).
+        torsion_friction_m: frictional torque about the contact normal, per normal force.
     """
 
     radius_m: float = 0.020
@@ -54,38 +54,38 @@ class TipMechanics:
 
     @property
     def shear_stiffness_n_m(self) -> float:
-        """Across the normal: 1 N/mm where it is 1.5 N/mm along it (SIMULATION part 2)."""
+        """Stiffness across the normal, in the proportion of 1 N/mm across to 1.5 N/mm along it."""
         return self.stiffness_n_m / 1.5
 
     @property
     def torsion_stiffness_n_m_rad(self) -> float:
-        """About the normal: 0.3 N m/rad for the same tip."""
+        """Stiffness about the normal, in the same proportion: 0.3 N m/rad."""
         return 0.2e-3 * self.stiffness_n_m
 
     @property
     def inertia_kg_m2(self) -> float:
-        """Of the sphere about its middle."""
+        """Moment of inertia of the sphere about its centre."""
         return 0.4 * self.mass_kg * self.radius_m**2
 
     @property
     def damping_n_s_m(self) -> float:
-        """Critical, along the normal."""
+        """Critical damping along the normal."""
         return 2.0 * math.sqrt(self.stiffness_n_m * self.mass_kg)
 
     @property
     def shear_damping_n_s_m(self) -> float:
-        """Critical, across the normal."""
+        """Critical damping across the normal."""
         return 2.0 * math.sqrt(self.shear_stiffness_n_m * self.mass_kg)
 
     @property
     def torsion_damping_n_m_s(self) -> float:
-        """Critical, about the normal."""
+        """Critical damping about the normal."""
         return 2.0 * math.sqrt(self.torsion_stiffness_n_m_rad * self.inertia_kg_m2)
 
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where a body's coordinates begin.
+    """Indices of a body's coordinates.
 
     Attributes:
         qpos, qvel: index of the first one.
@@ -97,7 +97,7 @@ class Address:
 
 @dataclass(frozen=True, slots=True)
 class TipAddress:
-    """Where a tip's six coordinates begin: along x, y, z and about x, y, z of its carriage.
+    """Indices of a tip's six coordinates: along x, y, z and about x, y, z of its carriage.
 
     Attributes:
         qpos, qvel: index of the first one.
@@ -113,13 +113,13 @@ class TipAddress:
 
 @dataclass(frozen=True, slots=True)
 class SceneModel:
-    """A compiled model, and where in it things are.
+    """A compiled model with the indices of its parts.
 
     Attributes:
         model: mujoco.MjModel.
         objects: free joint of each object.
-        tips: of each sensor's tip.
-        patches: free joint of the piece of surface before each sensor; empty without surfaces.
+        tips: tip of each sensor.
+        patches: free joint of the surface patch in front of each sensor; empty without surfaces.
     """
 
     model: Any
@@ -141,11 +141,11 @@ def build_model(
 
     Args:
         objects: free objects by name.
-        table_height_m: of the level plane that they stand on; None for no table.
-        sensors: names of those that carry a tip.
-        tip: what every tip is made of.
+        table_height_m: height of the level plane under the objects; None for no table.
+        sensors: names of the sensors that carry a tip.
+        tip: mechanics of every tip.
         step_s: time step.
-        patches: whether each sensor has a piece of prescribed surface before it.
+        patches: whether each sensor has a patch of prescribed surface in front of it.
     """
     spec = mujoco.MjSpec()
     option = spec.option
@@ -155,7 +155,7 @@ def build_model(
     option.impratio = 1000.0
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    # It would hide a state that is not finite by starting anew.
+    # Auto-reset would hide a non-finite state by starting anew.
     option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     if table_height_m is not None:
         spec.worldbody.add_geom(
@@ -207,7 +207,8 @@ def _add_tip(spec: Any, sensor: str, tip: TipMechanics, own_bit: int) -> None:
         "turn": (tip.torsion_stiffness_n_m_rad, tip.torsion_damping_n_m_s),
     }
     along, about = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
-    # A tip turns about x and y with its carriage alone: it coasts, because friction sees no velocity of what is placed.
+    # A tip rotates about x and y with its carriage only: it coasts, because friction ignores the velocity of placed
+    # bodies.
     for name, kind, axis, armature in (
         ("x", along, 0, 0.0),
         ("y", along, 1, 0.0),
@@ -227,7 +228,7 @@ def _add_tip(spec: Any, sensor: str, tip: TipMechanics, own_bit: int) -> None:
             armature=armature,
         )
         if name in springs:
-            # What it is told is the speed of the spring's other end, which so moves evenly over the physics' steps.
+            # The control input is the speed of the spring's other end, which so moves evenly over the physics steps.
             servo = spec.add_actuator(
                 name=joint,
                 target=joint,
@@ -316,9 +317,9 @@ def _add_prism(spec: Any, body: Any, name: str, outline_m: Array, height_m: floa
 
 
 def _add_feet(body: Any, solid: Solid, contact: dict[str, Any]) -> None:
-    """Small feet on a ring where friction has the lever of uniform pressure.
+    """Add small feet on a ring where friction has the lever arm of uniform pressure.
 
-    A flat bottom would touch at its corners alone and resist turning almost twice as much (SIMULATION part 3).
+    A flat bottom would touch at its corners alone and resist rotation almost twice as much.
     """
     if isinstance(solid, Ball):
         return
@@ -333,21 +334,21 @@ def _add_feet(body: Any, solid: Solid, contact: dict[str, Any]) -> None:
 
 
 def quaternion(R: Array) -> Array:
-    """[w x y z] of a rotation (3, 3)."""
+    """Return [w x y z] of a rotation (3, 3)."""
     q = np.empty(4)
     mujoco.mju_mat2Quat(q, np.ascontiguousarray(R).ravel())
     return q
 
 
 def rotation(q: Array) -> Array:
-    """(3, 3) of [w x y z]."""
+    """Return the rotation (3, 3) of [w x y z]."""
     R = np.empty(9)
     mujoco.mju_quat2Mat(R, q)
     return R.reshape(3, 3)
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Cross product (3,); np.cross takes ten times as long on arrays this small."""
+    """Return the cross product (3,); np.cross takes ten times as long on arrays this small."""
     a0, a1, a2 = a.tolist()
     b0, b1, b2 = b.tolist()
     return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])

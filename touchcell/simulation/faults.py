@@ -1,4 +1,4 @@
-"""Faults that tests and benchmarks switch on in simulated devices while they run: ``device.faults = ...``."""
+"""Faults that tests and benchmarks inject into simulated devices while they run: ``device.faults = ...``."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class FrameFaults:
-    """What goes wrong with a simulated camera.
+    """Faults of a simulated camera.
 
     Attributes:
-        frozen: frames keep coming, with new stamps and numbers, but show the last image that was drawn.
-        last_seq: no frame after this number comes; None for no such fault.
-        extra_latency_s: by how much later frames become available, at most 1 s.
-        gain: factor on the grey levels, as of an exposure that has drifted.
+        frozen: frames keep coming, with fresh timestamps and numbers, but show the last rendered image.
+        last_seq: number of the last frame delivered; None for no such fault.
+        extra_latency_s: additional latency of frames, at most 1 s.
+        gain: factor on the grey levels, like an exposure that has drifted.
     """
 
     frozen: bool = False
@@ -24,14 +24,14 @@ class FrameFaults:
 
 @dataclass(frozen=True, slots=True)
 class ArmFaults:
-    """What goes wrong with a simulated arm.
+    """Faults of a simulated arm.
 
     Attributes:
-        nan_state: it tells a pose and a twist that are not numbers.
-        deaf: stops do not reach it; what it follows still expires.
+        nan_state: it reports a pose and a twist that are NaN.
+        deaf: it ignores stops; twists still expire.
         runs_on: it keeps following its last twist, stopped or expired; only removing its power stops it.
         drift_m_s: it sinks along -z of its base at this speed while it has power.
-        stale: it tells the state that it had when this began, with the stamp of then.
+        stale: it keeps reporting the state at the start of the fault, with that timestamp.
     """
 
     nan_state: bool = False

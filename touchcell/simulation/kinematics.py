@@ -1,4 +1,4 @@
-"""A tool centre point that follows twists with limited acceleration and comes to rest when they expire."""
+"""Kinematics of an ideal arm: a tool centre point that follows expiring twists with limited acceleration."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _THREE_HALVES = 1.5 * np.eye(3)
 
 
 class TwistFollower:
-    """Ideal kinematics: no joints, no dynamics but the acceleration limits.
+    """Ideal kinematics: no joints, no dynamics except acceleration limits.
 
     Args:
         T_base_tcp: start pose (4, 4).
-        limits: of which it uses the accelerations.
+        limits: only the accelerations are used.
         step_ns: length of a step.
     """
 
@@ -32,29 +32,29 @@ class TwistFollower:
         self._expires_ns = 0
 
     def follow(self, twist: Array, expires_ns: int) -> None:
-        """Head for ``twist`` (6,), along base axes, until ``expires_ns``."""
+        """Follow ``twist`` (6,), along base axes, until ``expires_ns``."""
         self._target = twist.copy()
         self._expires_ns = expires_ns
 
     def prolong(self, t_ns: int) -> None:
-        """Let what it follows hold at least until ``t_ns``."""
+        """Extend the validity of the present twist at least until ``t_ns``."""
         self._expires_ns = max(self._expires_ns, t_ns)
 
     def halt(self) -> None:
-        """Slow down to rest."""
+        """Decelerate to rest."""
         self._target = np.zeros(6)
 
     def freeze(self) -> None:
-        """Rest at once."""
+        """Stop at once."""
         self.halt()
         self.velocity = np.zeros(6)
 
     def at_rest(self) -> bool:
-        """Whether it neither moves nor is about to."""
+        """True if it neither moves nor is about to."""
         return not (self.velocity.any() or self._target.any())
 
     def snapshot(self) -> Callable[[int], None]:
-        """What brings pose, velocity and command back, given how many nanoseconds later it is then."""
+        """Return a function that restores pose, velocity and command, given the nanoseconds elapsed since."""
         kept = self.T_base_tcp, self.velocity, self._target
         expires_ns = self._expires_ns
 
@@ -81,13 +81,13 @@ class TwistFollower:
         T[:3, 3] += (x, y, z)
         if a or b or c:
             R = se3.exp(np.array([0.0, 0.0, 0.0, a, b, c]))[:3, :3] @ T[:3, :3]
-            # One Newton-Schulz step takes off this step's rounding, so that none adds up; se3.project iterates more.
+            # One Newton-Schulz step removes this step's rounding, so that none accumulates; se3.project iterates more.
             T[:3, :3] = R @ (_THREE_HALVES - 0.5 * (R.T @ R))
         self.T_base_tcp = T
 
 
 def _towards(start: list[float], goal: list[float], longest: float) -> list[float]:
-    """As far from ``start`` to ``goal`` as ``longest`` allows."""
+    """Return ``start`` moved towards ``goal`` by at most ``longest``."""
     (x0, y0, z0), (x1, y1, z1) = start, goal
     x, y, z = x1 - x0, y1 - y0, z1 - z0
     length = math.sqrt(x * x + y * y + z * z)

@@ -1,7 +1,7 @@
-"""Arms from a user's checkout of MuJoCo Menagerie: https://github.com/google-deepmind/mujoco_menagerie
+"""Load arms from a user's checkout of MuJoCo Menagerie: https://github.com/google-deepmind/mujoco_menagerie
 
-Only joints and the masses of links are taken. What is drawn and what collides is left out, and so its files need not be
-there; motors are our own, as for the arms of rods. Imported only where such an arm is asked for.
+Only joints and the masses of links are used. Visual and collision meshes are ignored, so their files are not needed;
+motors are our own, as for the arms of rods. Imported only for such an arm.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ _ARMS = {
         tuple(f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")),
     ),
 }
-# Its UR5e differs from the maker's table by a millimetre, as a real arm does.
+# Its UR5e differs from the manufacturer's table by a millimetre, as a real arm does.
 _TOLERANCE_M = 5e-3
 _TOLERANCE_RAD = np.radians(0.5)
 
 
 def menagerie_arm(root: Path, name: str, description: ChainDescription) -> tuple[Any, Any, Array]:
-    """The bare arm ``name``, its base where the chain's is.
+    """Load the bare arm ``name``, with its base at the chain's.
 
     Args:
         root: folder of the checkout.
         name: ``panda`` or ``ur5e``.
-        description: the chain by which it is commanded.
+        description: chain by which it is commanded.
 
     Returns:
         Its MjSpec without motors, that spec's last link, and T_link_flange (4, 4).
 
     Raises:
-        ConfigError: there is no such file, it cannot be read, its joints are called otherwise, or it does not move as
-            the chain does.
+        ConfigError: no such file, it cannot be read, its joints have other names, or its kinematics differ from the
+            chain's.
     """
     file, names = _ARMS[name]
     path = root / file
     if not path.is_file():
-        raise _unusable(path, "there is no such file", "the folder that holds franka_emika_panda and the others")
+        raise _unusable(path, "no such file", "the folder that contains franka_emika_panda and the others")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         _strip(spec)
@@ -79,7 +79,7 @@ def _strip(spec: Any) -> None:
 
 
 def _fit(model: Any, link: str, chain: SerialChain, path: Path) -> tuple[Array, Array]:
-    """By which quarter turn its base stands otherwise than the chain's, and where the flange is on its last link."""
+    """Return the quarter turn of its base relative to the chain's, and the pose of the flange on its last link."""
     data = mujoco.MjData(model)
     postures = [np.zeros(chain.joint_count), *np.random.default_rng(1).uniform(-1.5, 1.5, (4, chain.joint_count))]
 
@@ -104,7 +104,7 @@ def _fit(model: Any, link: str, chain: SerialChain, path: Path) -> tuple[Array, 
         if worst_m < _TOLERANCE_M and turned_rad < _TOLERANCE_RAD:
             return T_chain_model, T_link_flange
         off_m = min(off_m, worst_m)
-    raise _unusable(path, f"it moves otherwise than {chain.description.name}: the flange by {1e3 * off_m:.0f} mm")
+    raise _unusable(path, f"it differs from {chain.description.name}: the flange by {1e3 * off_m:.0f} mm")
 
 
 def _pose(position: Array, quat: Array) -> Array:
@@ -117,5 +117,5 @@ def _pose(position: Array, quat: Array) -> Array:
 
 def _unusable(path: Path, reason: str, hint: str = "") -> ConfigError:
     return ConfigError(
-        f"no arm of MuJoCo Menagerie: {reason}", file=str(path), key="menagerie", value=str(path), hint=hint
+        f"not a usable arm of MuJoCo Menagerie: {reason}", file=str(path), key="menagerie", value=str(path), hint=hint
     )

@@ -1,4 +1,4 @@
-"""Prescribed motions of simulated objects: smooth, and known exactly with their velocities."""
+"""Prescribed motions of simulated objects: smooth, with exact velocities."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from touchcell.geometry.types import Array
 
 
 class Motion(Protocol):
-    """Where a body is, and how it moves, at any time."""
+    """Pose and velocity of a body as functions of time."""
 
     def pose(self, t_s: float) -> Array:
-        """T_world_body (4, 4)."""
+        """Return T_world_body (4, 4)."""
         ...
 
     def twist(self, t_s: float) -> Array:
-        """(6,) [v, w]: velocity of the body's origin and angular velocity, along world axes."""
+        """Return (6,) [v, w]: velocity of the body's origin and angular velocity, along world axes."""
         ...
 
 
@@ -34,11 +34,11 @@ class Still:
     T_world_body: Array = field(default_factory=_identity)
 
     def pose(self, t_s: float) -> Array:
-        """T_world_body (4, 4)."""
+        """Return T_world_body (4, 4)."""
         return self.T_world_body
 
     def twist(self, t_s: float) -> Array:
-        """Zero."""
+        """Return zero."""
         return np.zeros(6)
 
 
@@ -51,8 +51,8 @@ class Glide:
     Attributes:
         T_start: pose (4, 4) before the move.
         displacement: (6,) m and rad, one pose component (x, y, z, alpha, beta or gamma) of which is not zero.
-        start_s: when the move begins.
-        duration_s: how long it takes.
+        start_s: start of the move.
+        duration_s: duration of the move.
     """
 
     T_start: Array
@@ -61,12 +61,12 @@ class Glide:
     duration_s: float
 
     def pose(self, t_s: float) -> Array:
-        """T_world_body (4, 4)."""
+        """Return T_world_body (4, 4)."""
         u = min(max((t_s - self.start_s) / self.duration_s, 0.0), 1.0)
         return self.T_start @ _offset(self.displacement * (u**3 * (10.0 + u * (-15.0 + 6.0 * u))))
 
     def twist(self, t_s: float) -> Array:
-        """(6,) [v, w] along world axes."""
+        """Return (6,) [v, w] along world axes."""
         u = min(max((t_s - self.start_s) / self.duration_s, 0.0), 1.0)
         rate = self.displacement * (30.0 * (u * (1.0 - u)) ** 2 / self.duration_s)
         return _in_world(self.T_start, rate[:3], rate[3:])
@@ -74,7 +74,7 @@ class Glide:
 
 @dataclass(frozen=True, slots=True)
 class Periodic:
-    """Sines in all six pose components of the start frame, begun gently.
+    """Sines in all six pose components of the start frame, with a gentle start.
 
     Component i is ``amplitude[i] * (sin(phase + shift[i]) - sin(shift[i]))``; the phase's rate rises to 2 pi / period
     within ``ramp_s``, so the body starts from rest at the start pose. Shifts of 0 and 90 degrees in x and y make a
@@ -84,7 +84,7 @@ class Periodic:
         T_start: pose (4, 4) at time 0.
         amplitude: (6,) of (x, y, z, alpha, beta, gamma), m and rad.
         shift: (6,) rad.
-        period_s: time of one round.
+        period_s: period.
         ramp_s: time until full speed.
     """
 
@@ -95,16 +95,16 @@ class Periodic:
     ramp_s: float
 
     def pose(self, t_s: float) -> Array:
-        """T_world_body (4, 4)."""
+        """Return T_world_body (4, 4)."""
         phase, _ = self._phase(t_s)
         return self.T_start @ _offset(self.amplitude * (np.sin(phase + self.shift) - np.sin(self.shift)))
 
     def twist(self, t_s: float) -> Array:
-        """(6,) [v, w] along world axes."""
+        """Return (6,) [v, w] along world axes."""
         phase, rate = self._phase(t_s)
         angles = self.amplitude[3:] * (np.sin(phase + self.shift[3:]) - np.sin(self.shift[3:]))
         velocity = self.amplitude * np.cos(phase + self.shift) * rate
-        # Angular velocity of R = Rz(gamma) Ry(beta) Rx(alpha): each rate about its axis, turned by the later ones.
+        # Angular velocity of R = Rz(gamma) Ry(beta) Rx(alpha): each rate about its axis, rotated by the later ones.
         Rz, Ry = _turn(2, angles[2]), _turn(1, angles[1])
         w = Rz @ (Ry @ np.array([velocity[3], 0.0, 0.0]) + np.array([0.0, velocity[4], 0.0]))
         w[2] += velocity[5]
@@ -129,7 +129,7 @@ def _turn(axis: int, angle: float) -> Array:
 
 
 def _offset(pose: Array) -> Array:
-    """As ``se3.from_euler_mm_deg`` in m and rad, without its checks: scenes ask for it in every step."""
+    """Return ``se3.from_euler_mm_deg`` in m and rad, without its checks: scenes call it in every step."""
     x, y, z, alpha, beta, gamma = pose.tolist()
     sa, ca, sb, cb = math.sin(alpha), math.cos(alpha), math.sin(beta), math.cos(beta)
     sg, cg = math.sin(gamma), math.cos(gamma)

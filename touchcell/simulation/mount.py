@@ -1,8 +1,8 @@
-"""A tip on a real arm: which contact is left of the one that the arm was told to make.
+"""Mount of a tip on a real arm: the contact that remains of the commanded one.
 
-Labels of collected images (Algorithm 1 of the paper) are commands: tilt, press, shear. What the skin feels differs by
-the mount's offset, by what the arm and mount give way, and by slip. The forms are those that fits to the public
-surface_3d images needed; ``contact.ContactLaw`` is their simpler sibling for contacts that are stepped through time.
+Labels of collected images (Algorithm 1 of the paper) are commands: tilt, press, shear. The actual contact differs by
+the mount's offset, by the compliance of arm and mount, and by slip. The forms are those that fits to the public
+surface_3d images needed; ``contact.ContactLaw`` is their simpler counterpart for contacts that are stepped in time.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ import numpy as np
 from touchcell.geometry.types import Array
 
 _MM = 1e-3
-_SLIP_HARDNESS = 12.0  # 2.2 % below the sharp corner where the command is what can stick.
+_SLIP_HARDNESS = 12.0  # 2.2 % below the sharp corner where the command equals the largest shear that sticks.
 _STEEPEST = 0.3
 
 
 @dataclass(frozen=True, slots=True)
 class MountModel:
-    """How one sensor is mounted, and how it slips. The defaults are a perfect mount.
+    """Mounting and slip of one sensor. The defaults are a perfect mount.
 
     Attributes:
-        offset_m: (x, y) of the point about which the arm tilts, from the sensor's axis. Tilting then changes the depth.
-        depth_m: added to commanded depths.
-        level_rad: turn of the surface about its x, then y axis, from where the arm takes it to be.
-        press_slant: (x, y) shear per depth that pressing alone makes, as on a surface that is not level.
-        give: (along, across) of the symmetric, traceless part [[a, c], [c, -a]] of what lateral commands gain or lose.
+        offset_m: (x, y) of the tilt centre of the arm, from the sensor's axis. Tilting then changes the depth.
+        depth_m: offset added to commanded depths.
+        level_rad: rotation of the surface about its x, then y axis, relative to the arm's assumption.
+        press_slant: (x, y) shear per depth that pressing alone causes, as on a surface that is not level.
+        give: (along, across) of the symmetric, traceless compliance [[a, c], [c, -a]] on lateral commands.
         slip_at_1mm_m: shear that survives at 1 mm depth.
         slip_exponent: growth of that shear with depth.
-        uphill: depth that is lost per shear along a tilted contact's slope of 1.
-        torsion_release: share of the greatest shear, commanded, at which half of a torsion is lost.
-        torsion_release_power: how abruptly.
+        uphill: depth lost per shear along a tilted contact's slope of 1.
+        torsion_release: fraction of the largest shear, commanded, at which half of a torsion is lost.
+        torsion_release_power: steepness of that loss.
     """
 
     offset_m: tuple[float, float] = (0.0, 0.0)
@@ -48,13 +48,13 @@ class MountModel:
     torsion_release_power: float = 2.0
 
     def contact(self, T_f_s: Array) -> Array:
-        """Contacts that are left of commanded ones.
+        """Return the contacts that remain of commanded ones.
 
         Args:
             T_f_s: (..., 4, 4) commanded contacts.
 
         Returns:
-            (..., 4, 4) contacts that the skin feels; out of contact there is no shear.
+            (..., 4, 4) actual contacts; out of contact there is no shear.
         """
         R, command = _turn(*self.level_rad) @ T_f_s[..., :3, :3], T_f_s[..., :3, 3]
         axis = R[..., 2, :]
@@ -80,7 +80,8 @@ class MountModel:
         touching = depth > 0.0
         share, held = np.where(touching, share, 0.0), np.where(touching, held, 0.0)
 
-        # The torsion that slipped turned the skin over the surface, and left the shear's direction in the sensor alone.
+        # The torsion that slipped rotated the skin over the surface, and did not change the shear's direction in the
+        # sensor.
         back = _about_z(held - gamma)
         left = T_f_s.copy()
         left[..., :3, :3] = back @ R
@@ -90,7 +91,7 @@ class MountModel:
 
 
 def _turn(alpha: float, beta: float) -> Array:
-    """(3, 3) Ry(beta) Rx(alpha)."""
+    """Return (3, 3) Ry(beta) Rx(alpha)."""
     sin_a, cos_a, sin_b, cos_b = math.sin(alpha), math.cos(alpha), math.sin(beta), math.cos(beta)
     return np.array(
         [[cos_b, sin_b * sin_a, sin_b * cos_a], [0.0, cos_a, -sin_a], [-sin_b, cos_b * sin_a, cos_b * cos_a]]

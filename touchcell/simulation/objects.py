@@ -1,4 +1,4 @@
-"""Free rigid objects on a table: what they are shaped like, what they weigh, how they slide."""
+"""Free rigid objects on a table: shape, mass and sliding friction."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from touchcell.geometry.types import Array
 PoseMmDeg = tuple[float, float, float, float, float, float]
 
 TABLES: dict[str, float] = {"mdf": 0.3, "foam": 0.6}
-"""Coefficients of sliding friction of the paper's two tables (SIMULATION part 3 proposes them)."""
+"""Coefficients of sliding friction of the paper's two tables, chosen within literature values."""
 
 
 @dataclass(frozen=True, slots=True)
 class Prism:
-    """A convex outline drawn up along z; the origin is in the middle of its bottom.
+    """A convex outline extruded along z; the origin is in the middle of its bottom.
 
     Attributes:
         outline_m: (n, 2) corners, anticlockwise.
@@ -33,7 +33,7 @@ class Prism:
 
 @dataclass(frozen=True, slots=True)
 class Turned:
-    """A solid of revolution about z, made of cylinders upon each other; the origin is in the middle of its bottom.
+    """A solid of revolution about z, made of stacked cylinders; the origin is in the middle of its bottom.
 
     Attributes:
         sections_m: (height, radius) of each, from the bottom up. One section is a plain cylinder.
@@ -43,7 +43,7 @@ class Turned:
 
     @property
     def height_m(self) -> float:
-        """Along z."""
+        """Height along z."""
         return sum(height for height, _ in self.sections_m)
 
 
@@ -55,7 +55,7 @@ class Ball:
 
     @property
     def height_m(self) -> float:
-        """Its diameter."""
+        """Diameter of the ball."""
         return 2.0 * self.radius_m
 
 
@@ -64,13 +64,13 @@ Solid = Prism | Turned | Ball
 
 @dataclass(frozen=True, slots=True)
 class FreeObject:
-    """A rigid object that goes where it is pushed.
+    """A rigid object that can be pushed.
 
     Attributes:
-        solid: its shape, of even density.
-        mass_kg: its mass.
+        solid: shape, of even density.
+        mass_kg: mass.
         friction: coefficient of sliding friction against the table.
-        T_world_object: (4, 4) where it stands at first; see the solid for where its frame is.
+        T_world_object: (4, 4) initial pose; see the solid for the position of its frame.
     """
 
     solid: Solid
@@ -84,13 +84,13 @@ class _Part(BaseModel):
 
 
 class BoxShape(_Part):
-    """A block, its sides along the object's axes."""
+    """A box, its sides along the object's axes."""
 
     kind: Literal["box"]
     size_mm: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
 
     def build(self) -> Solid:
-        """The solid."""
+        """Build the solid."""
         x, y, z = (0.5e-3 * size for size in self.size_mm)
         return Prism(np.array([[-x, -y], [x, -y], [x, y], [-x, y]]), 2.0 * z)
 
@@ -103,7 +103,7 @@ class HexagonShape(_Part):
     height_mm: PositiveFloat
 
     def build(self) -> Solid:
-        """The solid."""
+        """Build the solid."""
         corner_m = 1e-3 * self.width_mm / math.sqrt(3.0)
         angles = np.radians(30.0 + 60.0 * np.arange(6))
         return Prism(corner_m * np.column_stack([np.cos(angles), np.sin(angles)]), 1e-3 * self.height_mm)
@@ -117,29 +117,29 @@ class CylinderShape(_Part):
     height_mm: PositiveFloat
 
     def build(self) -> Solid:
-        """The solid."""
+        """Build the solid."""
         return Turned(((1e-3 * self.height_mm, 0.5e-3 * self.diameter_mm),))
 
 
 class BottleShape(_Part):
-    """Cylinders upon each other: [height, diameter] of each, from the bottom up."""
+    """Stacked cylinders: [height, diameter] of each, from the bottom up."""
 
     kind: Literal["bottle"]
     sections_mm: tuple[tuple[PositiveFloat, PositiveFloat], ...] = Field(min_length=1)
 
     def build(self) -> Solid:
-        """The solid."""
+        """Build the solid."""
         return Turned(tuple((1e-3 * height, 0.5e-3 * diameter) for height, diameter in self.sections_mm))
 
 
 class BallShape(_Part):
-    """A ball; its frame is in its middle."""
+    """A ball; its frame is at its centre."""
 
     kind: Literal["ball"]
     diameter_mm: PositiveFloat
 
     def build(self) -> Solid:
-        """The solid."""
+        """Build the solid."""
         return Ball(0.5e-3 * self.diameter_mm)
 
 
@@ -154,19 +154,19 @@ class ObjectConfig(_Part):
     pose_mm_deg: PoseMmDeg = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     def build(self, table: TableConfig) -> FreeObject:
-        """The object, standing on ``table``."""
+        """Build the object, standing on ``table``."""
         T_world_object = se3.from_euler_mm_deg(np.array(self.pose_mm_deg))
         T_world_object[2, 3] += 1e-3 * table.height_mm
         return FreeObject(self.shape.build(), 1e-3 * self.mass_g, table.coefficient, T_world_object)
 
 
 class TableConfig(_Part):
-    """What objects stand on: a level plane."""
+    """The table under the objects: a level plane."""
 
     height_mm: float = 0.0
     friction: Literal["mdf", "foam"] | Annotated[float, Field(gt=0.0, le=2.0)] = "mdf"
 
     @property
     def coefficient(self) -> float:
-        """Of sliding friction."""
+        """Coefficient of sliding friction."""
         return TABLES[self.friction] if isinstance(self.friction, str) else self.friction

@@ -1,4 +1,4 @@
-"""What solids, tips and surfaces look like from above and from the side: flat outlines in mm."""
+"""Outlines of solids, tips and surfaces seen from above and from the side, as flat polygons in mm."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ View = tuple[int, int]
 ABOVE: View = (0, 1)
 SIDE: View = (0, 2)
 
-# Behind the tip's hemisphere a TacTip has a body of about its width.
+# Behind the hemisphere a TacTip has a body of about the same width.
 _BODY_LENGTH_M = 0.045
 _CIRCLE = np.linspace(0.0, 2.0 * math.pi, 49)
 
 
 def solid_outlines_mm(solid: Solid, T_world_object: Array, view: View) -> list[Array]:
-    """Closed outlines (n, 2) of a solid's convex parts, in two of the world's axes."""
+    """Return closed outlines (n, 2) of a solid's convex parts, in two of the world's axes."""
     return [_hull_mm(_moved(points, T_world_object), view) for points in _parts(solid)]
 
 
 def tip_outlines_mm(T_world_s: Array, radius_m: float, view: View) -> list[Array]:
-    """Closed outlines of a tip: the body behind it, and its hemisphere as a ball."""
+    """Return closed outlines of a tip: the body behind it, and its hemisphere as a ball."""
     circle = np.zeros((len(_CIRCLE), 3))
     circle[:, list(view)] = radius_m * np.column_stack([np.cos(_CIRCLE), np.sin(_CIRCLE)])
     rim = radius_m * np.column_stack([np.cos(_CIRCLE), np.sin(_CIRCLE), np.zeros_like(_CIRCLE)])
@@ -35,11 +35,11 @@ def tip_outlines_mm(T_world_s: Array, radius_m: float, view: View) -> list[Array
 
 
 def height_mm(surface: Surface, x_m: Array, y_m: Array | float, t_s: float) -> Array:
-    """(n,) height of a surface over points (``x_m``, ``y_m``), seen from above."""
+    """Return the height (n,) of a surface over points (``x_m``, ``y_m``), seen from above."""
     heights = []
     for x, y in np.broadcast(x_m, y_m):
         point = np.array([x, y, 1.0])
-        # Down by what is certainly free, until nothing is: a ray that marches through a distance field.
+        # Sphere tracing: step down by the free distance until it is zero.
         for _ in range(200):
             gap = surface.nearest(point, t_s).distance_m
             point[2] -= gap

@@ -1,13 +1,13 @@
-"""Objects that slide on a table where soft tips push them, so slowly that inertia does not matter.
+"""Quasi-static pushing: objects slide on a table under soft tips, without inertia.
 
-An object moves only as far as it must for the tips' forces to come down to what friction with the table can carry. The
+An object moves only as far as needed for the tips' forces to come down to what friction with the table can carry. The
 friction is an ellipsoidal limit surface (Goyal, Ruina & Papadopoulos 1991; Howe & Cutkosky 1996): its force is that of
 Coulomb's law, its moment that of a uniform pressure under the whole bottom, and the motion is along its normal, so that
 friction always dissipates. Tips are the springs of ``contact.ContactLaw``, which stick and slip.
 
-Each step is solved implicitly, as plasticity is (a return mapping): nothing creeps below the limit, and no stiffness is
-too large for the step. Objects stay upright, do not feel each other nor the scene's surfaces, and what presses down on
-them adds to their weight.
+Each step is solved implicitly, like plasticity (a return mapping): nothing creeps below the limit, and no stiffness is
+too large for the step. Objects stay upright and do not collide with each other or with the scene's surfaces; downward
+forces on them add to their weight.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ GRAVITY_M_S2: Final = 9.81
 
 _Three = tuple[float, float, float]
 _Matrix = tuple[float, float, float, float, float, float, float, float, float]
-"""3 x 3, by rows."""
+"""3 x 3 matrix, by rows."""
 
 _MAX_ITERATIONS: Final = 30
 _TOLERANCE_M: Final = 1e-10
@@ -40,26 +40,26 @@ _TOLERANCE: Final = 1e-7
 
 
 class _Slider:
-    """A free object and where it is; the motion of its own surface.
+    """A sliding object: its pose and the motion of its surface.
 
     Attributes:
         x, y, yaw: of the object's origin in the world, m and rad.
-        weight_n: its own weight and what tips press down on it.
+        weight_n: its own weight plus the downward force of tips.
     """
 
     def __init__(self, name: str, body: FreeObject) -> None:
         T, solid = body.T_world_object, body.solid
         if isinstance(solid, Ball):
             raise ConfigError(
-                "a ball rolls, which quasi-static physics does not know",
+                "a ball rolls, which quasi-static physics does not model",
                 key=f"scene.objects.{name}",
                 hint="use physics: dynamic",
             )
         if T[2, 2] < 1.0 - 1e-9:
             raise ConfigError(
-                "quasi-static physics holds objects upright",
+                "quasi-static physics keeps objects upright",
                 key=f"scene.objects.{name}.pose_mm_deg",
-                hint="turn it about z only",
+                hint="rotate it about z only",
             )
         self.shape = plain_shape_of(solid)
         self.surface = Surface(self.shape, self)
@@ -78,15 +78,15 @@ class _Slider:
         return self.friction * self.weight_n
 
     def pose(self, t_s: float) -> Array:
-        """T_world_body (4, 4) at the last step, whatever the time."""
+        """Return T_world_body (4, 4) at the last step, whatever the time."""
         return self._T
 
     def twist(self, t_s: float) -> Array:
-        """(6,) [v, w] in the last step, along world axes."""
+        """Return (6,) [v, w] in the last step, along world axes."""
         return self._velocity
 
     def snapshot(self) -> Restore:
-        """What brings it back where it is now."""
+        """Return a function that restores the present state."""
         kept = self.x, self.y, self.yaw, self.weight_n, self._velocity, self._T
 
         def restore() -> None:
@@ -108,15 +108,15 @@ class _Slider:
 
 
 class QuasiStaticWorld:
-    """Surfaces that move as they were told, and objects that slide; each tip touches the nearest of them.
+    """Surfaces with prescribed motion, and sliding objects; each tip touches the nearest of them.
 
     Args:
-        surfaces: by name.
-        objects: by name.
-        law: how every tip gives and slips.
+        surfaces: surfaces by name.
+        objects: objects by name.
+        law: contact law of every tip.
 
     Raises:
-        ConfigError: there is nothing to touch, an object does not stand upright, or one is a ball.
+        ConfigError: nothing to touch, an object is not upright, or it is a ball.
     """
 
     def __init__(self, surfaces: Mapping[str, Surface], objects: Mapping[str, FreeObject], law: ContactLaw) -> None:
@@ -129,13 +129,13 @@ class QuasiStaticWorld:
         self._t_s = 0.0
 
     def mount(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
-        """Let ``sensor`` feel; returns what it feels at ``T_world_s`` (4, 4) at ``t_s``."""
+        """Add ``sensor``; return its contact at ``T_world_s`` (4, 4) at ``t_s``."""
         self._t_s = t_s
         model = self._models[sensor] = ContactModel(self.law)
         return model.step(T_world_s, self._nearest(T_world_s, t_s), t_s)
 
     def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, Feeling]:
-        """Let the tips push the objects until friction holds; returns what each sensor feels then."""
+        """Let the tips push the objects until friction holds; return the contact of each sensor then."""
         dt_s, self._t_s = t_s - self._t_s, t_s
         touched = {sensor: self._nearest(pose, t_s) for sensor, pose in T_world_s.items()}
         for slider in self._sliders.values():
@@ -148,11 +148,11 @@ class QuasiStaticWorld:
         return {sensor: self._models[sensor].advance(pose, touched[sensor], t_s) for sensor, pose in T_world_s.items()}
 
     def objects(self) -> Mapping[str, Array]:
-        """T_world_object (4, 4) of every free object at the last step."""
+        """Return T_world_object (4, 4) of every free object at the last step."""
         return {name: slider.pose(self._t_s) for name, slider in self._sliders.items()}
 
     def snapshot(self) -> Restore:
-        """What brings every object and contact back."""
+        """Return a function that restores every object and contact."""
         parts = [slider.snapshot() for slider in self._sliders.values()]
         parts += [model.snapshot() for model in self._models.values()]
 
@@ -169,7 +169,7 @@ class QuasiStaticWorld:
 
 
 class _Tip:
-    """A tip that may press on an object: its centre in the world, and where its skin holds on to the object."""
+    """A tip that may push an object: its centre in the world, and the point of the object to which its skin sticks."""
 
     __slots__ = ("centre", "held")
 
@@ -179,7 +179,7 @@ class _Tip:
 
 
 def _settle(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw) -> _Three:
-    """How far the object slides under its tips in one step: x, y and friction radius times yaw, m.
+    """Return the slide of the object under its tips in one step: x, y and friction radius times yaw, m.
 
     In these coordinates the limit surface is a sphere: the object rests while the force ``f`` on it is below the limit;
     otherwise it moves along ``f`` until ``f`` has come down to the limit. Newton's method on both conditions,
@@ -218,7 +218,7 @@ def _settle(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw) -> _Three:
             )
             f, K, _ = _force(slider, tips, law, trial)
             size = math.hypot(*f)
-            # A step that lets go of the object has gone too far: there the force has no direction.
+            # A step that breaks the contact is too long: there the force has no direction.
             if size > 0.1 * limit or part < 1e-3:
                 break
             part *= 0.5
@@ -240,7 +240,7 @@ def _times(M: _Matrix, v: _Three) -> _Three:
 
 
 def _inverse(scale: float, K: _Matrix) -> _Matrix:
-    """Of the matrix 1 + scale K."""
+    """Return the inverse of the matrix 1 + scale K."""
     a, b, c, d, e, f, g, h, i = K
     a, b, c = 1.0 + scale * a, scale * b, scale * c
     d, e, f = scale * d, 1.0 + scale * e, scale * f
@@ -261,8 +261,8 @@ def _inverse(scale: float, K: _Matrix) -> _Matrix:
 
 
 def _force(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw, shift: _Three) -> tuple[_Three, _Matrix, float]:
-    """Force of all tips on the object moved by ``shift``, in its coordinates; how it falls with the shift to first
-    order; and how hard the tips press down, N."""
+    """Return force of all tips on the object moved by ``shift``, in its coordinates; its decrease with the shift to
+    first order; and the downward force of the tips, N."""
     radius, stiff_n, nearest = slider.radius_m, law.stiffness_n_m, slider.shape.nearest_numbers
     x, y, yaw = slider.x + shift[0], slider.y + shift[1], slider.yaw + shift[2] / radius
     sin, cos = math.sin(yaw), math.cos(yaw)
@@ -293,8 +293,8 @@ def _force(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw, shift: _Three
         force_x += cos * fx - sin * fy
         force_y += sin * fx + cos * fy
         force_turn += (px * fy - py * fx) / radius
-        # Of a shift of the object's side against the tip, along the normal and along the tangent. What counts for depth
-        # and shear is how the object moves where the tip's centre is.
+        # For a shift of the object's side against the tip, along the normal and along the tangent. Depth and shear
+        # change with the object's motion at the tip's centre.
         for stiff, ux, uy in ((stiff_n, nx, ny), (stiff_t, -ny, nx)):
             wx, wy = cos * ux - sin * uy, sin * ux + cos * uy
             felt = (bx * uy - by * ux) / radius

@@ -1,4 +1,4 @@
-"""Pictures of markers: anti-aliased discs, drawn as stamps that were made once for many sub-pixel offsets."""
+"""Render marker images: anti-aliased discs, drawn from stamps precomputed for many sub-pixel offsets."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _ROWS = 4
 
 
 class Stamps:
-    """A disc of one radius, drawn with its centre anywhere.
+    """A disc of one radius, drawn with its centre at any sub-pixel position.
 
     Args:
-        radius_px: of the disc.
-        phases: sub-pixel offsets per axis; a centre is off by at most 1 / (2 phases) px per axis.
+        radius_px: radius of the disc.
+        phases: sub-pixel offsets per axis; the centre error is at most 1 / (2 phases) px per axis.
     """
 
     def __init__(self, radius_px: float, phases: int = 64) -> None:
@@ -47,18 +47,18 @@ class Stamps:
         self.stamps = np.round(coverage).astype(np.uint8)
 
     def paint(self, image: ImageArray, centres: Array) -> None:
-        """Draw white discs at ``centres`` (n, 2) px into a grey ``image``; what lies outside is cut off."""
+        """Draw white discs at ``centres`` (n, 2) px into a grey ``image``, clipped at its border."""
         _kernels.paint(image, np.ascontiguousarray(centres, dtype=np.float64), self.stamps)
 
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
-    """How the camera sees the pins. Grey levels of 255.
+    """Illumination and optics of the sensor's camera. Grey levels of 255.
 
     Attributes:
-        background: skin at the image centre.
-        pin: pin at the image centre.
-        vignetting: share of brightness lost in the corners.
+        background: grey level of the skin at the image centre.
+        pin: grey level of a pin at the image centre.
+        vignetting: fraction of brightness lost in the corners.
         noise: standard deviation of the sensor noise.
         exposure: factor on the grey levels before the noise.
         blur_px: standard deviation of the lens's blur, 0 for none.
@@ -73,12 +73,12 @@ class Lighting:
 
 
 class FrameRenderer:
-    """Draws raw 640x480 camera frames and the public, thresholded kind.
+    """Renderer of raw 640x480 camera frames and of the public, thresholded images.
 
     Args:
-        disc_radius_px: of the pins in the frame.
+        disc_radius_px: radius of the pins in the frame.
         lighting: grey levels.
-        seed: of the noise.
+        seed: seed of the noise.
     """
 
     def __init__(self, disc_radius_px: float = 6.2, lighting: Lighting | None = None, seed: Seed = 0) -> None:
@@ -94,12 +94,12 @@ class FrameRenderer:
         self._contrast = (pin - background).astype(np.uint8)
         self._blur_px = light.blur_px
         self._seed = (seed,) if isinstance(seed, int) else tuple(seed)
-        # Drawing 307 200 normal numbers takes longer than the rest of the frame: frames take windows of one sheet.
+        # Drawing 307 200 normal numbers takes longer than the rest of the frame, so frames use windows of one sheet.
         sheet = np.random.default_rng(self._seed).normal(0.0, light.noise, (height + 64, width + 64))
         self._noise = np.clip(np.round(sheet), -128, 127).astype(np.int8)
 
     def raw(self, pixels: Array, frame: int = 0) -> ImageArray:
-        """Grey frame (480, 640) with discs at ``pixels`` (n, 2); ``frame`` chooses the noise."""
+        """Render a grey frame (480, 640) with discs at ``pixels`` (n, 2); ``frame`` selects the noise."""
         width, height = FRAME_SIZE
         cover = np.zeros((height, width), np.uint8)
         self._stamps.paint(cover, pixels)
@@ -111,7 +111,7 @@ class FrameRenderer:
         return np.asarray(cv2.add(cv2.GaussianBlur(lit, (0, 0), self._blur_px), grain, dtype=cv2.CV_8U), dtype=np.uint8)
 
     def processed(self, pixels: Array) -> ImageArray:
-        """Binary image (440, 445) as in the public data: cropped by PUBLIC_CROP and thresholded."""
+        """Render a binary image (440, 445) as in the public data: cropped by PUBLIC_CROP and thresholded."""
         left, top, right, bottom = PUBLIC_CROP
         cover = np.zeros((bottom - top, right - left), np.uint8)
         self._stamps.paint(cover, pixels - np.array([left, top], dtype=np.float64))

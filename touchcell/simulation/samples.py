@@ -1,4 +1,4 @@
-"""Random contacts as random simulated sensors see them, over the ranges of the public data (SPEC part 2)."""
+"""Random contacts of randomised simulated sensors, over the ranges of the public tactile data."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _ADDITIVE = {"centre_px", "image_rotation_rad", "layout_phase_rad", "camera_tilt
 
 @dataclass(frozen=True, slots=True)
 class Variation:
-    """How much simulated sensors and images differ, so that a model does not learn one of them by heart.
+    """Domain randomisation: variation of simulated sensors and images, so that a model does not overfit to one sensor.
 
     Attributes:
         parameters: relative standard deviation of the tip's parameters.
         turn_rad: standard deviation of the image's and the layout's rotation.
         shift_px: standard deviation of the image centre, in the frame.
-        marker_px: standard deviation of each marker's place, in the frame.
+        marker_px: standard deviation of each marker's position, in the frame.
         disc_radius: relative standard deviation of the discs' radius from image to image.
-        missing: share of markers that are not seen.
-        field: what no parameter can say: standard deviation of a smooth displacement of the whole field, as a share of
+        missing: fraction of markers that are not visible.
+        field: unmodelled deformation: standard deviation of a smooth displacement of the whole field, as a fraction of
             the markers' mean displacement.
-        slip: relative standard deviation of what a rig lets slip, from one batch of contacts to the next.
+        slip: relative standard deviation of the slip parameters of a mount, from one batch of contacts to the next.
     """
 
     parameters: float = 0.03
@@ -45,12 +45,12 @@ class Variation:
 
 @dataclass(frozen=True, slots=True)
 class SampledContact:
-    """One random contact as one random sensor sees it.
+    """One random contact of one random sensor.
 
     Attributes:
-        T_f_s: (4, 4) label: after slip, or with a rig the command.
-        pixels: (markers, 2) px of the markers that are seen, in the 640x480 frame.
-        disc_radius_px: of the markers.
+        T_f_s: (4, 4) label: after slip, or the commanded pose if there is a mount model.
+        pixels: (markers, 2) px of the visible markers, in the 640x480 frame.
+        disc_radius_px: radius of the markers.
     """
 
     T_f_s: Array
@@ -70,18 +70,18 @@ def contacts(
 ) -> Iterator[SampledContact]:
     """Yield ``n`` random contacts, the same for the same seed.
 
-    Depth is even in ``depth_mm``, tilt in a 25 deg disc, shear in a 5 mm disc, torsion in +-5 deg; what the depth
-    cannot hold slips, and the label is the pose that is left. With a ``rig`` the label is the command, as in collected
-    data, and the rig says what is left of it.
+    Depth is uniform in ``depth_mm``, tilt in a 25 deg disc, shear in a 5 mm disc, torsion in +-5 deg; what the depth
+    cannot hold slips, and the label is the remaining pose. With a ``rig`` the label is the commanded pose, as in
+    collected data, and the mount model determines the remaining contact.
 
     Args:
-        n: how many.
-        seed: of everything random.
-        depth_mm: least and greatest depth.
-        parameters: of the sensor around which the others scatter.
-        law: how the tips slip.
-        rig: how they are mounted and slip, in place of ``law``.
-        variation: how far they scatter.
+        n: number of contacts.
+        seed: seed of all randomness.
+        depth_mm: smallest and largest depth.
+        parameters: mean parameters of the sensors.
+        law: slip of the tips.
+        rig: mount model with its slip, in place of ``law``.
+        variation: amount of variation.
     """
     rng = np.random.default_rng(seed)
     middle, law, variation = parameters or TipParameters(), law or ContactLaw(), variation or Variation()
@@ -115,7 +115,7 @@ def _slipping(rig: MountModel, variation: Variation, rng: np.random.Generator) -
 
 
 def _smooth_fields(rest: Array, pixels: Array, share: float, rng: np.random.Generator) -> Array:
-    """(n, markers, 2) px: random polynomials of third degree over the lattice, growing with the displacements."""
+    """Return (n, markers, 2) px: random third-degree polynomials over the lattice, growing with the displacements."""
     u, v = ((rest - rest.mean(axis=0)) / np.abs(rest - rest.mean(axis=0)).max()).T
     terms = np.stack([np.ones_like(u), u, v, u * v, u * u, v * v, u**3, v**3])
     size = share * np.linalg.norm(pixels - rest, axis=2).mean(axis=1)
@@ -132,7 +132,7 @@ def _scattered(middle: TipParameters, variation: Variation, rng: np.random.Gener
         and getattr(middle, each.name)
     }
     u, v = middle.centre_px + rng.normal(0.0, variation.shift_px, 2)
-    # Focal length and camera distance together set the scale: scattered alone they would change it by too much.
+    # Focal length and camera distance together set the scale: varied separately they would change it by too much.
     zoom = 1.0 + rng.normal(0.0, 0.3 * variation.parameters)
     nearer = 1.0 + rng.normal(0.0, variation.parameters)
     distance = middle.camera_distance_m * nearer
@@ -149,7 +149,7 @@ def _scattered(middle: TipParameters, variation: Variation, rng: np.random.Gener
 
 
 def analytic_displacements(reference: Array, rings: int, seed: int, n: int = 2000) -> Array:
-    """(n, m, 2) px displacements of the simulated tip in random contacts, laid onto a sensor's lattice."""
+    """Return (n, m, 2) px displacements of the simulated tip in random contacts, mapped to a sensor's lattice."""
 
     tip = Tip(TipParameters(rings=rings))
     poses = random_poses(n, np.random.default_rng(seed), (0.0, 6.5))

@@ -1,4 +1,4 @@
-"""A simulated scene: what there is to touch, and the contacts of the sensors that arms carry through it."""
+"""A simulated scene: surfaces and objects to touch, and the contacts of sensors on simulated arms."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ HISTORY_S = 5.0
 
 
 class ContactNotKept(TouchcellError, LookupError):
-    """Asked for a contact of a time that the scene does not remember.
+    """Requested contact is outside the scene's history.
 
     Attributes:
-        t_ns: the time that was asked for.
-        oldest_ns, newest_ns: the times that are remembered.
+        t_ns: requested time.
+        oldest_ns, newest_ns: range of the history.
     """
 
     def __init__(self, t_ns: int, oldest_ns: int, newest_ns: int) -> None:
-        super().__init__(f"no contact of {t_ns} ns is kept, only of {oldest_ns} to {newest_ns} ns")
+        super().__init__(f"no contact at {t_ns} ns is stored, only from {oldest_ns} to {newest_ns} ns")
         self.t_ns = t_ns
         self.oldest_ns = oldest_ns
         self.newest_ns = newest_ns
@@ -46,30 +46,30 @@ class ContactNotKept(TouchcellError, LookupError):
 
 @runtime_checkable
 class Carrier(Protocol):
-    """A simulated arm, as the sensors see it that it carries."""
+    """A simulated arm that carries sensors."""
 
-    def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
-        """(4, 4) at the present step of the simulation; must not advance time."""
+    def T_world_tcp(self) -> Array:  # noqa: N802  standard notation for transforms
+        """Return the (4, 4) pose at the present step of the simulation; must not advance time."""
         ...
 
 
 @runtime_checkable
 class LoadBearer(Protocol):
-    """A simulated arm that gives way to what its sensors touch."""
+    """A simulated arm that yields to contact forces on its sensors."""
 
     def bear(self, force_world: Array, point_world: Array) -> None:
-        """From now on feel ``force_world`` (3,) N at ``point_world`` (3,) m."""
+        """Apply ``force_world`` (3,) N at ``point_world`` (3,) m from now on."""
         ...
 
 
 class MeasuredCarrier:
-    """Any other arm, as what it tells: so that a simulated sensor sits on a real or an emulated arm.
+    """A measured arm as carrier, so that a simulated sensor is mounted on a real or an emulated arm.
 
-    Where the arm tells nothing, because it is gone or has not begun, it is where it was last.
+    Where the arm reports nothing, because it is lost or not started, its last pose is used.
 
     Args:
-        arm: tells its pose.
-        T_world_base: (4, 4) where its base stands.
+        arm: source of its pose.
+        T_world_base: (4, 4) pose of its base.
     """
 
     def __init__(self, arm: TcpSource, T_world_base: Array) -> None:
@@ -77,15 +77,15 @@ class MeasuredCarrier:
         self._T_world_base = T_world_base
         self._T_base_tcp: Array | None = None
 
-    def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
-        """(4, 4) newest measured pose. Raises DeviceError if there has never been one."""
+    def T_world_tcp(self) -> Array:  # noqa: N802  standard notation for transforms
+        """Return the newest measured pose (4, 4). Raises DeviceError if there has never been one."""
         try:
             T_base_tcp = self._arm.tcp().value.T_base_tcp
         except DeviceError:
             if self._T_base_tcp is None:
                 raise
         else:
-            # What is not finite is for the supervisor to see, not for the physics.
+            # Non-finite poses are for the supervisor to detect, not for the physics.
             if self._T_base_tcp is None or np.isfinite(T_base_tcp).all():
                 self._T_base_tcp = T_base_tcp
         assert self._T_base_tcp is not None
@@ -93,15 +93,14 @@ class MeasuredCarrier:
 
 
 class Scene:
-    """A world and the sensors that touch it. One thread only.
+    """A world and the sensors that touch it. Single-threaded.
 
-    The world is stepped on the timeline's fixed grid to the clock's now whenever somebody reads a contact or an arm is
-    asked.
+    The world is stepped on the timeline's fixed grid to the clock's present time whenever a contact or an arm is read.
 
     Args:
-        world: what decides what is felt; its time counts from when the scene was made.
-        clock: injected time.
-        step_s: grid of the simulation.
+        world: physics of the scene; its time counts from the construction of the scene.
+        clock: injected clock.
+        step_s: step of the simulation grid.
     """
 
     def __init__(self, world: World, clock: Clock, step_s: float = DEFAULT_STEP_S) -> None:
@@ -110,20 +109,20 @@ class Scene:
         self._start_ns = self.timeline.t_ns
         self._poses: dict[str, Callable[[], Array]] = {}
         self._bearers: dict[str, Callable[[Array, Array], None]] = {}
-        # The last one is of the timeline's present step, the one before it of the step before.
+        # The last entry is of the timeline's present step, the one before it of the previous step.
         self._felt: dict[str, deque[Feeling]] = {}
         self._kept = round(HISTORY_S * 1e9 / self.timeline.step_ns)
         self.timeline.add(Phase.CONTACT, self._step)
         self.timeline.keep(self._snapshot)
 
     def mount(self, sensor: str, pose: Callable[[], Array], bear: Callable[[Array, Array], None] | None = None) -> None:
-        """Let ``sensor`` feel.
+        """Mount ``sensor``.
 
         Args:
-            sensor: its name.
-            pose: gives T_world_s (4, 4) at the present step and must not advance time.
-            bear: told after every step with which force (3,) N what is touched pushes the sensor, and at which point
-                (3,) m, both in the world frame.
+            sensor: name of the sensor.
+            pose: returns T_world_s (4, 4) at the present step and must not advance time.
+            bear: called after every step with the contact force (3,) N on the sensor and its point of application (3,)
+                m, both in the world frame.
         """
         if sensor in self._poses:
             raise ConfigError(f"sensor {sensor!r} is mounted already", key="scene", value=sensor)
@@ -135,15 +134,15 @@ class Scene:
         self._felt[sensor] = deque([known(state)], maxlen=self._kept)
 
     def has(self, sensor: str) -> bool:
-        """Whether ``sensor`` is mounted."""
+        """Return whether ``sensor`` is mounted."""
         return sensor in self._poses
 
     def contact(self, sensor: str, t_ns: int | None = None) -> Stamped[ContactState]:
-        """What ``sensor`` feels now, or felt at ``t_ns`` (the step before it), at most HISTORY_S ago.
+        """Return the contact of ``sensor`` now, or at ``t_ns`` (the step before it), at most HISTORY_S ago.
 
         Raises:
             ConfigError: no such sensor.
-            ContactNotKept: ``t_ns`` lies in the future or too far back.
+            ContactNotKept: ``t_ns`` is in the future or older than the history.
         """
         if sensor not in self._felt:
             raise ConfigError(f"no sensor {sensor!r} is mounted", key="scene", value=sensor)
@@ -159,15 +158,16 @@ class Scene:
         return Stamped(state, seq * step_ns, seq)
 
     def objects(self) -> Stamped[Mapping[str, Array]]:
-        """T_world_object (4, 4) of every free object now."""
+        """Return the present T_world_object (4, 4) of every free object."""
         t_ns = self.timeline.advance()
         return Stamped(self.world.objects(), t_ns, t_ns // self.timeline.step_ns)
 
     def snapshot(self) -> Restore:
-        """What puts the world, its contacts and the arms in it back as they are now, at whatever time it is called.
+        """Return a function that restores the world, its contacts and its arms to the present state at any later time.
 
-        The clock goes on: a surface that moves as it was told goes on from where it was. Lifecycles and leases of
-        devices are not touched.
+        The clock continues: a surface with prescribed motion continues from its pose. Lifecycles and leases of devices
+            are
+        not affected.
 
         Raises (when called):
             ConfigError: a sensor was mounted since.
@@ -175,7 +175,7 @@ class Scene:
         return self.timeline.snapshot()
 
     def seconds(self, t_ns: int) -> float:
-        """Time of the world at ``t_ns``."""
+        """Return the time of the world at ``t_ns``."""
         return (t_ns - self._start_ns) * 1e-9
 
     def _step(self, t_ns: int) -> None:
@@ -201,7 +201,7 @@ class Scene:
 
 @contextmanager
 def physics_engine(key: str, value: str) -> Iterator[None]:
-    """Around imports that need MuJoCo. Raises ConfigError, with what to install, where it is missing."""
+    """Guard imports that need MuJoCo. Raises ConfigError, with what to install, where it is missing."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -232,7 +232,7 @@ class GlideConfig(_Part):
     @model_validator(mode="after")
     def _one_rotation(self) -> GlideConfig:
         if sum(angle != 0.0 for angle in self.displacement_mm_deg[3:]) > 1:
-            raise ValueError("displacement_mm_deg may turn about one axis only; use kind: periodic for more")
+            raise ValueError("displacement_mm_deg may rotate about one axis only; use kind: periodic for more")
         return self
 
     def build(self, T_start: Array) -> Motion:
@@ -240,7 +240,7 @@ class GlideConfig(_Part):
 
 
 class PeriodicConfig(_Part):
-    """Sines in all pose components of the start frame, begun gently; see ``motions.Periodic``."""
+    """Sines in all pose components of the start frame, with a gentle start; see ``motions.Periodic``."""
 
     kind: Literal["periodic"]
     amplitude_mm_deg: PoseMmDeg
@@ -311,7 +311,7 @@ class SphereConfig(_SurfaceConfig):
 
 
 class TipLawConfig(_Part):
-    """What every simulated tip of the scene is made of; see ``contact.ContactLaw``."""
+    """Contact law of every simulated tip of the scene; see ``contact.ContactLaw``."""
 
     radius_mm: float = Field(default=20.0, gt=0.0)
     stiffness_n_mm: float = Field(default=1.5, gt=0.0)
@@ -324,10 +324,10 @@ class TipLawConfig(_Part):
 class SceneConfig(_Part, SceneSection):
     """The ``scene:`` section of a cell file. Poses are in the world frame.
 
-    ``physics`` is the fidelity (docs/explanation/simulation.md). ``kinematic``: surfaces move as prescribed, whatever
-    touches them. ``quasi_static``: besides, objects slide on the table where tips push them, without inertia and always
-    upright. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms`` within ``step_ms``,
-    the grid on which arms move and contacts are kept.
+    ``physics`` is the fidelity (docs/explanation/simulation.md). ``kinematic``: surfaces with prescribed motion,
+    unaffected by contact. ``quasi_static``: in addition, objects slide on the table where tips push them, without
+    inertia and always upright. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms``
+    within ``step_ms``, the grid on which arms move and contacts are stored.
     """
 
     physics: Literal["kinematic", "quasi_static", "dynamic"] = "kinematic"
@@ -346,14 +346,14 @@ class SceneConfig(_Part, SceneSection):
         if not (self.surfaces or self.objects):
             raise ValueError("the scene has neither surfaces nor objects to touch")
         if self.physics == "kinematic" and self.objects:
-            raise ValueError("free objects need another physics than kinematic")
+            raise ValueError("free objects need physics other than kinematic")
         steps = self.step_ms / self.physics_step_ms
         if self.physics == "dynamic" and abs(steps - max(round(steps), 1)) > 1e-6:
-            raise ValueError(f"step_ms {self.step_ms:g} is no multiple of physics_step_ms {self.physics_step_ms:g}")
+            raise ValueError(f"step_ms {self.step_ms:g} is not a multiple of physics_step_ms {self.physics_step_ms:g}")
         return self
 
     def build(self, clock: Clock) -> Scene:
-        """The scene, with its motions starting now."""
+        """Build the scene; its motions start now."""
         return Scene(self._world(), clock, self.step_ms * 1e-3)
 
     def _world(self) -> World:

@@ -1,4 +1,4 @@
-"""What follows from the shape of a free object: its nearest point, its inertia, and how a table resists its turning."""
+"""Geometry and mechanics of free objects: nearest surface point, inertia, friction moment on a table."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from touchcell.simulation.surfaces import Shape, Sphere, SurfacePoint
 
 @dataclass(frozen=True, slots=True)
 class MassProperties:
-    """Of an evenly dense solid, in its own frame, whose axes are principal through the centre of mass.
+    """Mass properties of a solid of even density, in its own frame, whose axes are principal through the centre of
+    mass.
 
     Attributes:
         com_m: (3,) centre of mass.
@@ -26,37 +27,37 @@ class MassProperties:
     inertia_per_kg_m2: Array
 
 
-# Closer to a corner than this, rounding may tell which of two faces is nearer.
+# Closer to a corner than this, rounding may decide which of two faces is nearer.
 _CLEAR_M = 1e-5
 
 Nearest = tuple[float, float, float, float, float, float, float]
-"""What a ``SurfacePoint`` holds, in plain numbers: distance, normal x, y, z and point x, y, z."""
+"""Contents of a ``SurfacePoint`` as plain numbers: distance, normal x, y, z and point x, y, z."""
 
 
 class PlainShape(Shape, Protocol):
-    """A shape whose nearest points can be had in plain numbers: NumPy takes several times as long for so few."""
+    """A shape with nearest points in plain numbers: NumPy takes several times as long for so few."""
 
     def nearest_numbers(self, x: float, y: float, z: float) -> Nearest:
-        """Nearest surface point to (x, y, z) m."""
+        """Return the nearest surface point to (x, y, z) m."""
         ...
 
 
 def shape_of(solid: Solid) -> Shape:
-    """The solid's outside, in its own frame; exact for points outside."""
+    """Return the outer shape of the solid, in its own frame; exact for points outside."""
     return Sphere(solid.radius_m) if isinstance(solid, Ball) else plain_shape_of(solid)
 
 
 def plain_shape_of(solid: Prism | Turned) -> PlainShape:
-    """The same of a solid that stands."""
+    """Return the same for an upright solid, in plain numbers."""
     if isinstance(solid, Prism):
         return _PrismShape(_sides(solid.outline_m), solid.height_m)
     return _TurnedShape(_sections(solid))
 
 
 def mass_properties(solid: Solid) -> MassProperties:
-    """Centre of mass and moments of inertia at even density.
+    """Return centre of mass and moments of inertia at even density.
 
-    A prism's outline must be symmetric about its axes, as those are that a scene can describe.
+    A prism's outline must be symmetric about its axes; all outlines that a scene can describe are.
     """
     match solid:
         case Ball():
@@ -79,9 +80,9 @@ def mass_properties(solid: Solid) -> MassProperties:
 
 
 def friction_radius_m(solid: Prism | Turned) -> float:
-    """Lever of the friction against turning in place: the mean distance of the bottom from its middle.
+    """Return the lever arm of friction in rotation on the spot: the mean distance of the bottom from its centre.
 
-    That is what uniform pressure gives: 2 R / 3 for a disc and 0.3826 w for a square.
+    This holds for uniform pressure: 2 R / 3 for a disc and 0.3826 w for a square.
     """
     if isinstance(solid, Turned):
         return 2.0 / 3.0 * solid.sections_m[0][1]
@@ -97,7 +98,7 @@ def friction_radius_m(solid: Prism | Turned) -> float:
 
 
 def _integral(s: float, d: float) -> float:
-    """Of sqrt(s^2 + d^2) over s."""
+    """Return the integral of sqrt(s^2 + d^2) over s."""
     r = math.hypot(s, d)
     return 0.5 * (s * r + d * d * math.asinh(s / d))
 
@@ -111,7 +112,7 @@ def _edges(outline_m: Array) -> tuple[tuple[_Point, _Point], ...]:
 
 
 def _sides(outline_m: Array) -> tuple[tuple[float, float, float, float, float], ...]:
-    """(x, y) of each corner, unit vector (x, y) to the next, and how far it is."""
+    """Return (x, y) of each corner, unit vector (x, y) to the next, and the distance to it."""
     sides = []
     for (ax, ay), (bx, by) in _edges(outline_m):
         length = math.hypot(bx - ax, by - ay)
@@ -120,7 +121,7 @@ def _sides(outline_m: Array) -> tuple[tuple[float, float, float, float, float], 
 
 
 def _sections(solid: Turned) -> tuple[tuple[float, float, float], ...]:
-    """(bottom, top, radius) of each."""
+    """Return (bottom, top, radius) of each section."""
     sections, bottom = [], 0.0
     for height, radius in solid.sections_m:
         sections.append((bottom, bottom + height, radius))
@@ -129,7 +130,7 @@ def _sections(solid: Turned) -> tuple[tuple[float, float, float], ...]:
 
 
 def _second_moments(outline_m: Array) -> tuple[float, float]:
-    """Mean of x^2 and of y^2 over the outline's area."""
+    """Return the mean of x^2 and of y^2 over the outline's area."""
     a, b = outline_m, np.roll(outline_m, -1, axis=0)
     cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     xx, yy = (cross[:, None] * (a * a + a * b + b * b)).sum(axis=0) / (6.0 * cross.sum())
@@ -153,7 +154,7 @@ class _PrismShape:
             beyond, along = dx * ty - dy * tx, dx * tx + dy * ty
             if beyond > 0.0:
                 if _CLEAR_M < along < length - _CLEAR_M:
-                    # Before one face of a convex outline no other is nearer.
+                    # In front of one face of a convex outline no other face is nearer.
                     px, py = ax + along * tx, ay + along * ty
                     distance = math.sqrt((x - px) ** 2 + (y - py) ** 2)
                     return _off_a_rim(z, px, py, ty, -tx, distance, self.height_m)
@@ -161,7 +162,7 @@ class _PrismShape:
             if beyond > deepest:
                 deepest, out_x, out_y = beyond, ty, -tx
             if 0.0 < along < length:
-                # Near a face its normal is exact, where the way to its nearest point is only rounding.
+                # Near a face its normal is exact, while the direction to its nearest point is dominated by rounding.
                 here_x, here_y = ty, -tx
             else:
                 here_x, here_y = 0.0, 0.0
@@ -218,7 +219,7 @@ def _in_arrays(found: Nearest) -> SurfacePoint:
 def _off_a_rim(
     z: float, foot_x: float, foot_y: float, out_x: float, out_y: float, beyond: float, height: float
 ) -> Nearest:
-    """Nearest point to one that is ``beyond`` the outline along the unit vector ``out``, its nearest point ``foot``."""
+    """Return the nearest point to one ``beyond`` the outline along unit vector ``out`` from its nearest ``foot``."""
     on_z = min(max(z, 0.0), height)
     distance = math.hypot(beyond, z - on_z)
     if distance == 0.0:
@@ -235,7 +236,7 @@ def _off_a_rim(
 
 
 def _off_an_end(x: float, y: float, height: float, over: float, under: float) -> Nearest:
-    """Nearest point of the top or the bottom to one within the outline."""
+    """Return the nearest point of the top or the bottom to one within the outline."""
     if over >= under:
         return over, 0.0, 0.0, 1.0, x, y, height
     return under, 0.0, 0.0, -1.0, x, y, 0.0

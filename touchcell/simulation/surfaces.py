@@ -1,6 +1,6 @@
-"""Rigid surfaces in closed form: where is the nearest point, and which way is out.
+"""Rigid surfaces in closed form: nearest point and outward normal.
 
-A ``Shape`` stands still in its own frame; a ``Surface`` is a shape that moves through the world.
+A ``Shape`` is fixed in its own frame; a ``Surface`` is a shape that moves through the world.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class SurfacePoint:
 
 
 class Shape(Protocol):
-    """A rigid body's outside, in the body's own frame."""
+    """Outer surface of a rigid body, in the body's own frame."""
 
     def nearest(self, p: Array) -> SurfacePoint:
-        """Nearest surface point to ``p`` (3,) m."""
+        """Return the nearest surface point to ``p`` (3,) m."""
         ...
 
 
@@ -44,7 +44,7 @@ class Plane:
     """The plane z = 0 with its outside towards +z."""
 
     def nearest(self, p: Array) -> SurfacePoint:
-        """Nearest surface point to ``p`` (3,) m."""
+        """Return the nearest surface point to ``p`` (3,) m."""
         return SurfacePoint(float(p[2]), np.array([0.0, 0.0, 1.0]), np.array([p[0], p[1], 0.0]))
 
 
@@ -55,7 +55,7 @@ class Sphere:
     radius_m: float
 
     def nearest(self, p: Array) -> SurfacePoint:
-        """Nearest surface point to ``p`` (3,) m; for the centre itself, the top."""
+        """Return the nearest surface point to ``p`` (3,) m; for the centre itself, the top."""
         length = math.sqrt(float(p @ p))
         normal = p / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
         return SurfacePoint(length - self.radius_m, normal, self.radius_m * normal)
@@ -68,7 +68,7 @@ class Dome:
     radius_m: float
 
     def nearest(self, p: Array) -> SurfacePoint:
-        """Nearest surface point to ``p`` (3,) m; exact outside the body, which is where a tip's centre is."""
+        """Return the nearest surface point to ``p`` (3,) m; exact outside the body, where a tip's centre always is."""
         on_cap = Sphere(self.radius_m).nearest(p)
         return on_cap if on_cap.distance_m < p[2] else Plane().nearest(p)
 
@@ -86,10 +86,10 @@ class Ramp:
 
     def __post_init__(self) -> None:
         if not 0.0 < abs(self.incline_rad) < math.pi / 2:
-            raise ConfigError("must lie between 0 and 90 deg", key="incline_rad", value=self.incline_rad)
+            raise ConfigError("must be between 0 and 90 deg", key="incline_rad", value=self.incline_rad)
 
     def nearest(self, p: Array) -> SurfacePoint:
-        """Nearest surface point to ``p`` (3,) m; exact within ``bend_radius_m`` above the surface."""
+        """Return the nearest surface point to ``p`` (3,) m; exact within ``bend_radius_m`` above the surface."""
         x, y, z = p.tolist()
         if x <= 0.0:
             return Plane().nearest(p)
@@ -102,7 +102,7 @@ class Ramp:
             distance = (z - end_z) * cos - (x - end_x) * sin
             point = np.array([end_x + along * cos, y, end_z + along * sin])
             return SurfacePoint(distance, np.array([-sin, 0.0, cos]), point)
-        # The arc's centre lies above a hollow bend and below a rounded edge; outwards is towards it or away from it.
+        # The arc's centre is above a hollow bend and below a rounded edge; outwards is towards it or away from it.
         from_centre = math.hypot(x, z - sign * R)
         normal = np.array([-sign * x / from_centre, 0.0, -sign * (z - sign * R) / from_centre])
         distance = sign * (R - from_centre)
@@ -111,18 +111,18 @@ class Ramp:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """A shape on its way through the world.
+    """A shape in motion through the world.
 
     Attributes:
-        shape: what it is.
-        motion: where it is when; a ``Still`` one unless told otherwise.
+        shape: shape of the body.
+        motion: prescribed motion; ``Still`` by default.
     """
 
     shape: Shape
     motion: Motion = field(default_factory=Still)
 
     def nearest(self, p_world: Array, t_s: float) -> SurfacePoint:
-        """Nearest point at time ``t_s`` to ``p_world`` (3,) m, in the world frame."""
+        """Return the nearest point at time ``t_s`` to ``p_world`` (3,) m, in the world frame."""
         T = self.motion.pose(t_s)
         R, origin = T[:3, :3], T[:3, 3]
         found = self.shape.nearest((p_world - origin) @ R)

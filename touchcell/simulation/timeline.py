@@ -1,4 +1,4 @@
-"""Simulated time on a fixed grid, so that results do not depend on who asks how often."""
+"""Simulated time on a fixed grid, so that results do not depend on how often it is polled."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from touchcell.drivers.core.clock import Clock
 DEFAULT_STEP_S = 0.002
 
 Restore = Callable[[], None]
-"""Puts something back as it was when this was made; may be called any number of times."""
+"""Restores a participant to the state at its snapshot; may be called any number of times."""
 
 
 class Phase(IntEnum):
@@ -21,11 +21,11 @@ class Phase(IntEnum):
 
 
 class Timeline:
-    """Brings its participants step by step to the clock's now, when somebody asks. One thread only.
+    """Advance participants step by step to the clock's present time, on demand. Single-threaded.
 
     Args:
-        clock: injected time.
-        step_s: grid of the simulation; steps end at whole multiples of it on the clock.
+        clock: injected clock.
+        step_s: step of the simulation grid; steps end at whole multiples of it on the clock.
     """
 
     def __init__(self, clock: Clock, step_s: float = DEFAULT_STEP_S) -> None:
@@ -47,13 +47,13 @@ class Timeline:
         self._participants.sort(key=lambda participant: participant[0])
 
     def keep(self, snapshot: Callable[[], Callable[[int], None]]) -> None:
-        """Let snapshots cover a participant. ``snapshot()`` returns what puts it back, given how many nanoseconds later
-        it is then."""
+        """Add a participant to snapshots. ``snapshot()`` returns a function that restores it, given the nanoseconds
+        elapsed since."""
         self._kept.append(snapshot)
 
     def snapshot(self) -> Restore:
-        """All participants as they are now. Putting them back leaves the clock alone: what they had before them then
-        begins anew."""
+        """Return a function that restores all participants to the present state. It leaves the clock alone: their
+        remaining motion starts again."""
         t_ns = self.advance()
         parts = [snapshot() for snapshot in self._kept]
 
@@ -65,7 +65,7 @@ class Timeline:
         return restore
 
     def advance(self) -> int:
-        """Make all steps up to the clock's now; returns ``t_ns``. Within a step it does nothing."""
+        """Make all steps up to the clock's present time; return ``t_ns``. Within a step it does nothing."""
         if self._advancing:
             return self._t_ns
         self._advancing = True

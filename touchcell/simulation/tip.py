@@ -1,7 +1,8 @@
-"""The TacTip's skin: where its 331 markers go in a contact, and where the camera sees them.
+"""The TacTip's skin: positions of its 331 markers in a contact, and their projection into the camera.
 
 The deformation is a sum of smooth fields around the contact axis, which is the inward normal through the sphere's
-centre; psi is a marker's angle from it. The forms are those that SIMULATION part 5 found necessary on real images.
+centre; psi is a marker's angle from it. The forms are those that were necessary to fit real images
+(docs/explanation/calibration.md).
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ _ROOT_MM = math.sqrt(_MM)
 
 @dataclass(frozen=True, slots=True)
 class TipParameters:
-    """One sensor: its layout, its camera and how its skin moves. Angles in radians, lengths in metres.
+    """Parameters of one sensor: layout, camera and deformation of the skin. Angles in radians, lengths in metres.
 
     The defaults were fitted to 320 images of the public surface_3d training set, together with the mount's offset and
-    level, and tested on 80 others: 99.3 % of the markers have a blob of the image within 12 px for partner, at 2.5 px
-    on average (1.2 px at depths below 1.5 mm, 3.3 px above 4.5 mm); the contact moves them by 14.5 px on average.
+    level, and tested on 80 others: 99.3 % of the markers match a blob of the image within 12 px, at 2.5 px on average
+    (1.2 px at depths below 1.5 mm, 3.3 px above 4.5 mm); the contact moves them by 14.5 px on average.
 
     Attributes:
         rings: marker rings around the central marker; ring k holds 6k.
@@ -35,30 +36,30 @@ class TipParameters:
         camera_distance_m: from the pinhole to the sphere's centre, along z.
         focal_px: focal length.
         centre_px: (u, v) of the optical axis in the 640x480 frame; pixel centres are whole numbers.
-        image_rotation_rad: turn from sensor axes to image axes about z.
-        camera_tilt_rad: turn of the markers about the sensor's x, then y axis, as a camera sees them that does not look
-            straight along the sensor's axis.
-        disc_radius_px: of the markers in the image.
-        follow: share of the shear that contacted markers follow.
-        rim_follow: share of the shear at the far rim.
+        image_rotation_rad: rotation from sensor axes to image axes about z.
+        camera_tilt_rad: rotation of the markers about the sensor's x, then y axis, in the view of a camera whose
+            optical axis is not the sensor's axis.
+        disc_radius_px: radius of the markers in the image.
+        follow: fraction of the shear that contacted markers follow.
+        rim_follow: fraction of the shear at the far rim.
         shear_width_rad, shear_power: falloff exp(-(psi / width)^power) of shear and torsion.
-        shear_width_growth_rad: by how much wider it is at 4 mm than at 1 mm depth; it grows with the root of depth.
-        rim_clamp: share of shear and torsion that the tip's body holds back at the outermost ring; it grows with the
+        shear_width_growth_rad: increase of that width from 1 mm to 4 mm depth; it grows with the root of depth.
+        rim_clamp: fraction of shear and torsion that the tip's body holds back at the outermost ring; it grows with the
             square of a marker's angle from the sensor's axis.
-        torsion_follow: share of the torsion that shows, at 3 mm depth.
-        torsion_growth: power of depth by which that share grows.
-        shear_twist: turn of the skin by a shear across the slope of a tilted contact, whose patch lies beside the
-            sensor's axis, as a share of the angle that the shear spans at the marker radius.
-        dent_follow: share of the depth by which the contacted skin moves in.
+        torsion_follow: visible fraction of the torsion, at 3 mm depth.
+        torsion_growth: power of depth by which that fraction grows.
+        shear_twist: rotation of the skin by a shear across the slope of a tilted contact, whose patch is beside the
+            sensor's axis, as a fraction of the angle that the shear spans at the marker radius.
+        dent_follow: fraction of the depth by which the contacted skin moves in.
         dent_width_rad_per_sqrt_m, dent_power: falloff exp(-(psi / width)^power) of the dent. The width grows with the
             root of depth; the edge of a sphere's flattened cap would have sqrt(2 / tip radius), 10 rad per root metre.
-        lean_follow: share of the dent's sideways part by which the whole dome leans, most at the apex.
+        lean_follow: fraction of the dent's sideways part by which the whole dome leans, most at the apex.
         sink_follow: the same for the part along the sensor's axis.
-        sink_growth_per_m: by how much both grow with depth beyond 3 mm.
-        bulge: outward push around the contact, as a share of depth.
-        bulge_at_rad, bulge_width_rad: where it is largest and how far it reaches.
-        rock: share of the shear by which skin ahead of it moves up, at full slope; negative moves it down.
-        pin_lever_m: length of the pins that swing when the skin under them turns.
+        sink_growth_per_m: growth of both with depth beyond 3 mm.
+        bulge: outward displacement around the contact, as a fraction of depth.
+        bulge_at_rad, bulge_width_rad: angle of its maximum, and its width.
+        rock: fraction of the shear by which skin ahead of it moves up, at full slope; negative moves it down.
+        pin_lever_m: length of the pins that swing when the skin under them rotates.
     """
 
     rings: int = 10
@@ -94,11 +95,11 @@ class TipParameters:
 
 
 class Tip:
-    """A sensor with given parameters. All its functions take batches and give the same for one as for many.
+    """Skin and camera of a sensor. All methods are vectorised, with results independent of the batch size.
 
     Args:
-        parameters: of the sensor.
-        every: only each so-many-th marker is simulated, for fits.
+        parameters: parameters of the sensor.
+        every: simulate only every so-many-th marker, for fits.
     """
 
     def __init__(self, parameters: TipParameters | None = None, *, every: int = 1) -> None:
@@ -114,14 +115,14 @@ class Tip:
 
     @property
     def rest_positions(self) -> Array:
-        """(markers, 3) m, undeformed, in the sensor frame."""
+        """Return (markers, 3) m, undeformed, in the sensor frame."""
         return self._rest.copy()
 
     def marker_positions(self, T_f_s: Array) -> Array:
-        """Marker positions in the sensor frame in contacts ``T_f_s``.
+        """Return marker positions in the sensor frame in contacts ``T_f_s``.
 
         Args:
-            T_f_s: (..., 4, 4) effective contact poses; those of negative depth leave the skin undeformed.
+            T_f_s: (..., 4, 4) contact poses after slip; those of negative depth leave the skin undeformed.
 
         Returns:
             (..., markers, 3) m.
@@ -151,7 +152,7 @@ class Tip:
 
         # Away from the contact axis, tangential to the sphere: sin(psi) long.
         outward = self._direction - cos_psi[..., None] * axis[..., None, :]
-        # The dent's slope turns the skin and swings the pins: lever * d(dent)/d(arc), along outward / sin(psi).
+        # The dent's slope rotates the skin and swings the pins: lever * d(dent)/d(arc), along outward / sin(psi).
         slope = dent * p.dent_power * reach / (np.maximum(psi * np.sin(psi), 1e-9) * p.marker_radius_m)
         bulge = p.bulge * depth * np.exp(-(((psi - p.bulge_at_rad) / p.bulge_width_rad) ** 2))
 
@@ -166,7 +167,7 @@ class Tip:
         return moved
 
     def project(self, positions: Array) -> Array:
-        """Pixels (..., 2) in the 640x480 frame of points (..., 3) m in the sensor frame, by a pinhole camera."""
+        """Project points (..., 3) m in the sensor frame to pixels (..., 2) in the 640x480 frame (pinhole camera)."""
         p = self.parameters
         if any(p.camera_tilt_rad):
             positions = positions @ _tilt(*p.camera_tilt_rad).T
@@ -178,12 +179,12 @@ class Tip:
         return np.stack([u, v], axis=-1)
 
     def pixels(self, T_f_s: Array) -> Array:
-        """(..., markers, 2) px in the 640x480 frame, of contacts ``T_f_s`` (..., 4, 4)."""
+        """Return (..., markers, 2) px in the 640x480 frame, of contacts ``T_f_s`` (..., 4, 4)."""
         return self.project(self.marker_positions(T_f_s))
 
 
 def _tilt(alpha: float, beta: float) -> Array:
-    """(3, 3) Ry(beta) Rx(alpha)."""
+    """Return (3, 3) Ry(beta) Rx(alpha)."""
     sin_a, cos_a, sin_b, cos_b = math.sin(alpha), math.cos(alpha), math.sin(beta), math.cos(beta)
     return np.array(
         [[cos_b, sin_b * sin_a, sin_b * cos_a], [0.0, cos_a, -sin_a], [-sin_b, cos_b * sin_a, cos_b * cos_a]]
@@ -191,7 +192,7 @@ def _tilt(alpha: float, beta: float) -> Array:
 
 
 def _turning(axis: Array) -> Array:
-    """(..., 3, 3) with ``points @ turning`` the cross product of ``axis`` (..., 3) and each of the points (n, 3)."""
+    """Return (..., 3, 3) with ``points @ turning`` the cross product of ``axis`` (..., 3) and each point (n, 3)."""
     turning = np.zeros((*axis.shape, 3))
     x, y, z = axis[..., 0], axis[..., 1], axis[..., 2]
     turning[..., 1, 0], turning[..., 2, 0] = -z, y
@@ -201,6 +202,6 @@ def _turning(axis: Array) -> Array:
 
 
 def _torsion(R: Array) -> Array:
-    """Gamma of R = Rz(gamma) Ry(beta) Rx(alpha), (...)."""
+    """Return gamma of R = Rz(gamma) Ry(beta) Rx(alpha), (...)."""
     gamma: Array = np.arctan2(R[..., 1, 0], R[..., 0, 0])
     return gamma

@@ -1,4 +1,4 @@
-"""Pictures of a calibrated tip: real beside simulated images, and where their markers still differ."""
+"""Figures of a calibrated tip: real beside simulated images, and the remaining marker errors."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def write_comparison(
     predicted: Sequence[Array],
     titles: Sequence[str],
 ) -> None:
-    """One column for each contact: real image, simulated image, arrows from simulated to real markers.
+    """Plot one column per contact: real image, simulated image, arrows from simulated to real markers.
 
     Args:
         path: PNG to write.
         real, simulated: images of one size.
-        measured, predicted: (k, 2) px markers that were seen, and where the simulation has them.
-        titles: of the columns.
+        measured, predicted: (k, 2) px of detected markers, and of the same markers in the simulation.
+        titles: titles of the columns.
     """
     from matplotlib.figure import Figure
 

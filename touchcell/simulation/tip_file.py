@@ -1,4 +1,4 @@
-"""A calibrated sensor as a file: what ``touchcell calibrate-sim`` found out about one tip, its camera and its mount."""
+"""File of a calibrated sensor: the parameters of one tip, its camera and its mount from ``touchcell calibrate-sim``."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ SHIPPED = Path(__file__).parent / "tips"
 
 
 class TipFile(BaseModel):
-    """One sensor. Units are in the names of the parameters.
+    """Parameters of one sensor; units are in their names.
 
     Attributes:
         tip: layout, camera and skin.
         rig: mount and slip.
-        measured: how it was fitted, and how far its markers are off in images that it was not fitted to, for people.
+        measured: fit method and marker errors on held-out images, for the operator.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -46,10 +46,10 @@ class TipFile(BaseModel):
 
 
 def load_tip(name: str) -> TipFile:
-    """Read the file of that path, or the sensor of that name that ships with touchcell.
+    """Read the tip file ``name``: a path, or the name of a sensor that ships with touchcell.
 
     Raises:
-        ConfigError: there is no such file, or it makes no sense.
+        ConfigError: no such file, or its content is invalid.
     """
     shipped = SHIPPED / f"{name}.yaml"
     path = shipped if shipped.is_file() else Path(name)
@@ -64,7 +64,7 @@ def load_tip(name: str) -> TipFile:
             hint=f"make one with `touchcell calibrate-sim`; these ship: {known}",
         ) from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"is no YAML: {error}", file=str(path)) from None
+        raise ConfigError(f"is not YAML: {error}", file=str(path)) from None
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
@@ -84,7 +84,7 @@ def save_tip(tip: TipFile, path: Path) -> None:
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    """Numbers with six digits: more than any of them is known to."""
+    """Round to six digits: more than the precision of any of them."""
     return {
         name: [float(f"{each:.6g}") for each in value]
         if isinstance(value, tuple)

@@ -1,8 +1,7 @@
-"""Fitting the simulated tip to a real one: camera, mount, slip and skin from labelled contacts whose markers are known.
+"""Fit the simulated tip to a real one: camera, mount, slip and skin from labelled contacts with known markers.
 
-The forms are ``touchcell.simulation.tip``'s and ``touchcell.simulation.mount``'s. Prior knowledge is what the start
-says, and how far tips may differ from it (``_FREE``): a score of frames do not determine forty parameters by
-themselves.
+The forms are those of ``touchcell.simulation.tip`` and ``touchcell.simulation.mount``. Prior knowledge is the start and
+the expected deviation of tips from it (``_FREE``): a score of frames alone does not determine forty parameters.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _FIRST_TURNS = 12
 _TURNS = 40
 _EVERY = 3
 
-# Parameter, its place in a tuple: how far it may be expected to lie from the start, least, greatest.
+# Parameter, its index in a tuple: expected deviation from the start, minimum, maximum.
 _Free = dict[tuple[str, int | None], tuple[float, float, float]]
 _CAMERA: _Free = {
     ("focal_px", None): (100.0, 50.0, 5000.0),
@@ -96,17 +95,17 @@ _Key = tuple[str, int | None]
 
 @dataclass(frozen=True)
 class Sensor:
-    """A simulated tip in its rig."""
+    """A simulated tip on its mount."""
 
     tip: TipParameters
     rig: MountModel
 
     def pixels(self, commanded: Array, *, every: int = 1) -> Array:
-        """(n, markers, 2) px in contacts that the arm is told to make (n, 4, 4)."""
+        """Return (n, markers, 2) px in commanded contacts (n, 4, 4)."""
         return Tip(self.tip, every=every).pixels(self.rig.contact(commanded))
 
     def errors(self, contacts: MarkedContacts) -> Array:
-        """(n, m) px from simulated to measured markers, NaN for those that were not seen."""
+        """Return (n, m) px from simulated to measured markers, NaN for undetected ones."""
         off = np.linalg.norm(self.pixels(contacts.T_f_s) - contacts.pixels, axis=2)
         return np.where(contacts.seen, off, np.nan)
 
@@ -119,20 +118,20 @@ def fit_tip(
     start: Sensor | None = None,
     told: Callable[[int, int], None] | None = None,
 ) -> Sensor:
-    """The simulated sensor whose markers are where the real one's were.
+    """Fit the simulated sensor to the markers of a real one.
 
     Args:
-        contacts: to fit to; a score or more, over the range of depths, tilts and shears.
+        contacts: contacts to fit to; a score or more, over the range of depths, tilts and shears.
         reference: (m, 2) px lattice of the undeformed tip, markers in the order of ``markers.lattice``.
-        rings: of the lattice.
-        start: what is believed so far about tips of this kind; its camera is laid onto the lattice anew.
-        told: of turns done, and turns in all.
+        rings: number of rings of the lattice.
+        start: prior parameters for tips of this kind; its camera is mapped to the lattice anew.
+        told: progress callback with the orientations tried so far and their total.
 
     Raises:
         TrainingError: fewer than 8 contacts, or no orientation of the camera explains them.
     """
     if len(contacts) < 8:
-        raise TrainingError(f"{len(contacts)} contacts cannot tell a camera from a mount", hint="give 20 or more")
+        raise TrainingError(f"{len(contacts)} contacts cannot separate camera from mount", hint="give 20 or more")
     start = start or Sensor(TipParameters(), MountModel())
     start = Sensor(_laid_onto(replace(start.tip, rings=rings), reference), start.rig)
     turned = [
@@ -145,14 +144,14 @@ def fit_tip(
     moved = float(np.linalg.norm(contacts.pixels - reference, axis=2)[contacts.seen].mean())
     if not np.nanmean(best.errors(contacts)) < 0.6 * moved:
         raise TrainingError(
-            "no orientation of the camera makes the contacts move the markers as they were seen to",
-            hint="check that labels and images belong together, and that the image is not mirrored",
+            "no orientation of the camera explains the observed marker motion",
+            hint="check that labels and images match, and that the image is not mirrored",
         )
     return _fitted(best, contacts, list(_FREE), _TURNS, _PRIOR_PX, told)
 
 
 def _laid_onto(tip: TipParameters, reference: Array) -> TipParameters:
-    """The tip with its camera moved so that the undeformed markers come to lie on a lattice."""
+    """Return the tip with its camera moved so that the undeformed markers match a lattice."""
     flat = lattice(tip.rings) @ np.array([1.0, 1j])
     place = (reference - reference.mean(axis=0)) @ np.array([1.0, 1j])
     phase = float(np.angle(np.vdot(flat, place)))

@@ -1,4 +1,4 @@
-"""What happens in a simulated scene at one fidelity: which tip feels what, and where free objects go."""
+"""Physics of a simulated scene at one fidelity: contact states of tips and motion of free objects."""
 
 from __future__ import annotations
 
@@ -13,43 +13,43 @@ from touchcell.simulation.surfaces import Surface
 from touchcell.simulation.timeline import Restore
 
 Feeling = Callable[[], ContactState]
-"""Works out what a tip felt at the step that made this, when somebody asks: nobody reads most of them."""
+"""Contact of a tip at one step, computed on demand: most are never read."""
 
 
 def known(state: ContactState) -> Feeling:
-    """One that is worked out already."""
+    """Return a contact that is already computed."""
     return lambda: state
 
 
 class World(Protocol):
-    """Physics of one scene, stepped on its timeline after all arms have moved. One thread only."""
+    """Physics of one scene, stepped on its timeline after all arms have moved. Single-threaded."""
 
     def mount(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
-        """Let ``sensor`` feel, at ``T_world_s`` (4, 4) at ``t_s`` seconds of the scene; returns what it feels there."""
+        """Add ``sensor`` at ``T_world_s`` (4, 4) at ``t_s`` seconds of the scene; return its contact there."""
         ...
 
     def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, Feeling]:
-        """Go on to ``t_s``, at which each mounted sensor is at its ``T_world_s`` (4, 4); returns what each feels."""
+        """Advance to ``t_s`` with each mounted sensor at its ``T_world_s`` (4, 4); return the contact of each."""
         ...
 
     def objects(self) -> Mapping[str, Array]:
-        """T_world_object (4, 4) of every free object at the last step."""
+        """Return T_world_object (4, 4) of every free object at the last step."""
         ...
 
     def snapshot(self) -> Restore:
-        """What puts it back as it is at the last step; no sensor may be mounted in between."""
+        """Return a function that restores the state of the last step; no sensor may be mounted in between."""
         ...
 
 
 class KinematicWorld:
-    """Surfaces that move as they were told, whatever touches them; each tip touches the nearest.
+    """Surfaces with prescribed motion, unaffected by contact; each tip touches the nearest.
 
     Args:
-        surfaces: by name, at least one.
-        law: how every tip gives and slips.
+        surfaces: surfaces by name, at least one.
+        law: contact law of every tip.
 
     Raises:
-        ConfigError: there is no surface.
+        ConfigError: no surface.
     """
 
     def __init__(self, surfaces: Mapping[str, Surface], law: ContactLaw) -> None:
@@ -60,20 +60,20 @@ class KinematicWorld:
         self._models: dict[str, ContactModel] = {}
 
     def mount(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
-        """Let ``sensor`` feel; returns what it feels at ``T_world_s`` (4, 4) at ``t_s``."""
+        """Add ``sensor``; return its contact at ``T_world_s`` (4, 4) at ``t_s``."""
         self._models[sensor] = ContactModel(self.law)
         return self._feel(sensor, T_world_s, t_s)()
 
     def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, Feeling]:
-        """What each sensor feels at ``t_s``."""
+        """Return the contact of each sensor at ``t_s``."""
         return {sensor: self._feel(sensor, pose, t_s) for sensor, pose in T_world_s.items()}
 
     def objects(self) -> Mapping[str, Array]:
-        """Nothing is free here."""
+        """Return an empty mapping: there are no free objects."""
         return {}
 
     def snapshot(self) -> Restore:
-        """What brings every contact back."""
+        """Return a function that restores every contact."""
         contacts = [model.snapshot() for model in self._models.values()]
 
         def restore() -> None:

@@ -16,6 +16,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 
 from touchcell.control.reach import Reach, is_there
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
+from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.errors import TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
@@ -310,7 +311,7 @@ SPEC = TaskSpec(
     name="data_collection",
     summary="touch a known surface with varied contacts and store labelled frames",
     config=DataCollectionConfig,
-    arms={ARM: frozenset({"TcpSource", "TwistSink", "Stoppable"})},
+    arms={ARM: SERVO_ARM},
     sensors=frozenset({SENSOR}),
     build=DataCollection,
     labels_frames=True,

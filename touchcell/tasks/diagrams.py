@@ -28,18 +28,22 @@ def tables() -> Mapping[str, Table]:
     }
 
 
-def redrawn(page: str) -> str:
-    """Return ``page`` with every diagram between its markers drawn from the code.
+def redraw(page: str, known: Mapping[str, Table]) -> str:
+    """Return ``page`` with every diagram between its markers drawn from ``known``.
 
     Raises:
-        KeyError: a marker names an unknown diagram.
+        KeyError: a diagram's name is not in ``known``.
     """
-    known = tables()
 
     def draw(block: re.Match[str]) -> str:
         return f"{block[1]}```mermaid\n{mermaid(known[block[2]])}\n```\n{block[3]}"
 
     return _BLOCK.sub(draw, page)
+
+
+def redrawn(page: str) -> str:
+    """``page`` with every diagram between its markers drawn from the tasks. Raises KeyError for an unknown one."""
+    return redraw(page, tables())
 
 
 def main(arguments: Sequence[str]) -> None:

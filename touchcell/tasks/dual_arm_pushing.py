@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from pydantic import PositiveFloat
 
+from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig, Six, SixGains
 from touchcell.tasks.interface import TaskContext, TaskSpec
@@ -114,8 +115,8 @@ SPEC = TaskSpec(
     summary="push an object to a target while a second arm holds and steadies its far side",
     config=DualArmPushingConfig,
     arms={
-        LEADER: frozenset({"TcpSource", "TwistSink", "Stoppable"}),
-        FOLLOWER: frozenset({"TcpSource", "TwistSink", "Stoppable"}),
+        LEADER: SERVO_ARM,
+        FOLLOWER: SERVO_ARM,
     },
     sensors=frozenset({LEADER_SENSOR, FOLLOWER_SENSOR}),
     build=build,

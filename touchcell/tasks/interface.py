@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Protocol
+from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
 from touchcell.drivers.core.commands import TwistCommand
+from touchcell.drivers.core.protocols import require_protocols
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
@@ -118,15 +119,18 @@ class TaskContext:
     kept: int = 0
 
 
+TaskConfigT = TypeVar("TaskConfigT", bound=TaskConfig)
+
+
 @dataclass(frozen=True, slots=True)
-class TaskSpec:
+class TaskSpec(Generic[TaskConfigT]):
     """A task's entry point (group ``touchcell.tasks``).
 
     Attributes:
         name: value of ``task`` in the cell file.
         summary: one line for ``touchcell list``.
         config: pydantic model of its parameters.
-        arms: roles of arms and the protocols (names in ``touchcell.drivers.core.protocols``) each must provide.
+        arms: roles of arms, and the Protocols (``touchcell.drivers.core.protocols``) that each driver must provide.
         sensors: roles of the tactile sensors it needs.
         build: builds the task from its parameters and the context.
         labels_frames: True if it labels frames, which the cell has to store.
@@ -134,12 +138,19 @@ class TaskSpec:
 
     name: str
     summary: str
-    config: type[TaskConfig]
-    arms: Mapping[str, frozenset[str]]
+    config: type[TaskConfigT]
+    arms: Mapping[str, frozenset[type]]
     sensors: frozenset[str]
-    build: Callable[[Any, TaskContext], Task]
+    build: Callable[[TaskConfigT, TaskContext], Task]
     labels_frames: bool = False
 
+    def __post_init__(self) -> None:
+        for protocols in self.arms.values():
+            require_protocols(protocols)
 
-TASKS: Final = Registry("touchcell.tasks", "task", TaskSpec)
+
+AnyTask: TypeAlias = TaskSpec[Any]
+"""A task that was found by name: its configuration is what its own model validates."""
+
+TASKS: Final[Registry[AnyTask]] = Registry("touchcell.tasks", "task", TaskSpec)
 """All installed tasks."""

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from pydantic import PositiveFloat
 
+from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import ContactServo, SixGains
 from touchcell.tasks.interface import TaskContext, TaskSpec
@@ -67,7 +68,7 @@ SPEC = TaskSpec(
     name="object_tracking",
     summary="keep contact with an object and follow its motion in all six components",
     config=ObjectTrackingConfig,
-    arms={ARM: frozenset({"TcpSource", "TwistSink", "Stoppable"})},
+    arms={ARM: SERVO_ARM},
     sensors=frozenset({SENSOR}),
     build=build,
 )

@@ -11,6 +11,7 @@ from pydantic import NonNegativeFloat, PositiveFloat, model_validator
 
 from touchcell.control.alignment import Aim, AlignmentGains, TargetAlignment
 from touchcell.control.path import Point
+from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig, Six, SixGains
 from touchcell.tasks.interface import TaskContext, TaskSpec
@@ -166,7 +167,7 @@ SPEC = TaskSpec(
     name="single_arm_pushing",
     summary="push an object over a table to a target, steering it by touch",
     config=SingleArmPushingConfig,
-    arms={ARM: frozenset({"TcpSource", "TwistSink", "Stoppable"})},
+    arms={ARM: SERVO_ARM},
     sensors=frozenset({SENSOR}),
     build=build,
 )

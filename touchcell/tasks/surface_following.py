@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from pydantic import PositiveFloat
 
+from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import ContactServo, SixGains
 from touchcell.tasks.interface import TaskContext, TaskSpec
@@ -75,7 +76,7 @@ SPEC = TaskSpec(
     name="surface_following",
     summary="slide over an unknown surface at constant depth and normal to it",
     config=SurfaceFollowingConfig,
-    arms={ARM: frozenset({"TcpSource", "TwistSink", "Stoppable"})},
+    arms={ARM: SERVO_ARM},
     sensors=frozenset({SENSOR}),
     build=build,
 )

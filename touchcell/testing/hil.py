@@ -1,7 +1,7 @@
-"""pytest plugin: the conformance suite on a real bench, ``pytest -m hil --cell bench.yaml``.
+"""pytest plugin: run the conformance suite on real hardware, ``pytest -m hil --cell bench.yaml``.
 
-Every device of the cell file is tested at no more than 5 mm/s. A person is asked before each arm; ``--hil-yes`` answers
-for them. Installed as an entry point of ``pytest11``; without ``--cell`` it does nothing but deselect ``hil`` tests.
+Every device of the cell file is tested at no more than 5 mm/s. The operator confirms each arm first; ``--hil-yes``
+skips the question. Installed as an entry point of ``pytest11``; without ``--cell`` it only deselects ``hil`` tests.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ _CONFIRMED = pytest.StashKey[set[str]]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--cell`` and ``--hil-yes``."""
+    """Add ``--cell`` and ``--hil-yes``."""
     group = parser.getgroup("touchcell")
-    group.addoption("--cell", type=Path, help="cell file of the bench on which `hil` tests run")
+    group.addoption("--cell", type=Path, help="cell file of the real devices on which `hil` tests run")
     group.addoption("--hil-yes", action="store_true", help="run `hil` tests without asking the operator")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Take the cell file as one more test file."""
+    """Collect the cell file as one more test file."""
     config.addinivalue_line("markers", "hil: moves a real device; needs --cell")
     config.stash[_CONFIRMED] = set()
     if cell := config.getoption("--cell"):
@@ -35,7 +35,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Without a bench there are no tests on it."""
+    """Deselect `hil` tests without a cell file."""
     if config.getoption("--cell"):
         return
     on_bench = [item for item in items if item.get_closest_marker("hil")]
@@ -45,7 +45,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
-    """The cell file becomes a module of suites."""
+    """Collect the cell file as a module of suites."""
     cell = parent.config.getoption("--cell")
     if cell is None or file_path != cell.resolve():
         return None
@@ -53,7 +53,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Ask the operator once for each device."""
+    """Ask the operator once per device."""
     device = getattr(getattr(item, "cls", None), "driver", None)
     confirmed = item.config.stash[_CONFIRMED]
     if device is None or device in confirmed or not item.get_closest_marker("hil"):
@@ -81,7 +81,7 @@ class BenchModule(pytest.Module):
 
 
 def _rig_of(plan: CellPlan, device: DevicePlan) -> FixtureFactory:
-    """A rig that knows nothing but the device itself."""
+    """Build a device fixture with no emulator and no ground truth."""
     from touchcell.cell.runtime.devices import build_devices
     from touchcell.drivers.core.clock import MonotonicClock, VirtualClock
     from touchcell.testing.emulation.rig import DeviceFixture
@@ -102,7 +102,7 @@ def _rig_of(plan: CellPlan, device: DevicePlan) -> FixtureFactory:
 
 
 def _scene_rate_hz(plan: CellPlan, device: DevicePlan) -> float | None:
-    """Of an arm that is sampled in the steps of the cell's scene."""
+    """Return the state rate of an arm that is sampled in the steps of the cell's scene, else None."""
     able = device.spec.capabilities
     if plan.cell.scene is None or able.kind != "arm" or not able.virtual_time:
         return None

@@ -36,7 +36,7 @@ DEADLINE_S = 60.0
 # A child process that leads a session with a terminal, as a shell would start it, and says how often it was asked.
 PROGRAM = """
 import fcntl, sys, termios
-from touchcell.cell.runtime.loop import StopRequest
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.cell.runtime.operator_input import stop_on_keys
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 stop = StopRequest()
@@ -94,7 +94,7 @@ def test_a_lost_terminal_stops_at_once(terminal: tuple[int, int]) -> None:
 
 
 def test_what_is_no_terminal_is_left_alone(tmp_path: Path) -> None:
-    from touchcell.cell.runtime.loop import StopRequest
+    from touchcell.cell.runtime.stop_request import StopRequest
 
     stop = StopRequest()
     file = tmp_path / "keys"
@@ -106,7 +106,7 @@ def test_what_is_no_terminal_is_left_alone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_ask_and_handlers_are_restored(number: signal.Signals) -> None:
-    from touchcell.cell.runtime.loop import StopRequest
+    from touchcell.cell.runtime.stop_request import StopRequest
 
     stop = StopRequest()
     before = signal.getsignal(number)

@@ -19,99 +19,20 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from tests.fault_injection.fault_matrix import cells
+from tests.helpers.operated_run import OperatedRun, tripped, waiting_cell
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_TASK_FAILED
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
-from touchcell.cell.runtime.cell import Cell
-from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
 from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest, Request, ask_run, is_waiting
+from touchcell.cell.runtime.run_result import Outcome
 from touchcell.cell.runtime.watchdog import NullWatchdog
 from touchcell.control.latch import LatchState
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.errors import DeviceFault
 from touchcell.geometry.types import Array
-from touchcell.simulation.devices.arm import SimArm
 
 DEADLINE_S = 60.0
-
-
-def data(**changes: Any) -> dict[str, Any]:
-    cell = cells()["surface_following"]
-    cell["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
-    cell["on_trip"] = "wait_for_reset"
-    cell["task"]["distance_mm"] = 4
-    return {**cell, **changes}
-
-
-class Run:
-    """A cell whose operator is the test."""
-
-    def __init__(self, folder: Path, cell: dict[str, Any] | None = None, *, desk: bool = True) -> None:
-        path = folder / "cell.yaml"
-        path.write_text(yaml.safe_dump(cell or data()))
-        self.cell: Cell = compose(plan_cell(path))
-        self.desk = OperatorChannel()
-        self.stop = StopRequest()
-        self.trips: list[RunResult] = []
-        self.waiting = ""
-        self.loop = RunLoop(
-            self.cell,
-            None,
-            stop=self.stop,
-            on_cycle=self._note,
-            desk=self.desk if desk else None,
-            on_trip=self.trips.append,
-        )
-        self.cell.__enter__()
-        arm = self.cell.arms["arm"]
-        assert isinstance(arm, SimArm)
-        self.arm = arm
-        self.going = True
-        self.loop.begin()
-
-    def _note(self, progress: Progress) -> None:
-        self.waiting = progress.waiting
-
-    def go(self, cycles: int) -> None:
-        for _ in range(cycles):
-            self.going = self.going and self.loop.step()
-
-    def until(self, state: str) -> None:
-        for _ in range(2000):
-            if self.cell.task.state == state:
-                return
-            self.go(1)
-        raise AssertionError(f"still {self.cell.task.state}")
-
-    def fault(self, **changes: Any) -> None:
-        self.arm.faults = replace(self.arm.faults, **changes)
-
-    def ask(self, ask: OperatorRequest) -> str:
-        self.desk.last_reply = ""
-        self.desk.ask(ask, "ada")
-        self.go(1)
-        return self.desk.last_reply
-
-    def end(self) -> RunResult:
-        result = self.loop.end()
-        self.cell.__exit__(None, None, None)
-        return result
-
-    def pose(self) -> Array:
-        return self.arm.T_world_tcp().copy()
-
-
-def tripped(folder: Path, **changes: Any) -> Run:
-    """A run whose arm stopped telling its state in the middle of its work."""
-    run = Run(folder, data(**changes))
-    run.until("run")
-    run.go(20)
-    run.fault(stale=True)
-    run.until("tripped")
-    return run
 
 
 def test_reset_then_resume_starts_the_task_from_its_first_state_and_it_ends_well(tmp_path: Path) -> None:
@@ -143,7 +64,7 @@ def test_reset_then_resume_starts_the_task_from_its_first_state_and_it_ends_well
 
 
 def test_without_the_key_in_the_file_a_trip_ends_the_run_as_ever(tmp_path: Path) -> None:
-    run = Run(tmp_path, data(on_trip="end"))
+    run = OperatedRun(tmp_path, waiting_cell(on_trip="end"))
     run.until("run")
     run.fault(stale=True)
     run.go(50)
@@ -153,7 +74,7 @@ def test_without_the_key_in_the_file_a_trip_ends_the_run_as_ever(tmp_path: Path)
 
 
 def test_without_anybody_to_ask_a_trip_ends_the_run(tmp_path: Path) -> None:
-    run = Run(tmp_path, desk=False)
+    run = OperatedRun(tmp_path, operated=False)
     run.until("run")
     run.fault(stale=True)
     run.go(50)
@@ -162,10 +83,10 @@ def test_without_anybody_to_ask_a_trip_ends_the_run(tmp_path: Path) -> None:
 
 
 def test_what_was_asked_before_the_trip_counts_for_nothing(tmp_path: Path) -> None:
-    run = Run(tmp_path)
+    run = OperatedRun(tmp_path)
     run.until("run")
-    run.desk.ask(OperatorRequest.RESET, "ada")
-    run.desk.ask(OperatorRequest.RESUME, "ada")
+    run.channel.ask(OperatorRequest.RESET, "ada")
+    run.channel.ask(OperatorRequest.RESUME, "ada")
     run.fault(stale=True)
     run.until("tripped")
     run.fault(stale=False)
@@ -197,9 +118,9 @@ def test_an_arm_that_moves_while_it_waits_is_stopped_again_by_stronger_means(tmp
 
 
 def test_category_1_takes_the_power_and_resume_gives_it_back(tmp_path: Path) -> None:
-    cell = data()
+    cell = waiting_cell()
     cell["arms"]["arm"]["stop_category"] = 1
-    run = Run(tmp_path, cell)
+    run = OperatedRun(tmp_path, cell)
     run.until("run")
     run.fault(stale=True)
     run.until("tripped")
@@ -215,7 +136,7 @@ def test_category_1_takes_the_power_and_resume_gives_it_back(tmp_path: Path) -> 
 
 
 def test_a_device_fault_waits_too_and_a_reset_recovers_the_device(tmp_path: Path) -> None:
-    run = Run(tmp_path)
+    run = OperatedRun(tmp_path)
     run.until("run")
     run.arm._to_faulted(DeviceFault("arm", "it complains"))
     run.until("tripped")
@@ -302,10 +223,10 @@ class Impatient(RuleBasedStateMachine):
 
     @initialize(category=st.sampled_from([1, 2]))
     def start(self, category: int) -> None:
-        cell = data(max_duration_s=100.0)
+        cell = waiting_cell(max_duration_s=100.0)
         cell["arms"]["arm"]["stop_category"] = category
         cell["task"]["distance_mm"] = 1000
-        self.run = Run(Path(self.folder.name), cell)
+        self.run = OperatedRun(Path(self.folder.name), cell)
         self.allowed = True
         follow = self.run.arm._body.follow
 
@@ -331,10 +252,10 @@ class Impatient(RuleBasedStateMachine):
         before, present = latch.first_cause, latch.state in (LatchState.TRIPPED, LatchState.FAULTED)
         waits = self.run.cell.task.state == "tripped"
         for ask in asks:
-            self.run.desk.ask(ask, "ada")
-        resets = len(self.run.loop._resets)
+            self.run.channel.ask(ask, "ada")
+        resets = len(self.run.loop.result.resets)
         self.run.go(1)
-        cleared = len(self.run.loop._resets) - resets
+        cleared = len(self.run.loop.result.resets) - resets
         assert cleared <= 1
         if cleared:
             assert waits
@@ -363,15 +284,15 @@ TestImpatient = Impatient.TestCase
 TestImpatient.settings = settings(max_examples=8, stateful_step_count=15)
 
 
-def two_arms(folder: Path, **pair: Any) -> Run:
+def two_arms(folder: Path, **pair: Any) -> OperatedRun:
     """The arm of the task, and another that carries its sensor and holds something for it."""
-    cell = data(on_trip="end")
+    cell = waiting_cell(on_trip="end")
     cell["arms"]["arm"]["stop_category"] = 1
     cell["arms"]["other"] = {**cell["arms"]["arm"]}
     cell["sensors"]["sensor"]["mounted_on"] = "other"
     cell["interlocks"] = {name: entry for name, entry in cell["interlocks"].items() if name not in ("contact_lost",)}
     cell["pairs"] = [{"leader": "arm", "follower": "other", **pair}]
-    return Run(folder, cell)
+    return OperatedRun(folder, cell)
 
 
 @pytest.mark.parametrize(
@@ -406,7 +327,7 @@ def test_an_orderly_end_leaves_both_their_power(tmp_path: Path) -> None:
 @pytest.mark.parametrize("pair", [{"leader": "arm", "follower": "nobody"}, {"leader": "arm", "follower": "arm"}])
 def test_a_pair_of_what_is_not_there_is_refused(tmp_path: Path, pair: dict[str, str]) -> None:
     path = tmp_path / "cell.yaml"
-    path.write_text(yaml.safe_dump(data(pairs=[pair])))
+    path.write_text(yaml.safe_dump(waiting_cell(pairs=[pair])))
     with pytest.raises(InvalidCell) as caught:
         plan_cell(path)
     assert caught.value.problems[0].key.startswith("pairs.0")
@@ -455,7 +376,7 @@ def test_reset_without_a_run_that_waits(
 
 
 def test_reset_and_resume_from_another_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cell = data()
+    cell = waiting_cell()
     # It trips by itself: pressed in deeper than allowed by the task's own depth.
     cell["interlocks"]["indentation"]["limit_mm"] = 1.0
     path, folder = tmp_path / "cell.yaml", tmp_path / "run"

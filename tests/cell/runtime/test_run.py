@@ -20,7 +20,9 @@ from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.recording.mcap import Recorder, read
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import Outcome, Progress, RunResult
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.errors import ConnectError
 from touchcell.drivers.core.samples import Stamped, TcpState

@@ -14,8 +14,9 @@ from tests.fault_injection.fault_matrix import cells
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, RunLoop
+from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.planning_scene import link_capsules
+from touchcell.cell.runtime.run_result import Outcome
 from touchcell.control.interlocks.clearance import Clearance, ClearanceConfig
 from touchcell.control.interlocks.collision import BASE, TOOL, Box, Capsule, Clearances
 from touchcell.control.interlocks.config import build_interlocks, parse_interlocks

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from touchcell.control.interlocks.basic import Finite
-from touchcell.control.interlocks.config import INTERLOCKS, build_interlocks, parse_interlocks
+from touchcell.control.interlocks.config import build_interlocks, parse_interlocks
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
+from touchcell.control.interlocks.spec import INTERLOCKS
 from touchcell.control.interlocks.timers import TimedInterlock
 from touchcell.control.interlocks.violation import Severity
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
@@ -238,8 +240,9 @@ def test_an_unknown_sensor_is_a_config_error():
 
 def test_every_kind_is_listed_with_one_line():
     # What a clearance does is in test_clearance.py.
-    assert set(INTERLOCKS) == {"finite", "clearance"} | {entry["kind"] for entry in GOOD.values()}
-    for kind, spec in INTERLOCKS.items():
-        assert spec.kind == kind
+    assert set(INTERLOCKS.names()) == {"clearance"} | {entry["kind"] for entry in GOOD.values()}
+    for kind in INTERLOCKS.names():
+        spec = INTERLOCKS.load(kind)
+        assert spec.config.model_fields["kind"].annotation == Literal[kind]
         assert spec.summary
         assert "\n" not in spec.summary

@@ -88,7 +88,7 @@ def command(
     return TwistCommand(np.array([vx, 0, 0, 0, 0, 0.0]), frame, clock.now_ns(), ttl_s)
 
 
-def test_it_has_the_abilities_of_an_arm(arm: NotedArm) -> None:
+def test_it_provides_the_protocols_of_an_arm(arm: NotedArm) -> None:
     assert isinstance(arm, TcpSource)
     assert isinstance(arm, TwistSink)
     assert isinstance(arm, Stoppable)
@@ -178,7 +178,7 @@ def test_only_the_leases_owner_may_command(arm: NotedArm, clock: VirtualClock) -
     assert arm.streamed == []
 
 
-def test_releasing_stops_but_a_void_lease_stops_nobody_else(arm: NotedArm) -> None:
+def test_releasing_stops_the_arm_but_a_void_lease_does_not(arm: NotedArm) -> None:
     old = arm.acquire("first")
     arm.release(old)
     assert arm.stops == [2]
@@ -217,7 +217,9 @@ def test_after_a_stop_the_next_twist_starts_from_rest(arm: NotedArm, clock: Virt
     assert 0.0 < arm.streamed[-1][0][0] <= 0.5 * FIRST_STEP_S
 
 
-def test_deactivation_voids_the_lease_waits_for_rest_then_obeys_the_policy(arm: NotedArm, clock: VirtualClock) -> None:
+def test_deactivation_voids_the_lease_waits_for_rest_then_applies_the_policy(
+    arm: NotedArm, clock: VirtualClock
+) -> None:
     lease = arm.acquire("task")
     began_ns = clock.now_ns()
     arm.deactivate(DeactivatePolicy.BRAKE)
@@ -281,7 +283,7 @@ def test_limits_are_positive_and_finite(value: float) -> None:
             LimitsConfig(**{key: value})
 
 
-def test_nobody_commands_an_arm_that_nobody_owns(arm: NotedArm, clock: VirtualClock) -> None:
+def test_an_arm_without_an_owner_rejects_commands(arm: NotedArm, clock: VirtualClock) -> None:
     def assert_refused() -> None:
         with pytest.raises(CommandRejected) as caught:
             arm.send_twist(command(clock), None)  # type: ignore[arg-type]

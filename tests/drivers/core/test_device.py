@@ -1,4 +1,4 @@
-"""Faults that a driver's own thread latches, devices that are gone, and refusals that are no faults."""
+"""Faults latched by a driver's own thread, lost devices, and refusals that are not faults."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from touchcell.drivers.core.errors import CommandRejected, DeviceError, DeviceFa
 
 
 class Gadget(Device):
-    """Does what each test tells it to."""
+    """Driver with behaviour set by each test."""
 
     def __init__(self) -> None:
         super().__init__("gadget", VirtualClock())
@@ -53,7 +53,7 @@ def test_a_fault_latched_during_activation_is_not_overwritten(gadget: Gadget) ->
     assert gadget.fault is gadget.latch_on_the_way
 
 
-def test_disconnecting_a_device_that_is_gone_does_not_raise(gadget: Gadget) -> None:
+def test_disconnecting_a_lost_device_does_not_raise(gadget: Gadget) -> None:
     gadget.activate()
     gadget.raise_at_rest = DeviceGone("gadget", "cable")
     gadget.disconnect()
@@ -68,7 +68,7 @@ def test_disconnecting_a_device_that_does_not_come_to_rest_raises(gadget: Gadget
     assert gadget.state is Lifecycle.DISCONNECTED
 
 
-def test_a_refused_command_is_no_fault_but_a_lost_device_is(gadget: Gadget) -> None:
+def test_a_rejected_command_is_not_a_fault_but_a_lost_device_is(gadget: Gadget) -> None:
     with pytest.raises(CommandRejected):
         gadget.attempt(CommandRejected("gadget", Rejection.MODE, "busy"))
     assert gadget.state is Lifecycle.READY

@@ -7,7 +7,7 @@ import numpy as np
 from touchcell.drivers.core.frame_monitor import FrameMonitor
 
 
-def test_counts_what_was_lost_and_whose_fault_it_was() -> None:
+def test_counts_lost_frames_and_their_cause() -> None:
     watch = FrameMonitor()
     watch.miss(2, overrun=False)
     watch.miss(5, overrun=True)

@@ -27,7 +27,7 @@ WORKING = np.deg2rad([10.0, 40.0, 90.0, 5.0, 50.0, 20.0])
 
 
 class Bench:
-    """A gate asked once in each ``DT_S``; ``q`` is where the joints are, if it is to know."""
+    """A gate called once per ``DT_S``; ``q`` is the joint configuration, if it is to be used."""
 
     def __init__(self, limits: TwistLimits = LIMITS, ik: DifferentialIk | None = None) -> None:
         self.clock = VirtualClock(10**9)
@@ -53,7 +53,7 @@ def norms(vector: Array) -> tuple[float, float]:
 
 @given(asked=st.lists(st.tuples(wanted, st.integers(1, 12)), min_size=1, max_size=6))
 @settings(max_examples=60)
-def test_speed_acceleration_and_jerk_hold_whatever_is_asked(asked: list[tuple[Array, int]]) -> None:
+def test_speed_acceleration_and_jerk_limits_hold_for_any_command(asked: list[tuple[Array, int]]) -> None:
     bench = Bench()
     bench.send(np.zeros(6))
     last, accel = np.zeros(6), np.zeros(6)
@@ -62,7 +62,7 @@ def test_speed_acceleration_and_jerk_hold_whatever_is_asked(asked: list[tuple[Ar
             sent = bench.send(twist).command.twist
             now = (sent - last) / DT_S
             jerk = (now - accel) / DT_S
-            # Where the jerk carries the twist over the speed limit, speed has the last word.
+            # Where the jerk limit carries the twist over the speed limit, the speed limit has priority.
             at_speed = norms(sent)[0] > 0.1 - 1e-9 or norms(sent)[1] > 0.5 - 1e-9
             for k, (most, most_accel, most_jerk) in enumerate(((0.1, 0.5, 20.0), (0.5, 2.5, 100.0))):
                 assert norms(sent)[k] <= most * (1 + 1e-9)
@@ -109,7 +109,7 @@ def test_the_first_step_from_rest_is_the_jerks_and_is_named_with_value_and_limit
     assert set(told) == {"tcp linear acceleration", "tcp linear jerk"}
 
 
-def test_what_is_left_in_the_last_cycle_before_is_taken_off_smoothly() -> None:
+def test_the_last_difference_before_the_target_is_removed_smoothly() -> None:
     bench = Bench()
     bench.send(np.zeros(6))
     accel = []

@@ -139,7 +139,7 @@ def test_only_an_active_arm_takes_a_twist(bench: Bench, state: Lifecycle) -> Non
 
 
 @pytest.mark.parametrize("lease", [None, "test", 0, object()])
-def test_what_is_no_lease_is_refused_whether_one_is_held_or_not(bench: Bench, lease: Any) -> None:
+def test_a_wrong_lease_object_is_refused_whether_one_is_held_or_not(bench: Bench, lease: Any) -> None:
     held, bench.lease = bench.lease, lease
     assert bench.refusal().reason is Rejection.LEASE
     bench.desk.release(held)
@@ -157,7 +157,7 @@ def test_a_lease_equal_to_the_one_that_is_held_is_another_lease(bench: Bench) ->
     assert bench.desk.owner == "test", "a copy releases nothing either"
 
 
-def test_of_threads_that_ask_at_once_exactly_one_is_given_the_lease() -> None:
+def test_of_concurrent_threads_exactly_one_acquires_the_lease() -> None:
     desk = LeaseManager("arm")
     given_out: list[Lease] = []
     together = threading.Barrier(8)
@@ -206,7 +206,7 @@ NOT_NUMBERS = {
 
 
 @pytest.mark.parametrize("kind", AS_NUMBERS)
-def test_every_kind_of_array_of_six_numbers_is_taken_for_what_it_says(bench: Bench, kind: str) -> None:
+def test_every_kind_of_array_of_six_numbers_is_accepted(bench: Bench, kind: str) -> None:
     twist = np.array([0.0625, -0.03125, 0.015625, 0.125, 0.25, -0.0625])
     for _ in range(60):
         sent = bench.send(AS_NUMBERS[kind](twist))
@@ -222,7 +222,7 @@ def test_integers_are_taken_for_numbers(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("kind", NOT_NUMBERS)
-def test_what_is_no_array_of_numbers_is_refused(bench: Bench, kind: str) -> None:
+def test_anything_but_an_array_of_numbers_is_refused(bench: Bench, kind: str) -> None:
     assert bench.refusal(NOT_NUMBERS[kind]).reason is Rejection.SHAPE
 
 
@@ -257,9 +257,7 @@ def test_masked_elements_are_refused_although_numbers_lie_beneath(bench: Bench) 
     frame=st.sampled_from([TwistFrame.BASE, TwistFrame.TCP, "base", None]),
 )
 @settings(max_examples=300)
-def test_whatever_is_asked_is_refused_as_such_or_sent_finite_and_within_the_limits(
-    twist: Any, ttl_s: Any, frame: Any
-) -> None:
+def test_any_command_is_refused_or_sent_finite_and_within_the_limits(twist: Any, ttl_s: Any, frame: Any) -> None:
     bench = Bench()
     for _ in range(3):
         try:
@@ -313,7 +311,7 @@ def test_a_read_only_view_of_an_array_that_changes_does_not_change_what_was_sent
         (np.array([0, 0, 0, -math.inf, 0, 0]), Rejection.NON_FINITE),
     ],
 )
-def test_what_a_driver_makes_of_a_twist_is_checked_again_and_forgotten(made: Array, reason: Rejection) -> None:
+def test_a_twist_changed_by_a_driver_is_checked_again(made: Array, reason: Rejection) -> None:
     bench = Bench()
     bench.cruise()
 
@@ -388,7 +386,7 @@ def test_a_reset_makes_the_next_command_the_first(bench: Bench) -> None:
     assert np.linalg.norm(bench.send(after_s=0.0).command.twist) <= 0.5 * FIRST_STEP_S
 
 
-def test_the_scale_is_the_least_of_what_either_part_asks() -> None:
+def test_the_scale_is_the_smaller_of_both_parts() -> None:
     """Also where the linear part asks for less and comes first."""
     bench = Bench(NO_JERK)
     asked = np.array([0.4, 0, 0, 1.0, 0, 0])

@@ -93,7 +93,7 @@ orders = st.one_of(
 
 @given(st.lists(st.tuples(orders, st.integers(1, 80)), max_size=8))
 @settings(max_examples=30)
-def test_whatever_is_ordered_stays_within_limits_and_comes_to_rest(script: list) -> None:  # type: ignore[type-arg]
+def test_any_motion_stays_within_limits_and_comes_to_rest(script: list) -> None:  # type: ignore[type-arg]
     setpoint, k = standing(), 0
 
     def advance(steps: int) -> None:

@@ -31,7 +31,7 @@ def test_poses_fill_the_ranges_of_the_public_data_and_no_more() -> None:
         assert np.abs(disc.mean(axis=0)).max() < 0.03 * radius
 
 
-def test_labels_are_what_is_left_after_slip() -> None:
+def test_labels_are_the_contacts_after_slip() -> None:
     law = ContactLaw()
     labels = np.stack([contact.T_f_s for contact in contacts(400, 3)])
     for T in labels:

@@ -90,7 +90,7 @@ def test_any_bytes_are_a_finite_answer_of_that_motor_or_refused(data: bytes, mot
 
 
 @given(st.integers(0, 7), st.integers(1, 255))
-def test_a_changed_register_reply_is_never_taken_for_another(position: int, change: int) -> None:
+def test_a_corrupt_register_reply_is_never_mistaken_for_another(position: int, change: int) -> None:
     good = bytearray(codec.encode_register_reply(3, Register.VMAX, 30.0))
     good[position] ^= change
     try:
@@ -119,7 +119,7 @@ def test_impossible_register_values_are_refused(register: int, value: float) -> 
 def test_every_status_is_normal_or_a_fault() -> None:
     assert codec.fault(codec.DISABLED) is None
     assert codec.fault(codec.ENABLED) is None
-    # Damiao's manual: 8 OV, 9 UV, A OC, B MOS, C rotor, D lost communication, E overload; 5 and 6 are newer.
+    # Damiao DM-J protocol: 8 OV, 9 UV, A OC, B MOS, C rotor, D lost communication, E overload; 5 and 6 are newer.
     assert set(codec.FAULTS) == {5, 6, 8, 9, 0xA, 0xB, 0xC, 0xD, 0xE}
     for status in range(2, 16):
         code = codec.fault(status)
@@ -131,8 +131,8 @@ def test_every_status_is_normal_or_a_fault() -> None:
     assert undocumented.fault_class is FaultClass.INTERNAL
 
 
-def test_bus_load_matches_what_is_known_of_these_arms() -> None:
-    # Seven motors, classic 1 Mbit/s: at most 47 % at 250 Hz, 95 % at 500 Hz;
+def test_bus_load_matches_published_figures_of_these_arms() -> None:
+    # Published figures, seven motors: classic 1 Mbit/s at most 47 % at 250 Hz, 95 % at 500 Hz;
     # CAN FD 1M/5M 69-77 % at 1 kHz.
     assert codec.bus_load(7, 250, 1_000_000) == pytest.approx(0.47, abs=0.01)
     assert codec.bus_load(7, 500, 1_000_000) == pytest.approx(0.945, abs=0.01)

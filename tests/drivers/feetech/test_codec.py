@@ -43,7 +43,7 @@ def test_sync_write_golden() -> None:
     assert codec.sync_write(Register.GOAL_POSITION, goals) == wanted
 
 
-def test_signs_are_bits_of_their_own() -> None:
+def test_signs_are_separate_bits() -> None:
     assert codec.signed_word(-100) == bytes.fromhex("6480")
     assert codec.from_signed_word(bytes.fromhex("6480")) == -100
     # Load: bit 10; homing offset: bit 11.
@@ -80,7 +80,7 @@ def test_impossible_packets_are_refused() -> None:
 
 
 @given(st.lists(packets, max_size=5), st.integers(0, 300))
-def test_packets_survive_any_way_of_cutting_the_stream(sent: list[Packet], cut: int) -> None:
+def test_packets_are_decoded_for_any_fragmentation_of_the_stream(sent: list[Packet], cut: int) -> None:
     stream = b"".join(codec.encode(packet) for packet in sent)
     first = codec.split(stream[:cut])
     second = codec.split(first.rest + stream[cut:])
@@ -89,7 +89,7 @@ def test_packets_survive_any_way_of_cutting_the_stream(sent: list[Packet], cut: 
 
 
 @given(packets, st.data())
-def test_one_wrong_byte_never_passes_for_the_answer_that_was_asked_for(packet: Packet, data: st.DataObject) -> None:
+def test_a_corrupt_packet_never_passes_for_the_expected_reply(packet: Packet, data: st.DataObject) -> None:
     good = codec.encode(packet)
     at = data.draw(st.integers(0, len(good) - 1))
     wrong = good[:at] + bytes([good[at] ^ data.draw(st.integers(1, 255))]) + good[at + 1 :]
@@ -134,14 +134,14 @@ def state_block(start: int) -> bytes:
 
 
 @pytest.mark.parametrize("start", codec.STATE_STARTS)
-def test_every_state_block_tells_the_same(start: int) -> None:
+def test_every_state_block_decodes_to_the_same_state(start: int) -> None:
     data = state_block(start)
     assert len(data) == codec.state_length(start)
     state = codec.decode_state(data)
     assert state == codec.ServoState(1, 3001, 600, 3000, -50, -0.25, 12.1, 31, 0x20, pytest.approx(0.065))
 
 
-def test_state_blocks_have_sixteen_lengths_and_no_other_answer_has_them() -> None:
+def test_state_blocks_have_sixteen_lengths_that_no_other_reply_has() -> None:
     assert sorted(codec.state_length(start) for start in codec.STATE_STARTS) == list(range(31, 47))
     assert codec.IDENTITY_LENGTH not in range(31, 47)
 

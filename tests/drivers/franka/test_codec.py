@@ -78,7 +78,7 @@ def test_golden_command() -> None:
     assert (command.has_elbow, command.finished, command.torque_finished) == (False, True, False)
 
 
-def test_golden_state_fields_lie_where_the_header_file_says() -> None:
+def test_golden_state_fields_are_at_the_offsets_of_the_header_file() -> None:
     state = codec.RobotState(message_id=258, mode=codec.Mode.REFLEX, generator=codec.Generator.CARTESIAN_VELOCITY)
     state["q"] = np.arange(1.0, 8.0)
     state["O_dP_EE_c"] = (0.5, 0, 0, 0, 0, 0)
@@ -122,7 +122,9 @@ def test_state_round_trip(
 
 
 @given(st.lists(st.sampled_from(codec.Request), min_size=1, max_size=5), st.data())
-def test_requests_survive_any_cutting_of_the_stream(requests: list[codec.Request], data: st.DataObject) -> None:
+def test_requests_are_decoded_for_any_fragmentation_of_the_stream(
+    requests: list[codec.Request], data: st.DataObject
+) -> None:
     stream = b"".join(
         codec.encode_request(request, i, bytes(codec.PAYLOAD_SIZE[request])) for i, request in enumerate(requests)
     )
@@ -135,7 +137,7 @@ def test_requests_survive_any_cutting_of_the_stream(requests: list[codec.Request
 
 
 @given(st.binary(max_size=200))
-def test_any_bytes_are_requests_or_refused(stream: bytes) -> None:
+def test_any_bytes_are_decoded_or_refused(stream: bytes) -> None:
     try:
         messages, rest = codec.split_requests(stream)
     except CorruptMessage:
@@ -145,7 +147,7 @@ def test_any_bytes_are_requests_or_refused(stream: bytes) -> None:
 
 
 @given(st.integers(0, codec.STATE_SIZE - 1), st.integers(0, 255))
-def test_a_mutated_state_is_refused_or_says_what_the_bytes_say(position: int, value: int) -> None:
+def test_a_mutated_state_is_refused_or_decoded_faithfully(position: int, value: int) -> None:
     wire = bytearray(codec.RobotState(message_id=5).encode())
     wire[position] = value
     try:

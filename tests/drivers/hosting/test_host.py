@@ -1,4 +1,4 @@
-"""A device host, cycle by cycle on virtual time: when it obeys and when it stops. No process is started."""
+"""A device host, cycle by cycle on virtual time: execution of commands and stops. No process is started."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def bench() -> Iterator[Bench]:
     bench.close()
 
 
-def test_without_a_guard_nothing_moves(bench: Bench) -> None:
+def test_nothing_moves_without_guarding(bench: Bench) -> None:
     bench.step()
     refused = bench.send("left")
     assert isinstance(refused, CommandRejected)
@@ -178,7 +178,7 @@ def test_lease_freshness_and_limits_are_checked_in_the_host(bench: Bench) -> Non
     assert 0.0 < sent[0] <= 0.5 * FIRST_STEP_S, "the gate limits acceleration"
 
 
-def test_a_command_expires_in_the_host_when_no_other_comes(bench: Bench) -> None:
+def test_a_command_expires_in_the_host_without_a_newer_one(bench: Bench) -> None:
     bench.move()
     bench.step(60)
     record = bench.states["left"].read()
@@ -186,7 +186,7 @@ def test_a_command_expires_in_the_host_when_no_other_comes(bench: Bench) -> None
     assert not bench.beat.read()["latched"]
 
 
-def test_the_stop_word_stops_both_arms_in_that_cycle_and_for_good(bench: Bench) -> None:
+def test_the_stop_flag_stops_both_arms_in_that_cycle_and_latches(bench: Bench) -> None:
     bench.move()
     bench.tell_watch(Cause(Reason.TASK_SILENT, bench.clock.now_ns(), 0.06, 0.05))
     bench.host.cycle()
@@ -231,7 +231,7 @@ def test_a_silent_watchdog_is_found_within_its_time(silent_after: int) -> None:
         bench.close()
 
 
-def test_an_end_of_the_guard_stops_what_still_moves(bench: Bench) -> None:
+def test_end_of_guarding_stops_moving_arms(bench: Bench) -> None:
     bench.move()
     bench.guarding = False
     bench.step(30)
@@ -262,7 +262,7 @@ def test_each_arm_stops_by_its_own_category() -> None:
     bench.close()
 
 
-def test_the_latch_is_cleared_at_rest_without_lease_and_stop_word_only(bench: Bench) -> None:
+def test_the_latch_is_cleared_only_at_rest_without_lease_and_stop_flag(bench: Bench) -> None:
     bench.move()
     bench.tell_watch(Cause(Reason.TASK_SILENT, bench.clock.now_ns()))
     bench.host.cycle()
@@ -277,10 +277,10 @@ def test_the_latch_is_cleared_at_rest_without_lease_and_stop_word_only(bench: Be
 
     assert refused(), "still moving"
     bench.step(60)
-    assert refused(), "the stop word stands"
+    assert refused(), "the stop flag is set"
     bench.watch.value["stop"] = False
     bench.step()
-    assert refused(), "somebody holds the lease"
+    assert refused(), "the lease is held"
     for name, epoch in bench.leases.items():
         bench.call("release", name, epoch=epoch)
     bench.guarding = True
@@ -308,7 +308,7 @@ def test_a_stop_drops_the_twist_that_was_written_before_it(bench: Bench) -> None
     assert record["at_rest"]
 
 
-def test_what_a_driver_raises_is_told_with_the_state(bench: Bench) -> None:
+def test_an_error_raised_by_a_driver_is_published_with_the_state(bench: Bench) -> None:
     bench.move()
     bench.arm("left").disconnect()
     bench.step()

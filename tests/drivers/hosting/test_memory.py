@@ -49,7 +49,7 @@ def test_another_layout_is_refused(fd: int) -> None:
     os.close(plain)
 
 
-def test_a_reader_cannot_write_and_nobody_can_cut_the_memory(fd: int) -> None:
+def test_a_reader_cannot_write_and_the_memory_cannot_be_truncated(fd: int) -> None:
     with BlockReader(fd, LAYOUT) as reader, pytest.raises(TypeError):
         reader._bytes[0] = 1
     with pytest.raises(PermissionError):
@@ -107,7 +107,7 @@ def _images(records: list[bytes]) -> list[bytes]:
 )
 @settings(max_examples=60)
 def test_no_interleaving_tears_a_record(fills: list[int], steps: list[int], length: int) -> None:
-    """The writer goes on by a drawn number of steps at each line of the reader."""
+    """The writer continues by a drawn number of steps at each line of the reader."""
     records = [bytes([fill]) * length for fill in fills]
     images = _images(records)
     fd = create("test", LAYOUT, 64)

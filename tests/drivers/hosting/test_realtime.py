@@ -1,4 +1,4 @@
-"""Real-time scheduling is asked for, and given back by who does not pause."""
+"""Real-time scheduling is requested, and lost by a process that never pauses."""
 
 from __future__ import annotations
 
@@ -39,5 +39,5 @@ def test_a_process_that_never_pauses_falls_back_to_ordinary_scheduling() -> None
     assert words == ["SCHED_FIFO", "True", "True"]
 
 
-def test_without_the_privilege_it_goes_on_and_says_so() -> None:
+def test_without_the_privilege_it_continues_and_reports_it() -> None:
     assert told(REFUSED + SPIN) == ["ordinary", "False", "True"]

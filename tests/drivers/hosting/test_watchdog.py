@@ -15,7 +15,7 @@ STEP_NS = round(2.5 * MS)
 
 
 class Scene:
-    """A task and two hosts, looked at four times in a period as the watchdog does."""
+    """A task and two hosts, polled four times per period as by the watchdog."""
 
     def __init__(self) -> None:
         self.judge = Judge(PERIOD_S)
@@ -54,7 +54,7 @@ def regular(start_ns: int, count: int, late: dict[int, int] | None = None) -> li
 
 @settings(max_examples=20)
 @given(st.lists(st.integers(0, 4 * MS), min_size=150, max_size=300))
-def test_a_task_that_keeps_its_time_is_let_be(jitter: list[int]) -> None:
+def test_a_punctual_task_is_not_stopped(jitter: list[int]) -> None:
     """Up to 4 ms late in a period of 10 ms."""
     scene = Scene()
     assert scene.run(regular(scene.now_ns, len(jitter), dict(enumerate(jitter, start=1)))) is None
@@ -96,7 +96,7 @@ def test_a_host_that_has_stopped_by_itself_stops_the_others() -> None:
     assert (cause.reason, cause.host) == (Reason.HOST_LATCHED, 0)
 
 
-def test_one_hiccup_is_forgiven_and_two_in_a_second_are_not() -> None:
+def test_one_late_period_is_tolerated_and_two_in_a_second_are_not() -> None:
     scene = Scene()
     assert scene.run(regular(scene.now_ns, 250, {150: 9 * MS})) is None
     scene = Scene()

@@ -1,4 +1,4 @@
-"""Errors cross between processes as what they are."""
+"""Errors keep their type and attributes between processes."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_every_attribute_arrives(error: TouchcellError) -> None:
             np.testing.assert_equal(getattr(arrived, name), value)
 
 
-def test_an_error_of_one_driver_arrives_as_what_it_is_a_kind_of() -> None:
+def test_a_driver_specific_error_arrives_as_its_base_type() -> None:
     class ReflexFault(DeviceFault):
         pass
 
@@ -65,7 +65,7 @@ def test_an_error_of_one_driver_arrives_as_what_it_is_a_kind_of() -> None:
     assert arrived.vendor_code == "cartesian"
 
 
-def test_a_mistake_in_a_program_arrives_too() -> None:
+def test_a_programming_error_arrives_too() -> None:
     arrived = wire.decode_error(wire.encode_error(ZeroDivisionError("division by zero")), "arm")
     assert type(arrived) is DeviceError
     assert arrived.device == "arm"
@@ -89,7 +89,7 @@ def test_adjustments_arrive(adjustments: list[Adjustment]) -> None:
     assert wire.decode_adjustments(wire.encode_adjustments(tuple(adjustments))) == tuple(adjustments)
 
 
-def test_a_closed_socket_is_no_message() -> None:
+def test_a_closed_socket_gives_no_message() -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, theirs:
         wire.send(ours, {"call": "activate"})
@@ -98,7 +98,7 @@ def test_a_closed_socket_is_no_message() -> None:
         assert wire.receive(theirs) is None
 
 
-def test_a_record_arrives_with_what_stands_behind_it_and_of_its_own_layout_only() -> None:
+def test_a_record_arrives_with_its_tail_and_only_for_its_own_layout() -> None:
     fd = new_block("arm", ARM)
     with RecordWriter(fd, ARM) as writer, RecordReader(fd, ARM) as reader:
         assert reader.read()["seq"] == 0
@@ -108,7 +108,7 @@ def test_a_record_arrives_with_what_stands_behind_it_and_of_its_own_layout_only(
         assert (number, int(record["seq"]), note) == (1, 7, b"note")
         np.testing.assert_array_equal(record["twist"], np.arange(6.0))
         writer.value["seq"] = 8
-        assert reader.read()["seq"] == 7, "what is filled in is seen only when it is published"
+        assert reader.read()["seq"] == 7, "fields are visible only once published"
     with pytest.raises(BlockMismatch):
         RecordReader(fd, ANSWER)
     close_fd(fd)
@@ -125,5 +125,5 @@ def plain(value: Any) -> Any:
         max_leaves=8,
     )
 )
-def test_values_survive(value: Any) -> None:
+def test_values_are_preserved(value: Any) -> None:
     assert plain(value) == value

@@ -15,7 +15,7 @@ from touchcell.geometry import se3
 TOOL = Tool(origin_mm=(10, -5, 120), rotation_deg=(0, 15, 40))
 
 
-def test_ur5e_is_where_its_table_puts_it() -> None:
+def test_ur5e_pose_matches_its_table() -> None:
     chain = SerialChain(ChainDescription.shipped("ur5e"), TOOL)
     for q in np.random.default_rng(0).uniform(-3.0, 3.0, (20, 6)):
         T, J = ur_model.forward(q, TOOL.pose())
@@ -23,7 +23,7 @@ def test_ur5e_is_where_its_table_puts_it() -> None:
         np.testing.assert_allclose(chain.jacobian(q), J, atol=1e-12)
 
 
-def test_fr3_is_where_its_table_puts_it_and_stays_within_its_ranges() -> None:
+def test_fr3_pose_matches_its_table_and_stays_within_its_ranges() -> None:
     chain = SerialChain(ChainDescription.shipped("fr3"))
     for q in np.random.default_rng(0).uniform(franka_arm.JOINT_MIN_RAD, franka_arm.JOINT_MAX_RAD, (20, 7)):
         np.testing.assert_allclose(chain.forward(q), franka_arm.flange_pose(q)[0], atol=1e-12)
@@ -36,7 +36,7 @@ def test_fr3_is_where_its_table_puts_it_and_stays_within_its_ranges() -> None:
     ("name", "reach_mm", "side_mm"),
     [("ur3e", 456.75, 223.15), ("ur5e", 817.2, 232.9), ("ur10e", 1184.25, 290.7), ("ur16e", 838.4, 290.7)],
 )
-def test_the_urs_reach_as_far_as_their_tables_say(name: str, reach_mm: float, side_mm: float) -> None:
+def test_the_reach_of_urs_matches_their_tables(name: str, reach_mm: float, side_mm: float) -> None:
     T = SerialChain(ChainDescription.shipped(name)).forward(np.zeros(6))
     np.testing.assert_allclose(1e3 * T[:2, 3], [-reach_mm, -side_mm], atol=1e-9)
 
@@ -52,7 +52,7 @@ def test_a_range_is_narrowed_and_never_widened() -> None:
 
 
 @pytest.mark.parametrize("off_mm_deg", [(0, 0, 25, 0, 0, 0), (0, 0, 0, 0, 2.5, 0)])
-def test_another_arm_than_the_chain_is_refused_and_a_calibrated_one_is_not(off_mm_deg: tuple[float, ...]) -> None:
+def test_a_different_arm_model_is_refused_and_a_calibrated_one_is_not(off_mm_deg: tuple[float, ...]) -> None:
     chain = SerialChain(ChainDescription.shipped("ur5e"))
     q = np.array([0.1, -1.2, 1.4, -1.0, -1.5, 0.3])
     require_same_arm("arm", chain, q, chain.forward(q) @ se3.from_euler_mm_deg(0.4 * np.array(off_mm_deg)))

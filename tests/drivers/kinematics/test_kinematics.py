@@ -73,7 +73,7 @@ def test_two_links_by_hand() -> None:
     np.testing.assert_allclose(arm.gravity_torques(np.zeros(2)), [9.80665 * 0.5, 9.80665 * 0.1], rtol=1e-12)
 
 
-def test_the_generic_arm_holds_its_tool_down_where_its_description_says() -> None:
+def test_the_generic_arm_holds_its_tool_down_at_the_described_pose() -> None:
     T = SerialChain(GENERIC).forward(np.deg2rad([0.0, 40.0, 90.0, 0.0, 50.0, 0.0]))
     np.testing.assert_allclose(T[:3, 2], [0.0, 0.0, -1.0], atol=1e-12)
 
@@ -168,7 +168,7 @@ def test_a_limited_motion_keeps_its_direction() -> None:
     assert motion.adjustments[0].limit.startswith("joint ")
 
 
-def test_a_joint_near_its_limit_goes_inwards_freely_and_outwards_ever_slower() -> None:
+def test_a_joint_near_its_limit_moves_inwards_freely_and_outwards_ever_slower() -> None:
     ik = DifferentialIk(ARM)
     q = WORKING.copy()
     q[5] = ARM.upper[5] - np.deg2rad(1.0)
@@ -189,7 +189,7 @@ def test_rounding_at_a_limit_does_not_stop_the_arm() -> None:
     )
 
 
-def test_a_redundant_arm_goes_round_a_joint_limit() -> None:
+def test_a_redundant_arm_avoids_a_joint_limit_in_its_null_space() -> None:
     arm = seven_joints()
     q = np.deg2rad([10.0, 40.0, 20.0, 80.0, 10.0, 50.0, 0.0])
     twist = np.array([0.05, 0.05, 0.02, 0.0, 0.1, 0.0])
@@ -223,13 +223,13 @@ def test_reaching_out_stops_before_the_singularity_and_can_turn_back() -> None:
 
 
 @pytest.mark.parametrize("q", [np.zeros(5), np.full(6, np.nan)])
-def test_angles_that_make_no_sense_are_refused(q: Array) -> None:
+def test_invalid_joint_angles_are_refused(q: Array) -> None:
     with pytest.raises(GeometryError):
         ARM.forward(q)
 
 
 @pytest.mark.parametrize("twist", [np.zeros(5), np.array([np.nan, 0, 0, 0, 0, 0]), np.array([0, 0, 0, 0, 0, np.inf])])
-def test_twists_that_make_no_sense_are_refused(twist: Array) -> None:
+def test_invalid_twists_are_refused(twist: Array) -> None:
     with pytest.raises(GeometryError):
         DifferentialIk(ARM).solve(WORKING, twist)
 

@@ -26,7 +26,7 @@ def test_with_the_tool_down_all_but_the_sideways_tilt_is_followed(axis: int) -> 
     assert adjustments == ()
 
 
-def test_the_sideways_tilt_is_lost_and_said_so() -> None:
+def test_the_sideways_tilt_is_lost_and_reported() -> None:
     twist = np.array([0.03, 0.0, 0.0, 0.1, 0.2, 0.0])
     followed, adjustments = followable(CHAIN.jacobian(DOWN), twist)
     np.testing.assert_allclose(followed, [0.03, 0.0, 0.0, 0.0, 0.2, 0.0], atol=1e-12)
@@ -35,7 +35,7 @@ def test_the_sideways_tilt_is_lost_and_said_so() -> None:
     assert (lost.asked, lost.allowed) == (pytest.approx(np.hypot(0.1, 0.2)), pytest.approx(0.2))
 
 
-def test_where_the_tip_cannot_move_without_rotating_the_rotation_is_said() -> None:
+def test_rotation_is_reported_where_the_tip_cannot_move_without_it() -> None:
     # Tool forward: only the pan joint moves it sideways, and the roll joint cannot turn it back.
     followed, adjustments = followable(CHAIN.jacobian(FORWARD), np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.0]))
     reach_m = CHAIN.forward(FORWARD)[0, 3]

@@ -1,4 +1,4 @@
-"""The remembered arm tells, for each image of a data set, where the sensor was."""
+"""The replay arm reports the sensor pose of each image of a data set."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_old_poses_are_stale(data: Path) -> None:
             arm.tcp(max_age_s=0.04)
 
 
-def test_missing_data_is_told_at_connect(tmp_path: Path) -> None:
+def test_missing_data_is_reported_at_connect(tmp_path: Path) -> None:
     arm = ReplayArm("arm", ReplayArmConfig(data=tmp_path, split="val"), VirtualClock())
     with pytest.raises(ConnectError, match="no such folder"):
         arm.connect()

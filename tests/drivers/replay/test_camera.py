@@ -48,7 +48,7 @@ def test_it_is_a_frame_source(folder: Path) -> None:
     camera = play(folder, VirtualClock())
     assert isinstance(camera, FrameSource)
     assert isinstance(camera, HealthSource)
-    assert DRIVERS.load("replay_camera").capabilities.abilities == {"FrameSource", "HealthSource"}
+    assert DRIVERS.load("replay_camera").capabilities.provides == {FrameSource, HealthSource}
     with pytest.raises(LifecycleError):
         camera.latest()
 
@@ -65,7 +65,7 @@ def test_images_come_in_natural_order_on_the_clock_and_then_end(folder: Path) ->
             camera.next(11, timeout_s=1.0)
 
 
-def test_images_that_nobody_reads_in_time_are_lost_and_not_opened(folder: Path) -> None:
+def test_images_not_read_in_time_are_lost_and_not_opened(folder: Path) -> None:
     clock = VirtualClock()
     with play(folder, clock) as camera:
         clock.advance_s(0.55)
@@ -130,7 +130,7 @@ def test_a_change_of_size_is_refused(folder: Path) -> None:
             camera.next(0, 1.0)
 
 
-def test_an_image_that_disappears_is_gone(folder: Path) -> None:
+def test_a_deleted_image_raises_device_gone(folder: Path) -> None:
     with play(folder, VirtualClock()) as camera:
         (folder / "image_1.png").unlink()
         with pytest.raises(DeviceGone):

@@ -42,7 +42,7 @@ def test_golden_data_packet() -> None:
     assert recipe.unpack(bytes.fromhex(wire)) == values
 
 
-def test_parsers_read_what_the_makers_wrote() -> None:
+def test_parsers_decode_the_vendors_encoding() -> None:
     assert ur_codec.parse_version_request(ur_codec.version_request().payload) == 2
     assert ur_codec.parse_accepted(ur_codec.accepted(PacketType.START, True).payload) is True
     assert ur_codec.parse_controller_version(ur_codec.controller_version(5, 11, 1, 9).payload) == (5, 11, 1, 9)

@@ -141,7 +141,7 @@ def _jpeg(width: int = 64, height: int = 48) -> bytes:
     return data
 
 
-def test_a_whole_jpeg_is_whole_also_when_padded() -> None:
+def test_a_complete_jpeg_is_complete_also_when_padded() -> None:
     assert codec.damage(_jpeg(), "MJPG", 64, 48) == ""
     assert codec.damage(_jpeg() + bytes(100), "MJPG", 64, 48) == ""
 
@@ -164,7 +164,7 @@ def test_a_mutated_jpeg_never_crashes_and_never_passes_for_another_size(data: st
 
 
 @given(st.binary(max_size=300))
-def test_noise_is_no_jpeg(data: bytes) -> None:
+def test_noise_is_not_a_jpeg(data: bytes) -> None:
     assert codec.damage(data, "MJPG", 64, 48) != ""
 
 

@@ -47,7 +47,7 @@ def rewrite(path: Path, *, header: object = None, drop: str = "", **tensors: np.
 
 
 @pytest.mark.parametrize("reference", [True, False])
-def test_comes_back_as_it_was_saved(path: Path, reference: bool) -> None:
+def test_a_saved_tip_loads_unchanged(path: Path, reference: bool) -> None:
     model = make_model(reference=reference)
     save_model(model, path)
     loaded = load_model(path)

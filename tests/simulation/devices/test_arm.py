@@ -51,16 +51,16 @@ def get_going(arm: SimArm, lease: Lease, clock: VirtualClock, twist: list[float]
         clock.advance_s(0.01)
 
 
-def test_the_spec_tells_the_truth() -> None:
+def test_the_spec_matches_the_device() -> None:
     spec = DRIVERS.load("sim_arm")
     arm = make(VirtualClock())
-    for ability in (TcpSource, TwistSink, Stoppable, HealthSource):
-        assert isinstance(arm, ability)
-        assert ability.__name__ in spec.capabilities.abilities
-    assert len(spec.capabilities.abilities) == 4
+    for protocol in (TcpSource, TwistSink, Stoppable, HealthSource):
+        assert isinstance(arm, protocol)
+        assert protocol in spec.capabilities.provides
+    assert len(spec.capabilities.provides) == 4
 
 
-def test_it_starts_where_the_configuration_says_and_can_be_read_while_passive() -> None:
+def test_it_starts_at_the_configured_pose_and_can_be_read_while_passive() -> None:
     clock = VirtualClock()
     arm = make(clock, base_pose_mm_deg=(0, 100, 0, 0, 0, 90))
     with pytest.raises(LifecycleError):
@@ -143,7 +143,7 @@ def test_acceleration_never_exceeds_the_limits() -> None:
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
 
 
-def test_where_it_goes_does_not_depend_on_who_asks() -> None:
+def test_its_path_does_not_depend_on_when_it_is_read() -> None:
     ends = []
     for polls in (1, 7):
         clock = VirtualClock()
@@ -221,7 +221,7 @@ def test_an_arm_deaf_to_stops_still_stops_when_its_command_expires() -> None:
     assert arm.at_rest()
 
 
-def test_state_is_fresh_to_one_step_and_says_so() -> None:
+def test_state_is_fresh_to_one_step_and_stamped_accordingly() -> None:
     clock = VirtualClock()
     arm, _ = active(clock)
     clock.advance_s(0.0011)
@@ -262,7 +262,7 @@ def test_twists_reach_a_late_arm_late_and_stops_at_once() -> None:
         moved.append([each.tcp().value.T_base_tcp[0, 3] - 0.4 for each in (arm, prompt)])
     late, at_once = np.array(moved).T
     np.testing.assert_allclose(late[:4], 0.0, atol=1e-12)
-    # What it did it does 40 ms later, to the end of the time-to-live.
+    # Its motion is delayed by 40 ms, to the end of the time-to-live.
     np.testing.assert_allclose(late[4:], at_once[:-4], atol=1e-12)
     send(arm, lease, clock, [0.05, 0, 0, 0, 0, 0])
     arm.stop()

@@ -7,7 +7,8 @@ from pydantic import ValidationError
 
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import Outcome, Progress
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.errors import LifecycleError
@@ -52,7 +53,7 @@ def follow(arm: SimJointArm, lease: Lease, clock: VirtualClock, twist: list[floa
     return limits
 
 
-def test_the_shipped_chains_are_where_their_makers_say() -> None:
+def test_the_shipped_chains_match_their_manufacturers_tables() -> None:
     panda = SerialChain(ChainDescription.shipped("panda"))
     ready = np.radians([0, -45, 0, -135, 0, 90, 45])
     np.testing.assert_allclose(panda.forward(ready)[:3, 3], [0.3069, 0.0, 0.5903], atol=2e-4)
@@ -61,7 +62,7 @@ def test_the_shipped_chains_are_where_their_makers_say() -> None:
 
 
 @pytest.mark.parametrize("model", ["panda", "ur5e"])
-def test_it_stands_where_it_was_told_and_stays(model: str) -> None:
+def test_it_starts_at_the_configured_pose_and_stays(model: str) -> None:
     clock = VirtualClock()
     arm = make(clock, model, base_pose_mm_deg=(0, 100, 0, 0, 0, 90))
     with pytest.raises(LifecycleError):
@@ -115,7 +116,7 @@ def test_a_joint_goal_is_reached() -> None:
 
 
 @pytest.mark.parametrize("physics", ["kinematic", "dynamic"])
-def test_what_it_presses_on_pushes_back(physics: str) -> None:
+def test_contact_forces_act_on_the_arm(physics: str) -> None:
     clock = VirtualClock()
     scene = SceneConfig.model_validate({"physics": physics, "surfaces": {"table": {"kind": "plane"}}}).build(clock)
     # The tip's centre 17 mm above the table: 3 mm deep.
@@ -140,7 +141,7 @@ def test_a_snapshot_brings_the_joints_back() -> None:
     restore = scene.snapshot()
     ends = []
     for _ in range(2):
-        # What the gate remembers is no matter of the simulation.
+        # The gate's history is not part of the simulation.
         arm.stop()
         follow(arm, lease, clock, [0.0, 0.05, 0, 0, 0, 0], 0.2)
         ends.append(arm.joints().value.q)
@@ -168,7 +169,7 @@ def test_a_panda_tracks_a_moving_plate_in_a_dynamic_scene(tmp_path: Path) -> Non
     assert np.sqrt(np.mean((np.array(depths_mm[50:]) - 6.0) ** 2)) < 0.5
 
 
-def test_what_it_cannot_reach_is_told() -> None:
+def test_an_unreachable_pose_is_reported() -> None:
     with pytest.raises(ConfigError, match="no inverse kinematics solution"):
         make(VirtualClock(), start_pose_mm_deg=(1500, 0, 300, 180, 0, 0))
     with pytest.raises(ConfigError, match="is not 7 angles"):

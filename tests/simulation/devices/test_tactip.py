@@ -46,9 +46,9 @@ class Cell:
             self.clock.advance_s(0.01)
 
 
-def test_the_spec_tells_the_truth() -> None:
+def test_the_spec_matches_the_device() -> None:
     cell = Cell()
-    assert DRIVERS.load("sim_tactip").capabilities.abilities == {"FrameSource", "HealthSource"}
+    assert DRIVERS.load("sim_tactip").capabilities.provides == {FrameSource, HealthSource}
     assert isinstance(cell.tip, FrameSource)
     assert isinstance(cell.tip, HealthSource)
 
@@ -180,7 +180,7 @@ def test_it_needs_a_scene_and_a_simulated_arm() -> None:
     config = SimTactipConfig(mounted_on="arm")
     with pytest.raises(ConfigError, match="needs a scene"):
         spec.build("tip2", config, DriverContext(cell.clock, {"arm": cell.arm}))
-    with pytest.raises(ConfigError, match="no arm of this cell") as caught:
+    with pytest.raises(ConfigError, match="not an arm of this cell") as caught:
         spec.build("tip2", config, DriverContext(cell.clock, {"tip": cell.tip}, cell.scene))
     assert caught.value.key == "tip2.mounted_on"
 
@@ -212,7 +212,7 @@ DOWN = se3.from_euler_mm_deg([400, 0, 0, 180, 0, 0])
 
 
 class Told:
-    """An arm that tells whatever it was given, or that it is gone."""
+    """An arm that returns a given state, or raises that it is lost."""
 
     def __init__(self) -> None:
         self.z_m: float | None = None
@@ -225,7 +225,7 @@ class Told:
         return Stamped(TcpState(T, np.zeros(6)), 0, 0)
 
 
-def test_a_simulated_sensor_sits_on_any_arm_that_tells_its_pose() -> None:
+def test_a_simulated_sensor_can_be_mounted_on_any_arm_with_a_pose() -> None:
     clock, arm = VirtualClock(), Told()
     scene: Scene = SceneConfig.model_validate({"surfaces": {"table": {"kind": "plane"}}}).build(clock)
     config = SimTactipConfig(mounted_on="arm", rate_hz=50, latency_ms=0)
@@ -246,7 +246,7 @@ def test_a_simulated_sensor_sits_on_any_arm_that_tells_its_pose() -> None:
         assert scene.contact("tip").value.depth_m == pytest.approx(depth_m)
 
 
-def test_dropped_frames_never_come_and_are_the_same_for_the_same_seed() -> None:
+def test_dropped_frames_never_arrive_and_are_the_same_for_the_same_seed() -> None:
     def arrived(seed: int) -> list[int]:
         cell = Cell(seed=seed, dropped=0.3, latency_ms=0)
         seqs = [cell.tip.next(-1, 1.0).seq]

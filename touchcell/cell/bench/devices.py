@@ -23,6 +23,7 @@ import numpy as np
 
 from touchcell.cell.bench.provenance import provenance
 from touchcell.drivers.core.errors import DeviceError
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.testing.conformance.client import MovingClient
 from touchcell.testing.conformance.context import Bench, DeviceUnderTest
 from touchcell.testing.emulation.rig import RIGS
@@ -82,7 +83,7 @@ def _measure(seat: DeviceUnderTest) -> dict[str, Any]:
     row = _client("ours", seat, name)
     for part in (_wire, _ttl, _kill, _frozen):
         seat.clear()
-        if "TwistSink" in seat.rig.spec.capabilities.abilities or part is _frozen:
+        if TwistSink in seat.rig.spec.capabilities.provides or part is _frozen:
             try:
                 row |= part(seat)
             except BaseException as error:
@@ -197,7 +198,7 @@ def _frozen(seat: DeviceUnderTest) -> dict[str, Any]:
     bench.spoiled = True
     try:
         bench.active()
-        lease = bench.arm.acquire("bench") if "TwistSink" in seat.rig.spec.capabilities.abilities else None
+        lease = bench.arm.acquire("bench") if TwistSink in seat.rig.spec.capabilities.provides else None
         with suppress(DeviceError):
             bench.read()
         bench.sleep(0.2)

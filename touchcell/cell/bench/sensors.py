@@ -27,8 +27,10 @@ from touchcell.cell.bench.quantiles import median_and_p99
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Progress, RunLoop, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import Progress
 from touchcell.cell.runtime.sensor import Sensor
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.drivers.core.clock import Clock
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate

@@ -7,7 +7,7 @@ from typing import Any
 
 from touchcell.cell.bench.catalog import benchmark_names
 from touchcell.cell.experiments.runner import EXPERIMENTS
-from touchcell.control.interlocks.config import INTERLOCKS
+from touchcell.control.interlocks.spec import INTERLOCKS
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
@@ -21,7 +21,7 @@ def listing() -> dict[str, list[tuple[str, str]]]:
     return {
         "drivers": _rows(DRIVERS),
         "tasks": _rows(TASKS),
-        "interlocks": [(spec.kind, spec.summary) for spec in INTERLOCKS.values()],
+        "interlocks": [("finite", "every number is finite; always on, checked first"), *_rows(INTERLOCKS)],
         "emulators": [(name, "") for name in EMULATORS.names()],
         "experiments": _rows(EXPERIMENTS),
         "benchmarks": [(name, "") for name in benchmark_names()],

@@ -22,10 +22,12 @@ from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlie
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.heap import trim_heap
-from touchcell.cell.runtime.loop import Outcome, Progress, RunLoop, RunResult, StopRequest
+from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.operator_channel import OperatorChannel
 from touchcell.cell.runtime.operator_input import stop_on_keys, stop_on_signals
 from touchcell.cell.runtime.run_directory import RunFolderError, run_directory
+from touchcell.cell.runtime.run_result import Outcome, Progress, RunResult
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.drivers.core.clock import VirtualClock
 
 _EXIT = {
@@ -122,14 +124,14 @@ def _report(folder: Path) -> str:
 
 
 def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
-    stop, desk = StopRequest(), OperatorChannel(folder)
+    stop, channel = StopRequest(), OperatorChannel(folder)
     with (
         note_crashes(folder),
         BlackBox(folder, _about(cell, folder)) as box,
         _recording(folder) as recorder,
         cell,
         stop_on_signals(stop),
-        stop_on_keys(stop, desk=desk) as look_at_keys,
+        stop_on_keys(stop, channel=channel) as look_at_keys,
         _live_line(cell.plan, live) as show,
     ):
         cell.watchdog.note_to(folder)
@@ -151,7 +153,7 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
             print(f"tripped: {so_far.reason}\n`touchcell why {folder}` explains; `touchcell reset {folder}` or r, when")
             print("it is safe, then `touchcell resume` or g; `touchcell stop` or q ends the run")
 
-        loop = RunLoop(cell, recorder, box=box, stop=stop, on_cycle=after_cycle, desk=desk, on_trip=tripped)
+        loop = RunLoop(cell, recorder, box=box, stop=stop, on_cycle=after_cycle, channel=channel, on_trip=tripped)
         result = loop.run()
         # Before the devices are given back, which an arm that obeys nothing may not survive.
         dumped = result.outcome is Outcome.DONE or loop.has_waited or _dump(box, folder, cell, result)

@@ -7,7 +7,7 @@ task fit, and says which devices the task does not need, so that they are not ev
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -16,20 +16,23 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag, model_validator
 
-from touchcell.cell.config.settings import with_settings
+from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
-from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile, load
+from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile
 from touchcell.control.interlocks.basic import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
-from touchcell.control.interlocks.config import INTERLOCKS, REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
+from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
+from touchcell.control.interlocks.spec import INTERLOCKS
+from touchcell.control.interlocks.violation import Severity
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.device import DeactivatePolicy
+from touchcell.drivers.core.protocols import JointSource, TwistSink, protocol_names
 from touchcell.drivers.core.scene import scene_section
-from touchcell.drivers.core.spec import DRIVERS, DriverConfig, DriverSpec
+from touchcell.drivers.core.spec import DRIVERS, AnyDriver, DriverConfig
 from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.tasks.interface import TASKS, TaskConfig, TaskSpec
+from touchcell.tasks.interface import TASKS, AnyTask, TaskConfig
 
 M = TypeVar("M", bound=BaseModel)
 Three = tuple[float, float, float]
@@ -256,7 +259,7 @@ class DevicePlan:
     """A device that will be built: its section, spec and validated configuration."""
 
     name: str
-    spec: DriverSpec
+    spec: AnyDriver
     config: DriverConfig
 
 
@@ -284,7 +287,7 @@ class CellPlan:
     sensors: Mapping[str, DevicePlan]
     arm_roles: Mapping[str, str]
     sensor_roles: Mapping[str, str]
-    task: TaskSpec
+    task: AnyTask
     task_config: TaskConfig
     skipped: tuple[str, ...]
     devices: Mapping[str, DevicePlan]
@@ -296,11 +299,11 @@ class CellPlan:
         return f"<CellPlan {self.cell.name!r}: task {self.task.name}, {', '.join(devices)}>"
 
     def text(self) -> str:
-        """The cell file as it is planned: the file itself, or YAML of its content with ``settings`` in place."""
-        if not self.settings:
+        """The cell file as it is planned: the file itself, or YAML of what comes of it and of what it extends."""
+        merged = load_layers(self.file, self.settings)
+        if not merged.sources:
             return self.file.read_text()
-        data = with_settings(load(self.file).data, self.settings)
-        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
+        return yaml.safe_dump(merged.data, sort_keys=False, allow_unicode=True)
 
 
 def plan_cell(
@@ -321,9 +324,7 @@ def plan_cell(
     Raises:
         ConfigError: with file, line, key, value and remedy; InvalidCell for several at once.
     """
-    file = load(Path(path))
-    if settings:
-        file = replace(file, data=with_settings(file.data, settings))
+    file = load_layers(Path(path), settings)
     if model is not None and isinstance(sensors := file.data.get("sensors"), dict):
         for sensor in sensors.values():
             estimator = sensor.get("estimator") if isinstance(sensor, dict) else None
@@ -357,7 +358,7 @@ class _Planner:
         sensors = {name: plan for name, plan in devices.items() if name in needed_sensors}
         if task:
             self._require_collection(cell, task)
-            self._require_abilities(task, arm_roles, arms)
+            self._require_protocols(task, arm_roles, arms)
             self._require_interlocks(cell, task)
             self._require_processes(cell, task, arm_roles)
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
@@ -389,7 +390,7 @@ class _Planner:
         if cell.emulated_scene is not None:
             self._validated(scene_section(), cell.emulated_scene, ("emulated_scene",))
 
-    def _task(self, cell: CellFile) -> tuple[TaskSpec | None, TaskConfig | None]:
+    def _task(self, cell: CellFile) -> tuple[AnyTask | None, TaskConfig | None]:
         try:
             spec = TASKS.load(cell.task.name)
         except ConfigError as error:
@@ -476,35 +477,35 @@ class _Planner:
         config = self._validated(spec.config, {**(section.model_extra or {}), **settings}, at)
         return DevicePlan(at[1], spec, config) if config is not None else None
 
-    def _require_interlocks(self, cell: CellFile, task: TaskSpec) -> None:
+    def _require_interlocks(self, cell: CellFile, task: AnyTask) -> None:
         """What moves must be bounded; limits have no defaults, so the file has to name them."""
-        moves = any("TwistSink" in abilities for abilities in task.arms.values())
+        moves = any(TwistSink in protocols for protocols in task.arms.values())
         required = REQUIRED_TO_MOVE if moves else frozenset()
         if moves and task.sensors:
             required |= REQUIRED_TO_TOUCH
-        stopping = {entry.kind for entry in cell.interlocks.values() if entry.severity != "limit"}
+        stopping = {entry.kind for entry in cell.interlocks.values() if entry.level is not Severity.LIMIT}
         for kind in sorted(required - stopping):
             self._add(
                 ("interlocks",),
                 f"no interlock of kind {kind!r} that stops, which a task that moves an arm must have",
-                hint=f"add one: {INTERLOCKS[kind].summary}",
+                hint=f"add one: {INTERLOCKS.load(kind).summary}",
             )
 
-    def _require_processes(self, cell: CellFile, task: TaskSpec, arm_roles: Mapping[str, str]) -> None:
+    def _require_processes(self, cell: CellFile, task: AnyTask, arm_roles: Mapping[str, str]) -> None:
         """What devices in other processes cannot do is not asked of them."""
         if cell.processes == "one":
             return
-        from touchcell.drivers.hosting.groups import REMOTE_ABILITIES
+        from touchcell.drivers.hosting.groups import REMOTE_PROTOCOLS
 
         if cell.time == "simulated":
             self._add(
                 ("processes",), "several processes share real time only", value=cell.processes, hint="`time: real`"
             )
-        for role, abilities in task.arms.items():
-            if missing := abilities - REMOTE_ABILITIES:
+        for role, protocols in task.arms.items():
+            if missing := protocols - REMOTE_PROTOCOLS:
                 self._add(
                     ("processes",),
-                    f"{task.name} needs {', '.join(sorted(missing))} of {role!r}, which no other process passes on",
+                    f"{task.name} needs {protocol_names(missing)} of {role!r}, which no other process passes on",
                     hint="leave out `processes:`",
                 )
 
@@ -562,7 +563,7 @@ class _Planner:
                 )
         return found
 
-    def _require_collection(self, cell: CellFile, task: TaskSpec) -> None:
+    def _require_collection(self, cell: CellFile, task: AnyTask) -> None:
         if task.labels_frames and cell.collect is None:
             self._add(("collect",), f"{task.name} labels frames, and nothing says where they go", hint="add `collect:`")
         if cell.collect is not None and not task.labels_frames:
@@ -575,7 +576,7 @@ class _Planner:
         ways = []
         for arm in arms.values():
             body = cell.arms[arm.name].body
-            if not body and "JointSource" not in arm.spec.capabilities.abilities:
+            if not body and JointSource not in arm.spec.capabilities.provides:
                 self._add(
                     ("arms", arm.name, "body"),
                     f"{arm.spec.name} tells only where its tool is; interlocks.{name} has to know its shape",
@@ -596,18 +597,18 @@ class _Planner:
             )
         return both
 
-    def _require_abilities(self, task: TaskSpec, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]) -> None:
-        for role, abilities in task.arms.items():
+    def _require_protocols(self, task: AnyTask, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]) -> None:
+        for role, protocols in task.arms.items():
             name = arm_roles.get(role)
             if name is None or name not in arms:
                 continue
-            missing = abilities - arms[name].spec.capabilities.abilities
+            missing = protocols - arms[name].spec.capabilities.provides
             if missing:
                 self._add(
                     ("arms", name, "driver"),
-                    f"{arms[name].spec.name} lacks {', '.join(sorted(missing))}, which {task.name} needs",
+                    f"{arms[name].spec.name} does not provide {protocol_names(missing)}, which {task.name} needs",
                     value=arms[name].spec.name,
-                    hint="choose another driver; `touchcell list` shows abilities",
+                    hint="choose another driver; `touchcell list` names all",
                 )
 
     def _validated(self, model: type[M], data: Any, at: KeyPath) -> M | None:

@@ -2,10 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from touchcell.cell.config.yaml_file import parse_value
 from touchcell.errors import ConfigError
+
+
+def parse_settings(arguments: Sequence[str]) -> dict[str, Any]:
+    """Read ``KEY=VALUE`` arguments of ``--set``; values are written as in a cell file.
+
+    Raises:
+        ConfigError: an argument has no "=", an empty key, or a value that is no YAML.
+    """
+    found: dict[str, Any] = {}
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if not equals or not all(key.split(".")):
+            raise ConfigError("is not KEY=VALUE", file="--set", value=argument, hint="e.g. --set task.depth_mm=2.5")
+        try:
+            found[key] = parse_value(value)
+        except ConfigError as error:
+            raise ConfigError(error.reason, file="--set", key=key, value=value, hint=error.hint) from None
+    return found
 
 
 def with_settings(data: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,14 +9,16 @@ import os
 import re
 import stat
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Final, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from touchcell.errors import ConfigError, suggest
+from touchcell.plugin_section import PluginSection
 
 KeyPath = tuple[str | int, ...]
 M = TypeVar("M", bound=BaseModel)
@@ -38,11 +40,25 @@ class InvalidCell(ConfigError):
 
 @dataclass(frozen=True, slots=True)
 class YamlFile:
-    """A parsed file: its data, and the line on which each key stands."""
+    """A parsed file: its data, and the line on which each key stands.
+
+    Attributes:
+        path: the file.
+        data: its content.
+        lines: line of each key.
+        sources: file or option that each key comes from, where it is not ``path`` (see ``layers``).
+    """
 
     path: Path
     data: dict[str, Any]
     lines: Mapping[KeyPath, int]
+    sources: Mapping[KeyPath, Path] = field(default_factory=dict)
+
+    def source(self, path: KeyPath) -> Path:
+        """Return the file or option that the key comes from."""
+        while path and path not in self.lines:
+            path = path[:-1]
+        return self.sources.get(path, self.path)
 
     def line(self, path: KeyPath) -> int:
         """Line of the key, or of the nearest thing around it that stands in the file."""
@@ -53,7 +69,7 @@ class YamlFile:
     def problem(self, path: KeyPath, reason: str, *, value: Any = None, hint: str = "") -> ConfigError:
         """A ConfigError about the key at ``path``."""
         key = ".".join(str(part) for part in path)
-        return ConfigError(reason, file=str(self.path), line=self.line(path), key=key, value=value, hint=hint)
+        return ConfigError(reason, file=str(self.source(path)), line=self.line(path), key=key, value=value, hint=hint)
 
     def validate(self, model: type[M], data: Any, at: KeyPath = ()) -> M:
         """Build ``model`` from ``data``, which stands at ``at``. Raises InvalidCell with every mistake.
@@ -80,7 +96,7 @@ class YamlFile:
         kind = detail["type"]
         context = detail.get("ctx", {})
         if kind == "extra_forbidden":
-            known = _fields_at(model, location[:-1])
+            known = _fields_at(model, location[:-1], data)
             return self.problem(path, "unknown key", value=value, hint=suggest(str(location[-1]), known))
         if kind == "missing":
             written = "schema: 1" if location == ("schema",) else f"{location[-1]}:"
@@ -89,6 +105,12 @@ class YamlFile:
             wanted = _NUMBERS.get(context["wanted"], str(context["wanted"]))
             meaning = next((words for ending, words in _MEANINGS if str(path[-1]).endswith(ending)), "")
             return self.problem(path, f"needs {wanted} numbers{meaning}, found {context['found']}", value=value)
+        if kind == "plugin":
+            return self.problem(
+                (*path, context["tag"]), context["reason"], value=context["value"], hint=context["hint"]
+            )
+        if kind == "plugin_missing":
+            return self.problem((*path, context["tag"]), "is missing", hint=f"add `{context['tag']}:`")
         if kind == "union_tag_invalid":
             tag = str(context["discriminator"]).strip("'")
             names = re.findall(r"'([^']*)'", str(context["expected_tags"]))
@@ -181,27 +203,58 @@ def _merged(details: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return list(found.values())
 
 
-def _fields_at(model: type[BaseModel], location: KeyPath) -> list[str]:
-    """Field names of the model that ``location`` leads to, through fields, indices and union tags."""
-    candidates = [model]
+def _fields_at(model: type[BaseModel], location: KeyPath, data: Any) -> list[str]:
+    """Field names of the model that ``location`` leads to in ``data``, through fields, indices, tags and plug-ins."""
+    candidates: list[type[BaseModel] | PluginSection] = [model]
     for part in location:
-        fields = [c.model_fields[str(part)] for c in candidates if str(part) in c.model_fields]
-        tagged = [c for c in candidates if _has_tag(c, part)]
+        models = _resolved(candidates, data)
+        fields = [each.model_fields[str(part)] for each in models if str(part) in each.model_fields]
+        tagged = [each for each in models if _has_tag(each, part)]
         if fields:
-            candidates = [m for field in fields for m in _models_in(field.annotation)] or candidates
+            candidates = [m for field in fields for m in _models_in(field)] or candidates
         elif tagged:
-            candidates = tagged
-    return sorted({field.alias or name for each in candidates for name, field in each.model_fields.items()})
+            candidates = [*tagged]
+        data = _child(data, part)
+    models = _resolved(candidates, data)
+    return sorted({field.alias or name for each in models for name, field in each.model_fields.items()})
+
+
+def _resolved(candidates: Sequence[type[BaseModel] | PluginSection], data: Any) -> list[type[BaseModel]]:
+    """``candidates`` with the model that ``data`` asks for in place of a section, once the section is reached."""
+    models = []
+    for each in candidates:
+        if not isinstance(each, PluginSection):
+            models.append(each)
+        elif isinstance(data, Mapping) and isinstance(data.get(each.tag, each.default), str):
+            models.append(each.model_of(data))
+    return models
+
+
+def _child(data: Any, part: str | int) -> Any:
+    try:
+        return data[part]
+    except (KeyError, IndexError, TypeError):
+        # A union tag, which is not in the file.
+        return data
 
 
 def _has_tag(model: type[BaseModel], tag: str | int) -> bool:
     return any(tag in get_args(field.annotation) for field in model.model_fields.values())
 
 
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
+def _models_in(annotation: Any) -> list[type[BaseModel] | PluginSection]:
+    """Models and plug-ins' sections in an annotation or a field."""
+    if isinstance(annotation, FieldInfo):
+        sections = [each for each in annotation.metadata if isinstance(each, PluginSection)]
+        return [*sections] or _models_in(annotation.annotation)
+    if isinstance(annotation, PluginSection):
+        return [annotation]
+    arguments = get_args(annotation)
+    if any(isinstance(each, PluginSection) for each in arguments):
+        return [each for each in arguments if isinstance(each, PluginSection)]
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [model for argument in get_args(annotation) for model in _models_in(argument)]
+    return [model for argument in arguments for model in _models_in(argument)]
 
 
 def load(path: Path) -> YamlFile:
@@ -229,6 +282,24 @@ def load(path: Path) -> YamlFile:
     finally:
         loader.dispose()
     return YamlFile(path, data, walk.lines)
+
+
+def parse_value(text: str) -> Any:
+    """Return the value that ``text`` has in a cell file. Raises ConfigError if it is no YAML."""
+    loader = _Loader(text)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        _Walk("", loader).visit(node, (), ())
+        return loader.construct_document(node)
+    except yaml.YAMLError as error:
+        reason = getattr(error, "problem", None) or "is no YAML"
+        raise ConfigError(str(reason), value=text, hint="quote what is not a number, list or mapping") from None
+    except RecursionError:
+        raise ConfigError(_TOO_DEEP, value=text, hint=_TOO_DEEP_HINT) from None
+    finally:
+        loader.dispose()
 
 
 _MOST_BYTES: Final = 256 * 1024

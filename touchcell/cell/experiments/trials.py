@@ -24,7 +24,8 @@ from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.compose import compose
-from touchcell.cell.runtime.loop import Outcome, RunLoop
+from touchcell.cell.runtime.loop import RunLoop
+from touchcell.cell.runtime.run_result import Outcome
 from touchcell.errors import ConfigError, suggest
 from touchcell.paths import CONFIGS
 
@@ -71,7 +72,7 @@ class Finished:
     Attributes:
         trial: which.
         folder: what it left.
-        outcome: a word of ``touchcell.cell.runtime.loop.Outcome``.
+        outcome: a word of ``touchcell.cell.runtime.run_result.Outcome``.
         reason: why it ended so.
         measures: named numbers.
     """

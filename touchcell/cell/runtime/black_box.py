@@ -19,7 +19,7 @@ from typing import Any, Final, Self
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import Message, Recorder, encode
 from touchcell.cell.recording.ring import RingWriter, read_ring
-from touchcell.cell.runtime.loop import RunResult
+from touchcell.cell.runtime.run_result import RunResult
 from touchcell.cell.runtime.stopping import StopReport
 from touchcell.control.interlocks.violation import Violation
 

@@ -1,124 +1,47 @@
 """The control cycle: read the arms, perceive, let the task think, let the supervisor judge, send, record.
 
-One thread. Whatever goes wrong, all arms are told to stop before anything else happens, each is watched until it
-stands, and the run ends in a report, or waits for a person if its cell file says so.
+One thread. Its states are those of ``touchcell.cell.runtime.run_states``. Whatever goes wrong, all arms are told to
+stop before anything else happens, each is watched until it stands, and the run ends in a report, or waits for the
+operator if its cell file says so.
 """
 
 from __future__ import annotations
 
-import math
+import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from enum import Enum
-from typing import Any, Protocol, cast
+from dataclasses import replace
+from functools import partial
+from typing import cast
 
-from touchcell.cell.errors import RecordingError
-from touchcell.cell.recording.dataset_writer import Collection
-from touchcell.cell.recording.mcap import Recorder, encode
-from touchcell.cell.recording.messages import (
-    command_message,
-    contact_message,
-    pose_message,
-    tcp_message,
-    verdict_message,
-)
+from touchcell.cell.errors import UnexpectedError
+from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.observer import Observer, call_driver
 from touchcell.cell.runtime.operator_channel import OperatorChannel
+from touchcell.cell.runtime.pacing import Pacing
 from touchcell.cell.runtime.reset_procedure import ResetProcedure
-from touchcell.cell.runtime.sensor import Sensor
-from touchcell.cell.runtime.stopping import Stopper, StopReport
+from touchcell.cell.runtime.run_record import Box, RunRecord
+from touchcell.cell.runtime.run_result import Outcome, Progress, RunResult
+from touchcell.cell.runtime.run_states import FINISHED, RESUME, STARTED, STOPPED, TIMEOUT, RunState, run_table
+from touchcell.cell.runtime.stop_procedure import StopProcedure
+from touchcell.cell.runtime.stop_request import StopRequest
+from touchcell.cell.runtime.stopping import StopReport
 from touchcell.cell.runtime.timing import CycleTimes
-from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
+from touchcell.control.interlocks.snapshot import CellView
 from touchcell.control.interlocks.violation import Severity, Violation
-from touchcell.control.latch import ResetDone
+from touchcell.control.latch import LatchState
 from touchcell.control.supervisor import Verdict
 from touchcell.drivers.core.commands import Sent, TwistCommand
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.protocols import ServoArm, TwistSink
-from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.errors import TouchcellError
-from touchcell.geometry import se3
-from touchcell.geometry.finite import all_finite
-from touchcell.geometry.types import Array
-from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.tasks.interface import Action, Observation, TransitionRecord
+from touchcell.tasks.state_machine import FAULT, STOP, TRIP, TaskMachine, state_name
 
-
-class Outcome(Enum):
-    """How a run ended."""
-
-    DONE = "done"
-    FAILED = "failed"
-    STOPPED = "stopped"
-    TRIPPED = "tripped"
-    ERROR = "error"
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """What a live display may show after a cycle."""
-
-    t_s: float
-    state: str
-    contacts: Mapping[str, ContactEstimate]
-    telemetry: Mapping[str, float]
-    waiting: str = ""
-    """What a person has to know while the run waits for a reset; empty while it goes on."""
-
-
-@dataclass(frozen=True, slots=True)
-class RunResult:
-    """How a run ended and how long its cycles took.
-
-    Attributes:
-        outcome: in one word.
-        reason: in one sentence; empty when the task simply finished.
-        state: the task's last state.
-        duration_s: cell time from start to end.
-        cycles: control cycles.
-        times: duration of each stage of each cycle.
-        error: what was raised, where something was.
-        causes: what the supervisor latched, the first cause first.
-        stops: how each arm came to rest.
-        resets: what was cleared on the way, and by whom, where the run waited for that.
-    """
-
-    outcome: Outcome
-    reason: str
-    state: str
-    duration_s: float
-    cycles: int
-    times: CycleTimes
-    error: TouchcellError | None = None
-    causes: tuple[Violation, ...] = ()
-    stops: Mapping[str, StopReport] = field(default_factory=dict)
-    resets: tuple[ResetDone, ...] = ()
-
-
-class StopRequest:
-    """Set by a signal handler or a key. The first asks for an orderly end, the second for a stop at once."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def ask(self) -> None:
-        """Ask once more."""
-        self.count += 1
-
-    def ask_at_once(self) -> None:
-        """Ask for a stop at once."""
-        self.count += 2
-
-
-class Box(Protocol):
-    """Something that keeps messages and never fails; see ``touchcell.cell.runtime.black_box``."""
-
-    def add(self, topic: str, t_ns: int, data: bytes) -> None:
-        """Keep one message, encoded as for the recording."""
-        ...
+logger = logging.getLogger(__name__)
 
 
 class RunLoop:
@@ -126,11 +49,11 @@ class RunLoop:
 
     Args:
         cell: built and activated.
-        recorder: where everything goes; None records nothing.
-        box: what keeps the latest messages in memory.
-        stop: looked at in every cycle.
+        recorder: where everything is recorded; None records nothing.
+        box: keeps the latest messages in memory.
+        stop: read in every cycle.
         on_cycle: called after every cycle, for a live display.
-        desk: where a person may reset a run that has tripped; without one it ends, whatever the cell file says.
+        channel: where an operator may reset a run that has tripped; without one it ends, whatever the cell file says.
         on_trip: called with what is known when the arms stand and the run begins to wait.
     """
 
@@ -142,217 +65,297 @@ class RunLoop:
         box: Box | None = None,
         stop: StopRequest | None = None,
         on_cycle: Callable[[Progress], None] | None = None,
-        desk: OperatorChannel | None = None,
+        channel: OperatorChannel | None = None,
         on_trip: Callable[[RunResult], None] | None = None,
     ) -> None:
         self._cell = cell
-        self._recorder = recorder
-        self._box = box
         self._stop = stop or StopRequest()
         self._on_cycle = on_cycle
-        self._times = CycleTimes()
-        self._transitions_written = 0
-        self._arms = {role: cast(ServoArm, arm) for role, arm in cell.arms.items() if isinstance(arm, TwistSink)}
-        self._stopper = Stopper(self._arms, cell.stop_categories, cell.clock, 1.0 / cell.rate_hz, cell.holding)
-        self._leases: dict[str, Lease] = {}
-        self._sent: Mapping[str, Sent[TwistCommand]] = {}
-        self._desk = desk if cell.plan.cell.on_trip == "wait_for_reset" else None
         self._on_trip = on_trip
-        self._waiting: ResetProcedure | None = None
-        self._resets: tuple[ResetDone, ...] = ()
-        self._waited_from_ns = self._waited_ns = 0
-        self._start_ns = self._due_ns = cell.clock.now_ns()
+        self._times = CycleTimes()
+        self._arms = {role: cast(ServoArm, arm) for role, arm in cell.arms.items() if isinstance(arm, TwistSink)}
+        self._leases: dict[str, Lease] = {}
+        self._record = RunRecord(cell, recorder, box)
+        self._observer = Observer(cell, self._times)
+        self._stops = StopProcedure(cell, self._arms, self._record)
+        self._channel = channel if cell.plan.cell.on_trip == "wait_for_reset" else None
+        self._reset = None if self._channel is None else ResetProcedure(cell, self._leases, self._channel)
+        self._pacing = Pacing(cell.clock, cell.rate_hz)
+        self._machine = TaskMachine(run_table(cell.max_duration_s), self)
+        self._start_ns = cell.clock.now_ns()
         self._cycles = 0
-        self._reason = ""
+        self._sent: Mapping[str, Sent[TwistCommand]] = {}
         self._error: TouchcellError | None = None
-        self._ending = False
+        self._reports: Mapping[str, StopReport] = {}
+        self._final: RunResult | None = None
+
+    @property
+    def state(self) -> RunState:
+        """Where the run is."""
+        return cast(RunState, self._machine.state)
+
+    @property
+    def has_waited(self) -> bool:
+        """Whether the latest trip has been reported to ``on_trip``."""
+        return _has_waited(self._machine.records)
+
+    @property
+    def result(self) -> RunResult:
+        """How the run stands, or how it ended."""
+        return self._final or self._result()
 
     def run(self) -> RunResult:
         """Run until the task has finished, the supervisor has tripped, or something has failed. Never raises for what
-        devices, data or disk do: that ends in a result, with the arms told to stop."""
+        devices, tasks, data or disk do: that ends in a result, with the arms told to stop."""
         try:
-            self.begin()
             while self.step():
                 pass
         finally:
             result = self.end()
         return result
 
-    @property
-    def has_waited(self) -> bool:
-        """Whether the latest trip has been told to ``on_trip``."""
-        return self._waiting is not None
-
     def begin(self) -> None:
         """Wait for each camera's first frame, take the arms' leases, and be watched from now on."""
+        cell = self._cell
         try:
-            for role, sensor in self._cell.sensors.items():
-                sensor.await_frame()
-                if (about := sensor.about()) is not None:
-                    self._write(f"/sensors/{role}/preprocessing", self._cell.clock.now_ns(), about)
+            for role, sensor in cell.sensors.items():
+                call_driver(cell.plan.sensor_roles[role], sensor.await_frame)
+            self._record.begin()
             for role, arm in self._arms.items():
-                self._leases[role] = arm.acquire(self._cell.task_name)
-            if self._cell.scene is not None:
+                self._leases[role] = call_driver(arm.name, partial(arm.acquire, cell.task_name))
+            if cell.scene is not None:
                 # In real time it has to catch up with all that happened since it was made.
-                self._cell.scene.objects()
-            self._cell.watchdog.begin()
-        except TouchcellError as error:
-            self._error = error
-        self._start_ns = self._due_ns = self._cell.clock.now_ns()
+                cell.scene.objects()
+            cell.watchdog.begin()
+        except Exception as error:
+            self._fail(error)
+        self._start_ns = cell.clock.now_ns()
+        self._fire(STARTED)
+        self._pacing.restart()
 
     def step(self) -> bool:
-        """One cycle, and the wait for the next; returns whether there is to be one."""
-        cell = self._cell
-        if self._waiting is not None:
-            going = self._wait(self._waiting)
-        elif self._error is not None or cell.task.finished:
-            return False
-        else:
-            going = self._work()
-        if going:
-            self._due_ns += round(1e9 / cell.rate_hz)
-            cell.clock.sleep_until_ns(self._due_ns)
-        return going
+        """One cycle, and the wait for the next; returns whether there is to be one.
 
-    def _work(self) -> bool:
-        cell = self._cell
-        now_ns = cell.clock.now_ns()
-        if now_ns - self._start_ns - self._waited_ns > cell.max_duration_s * 1e9:
-            self._reason = f"longer than max_duration_s: {cell.max_duration_s:g}"
-            return False
-        if self._stop.count > 1:
-            self._reason = "stopped at once by the operator"
-            return False
+        A stop that the cycle leads to is seen through until the arms stand.
+        """
+        if self.state is RunState.STARTING:
+            self.begin()
+        self._machine.tick(self._cell.clock.now_ns())
         try:
-            cell.watchdog.beat()
-            self._cycle()
-        except DeviceError as error:
-            if self._desk is None:
-                self._error = error
-                return False
-            self._distrust(error)
-        except TouchcellError as error:
-            self._error = error
-            return False
+            if self.state is RunState.RUNNING:
+                self._work()
+            elif self.state is RunState.WAITING_FOR_RESET:
+                self._wait()
+        except Exception as error:
+            self._fail(error)
+        if self.state in (RunState.RUNNING, RunState.WAITING_FOR_RESET) and self._record.error is not None:
+            self._fail(self._record.error)
+        if self.state is RunState.STOPPING:
+            self._await_rest()
+        elif self.state is not RunState.ENDED:
+            self._pacing.wait()
+        return self.state is not RunState.ENDED
+
+    def end(self) -> RunResult:
+        """Bring the arms to rest wherever the run is, give them back, and return how it went."""
+        while self.state is not RunState.ENDED:
+            if self.state is not RunState.STOPPING:
+                self._fire(STOP, "ended before the task had finished")
+            self._await_rest()
+        return self.result
+
+    def enter_running(self, record: TransitionRecord) -> None:
+        """Called on entry to RUNNING: after a reset the task begins anew, from its first state."""
+        if record.event == RESUME:
+            cell = self._cell
+            cell.task = cell.new_task()
+            self._record.new_task()
+            self._sent = {}
+            self._require_channel().close()
+            self._pacing.restart()
+
+    def enter_stopping(self, record: TransitionRecord) -> None:
+        """Called on entry to STOPPING: all arms are told to stop."""
+        latch = self._cell.supervisor.latch
+        if record.event == FAULT:
+            self._error = self._error or TouchcellError(record.reason)
+            # The watchdog may know better why a device does not answer.
+            if alarms := self._alarms():
+                latch.update(alarms)
+        self._stops.begin(tripped=record.event in (TRIP, FAULT) or latch.first_cause is not None)
+
+    def enter_waiting(self, record: TransitionRecord) -> None:
+        """Called on entry to WAITING_FOR_RESET: arms that no watchdog guards obey no motion, and the trip is reported
+        once."""
+        if not _has_waited(self._machine.records[:-1]):
+            # A black box takes longer to write than a watchdog waits.
+            self._cell.watchdog.end()
+            self._require_channel().open()
+            self._record.event("waiting", "for a reset")
+            if self._on_trip is not None:
+                self._on_trip(self._result())
+        self._pacing.restart()
+
+    def waits_for_reset(self) -> bool:
+        """Whether the run waits for the operator once its arms stand: after a trip, if the cell file says so."""
+        latched = self._cell.supervisor.latch.first_cause is not None
+        return self._reset is not None and latched and self._machine.records[-1].event == TRIP
+
+    def latch_is_clear(self) -> bool:
+        """Whether nothing is latched, so that the task may start again."""
+        return self._cell.supervisor.latch.state is LatchState.CLEAR
+
+    def _work(self) -> None:
+        """One cycle of the task."""
+        if self._stop.at_once:
+            self._fire(STOP, "stopped at once by the operator")
+            return
+        self._cell.watchdog.beat()
+        self._cycle()
         self._cycles += 1
-        if cell.supervisor.latch.first_cause is not None and cell.task.finished and self._desk is not None:
-            self._begin_waiting(self._desk)
-            return True
-        return not cell.task.finished
+        if self._cell.task.finished:
+            # Refused where the same cycle has tripped.
+            self._fire(FINISHED)
+
+    def _cycle(self) -> None:
+        cell = self._cell
+        started = time.perf_counter_ns()
+        reading = self._observer.read()
+        perceived = time.perf_counter_ns()
+        observation = Observation(
+            reading.now_ns,
+            reading.states,
+            reading.contacts,
+            operator_stop=self._stop.orderly,
+            ended=self._observer.exhausted,
+        )
+        action = cell.task.tick(observation)
+        thought = time.perf_counter_ns()
+        verdict = cell.supervisor.review(self._observer.view(reading, action, self._sent), self._alarms())
+        judged = time.perf_counter_ns()
+        if verdict.allow:
+            self._sent = self._send(action, verdict)
+        else:
+            self._sent = {}
+            self._fire(TRIP, str(verdict.trip))
+            cell.task.trip(reading.now_ns, str(verdict.trip))
+        self._record.keep_frames(reading.contacts, action)
+        done = time.perf_counter_ns()
+        for sensor in cell.sensors.values():
+            for stage, duration_ns in sensor.stage_times().items():
+                if duration_ns:
+                    self._times.add(stage, duration_ns)
+        self._times.add("sense", perceived - started)
+        self._times.add("task and control", thought - perceived)
+        self._times.add("supervisor", judged - thought)
+        self._times.add("gate and send", done - judged)
+        self._times.add("cycle", done - started)
+        self._record.cycle(reading, action, self._sent, verdict, self._times)
+        self._times.add("record", time.perf_counter_ns() - done)
+        if self._on_cycle is not None:
+            t_s = (reading.now_ns - cell.start_ns) * 1e-9
+            self._on_cycle(Progress(t_s, cell.task.state, reading.contacts, action.telemetry))
+
+    def _send(self, action: Action, verdict: Verdict) -> Mapping[str, Sent[TwistCommand]]:
+        """Send what the task asks for, and stop the arms that it asks nothing of."""
+        sent = {}
+        for role, command in action.twists.items():
+            # A violation that only limits slows everything down, in the direction that it has.
+            slowed = command if verdict.speed == 1.0 else replace(command, twist=verdict.speed * command.twist)
+            arm = self._arms[role]
+            sent[role] = call_driver(arm.name, partial(arm.send_twist, slowed, self._leases[role]))
+        for role, arm in self._arms.items():
+            if role not in action.twists:
+                call_driver(arm.name, arm.stop)
+        return sent
+
+    def _wait(self) -> None:
+        """One cycle of a run that has tripped: the arms stand and are watched, and the operator is answered."""
+        cell = self._cell
+        if self._stop.orderly:
+            self._fire(STOP, "ended by the operator after a trip")
+            return
+        view = None
+        try:
+            view = self._observer.view(self._observer.read())
+            cell.supervisor.review(view, self._alarms())
+            if not all(call_driver(arm.name, arm.at_rest) for arm in self._arms.values()):
+                self._fire(TRIP, "an arm does not stand while the run waits")
+        except DeviceError as error:
+            self._fail(error)
+        if self.state is RunState.WAITING_FOR_RESET:
+            self._answer(view)
+
+    def _answer(self, view: CellView | None) -> None:
+        """Answer what the operator has asked, and start the task again if that was asked and may be."""
+        assert self._reset is not None
+        resume, done = self._reset.answer(view)
+        for description in done:
+            self._record.event("operator", description)
+        if resume:
+            self._fire(RESUME)
+        if self._on_cycle is not None:
+            waiting = "" if resume else self._reset.describe()
+            t_s = (self._cell.clock.now_ns() - self._cell.start_ns) * 1e-9
+            self._on_cycle(Progress(t_s, self._cell.task.state, {}, {}, waiting))
+
+    def _fail(self, error: Exception) -> None:
+        """Stop because of ``error``; a run that may wait for a reset treats a device's like any other trip."""
+        logger.error("%s: %s", self.state.name.lower(), error, exc_info=error)
+        at_work = self.state in (RunState.RUNNING, RunState.WAITING_FOR_RESET)
+        if isinstance(error, DeviceError) and self._reset is not None and at_work:
+            self._distrust(error)
+            return
+        self._error = self._error or (error if isinstance(error, TouchcellError) else UnexpectedError(error))
+        self._fire(FAULT, str(error))
 
     def _distrust(self, error: DeviceError) -> None:
-        """Latch what a device has raised: a run that waits gets over it like over any other fault."""
+        """Latch what a device has raised."""
         cell = self._cell
         roles = {arm.name: role for role, arm in cell.arms.items()}
         now_ns, latch = cell.clock.now_ns(), cell.supervisor.latch
-        # Whoever looks on from outside may know better why a device does not answer.
-        latch.update(cell.watchdog.alarms(now_ns))
+        # The watchdog may know better why a device does not answer.
+        latch.update(self._alarms())
         fault = Violation("device", Severity.FAULT, roles.get(error.device, error.device), str(error), now_ns)
         is_new = (fault.interlock, fault.subject) not in {(cause.interlock, cause.subject) for cause in latch.causes}
         latch.update([fault])
+        if is_new:
+            self._fire(TRIP, str(error))
         if not cell.task.finished:
             cell.task.trip(now_ns, str(error))
-        if is_new:
-            self._stop_arms(tripped=True)
-            self._come_to_rest()
 
-    def _begin_waiting(self, desk: OperatorChannel) -> None:
-        self._waited_from_ns = self._cell.clock.now_ns()
-        stops = self._come_to_rest()
-        # A black box takes longer to write than a watchdog waits. Arms that nobody guards obey no motion.
+    def _await_rest(self) -> None:
+        """Watch the arms until they stand; a run that does not wait for a reset then ends."""
+        self._reports = self._stops.await_rest()
+        self._fire(STOPPED)
+        if self.state is RunState.ENDED:
+            self._finish()
+
+    def _finish(self) -> None:
+        """Give the arms back and keep how it went."""
         self._cell.watchdog.end()
-        self._waiting = ResetProcedure(self._cell, self._leases, desk)
-        desk.open()
-        self._due_ns = self._cell.clock.now_ns()
-        self._event("waiting", "for a reset")
-        if self._on_trip is not None:
-            self._on_trip(self._result(stops))
-
-    def _wait(self, waiting: ResetProcedure) -> bool:
-        """One cycle of a run that has tripped: the arms stand and are watched, and people are answered."""
-        cell = self._cell
-        if self._stop.count:
-            self._reason = "ended by the operator after a trip"
-            return False
-        view = None
-        try:
-            states, contacts, now_ns = self._look()
-            view = replace(self._view(now_ns, states, contacts, Action()), at_work=False)
-            cell.supervisor.review(view, cell.watchdog.alarms(now_ns))
-            if not all(arm.at_rest() for arm in self._arms.values()):
-                self._stop_arms(tripped=True)
-                self._come_to_rest()
-                self._due_ns = cell.clock.now_ns()
-        except DeviceError as error:
-            self._distrust(error)
-        going_on, done = waiting.answer(view)
-        for words in done:
-            self._event("operator", words)
-        self._resets += tuple(waiting.resets)
-        waiting.resets.clear()
-        if going_on:
-            self._restart()
-        if self._on_cycle is not None:
-            words = "" if going_on else waiting.words
-            t_s = (cell.clock.now_ns() - cell.start_ns) * 1e-9
-            self._on_cycle(Progress(t_s, cell.task.state, {}, {}, words))
-        return True
-
-    def _restart(self) -> None:
-        """The task begins anew, from its first state."""
-        cell = self._cell
-        cell.task = cell.new_task()
-        self._transitions_written = 0
-        self._sent = {}
-        self._waiting = None
-        if self._desk is not None:
-            self._desk.close()
-        self._due_ns = cell.clock.now_ns()
-        self._waited_ns += self._due_ns - self._waited_from_ns
-
-    def end(self) -> RunResult:
-        """Bring the arms to rest, give them back, and say how it went."""
-        cell = self._cell
-        self._ending = True
-        # Whoever looks on from outside may know better why a device does not answer.
-        if self._error is not None and (alarms := cell.watchdog.alarms(cell.clock.now_ns())):
-            cell.supervisor.latch.update(alarms)
-        self._stop_arms(tripped=self._error is not None or cell.supervisor.latch.first_cause is not None)
-        stops = self._come_to_rest()
-        cell.watchdog.end()
-        if self._desk is not None:
-            self._desk.close()
+        if self._channel is not None:
+            self._channel.close()
         for role, lease in self._leases.items():
-            # What an arm that is gone says to it has been told already.
+            # What an arm that is gone answers has been reported already.
             with suppress(DeviceError):
                 self._arms[role].release(lease)
-        result = self._result(stops)
-        self._write(
-            "/events", cell.clock.now_ns(), {"event": "end", "to": result.outcome.value, "reason": result.reason}
-        )
-        return result
+        self._final = self._result()
+        self._record.event("end", self._final.reason, to=self._final.outcome.value)
 
-    def _come_to_rest(self) -> Mapping[str, StopReport]:
-        """Watch the arms that were told to stop until they stand."""
-        stops = self._stopper.watch(self._record_state, self._escalated)
-        for role, report in stops.items():
-            if report.problem:
-                self._event("stop failed", f"{role}: {report.problem}")
-        return stops
-
-    def _result(self, stops: Mapping[str, StopReport]) -> RunResult:
-        """How it stands now."""
+    def _result(self) -> RunResult:
         cell = self._cell
-        reason = self._reason or ("" if self._error is None else str(self._error))
+        stop = next((r for r in reversed(self._machine.records) if r.target == _STOPPING), None)
+        error = self._error or self._record.error
         if (trip := cell.supervisor.latch.first_cause) is not None:
             outcome, reason = Outcome.TRIPPED, f"{trip.interlock}: {trip.subject}: {trip.reason}"
-        elif self._error is not None:
-            outcome = Outcome.ERROR
-        elif cell.task.finished and self._waiting is None:
+        elif error is not None:
+            outcome, reason = Outcome.ERROR, str(error)
+        elif stop is not None and stop.event == FINISHED:
             outcome = _OUTCOMES.get(cell.task.state, Outcome.DONE if cell.task.succeeded else Outcome.FAILED)
-            reason = reason or _last_reason(cell.task.transitions)
+            reason = _last_reason(cell.task.transitions)
         else:
-            outcome = Outcome.STOPPED
+            outcome, reason = Outcome.STOPPED, "" if stop is None else self._why(stop)
         return RunResult(
             outcome,
             reason,
@@ -360,224 +363,36 @@ class RunLoop:
             (cell.clock.now_ns() - self._start_ns) * 1e-9,
             self._cycles,
             self._times,
-            self._error,
+            error,
             cell.supervisor.latch.causes,
-            stops,
-            self._resets,
+            self._reports,
+            () if self._reset is None else tuple(self._reset.resets),
         )
 
-    def _cycle(self) -> None:
-        cell = self._cell
-        started = time.perf_counter_ns()
-        states, contacts, now_ns = self._look()
-        perceived = time.perf_counter_ns()
-        ended = bool(cell.sensors) and all(sensor.source.ended for sensor in cell.sensors.values())
-        observation = Observation(now_ns, states, contacts, operator_stop=self._stop.count > 0, ended=ended)
-        action = cell.task.tick(observation)
-        thought = time.perf_counter_ns()
-        verdict = cell.supervisor.review(self._view(now_ns, states, contacts, action), cell.watchdog.alarms(now_ns))
-        judged = time.perf_counter_ns()
-        sent: dict[str, Sent[TwistCommand]] = {}
-        if verdict.allow:
-            for role, command in action.twists.items():
-                # A violation that only limits slows everything down, in the direction that it has.
-                slowed = command if verdict.speed == 1.0 else replace(command, twist=verdict.speed * command.twist)
-                sent[role] = cell.arms[role].send_twist(slowed, self._leases[role])
-            for role in self._leases.keys() - action.twists.keys():
-                cell.arms[role].stop()
-        else:
-            self._stop_arms(tripped=True)
-            if verdict.trip is not None:
-                cell.task.trip(now_ns, str(verdict.trip))
-        self._sent = sent
-        if cell.collection is not None:
-            self._keep(cell.collection, contacts, action.labels)
-        done = time.perf_counter_ns()
-        for sensor in cell.sensors.values():
-            self._count_stages(sensor)
-        self._times.add("sense", perceived - started)
-        self._times.add("task and control", thought - perceived)
-        self._times.add("supervisor", judged - thought)
-        self._times.add("gate and send", done - judged)
-        self._times.add("cycle", done - started)
-        self._record(now_ns, states, contacts, action, sent, verdict)
-        self._times.add("record", time.perf_counter_ns() - done)
-        if self._on_cycle is not None:
-            self._on_cycle(Progress((now_ns - cell.start_ns) * 1e-9, cell.task.state, contacts, action.telemetry))
+    def _why(self, stop: TransitionRecord) -> str:
+        if stop.event == TIMEOUT and stop.source == _RUNNING:
+            return f"longer than max_duration_s: {self._cell.max_duration_s:g}"
+        return stop.reason
 
-    def _look(self) -> tuple[dict[str, Stamped[TcpState]], dict[str, ContactEstimate], int]:
-        """Read the arms and perceive; returns states, contacts and the time that they are for."""
-        cell = self._cell
-        self._times.begin()
-        started = time.perf_counter_ns()
-        states = {role: arm.tcp() for role, arm in cell.arms.items()}
-        self._times.add("read arms", time.perf_counter_ns() - started)
-        contacts = {}
-        for role, sensor in cell.sensors.items():
-            if sensor.arm_role is not None:
-                state = states[sensor.arm_role]
-                # A pose that is not finite is for the supervisor to see, not for the filter.
-                if all_finite(state.value.T_base_tcp):
-                    T_base_sensor = se3.compose(state.value.T_base_tcp, sensor.T_tcp_sensor)
-                    sensor.source.record_pose(state.t_ns, T_base_sensor)
-            if (estimate := sensor.source.update(cell.clock.now_ns())) is not None:
-                contacts[role] = estimate
-        # Only now: what a device's own thread brought in the meantime would seem to come from the future.
-        now_ns = cell.clock.now_ns()
-        return states, contacts, now_ns
+    def _fire(self, event: str, reason: str = "") -> None:
+        self._machine.fire(event, reason, now_ns=self._cell.clock.now_ns())
 
-    def _keep(
-        self, collection: Collection, contacts: Mapping[str, ContactEstimate], labels: Mapping[str, Array]
-    ) -> None:
-        """What a sensor sees while it touches nothing, once, and every frame that the task has labelled."""
-        for role in contacts:
-            frame = self._cell.sensors[role].frame
-            if frame is not None and not contacts[role].in_contact:
-                collection.keep_rest(frame.value.image)
-        for role, T_f_s in labels.items():
-            frame = self._cell.sensors[role].frame
-            if frame is not None:
-                collection.keep(frame.value.image, T_f_s)
+    def _alarms(self) -> Sequence[Violation]:
+        return self._cell.watchdog.alarms(self._cell.clock.now_ns())
 
-    def _stop_arms(self, *, tripped: bool) -> None:
-        """Tell all arms to stop: as the cell file says when something is wrong, else holding where they are."""
-        distrusted = {c.subject for c in self._cell.supervisor.latch.causes if c.severity is Severity.FAULT}
-        failed = self._stopper.stop(tripped=tripped, distrusted=distrusted)
-        for role, error in failed.items():
-            self._event("stop failed", f"{role}: {error}")
-
-    def _escalated(self, role: str, report: StopReport, waited_s: float) -> None:
-        reason = f"not seen at rest {waited_s:.3f} s after a stop by category {int(report.category)}"
-        now_ns = self._cell.clock.now_ns()
-        self._cell.supervisor.latch.update(
-            [Violation("stop", Severity.FAULT, role, reason, now_ns, value=waited_s, limit=report.declared_s, unit="s")]
-        )
-        self._event("escalated", f"{role}: {reason}")
-
-    def _record_state(self, role: str, state: Stamped[TcpState]) -> None:
-        # Arms on their way to rest are still guarded.
-        self._cell.watchdog.beat()
-        try:
-            message = tcp_message(state)
-        except TouchcellError as error:
-            # What cannot be put on file does not keep an arm from being watched.
-            self._event("no pose", f"{role}: {error}")
-        else:
-            self._write(f"/arms/{role}/tcp", state.t_ns, message)
-
-    def _event(self, event: str, reason: str) -> None:
-        self._write("/events", self._cell.clock.now_ns(), {"event": event, "reason": reason})
-
-    def _view(
-        self,
-        now_ns: int,
-        states: Mapping[str, Stamped[TcpState]],
-        contacts: Mapping[str, ContactEstimate],
-        action: Action,
-    ) -> CellView:
-        return CellView(
-            now_ns,
-            {
-                role: ArmView(state, action.twists.get(role), self._sent.get(role), self._joints(role))
-                for role, state in states.items()
-            },
-            {role: _sensor_view(estimate, self._cell.sensors[role]) for role, estimate in contacts.items()},
-            self._cell.task.state,
-        )
-
-    def _joints(self, role: str) -> Stamped[JointState] | None:
-        cell = self._cell
-        return cell.arms[role].joints() if role in cell.watched_joints else None
-
-    def _count_stages(self, sensor: Sensor) -> None:
-        for stage, duration_ns in sensor.stage_times().items():
-            if duration_ns:
-                self._times.add(stage, duration_ns)
-
-    def _record(
-        self,
-        now_ns: int,
-        states: Mapping[str, Stamped[TcpState]],
-        contacts: Mapping[str, ContactEstimate],
-        action: Action,
-        sent: Mapping[str, Sent[TwistCommand]],
-        verdict: Verdict,
-    ) -> None:
-        if self._recorder is None and self._box is None:
-            return
-        cell = self._cell
-        for role, state in states.items():
-            self._write(f"/arms/{role}/tcp", state.t_ns, tcp_message(state))
-        for role, estimate in contacts.items():
-            self._write(f"/sensors/{role}/contact", now_ns, contact_message(estimate))
-        for role, sensor in cell.sensors.items():
-            for topic, t_ns, message in sensor.extra_messages(now_ns):
-                self._write(f"/sensors/{role}/{topic}", t_ns, message, boxed=topic != "image")
-        if cell.scene is not None:
-            objects = cell.scene.objects()
-            for name, T_world_object in objects.value.items():
-                self._write(f"/objects/{name}", objects.t_ns, pose_message(T_world_object))
-        for role, command in sent.items():
-            self._write(f"/arms/{role}/command", command.t_ns, command_message(command))
-        if verdict.violations or not verdict.allow:
-            self._write("/safety", now_ns, verdict_message(verdict))
-        self._write("/task", now_ns, {"state": cell.task.state, **action.telemetry})
-        self._write("/timing", now_ns, self._times.message())
-        for record in cell.task.transitions[self._transitions_written :]:
-            self._write(
-                "/events",
-                record.t_ns,
-                {"event": record.event, "from": record.source, "to": record.target, "reason": record.reason},
-            )
-            self._transitions_written += 1
-
-    def _write(self, topic: str, t_ns: int, message: Mapping[str, Any], *, boxed: bool = True) -> None:
-        boxed = boxed and self._box is not None
-        recorded = self._recorder is not None and not self._recorder.failed
-        if not boxed and not recorded:
-            return
-        data = encode(message)
-        if boxed and self._box is not None:
-            self._box.add(topic, t_ns, data)
-        if self._recorder is None or not recorded:
-            return
-        try:
-            self._recorder.write_encoded(topic, t_ns, data)
-        except RecordingError as error:
-            # Nothing keeps the arms from being watched until they stand.
-            if not self._ending:
-                raise
-            self._error = self._error or error
+    def _require_channel(self) -> OperatorChannel:
+        assert self._channel is not None
+        return self._channel
 
 
+_RUNNING, _STOPPING, _WAITING = map(state_name, (RunState.RUNNING, RunState.STOPPING, RunState.WAITING_FOR_RESET))
 _OUTCOMES = {"stopped": Outcome.STOPPED, "tripped": Outcome.TRIPPED, "faulted": Outcome.ERROR}
 
 
-def _sensor_view(estimate: ContactEstimate, sensor: Sensor) -> SensorView:
-    depth_m = sigma_m = shear_m = torsion_rad = None
-    if estimate.belief is not None:
-        T_f_s = se3.inverse(estimate.belief.mean)
-        depth_m = float(T_f_s[2, 3])
-        sigma_m = math.sqrt(estimate.belief.covariance[2, 2])
-        shear_m = math.hypot(T_f_s[0, 3], T_f_s[1, 3])
-        torsion_rad = math.atan2(T_f_s[1, 0], T_f_s[0, 0])
-    content, brightness = sensor.picture()
-    return SensorView(
-        estimate.t_frame_ns,
-        estimate.seq,
-        estimate.in_contact,
-        depth_m,
-        estimate.in_range,
-        estimate.nis,
-        sigma_m,
-        shear_m,
-        torsion_rad,
-        content,
-        brightness,
-        None if estimate.belief is None else estimate.belief.mean,
-        estimate.markers,
-        sensor.arm_role,
-    )
+def _has_waited(records: Sequence[TransitionRecord]) -> bool:
+    """Whether the run has waited for a reset since its task was last at work."""
+    last = next((r for r in reversed(records) if r.target in (_RUNNING, _WAITING)), None)
+    return last is not None and last.target == _WAITING
 
 
 def _last_reason(transitions: Sequence[TransitionRecord]) -> str:

@@ -18,8 +18,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Final
 
-from touchcell.cell.runtime.loop import StopRequest
 from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest
+from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.errors import TouchcellError
 
 PID_FILE: Final = "pid"
@@ -73,13 +73,13 @@ def stop_on_signals(stop: StopRequest) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stop_on_keys(
-    stop: StopRequest, stream: IO[str] | None = None, desk: OperatorChannel | None = None
+    stop: StopRequest, stream: IO[str] | None = None, channel: OperatorChannel | None = None
 ) -> Iterator[Callable[[], None]]:
-    """Yields what the loop calls once a cycle: space or Esc stop at once, s or q end in an orderly way; r asks ``desk``
-    for a reset, and g to go on.
+    """Yield what the loop calls once a cycle to read the operator's keys.
 
-    A terminal that is gone stops at once too. Where ``stream`` (standard input) is no terminal, or belongs to another
-    job of the shell, it does nothing. The terminal is left as it was found.
+    Space or Esc stop at once, s or q end in an orderly way; r asks ``channel`` for a reset, g to resume. A terminal
+    that is gone stops at once too. Where ``stream`` (standard input) is no terminal, or belongs to another job of the
+    shell, no key is read. The terminal is left as it was found.
     """
     fd = _terminal(sys.stdin if stream is None else stream)
     if fd is None:
@@ -91,7 +91,7 @@ def stop_on_keys(
     before = termios.tcgetattr(fd)
     tty.setcbreak(fd)
     try:
-        yield lambda: _look(fd, stop, desk)
+        yield lambda: _look(fd, stop, channel)
     finally:
         # A terminal that is gone needs no repair.
         with contextlib.suppress(termios.error):
@@ -106,7 +106,7 @@ def _terminal(stream: IO[str]) -> int | None:
         return None
 
 
-def _look(fd: int, stop: StopRequest, desk: OperatorChannel | None) -> None:
+def _look(fd: int, stop: StopRequest, channel: OperatorChannel | None) -> None:
     if not select.select([fd], [], [], 0.0)[0]:
         return
     try:
@@ -117,10 +117,10 @@ def _look(fd: int, stop: StopRequest, desk: OperatorChannel | None) -> None:
         stop.ask_at_once()
     elif any(key in ORDERLY_KEYS for key in keys):
         stop.ask()
-    elif desk is not None:
+    elif channel is not None:
         for key in dict.fromkeys(keys.lower()):
             if key in ASK_KEYS:
-                desk.ask(ASK_KEYS[key], getpass.getuser())
+                channel.ask(ASK_KEYS[key], getpass.getuser())
 
 
 @contextlib.contextmanager

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from touchcell.cell.runtime.watchdog import NOTES
 from touchcell.control.interlocks.violation import Severity, Violation
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.drivers.hosting.groups import Group, HostedDevice
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def hosted_groups(plan: CellPlan) -> tuple[Group, ...]:
     alone = [
         device
         for device in plan.arms.values()
-        if device.name not in taken and "TwistSink" in device.spec.capabilities.abilities
+        if device.name not in taken and TwistSink in device.spec.capabilities.provides
     ]
     return (*groups, *(Group(each.name, (_hosted(plan, each),), "an arm by itself") for each in alone))
 

@@ -1,4 +1,4 @@
-"""A run that has tripped and waits: what a person may do about it. By a reset nothing moves, only by going on."""
+"""Reset of a run that has tripped: what the operator may ask of it. A reset moves nothing, only resuming does."""
 
 from __future__ import annotations
 
@@ -17,21 +17,20 @@ class ResetProcedure:
     Args:
         cell: whose latch is to be reset.
         leases: of the arms that the task moves, by role, renewed where a stop has voided them.
-        desk: where people ask.
+        channel: where the operator asks.
 
     Attributes:
         resets: what has been cleared, and by whom.
     """
 
-    def __init__(self, cell: Cell, leases: dict[str, Lease], desk: OperatorChannel) -> None:
+    def __init__(self, cell: Cell, leases: dict[str, Lease], channel: OperatorChannel) -> None:
         self._cell = cell
         self._leases = leases
-        self._desk = desk
+        self._channel = channel
         self.resets: list[ResetDone] = []
 
-    @property
-    def words(self) -> str:
-        """What a person has to know now, in one line."""
+    def describe(self) -> str:
+        """What the operator has to know now, in one line."""
         latch = self._cell.supervisor.latch
         if (cause := latch.first_cause) is None:
             return "reset; `touchcell resume` or g starts the task from its beginning"
@@ -45,9 +44,9 @@ class ResetProcedure:
             view: the cell now; None where a device does not answer, which no reset gets over.
         """
         done_so_far = []
-        while (request := self._desk.take()) is not None:
+        while (request := self._channel.take()) is not None:
             done, words = self._reset(request, view) if request.ask is OperatorRequest.RESET else self._resume()
-            self._desk.answer(request, done, words)
+            self._channel.answer(request, done, words)
             done_so_far.append(f"{request.ask.value} by {request.operator}: {words}")
             if done and request.ask is OperatorRequest.RESUME:
                 return True, done_so_far

@@ -13,6 +13,7 @@ from pydantic import Field, PositiveFloat, model_validator
 from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.settings import GradedSettings, InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
+from touchcell.control.interlocks.spec import InterlockSpec
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.errors import ConfigError
 from touchcell.geometry.finite import all_finite
@@ -337,3 +338,11 @@ class ArmStateAgeConfig(InterlockSettings):
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
         """Return the ``ArmStateAge`` interlock."""
         return ArmStateAge(name, self.level, 1e-3 * self.limit_ms)
+
+
+WORKSPACE = InterlockSpec("workspace", "sensor or tool stays inside a box in the arm's base frame", WorkspaceConfig)
+TCP_SPEED = InterlockSpec("tcp_speed", "measured and commanded tool speed stay below limits", TcpSpeedConfig)
+DEPTH = InterlockSpec("depth", "no sensor is pressed in too deep", DepthConfig)
+FRAME_AGE = InterlockSpec("frame_age", "tactile frames are fresh", FrameAgeConfig)
+ARM_STATE_AGE = InterlockSpec("arm_state_age", "arm states are fresh", ArmStateAgeConfig)
+TILT = InterlockSpec("tilt", "sensor or tool points along a direction within a cone", TiltConfig)

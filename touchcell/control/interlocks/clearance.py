@@ -12,6 +12,7 @@ from pydantic import PositiveFloat, model_validator
 from touchcell.control.interlocks.collision import Clearances, Pair
 from touchcell.control.interlocks.planning_scene import Body, PlanningScene, SpatialInterlockConfig
 from touchcell.control.interlocks.snapshot import CellView
+from touchcell.control.interlocks.spec import InterlockSpec
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
@@ -97,3 +98,6 @@ class ClearanceConfig(SpatialInterlockConfig):
                 hint="give the arms a `body:`, or name `obstacles:`",
             )
         return Clearance(name, self.level, bodies, clearances, 1e-3 * self.limit_mm, 1e-3 * self.slow_mm)
+
+
+CLEARANCE = InterlockSpec("clearance", "arms keep clear of each other, obstacles and themselves", ClearanceConfig)

@@ -11,6 +11,7 @@ from pydantic import NonNegativeFloat, PositiveFloat
 
 from touchcell.control.interlocks.settings import LEAVE, InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
+from touchcell.control.interlocks.spec import InterlockSpec
 from touchcell.control.interlocks.timers import (
     InterlockState,
     Judgement,
@@ -110,3 +111,8 @@ class LimitedConfig(InterlockSettings):
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the interlock on limited commands."""
         return OnDelay(name, self.level, _limited, 1e-3 * self.limit_ms)
+
+
+TRACKING = InterlockSpec("tracking", "an arm follows its commanded velocity", TrackingConfig)
+STANDSTILL = InterlockSpec("standstill", "an arm that is commanded to stop stays at rest", StandstillConfig)
+LIMITED = InterlockSpec("limited", "no gate limits an arm's command for long", LimitedConfig)

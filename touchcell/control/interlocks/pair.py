@@ -16,6 +16,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from touchcell.control.interlocks.planning_scene import PlanningScene, SpatialInterlockConfig
 from touchcell.control.interlocks.settings import LEAVE
 from touchcell.control.interlocks.snapshot import CellView, SensorView
+from touchcell.control.interlocks.spec import InterlockSpec
 from touchcell.control.interlocks.timers import (
     AnyOf,
     InterlockState,
@@ -326,3 +327,10 @@ def _require_sensor(name: str, key: str, sensor: str, T_tcp_sensor: Mapping[str,
             value=sensor,
             hint=f"sensors: {', '.join(sorted(T_tcp_sensor)) or 'none'}",
         )
+
+
+OUT_OF_STEP = InterlockSpec(
+    "out_of_step", "leader and follower keep their distance and share the load", OutOfStepConfig
+)
+OBJECT_LOST = InterlockSpec("object_lost", "the object held by two sensors stays between them", ObjectLostConfig)
+TOPPLING = InterlockSpec("toppling", "the pushed or held object does not begin to topple", TopplingConfig)

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict
 
 from touchcell.control.interlocks.violation import Severity
+from touchcell.geometry.types import Array
+
+if TYPE_CHECKING:
+    from touchcell.control.interlocks.interlock import Interlock
+    from touchcell.control.interlocks.timers import TimedInterlock
 
 
 class InterlockSettings(BaseModel):
@@ -14,12 +20,25 @@ class InterlockSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+    kind: str
     severity: Literal["trip", "fault"] = "trip"
 
     @property
     def level(self) -> Severity:
         """The severity as the interlocks use it."""
         return Severity[self.severity.upper()]
+
+    def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock | TimedInterlock:
+        """Return the interlock.
+
+        Args:
+            name: of the entry in the cell file.
+            T_tcp_sensor: (4, 4) pose of each sensor in the tool frame, by role.
+
+        Raises:
+            ConfigError: the entry names a sensor that the cell does not have.
+        """
+        raise NotImplementedError(f"{type(self).__name__} builds no interlock")
 
 
 class GradedSettings(InterlockSettings):

@@ -11,6 +11,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from touchcell.control.interlocks.settings import LEAVE, GradedSettings, InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
+from touchcell.control.interlocks.spec import InterlockSpec
 from touchcell.control.interlocks.timers import (
     InterlockState,
     Judgement,
@@ -300,3 +301,15 @@ class MarkersLostConfig(InterlockSettings):
         leave = self.leave_percent or LEAVE * self.limit_percent
         what = "markers missing:"
         return Sustained(name, self.level, _markers_missing, what, self.limit_percent, leave, "%", frames=self.frames)
+
+
+FRAME_FROZEN = InterlockSpec("frame_frozen", "tactile frames are not frozen: their content changes", FrameFrozenConfig)
+EXPOSURE = InterlockSpec("exposure", "brightness stays near that of the first frames", ExposureConfig)
+UNCERTAIN = InterlockSpec("uncertain", "standard deviation of the depth is below a limit", UncertainConfig)
+OUT_OF_RANGE = InterlockSpec("out_of_range", "the estimate stays inside the network's training range", OutOfRangeConfig)
+INCONSISTENT = InterlockSpec("inconsistent", "innovations match the filter's covariance", InconsistentConfig)
+CONTACT_LOST = InterlockSpec("contact_lost", "an established contact is not lost for long", ContactLostConfig)
+SHEAR = InterlockSpec("shear", "shear of every contact stays below saturation or slip", ShearConfig)
+TORSION = InterlockSpec("torsion", "torsion of every contact stays below a limit", TorsionConfig)
+SLIP = InterlockSpec("slip", "shear per depth of every contact stays below slip", SlipConfig)
+MARKERS_LOST = InterlockSpec("markers_lost", "most of the markers expected in view are detected", MarkersLostConfig)

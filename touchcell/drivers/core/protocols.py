@@ -1,9 +1,10 @@
-"""Small Protocols of device capabilities. Tasks require capabilities, never a driver by name."""
+"""Small Protocols of device capabilities. Tasks require protocols, never a driver by name."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import IntEnum
-from typing import Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 from touchcell.drivers.core.commands import Sent, TwistCommand
 from touchcell.drivers.core.gate import TwistLimits
@@ -136,3 +137,19 @@ class NativeWatchdog(Protocol):
     def watchdog_s(self) -> float:
         """Return the watchdog period as read back from the device: silence for this long stops it."""
         ...
+
+
+SERVO_ARM: Final[frozenset[type]] = frozenset({TcpSource, TwistSink, Stoppable})
+"""What a task needs of an arm that it moves; see ``ServoArm``."""
+
+
+def protocol_names(protocols: Iterable[type]) -> str:
+    """Names of ``protocols`` for messages, sorted and separated by commas."""
+    return ", ".join(sorted(protocol.__name__ for protocol in protocols))
+
+
+def require_protocols(protocols: Iterable[object]) -> None:
+    """Check a declaration. Raises TypeError for anything that ``isinstance`` cannot hold against a device."""
+    for each in protocols:
+        if not (isinstance(each, type) and getattr(each, "_is_runtime_protocol", False)):
+            raise TypeError(f"{each!r} is no runtime-checkable Protocol class")

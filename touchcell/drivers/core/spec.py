@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Any, Final, Generic, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
+from touchcell.drivers.core.protocols import require_protocols
 from touchcell.drivers.core.scene import SceneTruth
 from touchcell.geometry.types import Array
 from touchcell.registry import Registry
@@ -26,8 +27,9 @@ class Capabilities:
     """Static capabilities of a driver. The conformance suite verifies every entry.
 
     Attributes:
-        kind: "arm" or "camera".
-        abilities: names of the Protocols in ``touchcell.drivers.core.protocols`` that its devices satisfy.
+        kind: of device: "arm", "camera", or any other that a package brings, e.g. "gripper".
+        provides: runtime-checkable Protocols that its devices satisfy, of ``touchcell.drivers.core.protocols`` or the
+            package's own.
         state_rate_hz: rate at which new samples appear.
         min_command_rate_hz: lowest rate of twist commands that gives smooth motion; 0 for devices without commands.
         command_latency_s: typical time from the call to the transmission.
@@ -41,8 +43,8 @@ class Capabilities:
         virtual_time: whether the device runs on an injected clock; real hardware does not.
     """
 
-    kind: Literal["arm", "camera"]
-    abilities: frozenset[str]
+    kind: str
+    provides: frozenset[type]
     state_rate_hz: float
     min_command_rate_hz: float = 0.0
     command_latency_s: float = 0.0
@@ -53,6 +55,9 @@ class Capabilities:
     falls_on_power_loss: bool = False
     hardware_validated: bool = False
     virtual_time: bool = False
+
+    def __post_init__(self) -> None:
+        require_protocols(self.provides)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +79,12 @@ class DriverContext:
     bases: Mapping[str, Array] = field(default_factory=dict)
 
 
+ConfigT = TypeVar("ConfigT", bound=DriverConfig)
+DeviceT_co = TypeVar("DeviceT_co", bound=Device, covariant=True)
+
+
 @dataclass(frozen=True, slots=True)
-class DriverSpec:
+class DriverSpec(Generic[ConfigT, DeviceT_co]):
     """Entry point of a driver. Its module imports no SDK: that happens when a device is opened.
 
     Attributes:
@@ -89,11 +98,14 @@ class DriverSpec:
 
     name: str
     summary: str
-    config: type[DriverConfig]
+    config: type[ConfigT]
     capabilities: Capabilities
-    build: Callable[[str, Any, DriverContext], Device]
+    build: Callable[[str, ConfigT, DriverContext], DeviceT_co]
     extra: str | None = None
 
 
-DRIVERS: Final = Registry("touchcell.drivers", "driver", DriverSpec)
+AnyDriver: TypeAlias = DriverSpec[Any, Device]
+"""A driver that was found by name: its configuration is what its own model validates."""
+
+DRIVERS: Final[Registry[AnyDriver]] = Registry("touchcell.drivers", "driver", DriverSpec)
 """All installed drivers."""

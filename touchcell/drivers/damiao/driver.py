@@ -30,7 +30,14 @@ from touchcell.drivers.core.errors import (
     Remedy,
     TransportTimeout,
 )
-from touchcell.drivers.core.protocols import StopCategory
+from touchcell.drivers.core.protocols import (
+    SERVO_ARM,
+    HealthSource,
+    JointGoal,
+    JointSource,
+    NativeWatchdog,
+    StopCategory,
+)
 from touchcell.drivers.core.samples import JointState, Stamped
 from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.damiao import codec
@@ -429,9 +436,7 @@ SPEC = DriverSpec(
     config=DamiaoCanConfig,
     capabilities=Capabilities(
         kind="arm",
-        abilities=frozenset(
-            {"TcpSource", "JointSource", "TwistSink", "Stoppable", "JointGoal", "HealthSource", "NativeWatchdog"}
-        ),
+        provides=SERVO_ARM | {JointSource, JointGoal, HealthSource, NativeWatchdog},
         state_rate_hz=250.0,
         min_command_rate_hz=20.0,
         command_latency_s=0.004,

@@ -35,7 +35,7 @@ from touchcell.drivers.core.errors import (
     Remedy,
     TransportTimeout,
 )
-from touchcell.drivers.core.protocols import StopCategory
+from touchcell.drivers.core.protocols import SERVO_ARM, HealthSource, JointGoal, JointSource, StopCategory
 from touchcell.drivers.core.samples import JointState, Quality, Stamped
 from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.feetech import codec
@@ -498,7 +498,7 @@ SPEC = DriverSpec(
     config=FeetechSerialConfig,
     capabilities=Capabilities(
         kind="arm",
-        abilities=frozenset({"TcpSource", "JointSource", "TwistSink", "Stoppable", "JointGoal", "HealthSource"}),
+        provides=SERVO_ARM | {JointSource, JointGoal, HealthSource},
         state_rate_hz=50.0,
         min_command_rate_hz=10.0,
         command_latency_s=0.02,

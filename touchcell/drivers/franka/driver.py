@@ -42,7 +42,15 @@ from touchcell.drivers.core.errors import (
     TransportTimeout,
 )
 from touchcell.drivers.core.lease import Lease
-from touchcell.drivers.core.protocols import StopCategory
+from touchcell.drivers.core.protocols import (
+    SERVO_ARM,
+    HealthSource,
+    JointGoal,
+    JointSource,
+    NativeWatchdog,
+    StopCategory,
+    WrenchSource,
+)
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.franka.errors import BY_NAME, ERRORS, MODES, VendorError
@@ -53,18 +61,7 @@ from touchcell.geometry.types import Array
 
 CAPABILITIES = Capabilities(
     kind="arm",
-    abilities=frozenset(
-        {
-            "TcpSource",
-            "JointSource",
-            "WrenchSource",
-            "TwistSink",
-            "Stoppable",
-            "JointGoal",
-            "HealthSource",
-            "NativeWatchdog",
-        }
-    ),
+    provides=SERVO_ARM | {JointSource, WrenchSource, JointGoal, HealthSource, NativeWatchdog},
     state_rate_hz=1.0 / (2 * PERIOD_S),
     min_command_rate_hz=10.0,
     command_latency_s=0.001,

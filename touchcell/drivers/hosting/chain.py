@@ -14,6 +14,7 @@ from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.errors import DeviceFault, FaultClass, Remedy
+from touchcell.drivers.core.protocols import JointSource
 from touchcell.drivers.core.spec import DriverContext
 from touchcell.drivers.hosting.groups import Group, HostedDevice
 from touchcell.drivers.hosting.layouts import (
@@ -303,7 +304,7 @@ class Chain:
 def _proxy(device: HostedDevice, clock: Clock) -> RemoteDevice:
     if not device.is_arm:
         return RemoteCamera(device.name, clock)
-    if "JointSource" not in device.spec.capabilities.abilities:
+    if JointSource not in device.spec.capabilities.provides:
         return RemoteArm(device.name, clock)
     # Never connected: it provides the arm's links from its configuration.
     twin = device.spec.build(device.name, device.config, DriverContext(clock))

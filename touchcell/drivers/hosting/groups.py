@@ -6,15 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from touchcell.drivers.core.spec import DriverConfig, DriverSpec
+from touchcell.drivers.core.protocols import SERVO_ARM, FrameSource, HealthSource, JointSource
+from touchcell.drivers.core.spec import AnyDriver, DriverConfig
 
 FASTEST_HZ: Final = 500.0
 """Highest rate of device cycles of a host: a process in Python sustains no more beside others."""
 
-REMOTE_ABILITIES: Final = frozenset(
-    {"TcpSource", "TwistSink", "Stoppable", "JointSource", "FrameSource", "HealthSource"}
-)
-"""Capabilities of devices that are available to a task in another process."""
+REMOTE_PROTOCOLS: Final = SERVO_ARM | {JointSource, FrameSource, HealthSource}
+"""Protocols of devices that are available to a task in another process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +28,7 @@ class HostedDevice:
     """
 
     name: str
-    spec: DriverSpec
+    spec: AnyDriver
     config: DriverConfig
     category: int = 0
     policy: str = ""

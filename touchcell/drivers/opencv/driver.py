@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting
 from touchcell.drivers.core.clock import Clock
-from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.errors import ConnectError, DeviceGone
+from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.drivers.core.samples import Quality
 from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.v4l2 import codec
@@ -214,7 +214,7 @@ class OpencvCamera(Camera):
         return readings
 
 
-def build(name: str, config: Any, context: DriverContext) -> Device:
+def build(name: str, config: OpencvCameraConfig, context: DriverContext) -> OpencvCamera:
     """Build a DISCONNECTED camera."""
     return OpencvCamera(name, context.clock, config)
 
@@ -223,6 +223,6 @@ SPEC = DriverSpec(
     name="opencv_camera",
     summary="camera through OpenCV, where v4l2 cannot be used; lost frames are guessed, faults have no cause",
     config=OpencvCameraConfig,
-    capabilities=Capabilities(kind="camera", abilities=frozenset({"FrameSource", "HealthSource"}), state_rate_hz=30.0),
+    capabilities=Capabilities(kind="camera", provides=frozenset({FrameSource, HealthSource}), state_rate_hz=30.0),
     build=build,
 )

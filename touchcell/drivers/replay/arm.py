@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -11,6 +10,7 @@ from pydantic import Field
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device, Lifecycle
 from touchcell.drivers.core.errors import ConnectError, StaleData
+from touchcell.drivers.core.protocols import TcpSource
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.replay.dataset import natural_order, read_split
@@ -69,7 +69,7 @@ class ReplayArm(Device):
         self._poses = np.empty((0, 4, 4))
 
 
-def _build(name: str, config: Any, context: DriverContext) -> ReplayArm:
+def _build(name: str, config: ReplayArmConfig, context: DriverContext) -> ReplayArm:
     return ReplayArm(name, config, context.clock)
 
 
@@ -77,6 +77,6 @@ SPEC = DriverSpec(
     name="replay_arm",
     summary="replays the poses at which a labelled data set was collected",
     config=ReplayArmConfig,
-    capabilities=Capabilities(kind="arm", abilities=frozenset({"TcpSource"}), state_rate_hz=30.0, virtual_time=True),
+    capabilities=Capabilities(kind="arm", provides=frozenset({TcpSource}), state_rate_hz=30.0, virtual_time=True),
     build=_build,
 )

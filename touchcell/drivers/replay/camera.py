@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +18,7 @@ from touchcell.drivers.core.errors import (
     StaleData,
     TransportTimeout,
 )
+from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.replay.dataset import IMAGE_FOLDER, natural_order
@@ -26,7 +26,7 @@ from touchcell.geometry.types import ImageArray
 
 CAPABILITIES = Capabilities(
     kind="camera",
-    abilities=frozenset({"FrameSource", "HealthSource"}),
+    provides=frozenset({FrameSource, HealthSource}),
     state_rate_hz=30.0,
     virtual_time=True,
 )
@@ -160,7 +160,7 @@ class ReplayCamera(Device):
         self._newest = None
 
 
-def _build(name: str, config: Any, context: DriverContext) -> ReplayCamera:
+def _build(name: str, config: ReplayCameraConfig, context: DriverContext) -> ReplayCamera:
     return ReplayCamera(name, config, context.clock)
 
 

@@ -36,7 +36,15 @@ from touchcell.drivers.core.errors import (
     TransportTimeout,
 )
 from touchcell.drivers.core.lease import Lease
-from touchcell.drivers.core.protocols import StopCategory
+from touchcell.drivers.core.protocols import (
+    SERVO_ARM,
+    HealthSource,
+    JointGoal,
+    JointSource,
+    NativeWatchdog,
+    StopCategory,
+    WrenchSource,
+)
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, LocalIk, SerialChain, Tool
@@ -600,18 +608,7 @@ SPEC = DriverSpec(
     config=UrConfig,
     capabilities=Capabilities(
         kind="arm",
-        abilities=frozenset(
-            {
-                "TcpSource",
-                "JointSource",
-                "WrenchSource",
-                "TwistSink",
-                "Stoppable",
-                "JointGoal",
-                "HealthSource",
-                "NativeWatchdog",
-            }
-        ),
+        provides=SERVO_ARM | {JointSource, WrenchSource, JointGoal, HealthSource, NativeWatchdog},
         state_rate_hz=RATE_HZ,
         min_command_rate_hz=10.0,
         command_latency_s=0.0001,

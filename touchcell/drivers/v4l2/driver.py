@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any
 
 from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting
 from touchcell.drivers.core.clock import Clock
-from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.errors import ConnectError, DeviceGone, TransportError
+from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.drivers.core.samples import Quality
 from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.v4l2 import codec
@@ -226,7 +225,7 @@ def is_stable_name(path: str) -> bool:
     return path.startswith(("/dev/v4l/by-id/", "/dev/v4l/by-path/"))
 
 
-def build(name: str, config: Any, context: DriverContext) -> Device:
+def build(name: str, config: V4l2Config, context: DriverContext) -> V4l2Camera:
     """Build a DISCONNECTED camera."""
     return V4l2Camera(name, context.clock, config)
 
@@ -235,6 +234,6 @@ SPEC = DriverSpec(
     name="v4l2",
     summary="TacTip camera through Video4Linux2, with kernel stamps and sequence numbers",
     config=V4l2Config,
-    capabilities=Capabilities(kind="camera", abilities=frozenset({"FrameSource", "HealthSource"}), state_rate_hz=30.0),
+    capabilities=Capabilities(kind="camera", provides=frozenset({FrameSource, HealthSource}), state_rate_hz=30.0),
     build=build,
 )

@@ -1,4 +1,4 @@
-"""A simulated arm: a tool centre point that moves by twists, as ideally as its acceleration limits allow.
+"""Driver of a simulated arm: a tool centre point that follows twists exactly within its acceleration limits.
 
 It has no joints, no singularities and no tracking error beyond those limits; it is for tasks, not for arm dynamics.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -17,7 +16,7 @@ from touchcell.drivers.core.arm import Arm, LimitsConfig
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import StaleData
-from touchcell.drivers.core.protocols import StopCategory
+from touchcell.drivers.core.protocols import SERVO_ARM, HealthSource, StopCategory
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.geometry import se3
@@ -29,7 +28,7 @@ from touchcell.simulation.timeline import DEFAULT_STEP_S, Phase, Timeline
 
 CAPABILITIES = Capabilities(
     kind="arm",
-    abilities=frozenset({"TcpSource", "TwistSink", "Stoppable", "HealthSource"}),
+    provides=SERVO_ARM | {HealthSource},
     state_rate_hz=1.0 / DEFAULT_STEP_S,
     stop_categories=frozenset({1, 2}),
     has_brakes=True,
@@ -40,7 +39,7 @@ _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE, Lifecycle.FAU
 
 
 class SimArmConfig(DriverConfig):
-    """Where the arm stands, how fast it may be, and how late it obeys: twists only, stops reach it at once."""
+    """Base pose, start pose, limits and latency of the arm; the latency delays twists, not stops."""
 
     start_pose_mm_deg: tuple[float, float, float, float, float, float]
     base_pose_mm_deg: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -51,7 +50,7 @@ class SimArmConfig(DriverConfig):
 
 @dataclass(frozen=True, slots=True)
 class _Late:
-    """A twist that has not reached the arm yet."""
+    """A twist delayed by the latency."""
 
     due_ns: int
     twist_base: Array
@@ -62,13 +61,13 @@ class _Late:
 
 
 class SimArm(Arm):
-    """One simulated arm.
+    """Driver of a simulated arm.
 
     Args:
         name: the device's name in the cell.
         config: checked configuration.
-        clock: injected time.
-        timeline: of the scene that it moves in; its own if there is none.
+        clock: injected clock.
+        timeline: timeline of the scene that it moves in; its own if None.
 
     ``faults`` may be set at any time.
     """
@@ -93,8 +92,8 @@ class SimArm(Arm):
         self._timeline.keep(self._snapshot)
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """State at the last step of the simulation. Raises StaleData if it is older than ``max_age_s``."""
-        self._require("tell its pose", *_READABLE)
+        """Return the state at the last step of the simulation. Raises StaleData if it is older than ``max_age_s``."""
+        self._require("read its pose", *_READABLE)
         t_ns = self._timeline.advance()
         state = TcpState(self._body.T_base_tcp.copy(), self._velocity())
         if self.faults.nan_state:
@@ -109,12 +108,12 @@ class SimArm(Arm):
         return sample
 
     def at_rest(self) -> bool:
-        """Whether it stands still and is not about to move."""
+        """Return whether it is at rest with no motion pending."""
         self._timeline.advance()
         return self._body.at_rest() and not (self._on_the_way or self._velocity().any())
 
     def health(self) -> dict[str, float | int | str | bool]:
-        """Speeds of the tool centre point and who commands it."""
+        """Return the speeds of the tool centre point and the lease holder."""
         self._timeline.advance()
         velocity = self._body.velocity
         return {
@@ -123,8 +122,8 @@ class SimArm(Arm):
             "owner": self.owner or "",
         }
 
-    def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
-        """(4, 4) at the simulation's present step, in any lifecycle state and without advancing time: for scenes."""
+    def T_world_tcp(self) -> Array:  # noqa: N802  standard notation for transforms
+        """Return the present pose (4, 4), in any lifecycle state, without advancing time: for scenes."""
         return self.T_world_base @ self._body.T_base_tcp
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
@@ -158,7 +157,7 @@ class SimArm(Arm):
             self._body.T_base_tcp = T
 
     def _snapshot(self) -> Callable[[int], None]:
-        """The body alone: who may command it is no matter of the simulation."""
+        """Snapshot the body only: leases are not part of the simulation."""
         powered, body, on_the_way = self._powered, self._body.snapshot(), tuple(self._on_the_way)
 
         def restore(later_ns: int) -> None:
@@ -194,7 +193,7 @@ class SimArm(Arm):
         self._body.freeze()
 
 
-def _build(name: str, config: Any, context: DriverContext) -> SimArm:
+def _build(name: str, config: SimArmConfig, context: DriverContext) -> SimArm:
     scene = context.scene
     return SimArm(name, config, context.clock, scene.timeline if isinstance(scene, Scene) else None)
 

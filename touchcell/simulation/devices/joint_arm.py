@@ -1,7 +1,7 @@
-"""A simulated arm with joints: a Panda or UR5e of rods and servos, driven through damped least squares.
+"""Driver of a simulated arm with joint dynamics: a Panda or UR5e of rods and servos, with damped least squares.
 
-It sags under load, lags behind its setpoint, meets joint limits and slows down near singularities. What its tool
-touches pushes back on it. ``sim_arm`` is the one without all that.
+It sags under load, lags behind its setpoint, has joint limits and slows down near singularities, and contact forces act
+on its tool. ``sim_arm`` is the ideal one.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import Field
@@ -19,7 +19,7 @@ from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle, OperatorToken
 from touchcell.drivers.core.joint_arm import JointArm
 from touchcell.drivers.core.joint_setpoint import JointSetpoint
-from touchcell.drivers.core.protocols import StopCategory
+from touchcell.drivers.core.protocols import SERVO_ARM, HealthSource, JointGoal, JointSource, StopCategory
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain, Tool
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 CAPABILITIES = Capabilities(
     kind="arm",
-    abilities=frozenset({"TcpSource", "JointSource", "TwistSink", "Stoppable", "JointGoal", "HealthSource"}),
+    provides=SERVO_ARM | {JointSource, JointGoal, HealthSource},
     state_rate_hz=1.0 / DEFAULT_STEP_S,
     stop_categories=frozenset({1, 2}),
     has_brakes=True,
@@ -49,7 +49,7 @@ TOOLS = {
         origin_mm=(100.0, 0.0, 35.0), rotation_deg=(0.0, 90.0, 0.0), mass_kg=0.35, com_mm=(40.0, 0.0, 30.0)
     ),
 }
-"""What the flange may carry: a TacTip along the flange's axis, or one on a right-angle bracket along its x axis."""
+"""Tools: a TacTip along the flange's axis, or one on a right-angle bracket along its x axis."""
 
 _POSTURES_DEG = {"panda": (0, 20, 0, -120, 0, 140, 45), "ur5e": (0, -90, -90, -90, 90, 0)}
 _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE, Lifecycle.FAULTED)
@@ -58,12 +58,12 @@ _REST_SPEED_RAD_S = 1e-3
 
 
 class SimJointArmConfig(DriverConfig):
-    """Which arm, where it stands, what it carries, and how fast it may be."""
+    """Model, base pose, start pose, tool and limits of the arm."""
 
     model: Literal["panda", "ur5e"]
     start_pose_mm_deg: tuple[float, float, float, float, float, float]
     near_joints_deg: tuple[float, ...] | None = Field(
-        default=None, description="posture from which the joint angles of the start pose are sought"
+        default=None, description="initial guess of the joint angles for the start pose"
     )
     base_pose_mm_deg: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     tool: Literal["straight", "right_angle"] | Tool = "straight"
@@ -73,23 +73,23 @@ class SimJointArmConfig(DriverConfig):
     physics_step_ms: float = Field(default=1.0, ge=0.05, le=2.0)
     menagerie: str | None = Field(
         default=None,
-        description="checkout of MuJoCo Menagerie whose arm to use, or else $MENAGERIE_ROOT; rods where neither is set",
+        description="checkout of MuJoCo Menagerie whose arm to use, else $MENAGERIE_ROOT; rods if neither is set",
     )
 
 
 class SimJointArm(JointArm):
-    """One simulated arm with joints.
+    """Driver of a simulated arm with joint dynamics.
 
-    The setpoint moves every 10 ms; between, the joints follow it by the physics at ``physics_step_ms``.
+    The setpoint moves every 10 ms; in between, the joints follow it by the physics at ``physics_step_ms``.
 
     Args:
         name: the device's name in the cell.
         config: checked configuration.
-        clock: injected time.
-        timeline: of the scene that it moves in; its own if there is none.
+        clock: injected clock.
+        timeline: timeline of the scene that it moves in; its own if None.
 
     Raises:
-        ConfigError: the start pose cannot be reached, mujoco is not installed, or Menagerie's arm cannot be used.
+        ConfigError: the start pose is unreachable, mujoco is not installed, or Menagerie's arm cannot be used.
     """
 
     def __init__(self, name: str, config: SimJointArmConfig, clock: Clock, timeline: Timeline | None = None) -> None:
@@ -116,7 +116,7 @@ class SimJointArm(JointArm):
             raise ConfigError(f"is not {self._chain.joint_count} angles", key=f"{name}.near_joints_deg")
         q = joints_for_pose(self._chain, se3.from_euler_mm_deg(config.start_pose_mm_deg), near)
         self._setpoint.reset(q)
-        # Where the setpoint was when it moved last, and how many steps of the simulation ago that was.
+        # The setpoint at its last move, and the number of simulation steps since.
         self._from, self._phase = q, 0
         self._body = _dynamics(config, description, tool, q, step_s / self._steps)
         self._joints = self._sample()
@@ -124,24 +124,24 @@ class SimJointArm(JointArm):
         self._timeline.keep(self._snapshot)
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
-        """Joint states at the last step of the simulation. Raises StaleData if it is older than ``max_age_s``."""
-        self._require("tell its joints", *_READABLE)
+        """Return joint states at the last step of the simulation. Raises StaleData if older than ``max_age_s``."""
+        self._require("read its joints", *_READABLE)
         self._timeline.advance()
         self._joints = self._sample()
         return super().joints(max_age_s)
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """Tool pose and twist at the last step of the simulation. Raises StaleData."""
-        self._require("tell its pose", *_READABLE)
+        """Return tool pose and twist at the last step of the simulation. Raises StaleData."""
+        self._require("read its pose", *_READABLE)
         return super().tcp(max_age_s)
 
     def at_rest(self) -> bool:
-        """Whether setpoint and joints stand still."""
+        """Return whether setpoint and joints are at standstill."""
         self._timeline.advance()
         return not self._setpoint.moving and bool((np.abs(self._body.dq) <= _REST_SPEED_RAD_S).all())
 
     def health(self) -> dict[str, float | int | str | bool]:
-        """Largest joint torque beyond the arm's own weight, lag behind the setpoint, what limits the motion."""
+        """Return the largest joint torque beyond the arm's own weight, lag behind the setpoint, active limits."""
         self._timeline.advance()
         return {
             "torque_n_m": float(np.abs(self._body.torque).max()),
@@ -150,12 +150,12 @@ class SimJointArm(JointArm):
             "owner": self.owner or "",
         }
 
-    def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
-        """(4, 4) at the simulation's present step, in any lifecycle state and without advancing time: for scenes."""
+    def T_world_tcp(self) -> Array:  # noqa: N802  standard notation for transforms
+        """Return the present pose (4, 4), in any lifecycle state, without advancing time: for scenes."""
         return self.T_world_base @ self._body.T_base_tcp()
 
     def bear(self, force_world: Array, point_world: Array) -> None:
-        """From now on feel ``force_world`` (3,) N at ``point_world`` (3,) m on the tool: for scenes."""
+        """Apply ``force_world`` (3,) N at ``point_world`` (3,) m on the tool from now on: for scenes."""
         R, origin = self.T_world_base[:3, :3], self.T_world_base[:3, 3]
         self._body.bear(force_world @ R, (point_world - origin) @ R)
 
@@ -216,7 +216,7 @@ def _dynamics(
     return ArmDynamics(description, tool, q, step_s, links)
 
 
-def _build(name: str, config: Any, context: DriverContext) -> SimJointArm:
+def _build(name: str, config: SimJointArmConfig, context: DriverContext) -> SimJointArm:
     scene = context.scene
     return SimJointArm(name, config, context.clock, scene.timeline if isinstance(scene, Scene) else None)
 

@@ -1,18 +1,18 @@
-"""Rigs of the devices that live in this process, on virtual time: what they have in place of an emulator."""
+"""Test fixtures of in-process devices on virtual time, with a stand-in for the emulator."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import numpy as np
 
 from touchcell.drivers.core.clock import Clock, VirtualClock
 from touchcell.drivers.core.device import Device
-from touchcell.drivers.core.spec import DriverConfig, DriverContext, DriverSpec
+from touchcell.drivers.core.spec import ConfigT, DriverContext, DriverSpec
 from touchcell.drivers.replay import camera as replay_camera
 from touchcell.simulation.devices import arm as sim_arm
 from touchcell.simulation.devices import joint_arm as sim_joint_arm
@@ -28,12 +28,12 @@ _IMAGES = 90
 
 
 class StandIn:
-    """Plays the emulator for a device in this process: its truth is asked of the device itself.
+    """Stand-in for the emulator of an in-process device, which provides the ground truth itself.
 
     Args:
-        truth: tells it.
-        faults: what to do when a fault begins (with its value) and ends (with None).
-        end: called when the emulator is to vanish.
+        truth: returns the ground truth.
+        faults: called when a fault begins (with its value) and ends (with None).
+        end: called to make the emulator vanish.
     """
 
     def __init__(
@@ -58,10 +58,10 @@ class StandIn:
         return self.state()
 
     def freeze(self) -> None:
-        """It cannot hang while its client lives."""
+        """Do nothing: an in-process device cannot hang while its client runs."""
 
     def thaw(self) -> None:
-        """It never hangs."""
+        """Do nothing: it never hangs."""
 
     def kill(self) -> None:
         self._end()
@@ -71,25 +71,25 @@ class StandIn:
 
 
 def sim_arm_rig(folder: Path, address: int) -> DeviceFixture:
-    """A simulated arm with no scene around it."""
+    """Build a simulated arm without a scene."""
     return _arm_rig(sim_arm.SPEC, sim_arm.SimArmConfig(start_pose_mm_deg=_START))
 
 
 def sim_joint_arm_rig(folder: Path, address: int) -> DeviceFixture:
-    """A simulated Panda with no scene around it."""
+    """Build a simulated Panda without a scene."""
     return _arm_rig(sim_joint_arm.SPEC, sim_joint_arm.SimJointArmConfig(model="panda", start_pose_mm_deg=_START))
 
 
-def _arm_rig(spec: DriverSpec, config: DriverConfig) -> DeviceFixture:
+def _arm_rig(spec: DriverSpec[ConfigT, SimArm | SimJointArm], config: ConfigT) -> DeviceFixture:
     arms: list[SimArm | SimJointArm] = []
 
     def build(clock: Clock) -> Device:
-        arm = cast(SimArm | SimJointArm, spec.build("arm", config, DriverContext(clock)))
+        arm = spec.build("arm", config, DriverContext(clock))
         arms.append(arm)
         return arm
 
     def truth() -> dict[str, Any]:
-        # Simulated time advances when somebody asks; in the scene that is the camera.
+        # Simulated time advances on reads; in the scene the camera does that.
         arms[-1].health()
         T = arms[-1].T_world_tcp()
         return {"T_base_tcp": T.tolist(), "position_m": T[:3, 3].tolist()}
@@ -106,7 +106,7 @@ def _arm_rig(spec: DriverSpec, config: DriverConfig) -> DeviceFixture:
 
 
 def sim_tactip_rig(folder: Path, address: int) -> DeviceFixture:
-    """A simulated sensor on a simulated arm above a plane."""
+    """Build a simulated sensor on a simulated arm above a plane."""
     cameras: list[sim_tactip.SimTactip] = []
     clocks: list[Clock] = []
 
@@ -116,7 +116,7 @@ def sim_tactip_rig(folder: Path, address: int) -> DeviceFixture:
         arm = sim_arm.SPEC.build("arm", sim_arm.SimArmConfig(start_pose_mm_deg=_START), context)
         config = sim_tactip.SimTactipConfig(mounted_on="arm")
         context = DriverContext(clock, {"arm": arm}, scene)
-        cameras.append(cast(sim_tactip.SimTactip, sim_tactip.SPEC.build("tip", config, context)))
+        cameras.append(sim_tactip.SPEC.build("tip", config, context))
         clocks.append(clock)
         return cameras[-1]
 
@@ -140,7 +140,7 @@ def sim_tactip_rig(folder: Path, address: int) -> DeviceFixture:
 
 
 def replay_camera_rig(folder: Path, address: int) -> DeviceFixture:
-    """A folder of small images, as a camera."""
+    """Build a camera that replays a folder of small images."""
     images = folder / "images"
 
     def start() -> StandIn:

@@ -1,10 +1,10 @@
-"""A simulated TacTip: camera frames of the markers of a tip that an arm carries through the scene."""
+"""Driver of a simulated TacTip: camera frames of the markers of a tip that an arm carries through the scene."""
 
 from __future__ import annotations
 
 import math
 import zlib
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -12,7 +12,7 @@ from pydantic import Field
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device, Lifecycle
 from touchcell.drivers.core.errors import StaleData, TransportTimeout
-from touchcell.drivers.core.protocols import TcpSource
+from touchcell.drivers.core.protocols import FrameSource, HealthSource, TcpSource
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.errors import ConfigError
@@ -25,7 +25,7 @@ from touchcell.simulation.tip_file import load_tip
 
 CAPABILITIES = Capabilities(
     kind="camera",
-    abilities=frozenset({"FrameSource", "HealthSource"}),
+    provides=frozenset({FrameSource, HealthSource}),
     state_rate_hz=30.0,
     virtual_time=True,
 )
@@ -34,11 +34,11 @@ _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
 
 
 class SimTactipConfig(DriverConfig):
-    """Where the sensor is mounted and how its camera behaves.
+    """Mount and camera of the sensor.
 
-    ``exposure`` is a factor on grey levels, ``blur_px`` the standard deviation of a Gaussian, ``dropped`` the share of
-    frames that never come, ``tip`` a tip file (``touchcell calibrate-sim``) or the name of one that ships. Exposure,
-    blur and noise are of ``output: raw``; processed images are black and white.
+    ``exposure`` is a factor on grey levels, ``blur_px`` the standard deviation of a Gaussian, ``dropped`` the fraction
+    of frames lost, ``tip`` a tip file (``touchcell calibrate-sim``) or the name of one that ships. Exposure, blur and
+    noise apply to ``output: raw``; processed images are black and white.
     """
 
     mounted_on: str
@@ -54,19 +54,19 @@ class SimTactipConfig(DriverConfig):
 
 
 class SimTactip(Device):
-    """One simulated sensor.
+    """Driver of a simulated sensor.
 
-    Frames are exposed at whole multiples of the period on the clock, whether or not anybody reads them, and carry that
-    time; frame k has ``seq`` k. They become available ``latency_ms`` later and are drawn when they are read. ``faults``
-    may be set at any time.
+    Frames are exposed at whole multiples of the period on the clock, whether or not they are read, and carry that time;
+    frame k has ``seq`` k. They become available ``latency_ms`` later and are rendered on demand. ``faults`` may be set
+    at any time.
 
     Args:
         name: the device's name in the cell and in the scene.
         config: checked configuration.
-        clock: injected time.
-        scene: what there is to touch.
-        mount: what carries it.
-        seed: of the noise; the same seed and frame give the same image.
+        clock: injected clock.
+        scene: scene that it touches.
+        mount: arm that carries it.
+        seed: seed of the noise; the same seed and frame give the same image.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class SimTactip(Device):
             self._touch()
 
     def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
-        """Newest frame; waits for the very first. Raises StaleData if it is older than ``max_age_s``."""
+        """Return the newest frame; wait for the very first. Raises StaleData if it is older than ``max_age_s``."""
         self._require("deliver frames", *_READABLE)
         self._clock.sleep_until_ns(self._available_ns(self._from(self._first)))
         now_ns = self._clock.now_ns()
@@ -113,7 +113,7 @@ class SimTactip(Device):
         return self._draw(seq)
 
     def next(self, after_seq: int, timeout_s: float) -> Stamped[Frame]:
-        """Newest frame if its ``seq > after_seq``, else the first that is. Raises TransportTimeout."""
+        """Return the newest frame if its ``seq > after_seq``, else wait for the next. Raises TransportTimeout."""
         self._require("deliver frames", *_READABLE)
         now_ns = self._clock.now_ns()
         seq = self._from(max(self._newest_seq(now_ns), after_seq + 1, self._first))
@@ -125,7 +125,7 @@ class SimTactip(Device):
         return self._draw(seq)
 
     def health(self) -> dict[str, float | int | str | bool]:
-        """How many frames were drawn."""
+        """Return the number of rendered frames."""
         return {"frames_drawn": self._drawn, "rate_hz": 1e9 / self._period_ns}
 
     def _available_ns(self, seq: int) -> int:
@@ -143,13 +143,13 @@ class SimTactip(Device):
         return seq
 
     def _from(self, seq: int) -> int:
-        """The first frame that comes, from ``seq`` on."""
+        """Return the number of the first frame that is not dropped, from ``seq`` on."""
         while not self._comes(seq):
             seq += 1
         return seq
 
     def _comes(self, seq: int) -> bool:
-        """Whether frame ``seq`` is not dropped: the same for the same seed."""
+        """Return whether frame ``seq`` is not dropped: the same for the same seed."""
         return not self._dropped or np.random.default_rng((*self._seed, max(seq, 0), 1)).random() >= self._dropped
 
     def _never_comes(self, seq: int) -> bool:
@@ -172,7 +172,7 @@ class SimTactip(Device):
         return Frame(image)
 
     def _forget(self, later_ns: int) -> None:
-        """The newest picture may show what a restored scene has taken back."""
+        """Discard the newest image, which may show a state that a restored scene has undone."""
         self._newest = None
 
     def _open(self) -> None:
@@ -190,7 +190,7 @@ class SimTactip(Device):
         self._newest = None
 
 
-def _build(name: str, config: Any, context: DriverContext) -> SimTactip:
+def _build(name: str, config: SimTactipConfig, context: DriverContext) -> SimTactip:
     scene: object = context.scene
     arm: object = context.devices.get(config.mounted_on)
     mount: object = arm
@@ -200,7 +200,7 @@ def _build(name: str, config: Any, context: DriverContext) -> SimTactip:
         raise ConfigError("a simulated sensor needs a scene", key=name, hint="add a scene: section to the cell file")
     if not isinstance(mount, Carrier):
         raise ConfigError(
-            f"{config.mounted_on!r} is no arm of this cell",
+            f"{config.mounted_on!r} is not an arm of this cell",
             key=f"{name}.mounted_on",
             value=config.mounted_on,
             hint=f"devices so far: {', '.join(context.devices) or 'none'}",

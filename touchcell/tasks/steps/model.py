@@ -207,7 +207,12 @@ def _by_kind(step: Any) -> Any:
         raise ValueError(f"unknown step {kind!r} ({suggest(str(kind), KINDS, otherwise='steps')})")
     if not isinstance(fields, dict):
         raise ValueError(f"{kind} needs a mapping of its parameters, e.g. {{time_s: 1}}")
-    return {"kind": kind, **fields}
+    # Strict validation takes a list for a tuple from JSON alone, which this is no longer.
+    return {"kind": kind, **{key: tuple(value) if _numbers(value) else value for key, value in fields.items()}}
+
+
+def _numbers(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(each, int | float) for each in value)
 
 
 Step = Annotated[

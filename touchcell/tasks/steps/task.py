@@ -10,6 +10,7 @@ import numpy as np
 
 from touchcell.control.reach import Reach, is_there
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
+from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.errors import TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
@@ -290,7 +291,7 @@ SPEC = TaskSpec(
     name="steps",
     summary="do guarded motions written in the cell file: move, servo, hold, retract, record, repeat",
     config=StepsConfig,
-    arms={ARM: frozenset({"TcpSource", "TwistSink", "Stoppable"})},
+    arms={ARM: SERVO_ARM},
     sensors=frozenset({SENSOR}),
     build=StepsTask,
 )

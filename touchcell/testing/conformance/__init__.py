@@ -1,1 +1,1 @@
-"""One suite of checks for every driver; ``docs/how-to/write-a-driver.md`` explains how to certify one."""
+"""Conformance suite for drivers, built-in and third-party; see ``docs/how-to/write-a-driver.md``."""

@@ -1,57 +1,61 @@
-"""Marks a function as a check of the conformance suite."""
+"""Decorator for checks of the conformance suite."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from touchcell.drivers.core.commands import C
 from touchcell.testing.emulation.rig import DeviceFixture
 
+Circumstance = Literal["arm", "camera", "truth", "process", "limited axes"]
+"""A kind of device, or what has to hold for it beside its protocols."""
+
 
 @dataclass(frozen=True, slots=True)
 class Needs:
-    """What a check needs to make sense.
+    """Preconditions of a check.
 
     Attributes:
-        needs: abilities, "arm", "camera", "truth" (an emulator), "process" (an emulator of its own), "limited axes".
-        on_bench: whether it may be done to a real device.
-        of_faults: chooses among the rig's faults, by name, value and lawful answer, those for each of which it is done;
-            None for a check that has nothing to do with them.
+        needs: Protocols that the device provides, and "arm", "camera", "truth" (an emulator), "process" (an emulator of
+            its own), "limited axes".
+        on_bench: whether it may run on a real device.
+        of_faults: chooses among the rig's faults, by name, value and expected reaction, those for which it runs;
+            None for a check without faults.
     """
 
-    needs: tuple[str, ...]
+    needs: tuple[type | Circumstance, ...]
     on_bench: bool
     of_faults: Callable[[str, Any, str], bool] | None
 
     def missing(self, rig: DeviceFixture) -> str | None:
-        """Why the check does not apply to ``rig``, or None."""
+        """Return why the check does not apply to ``rig``, or None."""
         capabilities = rig.spec.capabilities
         if rig.start is None and not self.on_bench:
-            return "not done to a real device"
+            return "not run on a real device"
         for need in self.needs:
-            if need in ("arm", "camera"):
+            if isinstance(need, type):
+                if need not in capabilities.provides:
+                    return f"its capability record does not name {need.__name__}"
+            elif need in ("arm", "camera"):
                 if capabilities.kind != need:
                     return f"no {need}"
             elif need == "truth":
                 if rig.start is None:
-                    return "a real device tells no truth beside its own"
+                    return "a real device has no ground truth besides its own measurements"
             elif need == "process":
                 if not rig.process:
-                    return "simulated in the client's own process: it cannot vanish or hang while the client lives"
-            elif need == "limited axes":
-                if all(capabilities.twist_axes):
-                    return "follows all six axes"
-            elif need not in capabilities.abilities:
-                return f"its capability record does not name {need}"
+                    return "simulated in the client's own process: it cannot vanish or hang while the client runs"
+            elif all(capabilities.twist_axes):
+                return "follows all six axes"
         return None
 
 
 def check(
-    *needs: str, on_bench: bool = False, of_faults: Callable[[str, Any, str], bool] | None = None
+    *needs: type | Circumstance, on_bench: bool = False, of_faults: Callable[[str, Any, str], bool] | None = None
 ) -> Callable[[C], C]:
-    """Make a function of a ``Bench`` (and a fault's name) a check of the suite; see ``Needs``."""
+    """Mark a function of a ``Bench`` (and a fault's name) as a check of the suite; see ``Needs``."""
 
     def mark(function: C) -> C:
         function.conformance = Needs(needs, on_bench, of_faults)  # type: ignore[attr-defined]

@@ -1,8 +1,9 @@
-"""A client in a process of its own that keeps an arm moving, to be killed without warning.
+"""Client process that keeps an arm moving, to be killed without warning.
 
     python -m touchcell.testing.conformance.client FILE FUNCTION FOLDER ADDRESS SPEED_M_S
 
-runs the rig FUNCTION of the module in FILE, moves, and prints the silence in s after which the device should stop.
+builds the device fixture FUNCTION of the module in FILE, moves, and prints the silence in s that should stop the
+device.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ _START_TIMEOUT_S = 20.0
 
 
 class MovingClient:
-    """The child process; as a context manager it is surely gone at the end.
+    """The client process; a context manager that always ends it.
 
     Attributes:
-        silence_s: silence after which the device should stop by itself: its watchdog, or the time-to-live without one.
+        silence_s: silence after which the device should stop by itself: its watchdog, else the time-to-live.
     """
 
     def __init__(self, function: FixtureFactory, folder: Path, address: int, speed_m_s: float) -> None:
@@ -77,7 +78,7 @@ class MovingClient:
         self._reap()
 
     def kill(self) -> None:
-        """SIGKILL. Raises DeviceGone if it had ended by itself, so that there was nothing to kill."""
+        """Send SIGKILL. Raises DeviceGone if it had already ended by itself."""
         process = self._process
         if process is None:
             return

@@ -1,4 +1,4 @@
-"""Checks of the command gate as the driver's users meet it: what is refused, what is limited, what is reported."""
+"""Checks of the command gate: rejected commands, limited commands, reported adjustments."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import pytest
 from touchcell.drivers.core.commands import TwistFrame
 from touchcell.drivers.core.errors import CommandRejected, Rejection
 from touchcell.drivers.core.lease import Lease
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import OWNER, Bench
 
 _FORBIDDEN_TRAVEL_M = 1e-3
-"""Much less than any command that got through would make it; a soft arm may still creep to its setpoint."""
+"""Much less than the motion caused by any accepted command; a compliant arm may still creep to its setpoint."""
 
 
 def _refused(bench: Bench, lease: Lease, reason: Rejection, **changes: Any) -> None:
@@ -25,9 +26,9 @@ def _refused(bench: Bench, lease: Lease, reason: Rejection, **changes: Any) -> N
     assert caught.value.reason is reason
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def non_finite_commands_are_refused(bench: Bench) -> None:
-    """NaN and both infinities in any component, and in the time-to-live, are refused and move nothing."""
+    """NaN and both infinities in any component, and in the time-to-live, are rejected and move nothing."""
     lease = bench.leased()
     bench.settle()
     start = bench.position()
@@ -41,9 +42,9 @@ def non_finite_commands_are_refused(bench: Bench) -> None:
     assert np.linalg.norm(bench.position() - start) < _FORBIDDEN_TRAVEL_M
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def malformed_commands_are_refused(bench: Bench) -> None:
-    """Wrong shapes and frames that are none are refused and move nothing."""
+    """Wrong shapes and unknown frames are rejected and move nothing."""
     lease = bench.leased()
     bench.settle()
     start = bench.position()
@@ -55,7 +56,7 @@ def malformed_commands_are_refused(bench: Bench) -> None:
     assert np.linalg.norm(bench.position() - start) < _FORBIDDEN_TRAVEL_M
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def commands_without_the_lease_are_refused(bench: Bench) -> None:
     """A copied lease, another arm's, a released one: none of them moves the arm."""
     lease = bench.leased()
@@ -69,9 +70,9 @@ def commands_without_the_lease_are_refused(bench: Bench) -> None:
     assert np.linalg.norm(bench.position() - start) < _FORBIDDEN_TRAVEL_M
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def second_owner_is_refused(bench: Bench) -> None:
-    """One owner at a time, named; the next may come when the first has gone."""
+    """One owner at a time, by name; the next may acquire the lease after its release."""
     lease = bench.leased()
     with pytest.raises(CommandRejected) as caught:
         bench.arm.acquire("another")
@@ -81,9 +82,9 @@ def second_owner_is_refused(bench: Bench) -> None:
     assert bench.arm.acquire("another").owner == "another"
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def commands_out_of_their_time_are_refused(bench: Bench) -> None:
-    """Expired ones, ones from the future, and times-to-live that are zero, negative or endless."""
+    """Commands that are expired, from the future, or with a zero, negative or infinite time-to-live are rejected."""
     lease = bench.leased()
     with pytest.raises(CommandRejected) as caught:
         bench.arm.send_twist(bench.command(bench.twist(bench.axis()), ttl_s=0.1, age_s=0.2), lease)
@@ -95,7 +96,7 @@ def commands_out_of_their_time_are_refused(bench: Bench) -> None:
         _refused(bench, lease, Rejection.LIMIT, ttl_s=ttl_s)
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def commands_in_the_wrong_mode_are_refused(bench: Bench) -> None:
     """Nothing moves an arm that is not ACTIVE, lease or not."""
     bench.ready()
@@ -103,10 +104,10 @@ def commands_in_the_wrong_mode_are_refused(bench: Bench) -> None:
     _refused(bench, lease, Rejection.MODE)
 
 
-@check("TwistSink")
+@check(TwistSink)
 def commands_over_the_limits_are_scaled_and_reported(bench: Bench) -> None:
-    """Ten times too fast is sent within the limit, along the same direction, and the answer says so; nor is it truly
-    faster."""
+    """A tenfold speed is sent within the limit, along the same direction, and reported as adjusted; the arm is no
+    faster either."""
     lease = bench.leased()
     limit = bench.arm.limits.speed_m_s
     track, sent = bench.stream(lease, bench.twist(bench.axis(), speed=10.0 * limit), 0.5)
@@ -121,9 +122,9 @@ def commands_over_the_limits_are_scaled_and_reported(bench: Bench) -> None:
     bench.settle()
 
 
-@check("TwistSink")
+@check(TwistSink)
 def acceleration_is_limited_and_reported(bench: Bench) -> None:
-    """From rest the very first command is held back by the acceleration limit where the speed asked for is high."""
+    """From rest the first fast command is reduced by the acceleration limit."""
     lease = bench.leased()
     limits = bench.arm.limits
     ttl_s = min(0.02, 0.5 * limits.speed_m_s / limits.accel_m_s2)

@@ -1,4 +1,4 @@
-"""What a check works with: the device, its emulator's truth, and the clock that both live on."""
+"""Context of a conformance check: the device, its emulator's ground truth, and their common clock."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ _STILL_NS = 60_000_000
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Where the tool truly was.
+    """True poses of the tool over time.
 
     Attributes:
         t_ns: (n,) times on the check's clock.
         poses: (n, 4, 4) in the base frame.
-        t_true_s: (n,) the same times by the emulator's own clock, which counts for speeds.
+        t_true_s: (n,) the same times on the emulator's own clock, which is used for speeds.
     """
 
     t_ns: Array
@@ -47,23 +47,23 @@ class Track:
 
     @property
     def late_s(self) -> float:
-        """How long nobody looked, or by how much the emulator lagged behind, at worst: what a busy machine adds."""
+        """Return the longest gap between samples or lag of the emulator, s: the delay of a busy machine."""
         if len(self.t_ns) < 2:
             return 0.0
         lag_s = self.t_ns * 1e-9 - self.t_true_s
         return float(np.diff(self.t_ns).max() * 1e-9 + np.ptp(lag_s))
 
     def position_at(self, t_ns: float) -> Array:
-        """Position (3,) at ``t_ns``, between samples by straight lines."""
+        """Return the position (3,) at ``t_ns``, linearly interpolated."""
         return np.array([np.interp(t_ns, self.t_ns, self.poses[:, axis, 3]) for axis in range(3)])
 
     def since(self, t_ns: float) -> Track:
-        """The part from ``t_ns`` on."""
+        """Return the part from ``t_ns`` on."""
         late = self.t_ns >= t_ns
         return Track(self.t_ns[late], self.poses[late], self.t_true_s[late])
 
     def mean_twist(self, frame: TwistFrame) -> Array:
-        """Mean twist (6,) of the tool centre point from the first sample to the last, along base or first tool axes."""
+        """Return the mean twist (6,) of the TCP from the first to the last sample, along base or first tool axes."""
         first, last = self.poses[0], self.poses[-1]
         turn = np.eye(4)
         turn[:3, :3] = last[:3, :3] @ first[:3, :3].T
@@ -75,7 +75,7 @@ class Track:
 
 
 class _Recorder:
-    """Makes a track."""
+    """Recorder of a track."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench = bench
@@ -85,7 +85,7 @@ class _Recorder:
         self.truth: dict[str, Any] = {}
 
     def note(self) -> None:
-        """Take a sample."""
+        """Record a sample."""
         bench = self._bench
         before_ns = bench.clock.now_ns()
         self.truth = {} if bench.is_real else bench.truth()
@@ -95,13 +95,13 @@ class _Recorder:
         self._true.append(t_ns * 1e-9 if bench.rig.time is None or bench.is_real else self.truth[bench.rig.time])
 
     def track(self, count: int | None = None) -> Track:
-        """The first ``count`` samples, or all."""
+        """Return the first ``count`` samples, or all."""
         t_ns, poses, true = self.times[:count], self.poses[:count], self._true[:count]
         return Track(np.array(t_ns, dtype=np.float64), np.array(poses), np.array(true))
 
 
 class DeviceUnderTest:
-    """One rig and its emulator, which the checks of one driver share until one of them spoils it."""
+    """One device fixture and its emulator, shared by the checks of a driver until one of them spoils it."""
 
     def __init__(self, function: FixtureFactory, folder: Path, address: int) -> None:
         self.function = function
@@ -111,14 +111,14 @@ class DeviceUnderTest:
         self._emulator: Emulated | None = None
 
     def emulator(self) -> Emulated:
-        """The running emulator."""
+        """The running emulator, started on demand."""
         if self._emulator is None:
             assert self.rig.start is not None
             self._emulator = self.rig.start()
         return self._emulator
 
     def clear(self) -> None:
-        """End the emulator; the next check gets a fresh one."""
+        """End the emulator; the next check starts a fresh one."""
         emulator, self._emulator = self._emulator, None
         if emulator is not None:
             with suppress(DeviceError):
@@ -126,22 +126,22 @@ class DeviceUnderTest:
             emulator.stop()
 
     def vanish(self) -> None:
-        """The device disappears without a word."""
+        """Kill the emulator: the device disappears without notice."""
         emulator, self._emulator = self._emulator, None
         assert emulator is not None
         emulator.kill()
 
 
 class Bench:
-    """One check's view of a seat; makes devices and takes them away again.
+    """Context of one check; creates devices and cleans up after it.
 
     Attributes:
-        seat: the rig and its emulator.
-        rig: short for the seat's.
-        clock: what everything runs on; a virtual one passes only when somebody sleeps.
-        device: the device under test, DISCONNECTED at first.
-        late_s: by how much the host overslept at worst while the last ``stream`` was sent.
-        changed: set it if the emulator has to be put back to how it started.
+        seat: the device fixture and its emulator.
+        rig: the device fixture.
+        clock: common clock; a virtual one advances only when code sleeps.
+        device: the device under test, initially DISCONNECTED.
+        late_s: longest delay of the host while the last ``stream`` was sent.
+        changed: set it if the emulator has to be reset.
         spoiled: set it if the emulator cannot serve another check.
     """
 
@@ -155,18 +155,18 @@ class Bench:
         if self.rig.start is not None:
             seat.emulator()
         self.device = self.another()
-        # An arm that falls when it is let go begins each check where it began the first.
+        # An arm that sinks without power starts each check where it started the first.
         self.changed = self.rig.spec.capabilities.falls_on_power_loss or not self.rig.process
         self.spoiled = False
 
     @property
     def arm(self) -> Arm:
-        """The device, as an arm."""
+        """Return the device as an arm."""
         return cast(Arm, self.device)
 
     @property
     def camera(self) -> FrameSource:
-        """The device, as a camera."""
+        """Return the device as a camera."""
         return cast(FrameSource, self.device)
 
     @property
@@ -176,26 +176,26 @@ class Bench:
 
     @property
     def is_real(self) -> bool:
-        """Whether the device is one that can hurt people."""
+        """True for real hardware, which can injure people."""
         return self.rig.start is None
 
     @property
     def token(self) -> OperatorToken:
-        """An operator's."""
+        """Return an operator's token."""
         return OperatorToken("conformance suite", self.clock.now_ns())
 
     def is_in(self, state: Lifecycle) -> bool:
-        """Whether the device is in ``state`` now."""
+        """Return whether the device is in ``state``."""
         return self.device.state is state
 
     def another(self) -> Device:
-        """One more DISCONNECTED device object for the same device."""
+        """Return one more DISCONNECTED driver object for the same device."""
         device = self.rig.build(self.clock)
         self._devices.append(device)
         return device
 
     def close(self) -> None:
-        """Put everything back for the next check."""
+        """Restore everything for the next check."""
         try:
             if not self.is_real and self.rig.process:
                 self.emulator.thaw()
@@ -211,7 +211,7 @@ class Bench:
             self.restore()
 
     def restore(self) -> None:
-        """Put the emulator back to how it started, or start another."""
+        """Reset the emulator, or start another."""
         if self.rig.reset is not None:
             self.emulator.fault(self.rig.reset)
             return
@@ -219,7 +219,7 @@ class Bench:
         self.seat.emulator()
 
     def begin(self, fault: str, value: Any) -> None:
-        """Begin a fault in the emulator; it ends with the check at the latest."""
+        """Inject a fault into the emulator; it ends with the check at the latest."""
         self._began.add(fault)
         self.emulator.fault(fault, value)
 
@@ -245,11 +245,11 @@ class Bench:
         return self.arm.acquire(OWNER)
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass."""
+        """Sleep on the clock."""
         self.clock.sleep_until_ns(self.clock.now_ns() + round(seconds * 1e9))
 
     def until(self, condition: Callable[[], bool], within_s: float, what: str) -> float:
-        """Wait for ``condition``; returns how long it took in s, and fails the check if it took too long."""
+        """Wait for ``condition``; return the time in s, and fail the check if it took too long."""
         start_ns = self.clock.now_ns()
         while not condition():
             if (self.clock.now_ns() - start_ns) * 1e-9 > within_s:
@@ -258,15 +258,15 @@ class Bench:
         return (self.clock.now_ns() - start_ns) * 1e-9
 
     def truth(self) -> dict[str, Any]:
-        """What is true inside the emulator."""
+        """Return the ground truth from the emulator."""
         return self.emulator.state()
 
     def energised(self) -> int:
-        """How many messages that change power, mode or zero have reached the emulator."""
+        """Return the number of messages at the emulator that change power, mode or zero."""
         return int(self.truth()[self.rig.energising]) if self.rig.energising else 0
 
     def pose(self, truth: dict[str, Any] | None = None) -> Array:
-        """True pose (4, 4) of the tool centre point in the base frame; on a real bench what the arm says."""
+        """Return the true pose (4, 4) of the tool centre point in the base frame; on real hardware the measured one."""
         if self.is_real:
             return self.arm.tcp().value.T_base_tcp
         truth = truth or self.truth()
@@ -277,25 +277,25 @@ class Bench:
         return T
 
     def position(self) -> Array:
-        """True position (3,) of the tool centre point; on a real bench what the arm says."""
+        """Return the true position (3,) of the tool centre point; on real hardware the measured one."""
         if self.is_real or self.rig.position is None:
             return self.pose()[:3, 3]
         return np.array(self.truth()[self.rig.position])
 
     def speed(self, fraction: float = 0.3) -> float:
-        """Linear speed for tests in m/s: a fraction of the limit, and creeping on a real bench."""
+        """Return a linear speed for tests in m/s: a fraction of the limit, and at most 5 mm/s on real hardware."""
         return min(CREEP_M_S if self.is_real else 0.05, fraction * self.arm.limits.speed_m_s)
 
     def rot_speed(self, fraction: float = 0.3) -> float:
-        """The same for turning, in rad/s."""
+        """Return an angular speed for tests, in rad/s, likewise."""
         return min(CREEP_RAD_S if self.is_real else 0.15, fraction * self.arm.limits.rot_speed_rad_s)
 
     def axis(self) -> int:
-        """An axis that the arm can follow."""
+        """Return an axis that the arm can follow."""
         return self.rig.spec.capabilities.twist_axes.index(True)
 
     def twist(self, axis: int, *, speed: float | None = None) -> Array:
-        """(6,) along one axis at test speed."""
+        """Return a twist (6,) along one axis at test speed."""
         twist = np.zeros(6)
         twist[axis] = speed if speed is not None else self.speed() if axis < 3 else self.rot_speed()
         return twist
@@ -303,7 +303,7 @@ class Bench:
     def command(
         self, twist: Array, frame: TwistFrame = TwistFrame.BASE, ttl_s: float = _TTL_S, *, age_s: float = 0.0
     ) -> TwistCommand:
-        """A command computed ``age_s`` ago."""
+        """Return a command computed ``age_s`` ago."""
         return TwistCommand(twist, frame, self.clock.now_ns() - round(age_s * 1e9), ttl_s)
 
     def stream(
@@ -315,7 +315,7 @@ class Bench:
         frame: TwistFrame = TwistFrame.BASE,
         ttl_s: float = _TTL_S,
     ) -> tuple[Track, Sent[TwistCommand]]:
-        """Send ``twist`` at 50 Hz for a while; returns where the tool truly went, and the last command as sent."""
+        """Send ``twist`` at 50 Hz for a while; return the true track of the tool, and the last command as sent."""
         recorder = _Recorder(self)
         self.late_s = 0.0
         due_ns = self.clock.now_ns()
@@ -327,7 +327,7 @@ class Bench:
                 sent = self.arm.send_twist(self.command(twist, frame, ttl_s), lease)
             except StaleData as error:
                 recorder.note()
-                # Not the driver's doing where the emulator was not let run; the caller tries again.
+                # Not the driver's fault where the emulator was starved; the caller tries again.
                 if recorder.track().late_s < error.limit_s or now_ns >= end_ns:
                     pytest.fail(f"{error}; fault: {self.device.fault}", pytrace=False)
                 self.late_s = max(self.late_s, error.age_s)
@@ -342,9 +342,9 @@ class Bench:
             self.clock.sleep_until_ns(due_ns)
 
     def track_to_rest(self, within_s: float, ended: Callable[[dict[str, Any]], bool] | None = None) -> Track:
-        """Watch the true pose until it rests (or ``ended`` says so of the truth); fails the check if it does not.
+        """Track the true pose until it rests (or ``ended(truth)`` is true); fail the check if it does not.
 
-        The track ends where the rest began.
+        The track ends at the start of the rest.
         """
         recorder = _Recorder(self)
         times, poses = recorder.times, recorder.poses
@@ -361,24 +361,24 @@ class Bench:
             self.sleep(0.003)
 
     def settle(self, within_s: float = 2.0) -> None:
-        """Wait until the tool truly rests."""
+        """Wait until the tool is truly at rest."""
         self.track_to_rest(within_s)
 
     def read(self, max_age_s: float | None = None) -> Any:
-        """Newest sample of the device, whatever it delivers."""
+        """Return the newest sample of the device, of any kind."""
         if self.rig.spec.capabilities.kind == "camera":
             return self.camera.latest(max_age_s)
         return self.arm.tcp(max_age_s)
 
     def counters(self) -> dict[str, int]:
-        """Whole numbers in the device's health."""
+        """Return the integers in the device's health."""
         if not isinstance(self.device, HealthSource):
             return {}
         health = self.device.health()
         return {key: value for key, value in health.items() if isinstance(value, int) and not isinstance(value, bool)}
 
     def reach_faulted(self, within_s: float, lease: Lease | None = None) -> float:
-        """Use the device as a task would until it is FAULTED; returns how long it took in s."""
+        """Use the device as a task would until it is FAULTED; return the time in s."""
 
         def use() -> bool:
             with suppress(DeviceError):
@@ -390,7 +390,7 @@ class Bench:
         return self.until(use, within_s, "FAULTED")
 
     def reconnect(self, within_s: float = 5.0) -> None:
-        """Disconnect, and bring the device to ACTIVE again as soon as it can be reached."""
+        """Disconnect, and bring the device to ACTIVE again as soon as it is reachable."""
         self.device.disconnect()
         assert self.device.state is Lifecycle.DISCONNECTED
         refused: list[DeviceError] = []

@@ -1,4 +1,4 @@
-"""Checks of what a driver does when its device misbehaves: count it, call it stale, or latch FAULTED."""
+"""Checks of a driver's reaction to device faults: count them, raise StaleData, or latch FAULTED."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, DeviceError, LifecycleError, StaleData
 from touchcell.drivers.core.lease import Lease
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import OWNER, Bench
 
@@ -33,7 +34,7 @@ def _counted(fault: str, value: Any, answer: str) -> bool:
 
 @check("truth", of_faults=_every)
 def fault_triggers_expected_reaction(bench: Bench, fault: str) -> None:
-    """Each fault of the rig is counted, called stale, or latched, as the rig says; and the device serves again."""
+    """Each fault of the device fixture has its expected reaction (counted, stale, latched), and is recovered from."""
     value, answer = bench.rig.faults[fault]
     bench.changed = True
     lease = _begin(bench)
@@ -47,7 +48,7 @@ def fault_triggers_expected_reaction(bench: Bench, fault: str) -> None:
 
 @check("truth", of_faults=_counted)
 def budget_for_transient_faults_ends(bench: Bench, fault: str) -> None:
-    """What may happen a few times may not happen without end: FAULTED with the cause, or no sample at all."""
+    """A transient fault that does not end leads to FAULTED with its cause, or to no sample at all."""
     bench.changed = True
     lease = _begin(bench)
     bench.begin(fault, _BEYOND_ANY_BUDGET)
@@ -58,7 +59,7 @@ def budget_for_transient_faults_ends(bench: Bench, fault: str) -> None:
 
 @check("truth", "process")
 def vanished_device_is_a_fault_and_can_return(bench: Bench) -> None:
-    """kill -9 of the device: FAULTED, ``disconnect`` does not raise, and after its restart all is as before."""
+    """kill -9 of the device: FAULTED, ``disconnect`` does not raise, and after its restart everything works again."""
     bench.spoiled = True
     lease = _begin(bench)
     bench.seat.vanish()
@@ -73,9 +74,9 @@ def vanished_device_is_a_fault_and_can_return(bench: Bench) -> None:
 
 
 def _begin(bench: Bench) -> Lease | None:
-    """ACTIVE and in use."""
+    """Bring the device to ACTIVE and use it."""
     bench.active()
-    if "TwistSink" not in bench.rig.spec.capabilities.abilities:
+    if TwistSink not in bench.rig.spec.capabilities.provides:
         bench.until(lambda: _reads(bench), 2.0, "first sample")
         return None
     lease = bench.arm.acquire(OWNER)
@@ -84,7 +85,7 @@ def _begin(bench: Bench) -> Lease | None:
 
 
 def _use(bench: Bench, lease: Lease | None, seconds: float) -> list[Any]:
-    """Use the device as a task does; returns the samples that it gave."""
+    """Use the device as a task does; return the samples that it gave."""
     samples = []
     end_ns = bench.clock.now_ns() + round(seconds * 1e9)
     while bench.clock.now_ns() < end_ns:
@@ -110,7 +111,7 @@ def _is_survived(bench: Bench, lease: Lease | None, fault: str, value: Any, *, c
     assert stamps == sorted(stamps)
     if not counted:
         return
-    # Counters of what goes well grow most; on a busy machine those of what goes wrong are not still either.
+    # Counters of normal operation grow most; on a busy machine those of faults are not constant either.
     grown = {name: calm[name] - before.get(name, 0) for name in calm}
     rare = {name for name in after if grown.get(name, 0) <= max(grown.values()) // 2}
     assert any(after[name] > calm.get(name, 0) for name in rare), f"counted nowhere in health: {after}"
@@ -161,7 +162,7 @@ def _is_latched(bench: Bench, lease: Lease | None, fault: str, value: Any) -> No
 
 
 def _serves_again(bench: Bench) -> None:
-    """``recover`` leads to READY, never to ACTIVE; where it says that it cannot, connecting anew does."""
+    """``recover`` leads to READY, never to ACTIVE; if it cannot, reconnecting does."""
     deadline_ns = bench.clock.now_ns() + round(_RECOVERED_S * 1e9)
     while bench.is_in(Lifecycle.FAULTED) and bench.clock.now_ns() < deadline_ns:
         with suppress(DeviceError):
@@ -174,7 +175,7 @@ def _serves_again(bench: Bench) -> None:
             bench.device.activate()
     if not bench.is_in(Lifecycle.ACTIVE):
         if bench.rig.spec.capabilities.falls_on_power_loss:
-            # It fell; somebody has to lift it.
+            # It fell; it has to be lifted.
             bench.device.disconnect()
             bench.restore()
         bench.reconnect(_RECONNECTED_S)

@@ -1,4 +1,4 @@
-"""Checks of cameras beyond stamps and numbers: waiting, losing, and not working for nobody."""
+"""Checks of cameras beyond timestamps and numbers: waiting, losing frames, and decoding on demand."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from typing import Any
 import pytest
 
 from touchcell.drivers.core.errors import DeviceError, TransportTimeout
+from touchcell.drivers.core.protocols import FrameSource
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import Bench
 
 _UNREAD_PERIODS = 8
 
 
-@check("FrameSource", on_bench=True)
+@check(FrameSource, on_bench=True)
 def next_waits_and_gives_up(bench: Bench) -> None:
-    """``next`` gives a frame beyond the number that is known, and TransportTimeout when none comes in time."""
+    """``next`` returns a frame beyond the known number, and raises TransportTimeout if none arrives in time."""
     bench.active()
     first = bench.camera.next(-1, 2.0)
     assert bench.camera.next(first.seq, 2.0).seq > first.seq
@@ -27,9 +28,9 @@ def next_waits_and_gives_up(bench: Bench) -> None:
     assert (bench.clock.now_ns() - start_ns) * 1e-9 >= 0.099
 
 
-@check("FrameSource", on_bench=True)
+@check(FrameSource, on_bench=True)
 def latest_never_goes_back(bench: Bench) -> None:
-    """``latest`` repeats the newest frame until a newer one is there, and skips those that nobody read."""
+    """``latest`` repeats the newest frame until a newer one arrives, and skips unread ones."""
     rate_hz = bench.rig.state_rate_hz or bench.rig.spec.capabilities.state_rate_hz
     bench.active()
     first = bench.camera.next(-1, 2.0)
@@ -39,9 +40,9 @@ def latest_never_goes_back(bench: Bench) -> None:
     assert bench.camera.latest().seq >= newest.seq
 
 
-@check("FrameSource")
+@check(FrameSource)
 def frames_that_nobody_reads_are_not_decoded(bench: Bench) -> None:
-    """While frames pass unread OpenCV decodes none of them; reading decodes one."""
+    """While frames pass unread OpenCV decodes none of them; a read decodes one."""
     import cv2
 
     decoded = 0
@@ -62,13 +63,13 @@ def frames_that_nobody_reads_are_not_decoded(bench: Bench) -> None:
         assert bench.camera.latest().seq > first.seq
         bench.camera.latest()
     if decoded == 0:
-        pytest.skip("decodes nothing with OpenCV: not to be seen from outside")
+        pytest.skip("does not decode with OpenCV: not observable")
     assert decoded <= 2
 
 
-@check("FrameSource", "truth")
+@check(FrameSource, "truth")
 def lost_frames_leave_a_gap(bench: Bench) -> None:
-    """Frames that are lost on the way are missing in the numbers."""
+    """Frames lost in transport leave gaps in the sequence numbers."""
     if "drop" not in bench.rig.faults:
         pytest.skip("its emulator drops no frames")
     bench.active()

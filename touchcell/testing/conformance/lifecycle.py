@@ -1,4 +1,4 @@
-"""Checks of connecting, configuring, energising and giving back."""
+"""Checks of connecting, configuring, energising and releasing."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ import threading
 import numpy as np
 import pytest
 
-from touchcell.drivers.core import protocols as abilities
+from touchcell.drivers.core import protocols
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, DeviceError, LifecycleError, Rejection
-from touchcell.drivers.core.protocols import HealthSource, NativeWatchdog, StopCategory
+from touchcell.drivers.core.protocols import HealthSource, NativeWatchdog, StopCategory, Stoppable, TwistSink
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import Bench
 
-# What combines abilities, as ServoArm does, is none itself.
-_PROTOCOLS = {
-    name: protocol
-    for name, protocol in vars(abilities).items()
+# ServoArm, which only combines others, is not declared by drivers.
+_PROTOCOLS = frozenset(
+    protocol
+    for protocol in vars(protocols).values()
     if getattr(protocol, "_is_runtime_protocol", False) and len(protocol.__bases__) == 1
-}
+)
 _WARM_UP_CYCLES = 2
 _CYCLES = 10
 
 
 @check(on_bench=True)
 def lifecycle_in_order_only(bench: Bench) -> None:
-    """Every operation is refused outside its state, and leaves the state as it was."""
+    """Every operation is refused outside its state, and does not change the state."""
     device = bench.device
     allowed = {
         "connect": (Lifecycle.DISCONNECTED,),
@@ -53,7 +53,7 @@ def lifecycle_in_order_only(bench: Bench) -> None:
 
 @check("truth")
 def connect_never_energises(bench: Bench) -> None:
-    """Until ``activate`` nothing that changes power, mode or zero is sent, and nothing moves."""
+    """Until ``activate`` no message that changes power, mode or zero is sent, and nothing moves."""
     before = bench.energised()
     start = None if bench.rig.position is None else bench.truth()[bench.rig.position]
     bench.ready()
@@ -81,7 +81,7 @@ def failed_connect_can_be_retried(bench: Bench) -> None:
 
 @check(on_bench=True)
 def disconnect_from_every_state(bench: Bench) -> None:
-    """PASSIVE, READY and ACTIVE can all be left by ``disconnect``, and the device serves again."""
+    """``disconnect`` works from PASSIVE, READY and ACTIVE, and the device can be used again."""
     steps = ("connect", "configure", "activate")
     for length in range(1, len(steps) + 1):
         for step in steps[:length]:
@@ -93,16 +93,15 @@ def disconnect_from_every_state(bench: Bench) -> None:
 
 
 @check(on_bench=True)
-def abilities_are_those_of_the_record(bench: Bench) -> None:
-    """Every ability that is named is there, and every one that is there is named."""
-    named = bench.rig.spec.capabilities.abilities
-    assert named <= _PROTOCOLS.keys()
-    assert {name for name, protocol in _PROTOCOLS.items() if isinstance(bench.device, protocol)} == named
+def protocols_are_those_of_the_record(bench: Bench) -> None:
+    """Every protocol that is declared is provided, and every one of ours that is provided is declared."""
+    declared = bench.rig.spec.capabilities.provides
+    assert {protocol for protocol in declared | _PROTOCOLS if isinstance(bench.device, protocol)} == declared
 
 
-@check("HealthSource", on_bench=True)
+@check(HealthSource, on_bench=True)
 def health_is_told_by_name(bench: Bench) -> None:
-    """``health`` gives named numbers and words while connected; no number is NaN."""
+    """``health`` returns named numbers and texts while connected; no number is NaN."""
     device = bench.ready()
     assert isinstance(device, HealthSource)
     health = device.health()
@@ -112,9 +111,9 @@ def health_is_told_by_name(bench: Bench) -> None:
         assert reading == reading, name
 
 
-@check("NativeWatchdog", on_bench=True)
+@check(NativeWatchdog, on_bench=True)
 def watchdog_is_read_back(bench: Bench) -> None:
-    """An active device tells a watchdog no longer than its record says."""
+    """An active device reports a watchdog no longer than declared."""
     device = bench.active()
     longest_s = bench.rig.spec.capabilities.max_watchdog_s
     assert isinstance(device, NativeWatchdog)
@@ -124,14 +123,14 @@ def watchdog_is_read_back(bench: Bench) -> None:
 
 @check("arm", on_bench=True)
 def record_of_the_watchdog_is_consistent(bench: Bench) -> None:
-    """``max_watchdog_s`` is given exactly by devices that have a watchdog."""
+    """``max_watchdog_s`` is declared exactly by devices that have a watchdog."""
     capabilities = bench.rig.spec.capabilities
-    assert (capabilities.max_watchdog_s is not None) == ("NativeWatchdog" in capabilities.abilities)
+    assert (capabilities.max_watchdog_s is not None) == (NativeWatchdog in capabilities.provides)
 
 
-@check("Stoppable")
+@check(Stoppable)
 def stop_categories_are_those_of_the_record(bench: Bench) -> None:
-    """Offered categories stop a moving arm in the state that they promise; the others are refused."""
+    """Supported categories stop a moving arm in the promised state; the others are refused."""
     offered = bench.rig.spec.capabilities.stop_categories
     assert StopCategory.STOP_AND_HOLD in offered
     lease = bench.leased()
@@ -165,9 +164,9 @@ def _activates(bench: Bench) -> bool:
     return True
 
 
-@check("TwistSink")
+@check(TwistSink)
 def deactivation_rests_and_voids_the_lease(bench: Bench) -> None:
-    """``deactivate`` of a moving arm ends at rest in READY; the lease is worth nothing afterwards."""
+    """``deactivate`` of a moving arm ends at rest in READY; the lease is invalid afterwards."""
     lease = bench.leased()
     bench.stream(lease, bench.twist(bench.axis()), 0.3)
     bench.device.deactivate(DeactivatePolicy.HOLD)
@@ -181,9 +180,9 @@ def deactivation_rests_and_voids_the_lease(bench: Bench) -> None:
     assert caught.value.reason is Rejection.LEASE
 
 
-@check("TwistSink")
+@check(TwistSink)
 def deactivation_policies_are_obeyed_or_refused(bench: Bench) -> None:
-    """Each policy ends in READY, or is refused by LifecycleError and leaves the arm held; power off is true."""
+    """Each policy ends in READY, or raises LifecycleError and keeps the arm held; power is really off."""
     bench.ready()
     for policy in DeactivatePolicy:
         bench.until(lambda: _activates(bench), 10.0, f"ACTIVE before {policy.value}")
@@ -202,7 +201,7 @@ def deactivation_policies_are_obeyed_or_refused(bench: Bench) -> None:
 
 @check("truth")
 def ten_cycles_leak_nothing(bench: Bench) -> None:
-    """After ten more lifecycles there are no more threads and open files than before."""
+    """Ten more lifecycles leave no more threads and open files than before."""
     for _ in range(_WARM_UP_CYCLES):
         _cycle(bench)
     before = _threads(), _files()

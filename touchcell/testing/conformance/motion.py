@@ -1,10 +1,11 @@
-"""Checks of what the tool truly does: it follows, and it stops, whoever fails to tell it."""
+"""Checks of the true tool motion: it follows commands, and it stops in every failure of the client."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from touchcell.drivers.core.commands import TwistFrame
+from touchcell.drivers.core.protocols import TwistSink
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.client import MovingClient
 from touchcell.testing.conformance.context import Bench
@@ -12,20 +13,20 @@ from touchcell.testing.conformance.context import Bench
 _STREAM_S = 0.8
 _STEADY_S = 0.3
 _HOST_DELAY_S = 0.06
-"""How late a busy host may be, on top of what the record says."""
+"""Delay of a busy host in addition to the declared latency."""
 _TTL_S = 0.2
 _ATTEMPTS = 3
 _LATE_S = 0.01
 _AXES = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def twists_along_base_axes_are_followed(bench: Bench) -> None:
-    """Along every axis of the record the tool truly moves with the right sign, within 20 % of the speed."""
+    """Along every declared axis the tool moves with the right sign, within 20 % of the speed."""
     _follows_all_axes(bench, TwistFrame.BASE)
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def twists_along_tool_axes_are_followed(bench: Bench) -> None:
     """The same for twists along the tool's own axes."""
     _follows_all_axes(bench, TwistFrame.TCP)
@@ -35,7 +36,7 @@ def _follows_all_axes(bench: Bench, frame: TwistFrame) -> None:
     lease = bench.leased()
     bench.settle()
     wrong = []
-    # Forth along base axes and back along the tool's, so that the two checks need little room.
+    # Forward along base axes and back along the tool's, so that the two checks need little space.
     sign = 1.0 if frame is TwistFrame.BASE else -1.0
     for axis, follows in enumerate(bench.rig.spec.capabilities.twist_axes):
         if not follows:
@@ -50,17 +51,17 @@ def _follows_all_axes(bench: Bench, frame: TwistFrame) -> None:
             aside = np.delete(got[:3] if axis < 3 else got[3:], axis % 3)
             followed = abs(got[axis] - asked[axis]) <= 0.2 * size and np.abs(aside).max() <= 0.2 * size
             good = followed and not sent.adjustments
-            # What was measured while the host overslept says nothing about the driver.
+            # A measurement while the host overslept is no evidence about the driver.
             if good or bench.late_s < _LATE_S:
                 break
         if not good:
             wrong.append(f"{_AXES[axis]} {asked[axis]:+.3f}: {np.round(got, 4).tolist()} {sent.adjustments}")
-    assert not wrong, "the tool truly moved otherwise:\n" + "\n".join(wrong)
+    assert not wrong, "the tool moved otherwise:\n" + "\n".join(wrong)
 
 
-@check("TwistSink", "limited axes")
+@check(TwistSink, "limited axes")
 def axes_that_it_cannot_follow_are_reported(bench: Bench) -> None:
-    """A twist along an axis that the record excludes is sent without it, and the answer says so."""
+    """A twist along an undeclared axis is sent without it and reported as adjusted."""
     lease = bench.leased()
     for axis, follows in enumerate(bench.rig.spec.capabilities.twist_axes):
         if not follows:
@@ -69,9 +70,9 @@ def axes_that_it_cannot_follow_are_reported(bench: Bench) -> None:
     bench.settle()
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def time_to_live_stops_the_motion(bench: Bench) -> None:
-    """After the last command has expired the tool brakes: it goes no farther than latency and limits allow."""
+    """After the last command has expired the tool brakes, within the distance from latency and limits."""
     lease = bench.leased()
     bench.settle()
     asked = bench.twist(bench.axis())
@@ -87,7 +88,7 @@ def time_to_live_stops_the_motion(bench: Bench) -> None:
     assert travelled_m <= _braking_m(bench, rest.late_s)
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def stop_stops_at_once(bench: Bench) -> None:
     """``stop`` needs no lease and does not wait for the time-to-live."""
     lease = bench.leased()
@@ -100,9 +101,9 @@ def stop_stops_at_once(bench: Bench) -> None:
     bench.until(bench.arm.at_rest, 1.0, "at_rest")
 
 
-@check("TwistSink", on_bench=True)
+@check(TwistSink, on_bench=True)
 def release_stops_at_once(bench: Bench) -> None:
-    """Giving the lease back stops the arm too."""
+    """Releasing the lease stops the arm too."""
     lease = bench.leased()
     bench.settle()
     bench.stream(lease, bench.twist(bench.axis()), _STREAM_S, ttl_s=0.9)
@@ -112,11 +113,11 @@ def release_stops_at_once(bench: Bench) -> None:
     assert np.linalg.norm(rest.poses[-1][:3, 3] - start) <= _braking_m(bench, rest.late_s)
 
 
-@check("TwistSink", "truth", "process")
+@check(TwistSink, "truth", "process")
 def killed_client_leaves_the_arm_at_rest(bench: Bench) -> None:
-    """kill -9 of the process that moves the arm: the device itself stops within its watchdog.
+    """kill -9 of the client process: the device itself stops within its watchdog.
 
-    An arm that has no brakes is watched until its motors let go, as its record says that it falls then.
+    An arm without brakes is tracked until its motors disable themselves, as it falls then by declaration.
     """
     bench.spoiled = True
     falls = bench.rig.spec.capabilities.falls_on_power_loss
@@ -132,9 +133,9 @@ def killed_client_leaves_the_arm_at_rest(bench: Bench) -> None:
 
 
 def _braking_m(bench: Bench, silence_s: float) -> float:
-    """Longest lawful way from the moment when the arm should begin to notice, at test speed.
+    """Return the longest allowed distance from the moment when the arm should begin to react, at test speed.
 
-    ``silence_s`` is what it may take besides: what its client does by itself, and what this machine lost.
+    ``silence_s`` is additional time: reaction of the client, and delay of this machine.
     """
     capabilities = bench.rig.spec.capabilities
     speed = bench.speed()

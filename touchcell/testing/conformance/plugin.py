@@ -1,4 +1,4 @@
-"""pytest plugin: the fixture behind ``suite``, and a table of drivers and checks at the end of the run.
+"""pytest plugin: fixtures of ``suite``, and a table of drivers and checks at the end of the run.
 
 Installed as an entry point of ``pytest11``. It imports nothing of touchcell until a suite runs.
 """
@@ -20,13 +20,13 @@ pytest.register_assert_rewrite(*(f"touchcell.testing.conformance.{name}" for nam
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Add the table and the number of the next rig."""
+    """Register the result table."""
     config.pluginmanager.register(_Table(), "touchcell conformance table")
 
 
 @pytest.fixture(scope="class")
 def conformance_seat(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """The rig of a suite's class and its emulator."""
+    """Provide the device fixture of a suite's class and its emulator."""
     from touchcell.testing.conformance.context import DeviceUnderTest
 
     suite: Any = request.cls
@@ -38,7 +38,7 @@ def conformance_seat(request: pytest.FixtureRequest, tmp_path_factory: pytest.Te
 
 @pytest.fixture
 def conformance_bench(request: pytest.FixtureRequest, conformance_seat: Any) -> Iterator[Any]:
-    """What a check works with."""
+    """Provide the context of a check."""
     from touchcell.testing.conformance.context import Bench
 
     needs: Any = getattr(request.function, "conformance", None)
@@ -59,14 +59,14 @@ _NUMBERS = pytest.StashKey[Any]()
 
 
 def _address(config: pytest.Config) -> int:
-    """A number that no other rig on this machine has, so that suites may run side by side."""
+    """Return a number unique on this machine, so that suites may run side by side."""
     number: int = next(config.stash.setdefault(_NUMBERS, count(1)))
     return 1000 + (os.getpid() % 30_000) * 16 + number % 16
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, Any]:
-    """Mark a failed check, so that it leaves nothing to the next one; name it for the table."""
+    """Mark a failed check, so that its emulator is not reused; name it for the table."""
     report: Any = yield
     driver = getattr(getattr(item, "cls", None), "driver", None)
     if driver is not None and hasattr(getattr(item, "function", None), "conformance"):
@@ -77,7 +77,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 
 class _Table:
-    """Collects what became of each check and prints it: green, skipped, known to fail, RED."""
+    """Collect the result of each check and print it: green, skipped, known failure, RED."""
 
     def __init__(self) -> None:
         self._marks: dict[str, dict[str, str]] = {}
@@ -85,7 +85,7 @@ class _Table:
         self._seconds: dict[str, float] = {}
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Note one phase of one check."""
+        """Record one phase of one check."""
         for key, value in report.user_properties:
             if key == _KEY and isinstance(value, list):
                 driver, name = value

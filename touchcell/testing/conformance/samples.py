@@ -1,4 +1,4 @@
-"""Checks of what a device delivers: stamped, numbered, finite, and never old data as new."""
+"""Checks of delivered samples: timestamped, numbered, finite, and never stale data as new."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from touchcell.drivers.core.errors import DeviceError, StaleData
-from touchcell.drivers.core.protocols import JointSource, WrenchSource
+from touchcell.drivers.core.protocols import JointSource, TcpSource, WrenchSource
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import Bench
 
@@ -18,9 +18,9 @@ _WINDOW_S = 0.5
 _FROZEN_S = 0.3
 
 
-@check("TcpSource", on_bench=True)
+@check(TcpSource, on_bench=True)
 def states_are_stamped_and_numbered(bench: Bench) -> None:
-    """Stamps lie on the injected clock and advance; numbers rise; values are finite rigid poses."""
+    """Timestamps are on the injected clock and advance; numbers rise; values are finite rigid poses."""
     before_ns = bench.clock.now_ns()
     bench.ready()
     samples = []
@@ -29,7 +29,7 @@ def states_are_stamped_and_numbered(bench: Bench) -> None:
         samples.append(bench.arm.tcp())
         assert samples[-1].t_ns <= bench.clock.now_ns()
         bench.sleep(0.002)
-    # What was underway before the connection may be a little older than it.
+    # A sample in progress before the connection may be a little older than it.
     assert samples[0].t_ns > before_ns - round(0.1e9)
     for older, newer in pairwise(samples):
         assert newer.t_ns >= older.t_ns
@@ -47,7 +47,7 @@ def states_are_stamped_and_numbered(bench: Bench) -> None:
 
 @check("camera", on_bench=True)
 def frames_are_stamped_and_numbered(bench: Bench) -> None:
-    """Stamps lie on the injected clock and rise with the numbers, by about a period each."""
+    """Timestamps are on the injected clock and rise with the numbers, by about a period each."""
     before_ns = bench.clock.now_ns()
     bench.active()
     frames = [bench.camera.next(-1, 2.0)]
@@ -65,8 +65,8 @@ def frames_are_stamped_and_numbered(bench: Bench) -> None:
 
 
 def _agrees_with_rate(bench: Bench, samples: list[Any]) -> None:
-    """Numbers rise by no less than half the declared rate, for machines are busy; samples come no more than 2.5 times
-    as often, for some drivers read more often at rest.
+    """Check that numbers rise at no less than half the declared rate, as machines are busy; samples arrive at no more
+    than 2.5 times it, as some drivers read more often at rest.
     """
     declared_hz = bench.rig.state_rate_hz or bench.rig.spec.capabilities.state_rate_hz
     first, last = samples[0], samples[-1]
@@ -77,7 +77,7 @@ def _agrees_with_rate(bench: Bench, samples: list[Any]) -> None:
 
 @check(on_bench=True)
 def too_old_is_stale(bench: Bench) -> None:
-    """A sample older than the caller accepts is refused with its age, limit and number."""
+    """A sample older than the caller accepts is rejected with its age, limit and number."""
     bench.active()
     bench.until(lambda: _newest_is_there(bench), 2.0, "first sample")
     with pytest.raises(StaleData) as caught:
@@ -86,9 +86,9 @@ def too_old_is_stale(bench: Bench) -> None:
     assert caught.value.age_s > -1.0
 
 
-@check("JointSource", on_bench=True)
+@check(JointSource, on_bench=True)
 def joints_are_finite_and_fresh(bench: Bench) -> None:
-    """Joint angles and velocities of one length, finite, no older than asked for."""
+    """Joint angles and velocities have one length, are finite, and no older than requested."""
     device = bench.ready()
     assert isinstance(device, JointSource)
     sample = device.joints(max_age_s=0.5)
@@ -97,9 +97,9 @@ def joints_are_finite_and_fresh(bench: Bench) -> None:
     assert np.isfinite(sample.value.dq).all()
 
 
-@check("WrenchSource", on_bench=True)
+@check(WrenchSource, on_bench=True)
 def wrench_is_finite_and_fresh(bench: Bench) -> None:
-    """(6,) finite numbers, no older than asked for."""
+    """The wrench is (6,) finite numbers, no older than requested."""
     device = bench.ready()
     assert isinstance(device, WrenchSource)
     wrench = device.wrench(max_age_s=0.5).value
@@ -109,7 +109,7 @@ def wrench_is_finite_and_fresh(bench: Bench) -> None:
 
 @check("truth", "process")
 def frozen_device_never_looks_fresh(bench: Bench) -> None:
-    """While the device hangs, nothing it told before is given out with a younger stamp, nor within a short max_age."""
+    """While the device hangs, no earlier sample is returned with a younger timestamp, nor within a short max_age."""
     bench.spoiled = True
     bench.active()
     bench.until(lambda: _newest_is_there(bench), 2.0, "first sample")
@@ -118,7 +118,7 @@ def frozen_device_never_looks_fresh(bench: Bench) -> None:
     bench.sleep(_FROZEN_S)
     with pytest.raises(DeviceError):
         bench.read(max_age_s=_FROZEN_S / 2)
-    # Refusing altogether is lawful as well.
+    # Raising every time is correct too.
     with suppress(DeviceError):
         assert bench.read().t_ns <= frozen_ns + round(0.05e9)
 

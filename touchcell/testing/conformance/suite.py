@@ -1,4 +1,4 @@
-"""Makes a test class out of a rig: one small test for each check, skipped with a reason where it does not apply."""
+"""Build a test class from a device fixture: one test per check, skipped with a reason where it does not apply."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ from touchcell.testing.emulation.rig import FixtureFactory
 
 
 def suite(rig: FixtureFactory, *, prefix: str = "Test") -> type:
-    """The test class of ``rig``; assign it to a name that begins with ``prefix``.
+    """Return the test class of ``rig``; assign it to a name that begins with ``prefix``.
 
     Args:
-        rig: a function of a module, so that a child process can import it: it must be able to make the client that the
-            suite kills.
-        prefix: what pytest takes for a test class.
+        rig: a module-level function, so that the client process that the suite kills can import it.
+        prefix: prefix of test classes in pytest.
     """
     plan = rig(Path(), 0)
     body: dict[str, Any] = {"rig_function": staticmethod(rig), "driver": plan.spec.name}

@@ -1,1 +1,1 @@
-"""Devices that exist only on the wire, each a process of its own, to test drivers without hardware."""
+"""Emulated devices, each a process of its own, to test drivers without hardware."""

@@ -1,11 +1,11 @@
-"""What all emulators share: faults that can be switched on and off, and a control channel to do it from outside.
+"""Base class of emulators: injectable faults, and a control channel to inject them from outside.
 
-An emulator is one asyncio program. It owns the device's wire and, beside it, a UNIX socket on which each line is a JSON
+An emulator is one asyncio program. It serves the device's interface and a UNIX socket on which each line is a JSON
 request, answered by one JSON line:
 
     {"fault": "drop", "value": 3}    begin a fault (its meaning and value are in ``Emulator.faults``)
     {"clear": "drop"}                end it
-    {"state": true}                  what is true inside: pose, energised, counters
+    {"state": true}                  ground truth: pose, energised, counters
     {"quit": true}                   end the process in an orderly way
 
 A fault script is YAML: a list of ``{at_s: 1.2, fault: drop, value: 3}`` or ``{at_s: 2.0, clear: drop}``.
@@ -41,7 +41,7 @@ class FaultEvent:
 
 
 class CommandOnset:
-    """When motion commands on the wire last began to change, for measuring how long a command takes to get there.
+    """Time of the last change of motion commands at the emulator, for measuring command latency.
 
     Attributes:
         t_ns: CLOCK_MONOTONIC time of the last change that followed at least 50 ms without one; 0 before the first.
@@ -55,7 +55,7 @@ class CommandOnset:
         self._changed_ns = 0
 
     def note(self, addressee: object, content: object) -> None:
-        """To be called with each motion command that arrives."""
+        """Record a motion command; call for each one that arrives."""
         if self._content.get(addressee) == content:
             return
         now_ns = time.monotonic_ns()
@@ -66,46 +66,46 @@ class CommandOnset:
 
 
 class Emulator(ABC):
-    """One emulated device. Subclasses own the wire and read ``self.active`` where a fault would bite."""
+    """One emulated device. Subclasses serve the interface and check ``self.active`` where a fault has effect."""
 
     faults: ClassVar[Mapping[str, str]] = {}
-    """Fault name -> one line: what it does and what its value means."""
+    """Fault name -> one line: its effect and the meaning of its value."""
 
     def __init__(self) -> None:
         self.active: dict[str, Any] = {}
 
     @abstractmethod
     async def start(self) -> None:
-        """Open the wire; return once a client could connect."""
+        """Open the interface; return once a client could connect."""
 
     @abstractmethod
     async def stop(self) -> None:
-        """Close the wire."""
+        """Close the interface."""
 
     @abstractmethod
     def state(self) -> dict[str, Any]:
-        """The truth inside, JSON-serialisable, for tests and people."""
+        """Return the ground truth, JSON-serialisable, for tests and operators."""
 
     def begin(self, fault: str, value: Any = True) -> None:
-        """Switch a fault on. Raises ConfigError for one that this emulator does not know."""
+        """Inject a fault. Raises ConfigError for an unknown one."""
         self._known(fault)
         self.active[fault] = value
         self.on_fault(fault, value)
 
     def end(self, fault: str) -> None:
-        """Switch a fault off."""
+        """End a fault."""
         self._known(fault)
         self.active.pop(fault, None)
         self.on_clear(fault)
 
     def on_fault(self, fault: str, value: Any) -> None:
-        """Act at once where looking at ``self.active`` later is not enough (unplug, protective stop)."""
+        """Act at once where checking ``self.active`` later is not enough (unplug, protective stop)."""
 
     def on_clear(self, fault: str) -> None:
-        """Undo what ``on_fault`` did."""
+        """Undo the effects of ``on_fault``."""
 
     def spend(self, fault: str) -> bool:
-        """For faults whose value is a count: use one up and tell whether there was one."""
+        """For faults whose value is a count: use one up; return whether there was one."""
         left = int(self.active.get(fault, 0))
         if left <= 0:
             return False
@@ -139,7 +139,7 @@ def read_fault_script(path: Path) -> list[FaultEvent]:
             )
         except (KeyError, TypeError, ValueError) as error:
             raise ConfigError(
-                f"entry {number} is no fault event: {error!r}",
+                f"entry {number} is not a fault event: {error!r}",
                 file=str(path),
                 key=f"[{number}]",
                 value=entry,
@@ -153,9 +153,9 @@ async def serve(
 ) -> None:
     """Run ``emulator`` with its control channel and fault script until ``quit``, SIGTERM or SIGINT.
 
-    With ``lifeline`` it also ends when its standard input closes, which is when whoever started it is gone.
+    With ``lifeline`` it also ends when its standard input closes, i.e. when its parent process has ended.
 
-    Prints one line ``ready`` on standard output once the wire and the control channel are open.
+    Prints one line ``ready`` on standard output once interface and control channel are open.
     """
     done = asyncio.Event()
     loop = asyncio.get_running_loop()

@@ -1,8 +1,8 @@
-"""A CAN bus without a kernel module: a UNIX SEQPACKET hub, and the python-can interface ``touchcell_hub`` to it.
+"""A CAN bus without a kernel module: a UNIX SEQPACKET hub, and its python-can interface ``touchcell_hub``.
 
 Every packet is one frame in SocketCAN's layout (``struct can_frame``, 16 bytes, or ``struct canfd_frame``, 72 bytes),
-so order and frame boundaries are the kernel's. The hub closing its end is an unplugged adapter. Any python-can program
-can use it: ``can.Bus(interface="touchcell_hub", channel="/path/of/the/hub")``.
+so order and frame boundaries are the kernel's. A hub that closes its end acts as an unplugged adapter. Any python-can
+program can use it: ``can.Bus(interface="touchcell_hub", channel="/path/of/the/hub")``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _BIT_RATE_SWITCH, _FD_FRAME = 0x01, 0x04
 
 
 def pack(message: can.Message) -> bytes:
-    """A message in SocketCAN's layout."""
+    """Encode a message in SocketCAN's layout."""
     number = message.arbitration_id
     number |= _EXTENDED if message.is_extended_id else 0
     number |= _REMOTE if message.is_remote_frame else 0
@@ -43,14 +43,14 @@ def pack(message: can.Message) -> bytes:
 
 
 def unpack(packet: bytes, timestamp_s: float = 0.0) -> can.Message:
-    """The inverse of ``pack``. Raises ValueError for a packet of another size or with an impossible length."""
+    """Decode a packet of ``pack``. Raises ValueError for a packet of another size or with an impossible length."""
     if len(packet) == _CLASSIC.size:
         (number, length, data), flags, longest = _CLASSIC.unpack(packet), 0, 8
     elif len(packet) == _FD.size:
         number, length, flags, data = _FD.unpack(packet)
         longest = 64
     else:
-        raise ValueError(f"a packet of {len(packet)} bytes is no CAN frame")
+        raise ValueError(f"a packet of {len(packet)} bytes is not a CAN frame")
     if length > longest:
         raise ValueError(f"a frame cannot carry {length} bytes")
     is_remote = bool(number & _REMOTE)
@@ -75,7 +75,7 @@ class HubBus(can.BusABC):  # type: ignore[misc]
         channel: path of the hub's socket.
         fd: whether CAN FD frames may be sent.
         can_filters: as in python-can.
-        options: ``bitrate`` and the like, which a wire of no length has no use for.
+        options: ``bitrate`` and the like, which are ignored.
     """
 
     def __init__(self, channel: str, fd: bool = False, can_filters: Any = None, **options: Any) -> None:
@@ -91,17 +91,17 @@ class HubBus(can.BusABC):  # type: ignore[misc]
         super().__init__(channel=channel, can_filters=can_filters)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Put a frame on the bus. Raises CanOperationError when the adapter is gone or its queue is full."""
+        """Send a frame. Raises CanOperationError when the adapter is disconnected or its queue is full."""
         try:
             self._socket.settimeout(timeout or 0.0)
             self._socket.send(pack(msg))
         except BlockingIOError as error:
             raise can.CanOperationError("transmit queue is full", errno.ENOBUFS) from error
         except OSError as error:
-            raise can.CanOperationError(f"adapter is gone: {error}", error.errno) from error
+            raise can.CanOperationError(f"adapter is disconnected: {error}", error.errno) from error
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        # Not select(), which knows no file beyond number 1023.
+        # Not select(), which fails for file descriptors beyond 1023.
         poller = select.poll()
         poller.register(self._socket, select.POLLIN)
         if not poller.poll(None if timeout is None else math.ceil(1e3 * timeout)):
@@ -109,9 +109,9 @@ class HubBus(can.BusABC):  # type: ignore[misc]
         try:
             packet = self._socket.recv(128)
         except OSError as error:
-            raise can.CanOperationError(f"adapter is gone: {error}", error.errno) from error
+            raise can.CanOperationError(f"adapter is disconnected: {error}", error.errno) from error
         if not packet:
-            raise can.CanOperationError("adapter is gone", errno.ENODEV)
+            raise can.CanOperationError("adapter is disconnected", errno.ENODEV)
         message = unpack(packet, time.time())
         if message.is_error_frame:
             self._note_error(message)
@@ -127,24 +127,24 @@ class HubBus(can.BusABC):  # type: ignore[misc]
 
     @property
     def state(self) -> can.BusState:
-        """Controller state as far as error frames have told."""
+        """Controller state from the error frames received."""
         return self._bus_state
 
     def fileno(self) -> int:
-        """For select, and for python-can's asyncio notifier."""
+        """Return the file descriptor, for select and for python-can's asyncio notifier."""
         return self._socket.fileno()
 
     def shutdown(self) -> None:
-        """Leave the bus."""
+        """Disconnect from the bus."""
         super().shutdown()
         self._socket.close()
 
 
 class Hub:
-    """The bus itself: passes every frame to all other clients and to the emulated nodes.
+    """The bus: passes every frame to all other clients and to the emulated nodes.
 
     Args:
-        path: of its socket.
+        path: path of its socket.
         on_frame: called with every frame from a client.
     """
 
@@ -156,11 +156,11 @@ class Hub:
 
     @property
     def client_count(self) -> int:
-        """How many programs are on the bus."""
+        """Number of connected programs."""
         return len(self._clients)
 
     def open(self) -> None:
-        """Listen; must run in the event loop's thread."""
+        """Listen; call in the event loop's thread."""
         self._path.unlink(missing_ok=True)
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.setblocking(False)
@@ -179,7 +179,7 @@ class Hub:
         self._path.unlink(missing_ok=True)
 
     def send(self, message: can.Message, *, but: socket.socket | None = None) -> None:
-        """Give a frame to every client; one whose queue is full loses it, as on a real adapter."""
+        """Send a frame to every client; one whose queue is full loses it, as on a real adapter."""
         packet = pack(message)
         for client in list(self._clients):
             if client is but:
@@ -192,7 +192,7 @@ class Hub:
                 self._leave(client)
 
     def drain(self) -> None:
-        """Read what clients have sent already, before time is told to have passed."""
+        """Read pending frames of clients before the simulated time advances."""
         for client in list(self._clients):
             self._read(client)
 

@@ -17,14 +17,14 @@ from touchcell.testing.emulation.base import Emulator, read_fault_script, serve
 
 @runtime_checkable
 class EmulatorModule(Protocol):
-    """What an emulator's module offers."""
+    """Interface of an emulator's module."""
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Declare its command line."""
+        """Add the command-line arguments."""
         ...
 
     def build(self, arguments: argparse.Namespace) -> Emulator:
-        """Make the emulator, not yet started."""
+        """Build the emulator; it is not started yet."""
         ...
 
 
@@ -33,9 +33,9 @@ EMULATORS: Final = Registry("touchcell.emulators", "emulator", EmulatorModule)
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the emulator named first in ``arguments`` until it is told to end; returns the exit code."""
+    """Run the emulator named first in ``arguments`` until it is stopped; return the exit code."""
     names = EMULATORS.names()
-    parser = argparse.ArgumentParser("touchcell emulate", description="Emulate a device on the wire.")
+    parser = argparse.ArgumentParser("touchcell emulate", description="Emulate a device at its interface.")
     parsers = parser.add_subparsers(dest="name", required=True, metavar=" | ".join(names))
     wanted = arguments[0] if arguments else ""
     for name in names:

@@ -1,4 +1,4 @@
-"""An emulator as a child process, for tests and benches: start it, hurt it, look inside, kill it."""
+"""An emulator as a child process, for tests and benchmarks: start it, inject faults, read its state, kill it."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from touchcell.drivers.core.errors import ConnectError, TransportTimeout
 
 
 class EmulatorProcess:
-    """Runs ``python -m touchcell.testing.emulation NAME ARGUMENTS`` and speaks to its control channel.
+    """Run ``python -m touchcell.testing.emulation NAME ARGUMENTS`` and use its control channel.
 
     Args:
         name: emulator, as in ``touchcell emulate NAME``.
         arguments: its command line.
-        timeout_s: how long it may take to become ready or to answer.
+        timeout_s: timeout of its start and of its replies.
     """
 
     def __init__(self, name: str, *arguments: str, timeout_s: float = 10.0, environment: dict[str, str] | None = None):
@@ -53,7 +53,7 @@ class EmulatorProcess:
                     *(sys.executable, "-m", "touchcell.testing.emulation", self._name, *self._arguments),
                     *("--control", str(control), "--lifeline"),
                 ],
-                # Closed by the kernel when this process dies, however it dies.
+                # The kernel closes it when this process dies, for any reason.
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
@@ -74,19 +74,19 @@ class EmulatorProcess:
         return self
 
     def fault(self, name: str, value: Any = True) -> dict[str, Any]:
-        """Begin a fault; returns the emulator's state."""
+        """Inject a fault; return the emulator's state."""
         return self._ask({"fault": name, "value": value})
 
     def clear(self, name: str) -> dict[str, Any]:
-        """End a fault; returns the emulator's state."""
+        """End a fault; return the emulator's state."""
         return self._ask({"clear": name})
 
     def state(self) -> dict[str, Any]:
-        """The truth inside the emulator."""
+        """Return the ground truth of the emulator."""
         return self._ask({"state": True})
 
     def wait_for(self, **wanted: Any) -> dict[str, Any]:
-        """Poll ``state`` until every named entry equals what is wanted. Raises TransportTimeout."""
+        """Poll ``state`` until every named entry has the given value. Raises TransportTimeout."""
         deadline = time.monotonic() + self._timeout_s
         while time.monotonic() < deadline:
             state = self.state()
@@ -96,21 +96,21 @@ class EmulatorProcess:
         raise TransportTimeout(self._name, f"state {wanted}", self._timeout_s)
 
     def freeze(self) -> None:
-        """SIGSTOP: the device hangs but its sockets stay open."""
+        """Send SIGSTOP: the device hangs but its sockets stay open."""
         os.kill(self.pid, signal.SIGSTOP)
 
     def thaw(self) -> None:
-        """SIGCONT."""
+        """Send SIGCONT."""
         os.kill(self.pid, signal.SIGCONT)
 
     def kill(self) -> None:
-        """SIGKILL: the device vanishes."""
+        """Send SIGKILL: the device vanishes."""
         if self._process is not None and self._process.poll() is None:
             self._process.kill()
         self._reap()
 
     def stop(self) -> None:
-        """End it in an orderly way, or by force if it does not."""
+        """Stop it in an orderly way, or kill it if it does not end."""
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGCONT)
             self._process.terminate()
@@ -146,7 +146,7 @@ class EmulatorProcess:
         while not answer.endswith(b"\n"):
             piece = self._channel.recv(65536)
             if not piece:
-                raise ConnectError(self._name, "the emulator has gone")
+                raise ConnectError(self._name, "the emulator has ended")
             answer += piece
         reply = json.loads(answer)
         if not reply["ok"]:

@@ -1,4 +1,4 @@
-"""A driver beside its emulated device: what the conformance suite and ``touchcell bench devices`` run."""
+"""Device fixture: a driver with its emulated device, for the conformance suite and ``touchcell bench devices``."""
 
 from __future__ import annotations
 
@@ -9,68 +9,68 @@ from typing import Any, Final, Protocol, runtime_checkable
 
 from touchcell.drivers.core.clock import Clock, MonotonicClock
 from touchcell.drivers.core.device import Device
-from touchcell.drivers.core.spec import DriverConfig, DriverSpec
+from touchcell.drivers.core.spec import AnyDriver, DriverConfig
 from touchcell.registry import Registry
 
 
 class Emulated(Protocol):
-    """A device of which the truth is known and that can be hurt: ``EmulatorProcess``, or a simulation's stand-in."""
+    """A device with ground truth and injectable faults: ``EmulatorProcess``, or a simulation's stand-in."""
 
     def state(self) -> dict[str, Any]:
-        """The truth inside."""
+        """Return the ground truth."""
         ...
 
     def fault(self, name: str, value: Any = True) -> dict[str, Any]:
-        """Begin a fault; returns the truth."""
+        """Inject a fault; return the ground truth."""
         ...
 
     def clear(self, name: str) -> dict[str, Any]:
-        """End a fault; returns the truth."""
+        """End a fault; return the ground truth."""
         ...
 
     def freeze(self) -> None:
-        """It hangs, with its connections open."""
+        """Suspend it, with its connections open."""
         ...
 
     def thaw(self) -> None:
-        """It goes on."""
+        """Resume it."""
         ...
 
     def kill(self) -> None:
-        """It vanishes."""
+        """Kill it without notice."""
         ...
 
     def stop(self) -> None:
-        """It ends in an orderly way."""
+        """Stop it in an orderly way."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceFixture:
-    """How to bring up one driver on its emulator.
+    """How to build one driver and its emulator.
 
     Attributes:
         spec: the driver.
-        start: starts a fresh emulator and waits until it is ready; None on a real bench, where nothing knows the truth.
-        build: makes the DISCONNECTED device that will find that emulator; called again after a restart.
-        config: the device's part of a cell file, for running tasks on the emulator; None where nobody does.
+        start: starts a fresh emulator and waits until it is ready; None for real hardware, which has no ground truth.
+        build: builds the DISCONNECTED device for that emulator; called again after a restart.
+        config: the device's part of a cell file, for running tasks on the emulator; None if unused.
         energising: entry of the emulator's ``state()`` that counts messages which change power, mode or zero; None for
             a device that has no such messages.
         position: entry with the tool's true position [x, y, z] in m (arms), or None for cameras.
-        pose: entry with the tool's true pose (4, 4) in the base frame (arms), or None where only its position is told.
+        pose: entry with the tool's true pose (4, 4) in the base frame (arms), or None if only its position is known.
         time: entry with the emulator's own time in s, which may lag behind the machine's where that is busy; None if it
-            keeps the machine's.
-        faults: emulator faults to try, each with the driver's lawful answer: "transient" (counted, goes on), "unseen"
-            (goes on; the vendor's library hides it), "stale" (StaleData), "fault" (FAULTED).
-        reset: fault that puts the emulator back to how it started, where a check would need a fresh one.
+            uses the machine's.
+        faults: emulator faults to inject, each with the expected reaction of the driver: "transient" (counted,
+            continues), "unseen" (continues; the vendor's library hides it), "stale" (StaleData), "fault" (FAULTED).
+        reset: fault that resets the emulator, where a check would need a fresh one.
         known: checks that this driver is known to fail, each with the reason.
-        state_rate_hz: rate that ``build`` configures, where it is not the one in the capability record.
-        clock: makes the clock that everything in a check runs on.
-        process: whether the emulator is a process of its own, which can hang and vanish while the client lives.
+        state_rate_hz: rate that ``build`` configures, if not the declared one.
+        clock: creates the common clock of a check.
+        process: whether the emulator is a process of its own, which can hang and vanish while the client runs.
         notes: behaviours known only from public documents.
     """
 
-    spec: DriverSpec
+    spec: AnyDriver
     start: Callable[[], Emulated] | None
     build: Callable[[Clock], Device]
     config: DriverConfig | None = None
@@ -89,12 +89,12 @@ class DeviceFixture:
 
 @runtime_checkable
 class FixtureFactory(Protocol):
-    """Makes the fixture of one driver."""
+    """Function that builds the device fixture of a driver."""
 
     __name__: str
 
     def __call__(self, folder: Path, address: int, /) -> DeviceFixture:
-        """A fixture that keeps its files in ``folder``; fixtures with different ``address`` share no port or bus."""
+        """Build a fixture with its files in ``folder``; fixtures of different ``address`` share no port or bus."""
         ...
 
 

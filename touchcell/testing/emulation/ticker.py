@@ -23,10 +23,10 @@ class _Itimerspec(ctypes.Structure):
 
 
 class Ticker:
-    """Calls ``on_tick(late)`` from the running loop each period.
+    """Call ``on_tick(late)`` from the running loop each period.
 
-    Two ticks are never closer than three quarters of a period. So those that are late are made up for at four thirds of
-    the rate, unless there are more than fifty of them: then what was missed stays missed.
+    Two ticks are never closer than three quarters of a period. Late ticks are made up for at four thirds of the rate,
+    unless there are more than fifty of them: then the missed ones are skipped.
 
     Args:
         period_ns: below one second.

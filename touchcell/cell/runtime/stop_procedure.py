@@ -1,0 +1,59 @@
+"""What stops a run's arms: all are told in the same moment, and each is watched until it stands."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+
+from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.run_record import RunRecord
+from touchcell.cell.runtime.stopping import Stopper, StopReport
+from touchcell.control.interlocks.violation import Severity, Violation
+from touchcell.drivers.core.protocols import ServoArm
+from touchcell.drivers.core.samples import Stamped, TcpState
+
+logger = logging.getLogger(__name__)
+
+
+class StopProcedure:
+    """Stops the moved arms of a cell, records how they come to rest, and latches what does not.
+
+    Args:
+        cell: activated.
+        arms: that the run moves, by role.
+        record: of the run.
+    """
+
+    def __init__(self, cell: Cell, arms: Mapping[str, ServoArm], record: RunRecord) -> None:
+        self._cell = cell
+        self._arms = arms
+        self._record = record
+        self._stopper = Stopper(arms, cell.stop_categories, cell.clock, 1.0 / cell.rate_hz, cell.holding)
+
+    def begin(self, *, tripped: bool) -> None:
+        """Tell all arms to stop: as the cell file says when something is wrong, else holding where they are."""
+        distrusted = {c.subject for c in self._cell.supervisor.latch.causes if c.severity is Severity.FAULT}
+        failed = self._stopper.stop(tripped=tripped, distrusted=distrusted)
+        for role, error in failed.items():
+            self._record.event("stop failed", f"{role}: {error}")
+
+    def await_rest(self) -> Mapping[str, StopReport]:
+        """Watch the arms that were told to stop until they stand."""
+        stops = self._stopper.watch(self._on_state, self._on_escalation)
+        for role, report in stops.items():
+            if report.problem:
+                self._record.event("stop failed", f"{role}: {report.problem}")
+        return stops
+
+    def _on_state(self, role: str, state: Stamped[TcpState]) -> None:
+        # Arms on their way to rest are still guarded.
+        self._cell.watchdog.beat()
+        self._record.state(role, state)
+
+    def _on_escalation(self, role: str, report: StopReport, waited_s: float) -> None:
+        reason = f"not seen at rest {waited_s:.3f} s after a stop by category {int(report.category)}"
+        now_ns = self._cell.clock.now_ns()
+        self._cell.supervisor.latch.update(
+            [Violation("stop", Severity.FAULT, role, reason, now_ns, value=waited_s, limit=report.declared_s, unit="s")]
+        )
+        self._record.event("escalated", f"{role}: {reason}")
