@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import numpy as np
 from pydantic import PositiveFloat
@@ -10,7 +11,7 @@ from pydantic import PositiveFloat
 from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import ContactServo, SixGains
-from touchcell.tasks.interface import TaskContext, TaskSpec
+from touchcell.tasks.interface import DEPTH, TaskContext, TaskSpec
 from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
 
 
@@ -22,7 +23,7 @@ class ObjectTrackingConfig(ServoConfig):
         duration_s: duration of the tracking.
     """
 
-    depth_mm: PositiveFloat = 6.0
+    depth_mm: Annotated[PositiveFloat, DEPTH] = 6.0
     settle_tolerance_mm: PositiveFloat = 1.0
     settle_tolerance_deg: PositiveFloat = 3.0
     kp_per_s: SixGains = (10.0, 10.0, 10.0, 8.0, 8.0, 8.0)

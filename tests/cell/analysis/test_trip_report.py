@@ -114,3 +114,17 @@ def test_an_arm_that_obeys_nothing_still_leaves_a_black_box(
     assert "never seen at rest: does not come to rest by any means that its driver has: use the emergency stop" in told
     assert "then " in told
     assert "stop (fault): arm: not seen at rest" in told
+
+
+def test_limited_tells_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = yaml.safe_load(SHIPPED.read_text())
+    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    data["arms"]["arm"]["limits"] |= {"tcp_rot_accel_rad_s2": 0.01}
+    cell, folder = tmp_path / "cell.yaml", tmp_path / "run"
+    cell.write_text(yaml.safe_dump(data))
+    assert main(["run", str(cell), "--out", str(folder), "--quiet"]) == EXIT_TRIPPED
+    capsys.readouterr()
+    assert main(["why", str(folder)]) == EXIT_OK
+    told = capsys.readouterr().out
+    assert "limited (trip): arm: limited by its gate" in told
+    assert "what to do: lower the task's gains" in told

@@ -10,11 +10,13 @@ from typing import Any, Final
 import numpy as np
 
 from touchcell.cell.analysis.run_data import Run, Series, load_run, run_of
+from touchcell.cell.config.yaml_file import load
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.runtime.black_box import ABOUT, CRASH, MESSAGES, RING, read_left_ring
 from touchcell.cell.runtime.operator_input import is_running
 from touchcell.cell.runtime.watchdog import NOTES
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 
 RESULT: Final = "result.json"
@@ -59,6 +61,8 @@ def explain(folder: Path) -> str:
     if causes:
         lines.append(f"first cause, {(t_ns - start_ns) * 1e-9:.3f} s after the start:")
         lines.append(f"  {_cause(causes[0])}")
+        if remedy := _remedy(folder, causes[0]):
+            lines.append(f"  what to do: {remedy}")
         lines += [f"  then {1e-6 * (cause['t_ns'] - t_ns):.0f} ms later: {_cause(cause)}" for cause in causes[1:]]
     elif about.get("outcome") == "done":
         lines.append("  the task reached its end; there is nothing to explain")
@@ -149,6 +153,29 @@ def _cause(cause: dict[str, Any]) -> str:
     if cause["value"] is not None and cause["limit"] is not None:
         words += f"  [value {cause['value']:.4g}, limit {cause['limit']:.4g} {cause['unit']}]"
     return words + (f", tactile frame {cause['frame_seq']}" if cause["frame_seq"] is not None else "")
+
+
+_REMEDIES: Final = {
+    "limited": "lower the task's gains or speeds, raise that limit of the arm if it can do more, or, where the "
+    "estimate itself jumps, train the estimator on more images",
+    "workspace": "if the task was right to go there, make the box larger; if not, look at its start and its target",
+    "depth": "lower the task's depth or gains, or approach more slowly",
+    "out_of_range": "press less deep and less slanted, or train the estimator on the contacts that occur",
+    "frame_age": "find what delays the camera or the cycle (budget.png); raise the limit only if the arm is slow",
+    "arm_state_age": "find what delays the arm's states or the cycle (budget.png)",
+    "tcp_speed": "lower the task's speeds or gains; the limit is for the tool, with the turn about it",
+    "tracking": "the arm does not follow: look at its load, its own speed limits and what it touches",
+    "contact_lost": "lower the speed, raise the depth, or let the task search again more often",
+}
+
+
+def _remedy(folder: Path, cause: dict[str, Any]) -> str:
+    """What to do about a trip, by the kind of its interlock in the run's cell file."""
+    try:
+        entry = load(folder / "cell.yaml").data.get("interlocks", {}).get(cause["interlock"], {})
+    except (ConfigError, AttributeError):
+        return ""
+    return _REMEDIES.get(str(entry.get("kind")), "") if isinstance(entry, dict) else ""
 
 
 def _stop(stop: dict[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -17,12 +18,13 @@ from touchcell.drivers.replay.dataset import natural_order, read_split
 from touchcell.errors import DataError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.input_file import InputFile
 
 
 class ReplayArmConfig(DriverConfig):
     """Data set and rate; equal to those of the replay camera."""
 
-    data: Path
+    data: Annotated[Path, InputFile("a data set", folder=True)]
     split: str
     rate_hz: float = Field(default=30.0, gt=0.0, le=1000.0)
 
