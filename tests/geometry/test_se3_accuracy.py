@@ -1,4 +1,4 @@
-"""Errors against mpmath over the whole grid and sweep: random twists never find where formulas cancel."""
+"""Errors against mpmath over the whole grid and sweep: random twists never hit the points of cancellation."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_errors_are_a_few_eps(exact: Reference, backend: str, batched: bool) -> 
     assert not too_large, f"in eps: {too_large}"
 
 
-def test_the_measure_sees_a_fault(exact: Reference) -> None:
+def test_the_error_measure_detects_a_fault(exact: Reference) -> None:
     def careless(xi: Any) -> Any:
         T = _plain.exp(xi)
         T[:, :3, 3] *= 1.0 + 1e-14

@@ -38,9 +38,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Deselect `hil` tests without a cell file."""
     if config.getoption("--cell"):
         return
-    on_bench = [item for item in items if item.get_closest_marker("hil")]
-    if on_bench:
-        config.hook.pytest_deselected(items=on_bench)
+    on_hardware = [item for item in items if item.get_closest_marker("hil")]
+    if on_hardware:
+        config.hook.pytest_deselected(items=on_hardware)
         items[:] = [item for item in items if not item.get_closest_marker("hil")]
 
 
@@ -49,7 +49,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
     cell = parent.config.getoption("--cell")
     if cell is None or file_path != cell.resolve():
         return None
-    return BenchModule.from_parent(parent, path=file_path)
+    return CellModule.from_parent(parent, path=file_path)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -63,7 +63,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     confirmed.add(device)
 
 
-class BenchModule(pytest.Module):
+class CellModule(pytest.Module):
     """A cell file, with one suite for each of its devices."""
 
     def _getobj(self) -> ModuleType:

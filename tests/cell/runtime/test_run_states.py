@@ -23,7 +23,7 @@ from touchcell.tasks.state_machine import FAULT, STOP, TRIP, Accepted, TaskMachi
 
 STARTING, RUNNING, STOPPING, WAITING, ENDED = RunState
 
-# Written from docs/architecture.md: what each event does where it does anything.
+# Written from docs/explanation/architecture.md: what each event does where it does anything.
 ALLOWED: Mapping[tuple[RunState, str], RunState] = {
     (STARTING, STARTED): RUNNING,
     (RUNNING, FINISHED): STOPPING,

@@ -1,4 +1,4 @@
-"""The plot around a trip. Imported only then, because matplotlib is heavy."""
+"""The plot around a trip. Imported only when needed, because matplotlib is heavy."""
 
 from __future__ import annotations
 

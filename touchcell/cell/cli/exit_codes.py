@@ -1,12 +1,14 @@
 """Exit codes of ``touchcell``."""
 
-EXIT_OK = 0
+from typing import Final
 
-
-EXIT_TASK_FAILED = 1
-
-
-EXIT_BAD_INPUT = 2
-
-
-EXIT_TRIPPED = 3
+EXIT_OK: Final = 0
+"""Done, or ended by the operator."""
+EXIT_TASK_FAILED: Final = 1
+"""The task or the command failed."""
+EXIT_BAD_INPUT: Final = 2
+"""A file, a key or an argument is wrong; nothing has moved."""
+EXIT_TRIPPED: Final = 3
+"""An interlock tripped."""
+EXIT_LOST: Final = 4
+"""A device or a process was lost: unplugged, not reachable, killed."""

@@ -11,7 +11,10 @@ from touchcell.control.interlocks.spec import INTERLOCKS
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
+from touchcell.perception.runtime.estimator_spec import ESTIMATORS
+from touchcell.perception.runtime.filter_spec import FILTERS
 from touchcell.registry import Registry
+from touchcell.simulation.shape_spec import OBJECTS, SURFACES
 from touchcell.tasks.interface import TASKS
 from touchcell.testing.emulation.launcher import EMULATORS
 
@@ -21,7 +24,15 @@ def listing() -> dict[str, list[tuple[str, str]]]:
     return {
         "drivers": _rows(DRIVERS),
         "tasks": _rows(TASKS),
-        "interlocks": [("finite", "every number is finite; always on, checked first"), *_rows(INTERLOCKS)],
+        "interlocks": [
+            ("finite", "every number is finite; always on, checked first"),
+            ("missing", "every arm and sensor is in the view; always on"),
+            *_rows(INTERLOCKS),
+        ],
+        "estimators": _rows(ESTIMATORS),
+        "filters": _rows(FILTERS),
+        "surfaces": _rows(SURFACES),
+        "objects": _rows(OBJECTS),
         "emulators": [(name, "") for name in EMULATORS.names()],
         "experiments": _rows(EXPERIMENTS),
         "benchmarks": [(name, "") for name in benchmark_names()],

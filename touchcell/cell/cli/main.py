@@ -201,7 +201,7 @@ def _check(options: argparse.Namespace) -> int:
     plan = plan_cell(find_cell(options.cell), _overrides(options.data))
     print(f"{options.cell}: {plan.cell.name} is valid")
     print(f"  task     {plan.task.name}: {plan.task.summary}")
-    for device in [*plan.arms.values(), *plan.sensors.values()]:
+    for device in plan.built.values():
         print(f"  {device.spec.capabilities.kind:<8} {device.name}: {device.spec.name}, {device.spec.summary}")
     for name, interlock in plan.cell.interlocks.items():
         way = plan.stopping_distances.get(name)

@@ -7,7 +7,7 @@ task fit, and says which devices the task does not need, so that they are not ev
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
 from touchcell.cell.config.feasibility import unfeasible
 from touchcell.cell.config.input_files import with_input_files
@@ -24,19 +24,19 @@ from touchcell.cell.config.stopping_distance import StoppingDistance, combined, 
 from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile
 from touchcell.control.interlocks.basic import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
-from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
+from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_READ, REQUIRED_TO_TOUCH, InterlocksConfig
 from touchcell.control.interlocks.spec import INTERLOCKS
 from touchcell.control.interlocks.violation import Severity
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.device import DeactivatePolicy
-from touchcell.drivers.core.protocols import JointSource, TwistSink, protocol_names
+from touchcell.drivers.core.protocols import JointSource, ReadingSource, TwistSink, protocol_names
 from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DRIVERS, AnyDriver, DriverConfig
 from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.input_file import BUILTIN, InputFile, files_in
-from touchcell.paths import MODELS
+from touchcell.input_file import BUILTIN
+from touchcell.perception.runtime.estimator_spec import EstimatorSection
 from touchcell.tasks.interface import TASKS, AnyTask, TaskConfig
 
 M = TypeVar("M", bound=BaseModel)
@@ -44,8 +44,6 @@ Three = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]
 
 
-_TRAIN: Final = "`touchcell train --data DIR --out NAME.safetensors` writes one, --model names another"
-_CALIBRATE: Final = "`touchcell calibrate` writes one"
 _LONGEST_NAME: Final = 100
 
 
@@ -67,92 +65,6 @@ class _OpenSection(BaseModel):
     """A section whose other keys belong to the driver or task that it names."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
-
-
-class StillSurfaceSection(_Section):
-    """The SE(3) Bayesian filter: how fast certainty is lost when no frame comes (slip, curvature)."""
-
-    model: Literal["still_surface"] = "still_surface"
-    drift_mm_per_sqrt_s: PositiveFloat
-    drift_deg_per_sqrt_s: PositiveFloat
-
-
-class MovingSurfaceSection(_Section):
-    """The filter that also estimates the surface's velocity, for surfaces that move steadily.
-
-    ``speed_*`` is how fast a surface may be when it is first touched (one standard deviation), ``accel_*`` how fast its
-    velocity stops being known.
-    """
-
-    model: Literal["moving_surface"]
-    drift_mm_per_sqrt_s: PositiveFloat
-    drift_deg_per_sqrt_s: PositiveFloat
-    speed_mm_s: PositiveFloat
-    speed_deg_s: PositiveFloat
-    accel_mm_s_per_sqrt_s: PositiveFloat
-    accel_deg_s_per_sqrt_s: PositiveFloat
-
-
-def _filter_model(value: Any) -> str | None:
-    """Which model a filter section means: a file that names none means a still surface."""
-    if isinstance(value, Mapping):
-        return str(value.get("model", "still_surface"))
-    return getattr(value, "model", None)
-
-
-FilterSection = Annotated[
-    Annotated[StillSurfaceSection, Tag("still_surface")] | Annotated[MovingSurfaceSection, Tag("moving_surface")],
-    Discriminator(
-        _filter_model,
-        custom_error_type="filter_model",
-        custom_error_message="must say `model: still_surface` or `model: moving_surface`",
-    ),
-]
-
-
-class GateSection(_Section):
-    """The contact gate: mean marker-image change, in per cent, that begins and ends a contact."""
-
-    touch_percent: PositiveFloat
-    release_percent: PositiveFloat
-
-    @model_validator(mode="after")
-    def _hysteresis(self) -> Self:
-        if self.release_percent >= self.touch_percent:
-            raise ValueError(
-                f"release_percent {self.release_percent:g} is not below touch_percent {self.touch_percent:g}: "
-                "a contact would end as it begins"
-            )
-        return self
-
-
-class NetworkEstimator(_Section):
-    """Image -> network -> filter. ``calibration`` is a file of ``touchcell calibrate``."""
-
-    kind: Literal["network"]
-    model: Annotated[str, InputFile("a model file", files_in(MODELS, ".safetensors"), BUILTIN, hint=_TRAIN)]
-    calibration: Annotated[str | None, InputFile("a calibration file", hint=_CALIBRATE)] = None
-    gate: GateSection | None = None
-    filter: FilterSection | None = None
-
-
-class TrueContact(_Section):
-    """The simulator's own contact state, to see control error apart from estimation error."""
-
-    kind: Literal["true_contact"]
-
-
-class KnownSurface(_Section):
-    """The contact from the arm's pose over a surface that stands where the file says, for collecting labels.
-
-    ``surface_mm_deg`` is where the sensor frame is, in the arm's base, when it just touches the surface, upright.
-    """
-
-    kind: Literal["known_surface"]
-    surface_mm_deg: Six
-
-
-EstimatorSection = Annotated[NetworkEstimator | TrueContact | KnownSurface, Field(discriminator="kind")]
 
 
 class CapsuleSection(_Section):
@@ -215,12 +127,26 @@ class SensorSection(_OpenSection):
         return se3.from_euler_mm_deg(self.tcp_to_sensor_mm_deg)
 
 
+class DeviceSection(_OpenSection):
+    """A device that is neither an arm nor a tactile sensor, as a force-torque sensor or a gripper: its driver, the arm
+    that carries it, what happens when it is deactivated, and the driver's own keys.
+    """
+
+    driver: str
+    mounted_on: str | None = None
+    deactivate: DeactivatePolicy = DeactivatePolicy.HOLD
+
+
 class TaskSection(_OpenSection):
-    """The task, which arms and sensors play its roles, and the task's own keys; ``steps:`` alone names the task too."""
+    """The task, which arms, sensors and devices play its roles, and the task's own keys.
+
+    ``steps:`` alone names the task too.
+    """
 
     name: str
     arms: dict[str, str] = {}
     sensors: dict[str, str] = {}
+    devices: dict[str, str] = {}
 
     @model_validator(mode="before")
     @classmethod
@@ -275,6 +201,7 @@ class CellFile(_Section):
     obstacles: dict[str, BoxSection] = {}
     arms: dict[str, ArmSection] = {}
     sensors: dict[str, SensorSection] = {}
+    devices: dict[str, DeviceSection] = {}
     pairs: tuple[PairSection, ...] = ()
     interlocks: InterlocksConfig = {}
     on_trip: Literal["end", "wait_for_reset"] = "end"
@@ -308,6 +235,8 @@ class CellPlan:
         stopping_distances: by the name of a workspace or clearance, how far its arm gets beyond it, or the two fastest
             arms towards each other, before they stand.
         settings: values that were set in place of the file's own, by dotted key.
+        auxiliaries: other devices that the task needs or that are read, by name in the cell.
+        auxiliary_roles: role in the task -> name in the cell; a device without a role has its own name as role.
     """
 
     file: Path
@@ -322,10 +251,17 @@ class CellPlan:
     devices: Mapping[str, DevicePlan]
     stopping_distances: Mapping[str, StoppingDistance] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
+    auxiliaries: Mapping[str, DevicePlan] = field(default_factory=dict)
+    auxiliary_roles: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        devices = [f"{name} {device.spec.name}" for name, device in {**self.arms, **self.sensors}.items()]
+        devices = [f"{name} {device.spec.name}" for name, device in self.built.items()]
         return f"<CellPlan {self.cell.name!r}: task {self.task.name}, {', '.join(devices)}>"
+
+    @property
+    def built(self) -> Mapping[str, DevicePlan]:
+        """Every device that is built, each after those that it may depend on."""
+        return {**self.arms, **self.sensors, **self.auxiliaries}
 
     def text(self) -> str:
         """The cell file as it is planned: the file itself, or YAML of what comes of it and of what it extends."""
@@ -389,16 +325,27 @@ class _Planner:
         task, task_config = self._task(cell)
         arm_roles = self._roles(cell, "arms", task.arms, cell.arms) if task else {}
         sensor_roles = self._roles(cell, "sensors", task.sensors, cell.sensors) if task else {}
+        auxiliary_roles = self._roles(cell, "devices", task.devices, cell.devices) if task else {}
+        others = {name: plan for name in cell.devices if (plan := self._auxiliary(cell, name))}
+        auxiliaries = {
+            name: plan
+            for name, plan in others.items()
+            if name in auxiliary_roles.values() or ReadingSource in plan.spec.capabilities.provides
+        }
+        auxiliary_roles |= {name: name for name in auxiliaries if name not in auxiliary_roles.values()}
         needed_sensors = set(sensor_roles.values())
-        mounts = {cell.sensors[name].mounted_on for name in needed_sensors} - {None}
-        needed_arms = set(arm_roles.values()) | mounts
+        carried = [cell.sensors[name] for name in needed_sensors] + [cell.devices[name] for name in auxiliaries]
+        needed_arms = set(arm_roles.values()) | {section.mounted_on for section in carried} - {None}
         devices = {name: plan for name in cell.arms if (plan := self._arm(cell, name))}
         devices |= {name: plan for name in cell.sensors if (plan := self._sensor(cell, name))}
         arms = {name: plan for name, plan in devices.items() if name in needed_arms}
         sensors = {name: plan for name, plan in devices.items() if name in needed_sensors}
+        devices |= others
+        self._require_names(cell)
         if task:
             self._require_collection(cell, task)
-            self._require_protocols(task, arm_roles, arms)
+            self._require_protocols(task, "arms", task.arms, arm_roles, arms)
+            self._require_protocols(task, "devices", task.devices, auxiliary_roles, others)
             self._require_interlocks(cell, task)
             self._require_processes(cell, task, arm_roles)
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
@@ -409,7 +356,7 @@ class _Planner:
             raise InvalidCell(self._problems)
         assert task is not None
         assert task_config is not None
-        skipped = sorted((set(cell.arms) - set(arms)) | (set(cell.sensors) - set(sensors)))
+        skipped = sorted({*cell.arms, *cell.sensors, *cell.devices} - {*arms, *sensors, *auxiliaries})
         planned = CellPlan(
             file.path,
             cell,
@@ -423,6 +370,8 @@ class _Planner:
             devices,
             stopping_distances,
             self._settings,
+            auxiliaries,
+            auxiliary_roles,
         )
         if self._to_run and (problems := unfeasible(file, planned)):
             raise InvalidCell(problems)
@@ -443,7 +392,7 @@ class _Planner:
         return spec, self._validated(spec.config, cell.task.model_extra or {}, ("task",))
 
     def _roles(
-        self, cell: CellFile, kind: str, roles: Any, devices: Mapping[str, ArmSection] | Mapping[str, SensorSection]
+        self, cell: CellFile, kind: str, roles: Collection[str], devices: Mapping[str, _OpenSection]
     ) -> dict[str, str]:
         """Role -> device name. A role that the file does not assign goes to the device of the same name."""
         assigned: dict[str, str] = getattr(cell.task, kind)
@@ -480,32 +429,51 @@ class _Planner:
 
     def _sensor(self, cell: CellFile, name: str) -> DevicePlan | None:
         section = cell.sensors[name]
-        if section.mounted_on is not None and section.mounted_on not in cell.arms:
+        self._require_mount(cell, ("sensors", name), section.mounted_on)
+        if section.estimator.needs_truth and cell.scene is None:
             self._add(
-                ("sensors", name, "mounted_on"),
-                f"there is no arm {section.mounted_on!r}",
-                value=section.mounted_on,
-                hint=suggest(section.mounted_on, sorted(cell.arms)),
+                ("sensors", name, "estimator"), f"{section.estimator.kind} needs a `scene:`", hint="use kind: network"
             )
-        if section.estimator.kind == "true_contact" and cell.scene is None:
-            self._add(("sensors", name, "estimator"), "true_contact needs a `scene:`", hint="use kind: network")
         shared = {"mounted_on": section.mounted_on, "tcp_to_sensor_mm_deg": section.tcp_to_sensor_mm_deg}
         return self._device(cell, ("sensors", name), section, shared, "camera")
+
+    def _auxiliary(self, cell: CellFile, name: str) -> DevicePlan | None:
+        section = cell.devices[name]
+        self._require_mount(cell, ("devices", name), section.mounted_on)
+        shared = {"mounted_on": section.mounted_on, "deactivate": section.deactivate}
+        return self._device(cell, ("devices", name), section, shared, None)
+
+    def _require_mount(self, cell: CellFile, at: tuple[str, str], arm: str | None) -> None:
+        if arm is not None and arm not in cell.arms:
+            self._add((*at, "mounted_on"), f"there is no arm {arm!r}", value=arm, hint=suggest(arm, sorted(cell.arms)))
+
+    def _require_names(self, cell: CellFile) -> None:
+        """A device is known by its name alone, to drivers and in messages."""
+        taken: set[str] = set()
+        for kind in ("arms", "sensors", "devices"):
+            for name in getattr(cell, kind):
+                if name in taken:
+                    self._add(
+                        (kind, name), "another device has this name", value=name, hint="give it a name of its own"
+                    )
+                taken.add(name)
 
     def _device(
         self,
         cell: CellFile,
         at: tuple[str, str],
-        section: ArmSection | SensorSection,
+        section: ArmSection | SensorSection | DeviceSection,
         shared: Mapping[str, Any],
-        kind: str,
+        kind: str | None,
     ) -> DevicePlan | None:
         try:
             spec = DRIVERS.load(section.driver)
         except ConfigError as error:
             self._add((*at, "driver"), error.reason, value=section.driver, hint=error.hint)
             return None
-        if spec.capabilities.kind != kind:
+        if kind is None and spec.capabilities.kind == "arm":
+            self._add((*at, "driver"), f"{spec.name} drives an arm", value=spec.name, hint="list it under `arms:`")
+        if kind is not None and spec.capabilities.kind != kind:
             self._add(
                 (*at, "driver"),
                 f"{spec.name} drives {_a(spec.capabilities.kind)}, not {_a(kind)}",
@@ -527,6 +495,8 @@ class _Planner:
         required = REQUIRED_TO_MOVE if moves else frozenset()
         if moves and task.sensors:
             required |= REQUIRED_TO_TOUCH
+        if moves and any(ReadingSource in protocols for protocols in task.devices.values()):
+            required |= REQUIRED_TO_READ
         stopping = {entry.kind for entry in cell.interlocks.values() if entry.level is not Severity.LIMIT}
         for kind in sorted(required - stopping):
             self._add(
@@ -641,17 +611,24 @@ class _Planner:
             )
         return both
 
-    def _require_protocols(self, task: AnyTask, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]) -> None:
-        for role, protocols in task.arms.items():
-            name = arm_roles.get(role)
-            if name is None or name not in arms:
+    def _require_protocols(
+        self,
+        task: AnyTask,
+        kind: str,
+        needed: Mapping[str, frozenset[type]],
+        names: Mapping[str, str],
+        devices: Mapping[str, DevicePlan],
+    ) -> None:
+        for role, protocols in needed.items():
+            name = names.get(role)
+            if name is None or name not in devices:
                 continue
-            missing = protocols - arms[name].spec.capabilities.provides
+            missing = protocols - devices[name].spec.capabilities.provides
             if missing:
                 self._add(
-                    ("arms", name, "driver"),
-                    f"{arms[name].spec.name} does not provide {protocol_names(missing)}, which {task.name} needs",
-                    value=arms[name].spec.name,
+                    (kind, name, "driver"),
+                    f"{devices[name].spec.name} does not provide {protocol_names(missing)}, which {task.name} needs",
+                    value=devices[name].spec.name,
                     hint="choose another driver; `touchcell list` names all",
                 )
 

@@ -1,4 +1,4 @@
-"""Trials: cell files with some keys changed, run beside each other in processes, kept once they have finished."""
+"""Trials: runs of cell files with some keys changed, in parallel processes, kept once they have finished."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from touchcell.errors import ConfigError, suggest
 from touchcell.paths import CONFIGS
 
 COLLECTED = "data"
-"""Folder, in a trial's own, of the frames that a trial collects."""
+"""Subfolder of a trial's folder for collected frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One run that an experiment asks for.
+    """One run of an experiment.
 
     Attributes:
-        name: its folder; no two trials of an experiment share one.
+        name: its folder; unique within an experiment.
         row: the row of the table that it belongs to.
-        cell: a cell file, among those that ship unless it is a path.
+        cell: a cell file, among the shipped ones unless it is a path.
         changes: values in place of the file's own, by dotted key ("task.depth_mm").
     """
 
@@ -50,7 +50,7 @@ class Trial:
     changes: Mapping[str, Any] = field(default_factory=dict)
 
     def cell_data(self) -> dict[str, Any]:
-        """The whole cell file with the changes. Raises ConfigError for a key that leads nowhere."""
+        """Return the whole cell file with the changes. Raises ConfigError for a key whose section does not exist."""
         path = Path(self.cell)
         data: dict[str, Any] = yaml.safe_load((path if path.is_absolute() else CONFIGS / path).read_text())
         data = copy.deepcopy(data)
@@ -67,13 +67,13 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """A trial that has run.
+    """A finished trial.
 
     Attributes:
-        trial: which.
-        folder: what it left.
-        outcome: a word of ``touchcell.cell.runtime.run_result.Outcome``.
-        reason: why it ended so.
+        trial: the trial.
+        folder: its run folder.
+        outcome: value of ``touchcell.cell.runtime.loop.Outcome``.
+        reason: reason of the outcome.
         measures: named numbers.
     """
 
@@ -85,16 +85,16 @@ class Finished:
 
     @property
     def done(self) -> bool:
-        """Whether the task came to its end."""
+        """True if the task finished."""
         return self.outcome == Outcome.DONE.value
 
 
 @dataclass(frozen=True, slots=True)
 class Perform:
-    """Runs trials into ``root``; as a whole it is handed to other processes.
+    """Runs trials into ``root``; picklable, to be passed to other processes.
 
     Attributes:
-        measure: named numbers of a trial that has run.
+        measure: named numbers of a finished trial.
         root: holds one folder for each trial.
     """
 
@@ -102,7 +102,7 @@ class Perform:
     root: Path
 
     def __call__(self, trial: Trial) -> Finished:
-        """Run a trial, measure it, and only then say that it has finished."""
+        """Run a trial and measure it; mark it as finished last."""
         started = time.perf_counter()
         folder = self.root / trial.name
         folder.mkdir(parents=True, exist_ok=True)
@@ -123,15 +123,15 @@ class Perform:
             "reason": result.reason,
             "duration_s": result.duration_s,
             "wall_s": round(time.perf_counter() - started, 3),
-            # What could not be measured is left out, as JSON knows no number for it.
+            # Measures that are not finite are left out, as JSON has no number for them.
             "measures": {name: float(value) for name, value in measures.items() if math.isfinite(value)},
         }
         _write_whole(marker, json.dumps(record, indent=1))
-        # A folder of its own: the one that was measured holds its whole recording in memory.
+        # A new RunFolder: the measured one holds its whole recording in memory.
         return _finished(trial, RunFolder(folder), record)
 
     def kept(self, trial: Trial) -> Finished | None:
-        """The trial as an earlier run of the experiment left it, if it had the same settings."""
+        """Return the trial's result from an earlier run of the experiment, if it had the same settings."""
         folder = self.root / trial.name
         try:
             record = json.loads((folder / "trial.json").read_text())
@@ -143,17 +143,17 @@ class Perform:
 def perform_all(
     perform: Perform, trials: Sequence[Trial], *, jobs: int = 1, live: bool = False, title: str = ""
 ) -> list[Finished]:
-    """Run what is missing of ``trials``; returns all of them in order.
+    """Run the missing ones of ``trials``; return all of them in order.
 
     Args:
-        perform: how to run one.
-        trials: which.
-        jobs: how many at a time; 1 runs them in this process.
+        perform: runs one.
+        trials: all trials.
+        jobs: number in parallel; 1 runs them in this process.
         live: show a progress bar.
         title: on it.
 
     Raises:
-        KeyboardInterrupt: what runs is ended; what has finished is kept.
+        KeyboardInterrupt: running trials are ended; finished ones are kept.
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -173,7 +173,7 @@ def _each(perform: Perform, trials: Sequence[Trial], jobs: int) -> Iterator[Fini
         for trial in trials:
             yield perform(trial)
         return
-    # Fresh processes: a fork would inherit the threads of libraries that do not outlive it.
+    # Spawned processes: a fork would inherit locks of library threads that do not survive it.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(trials)), context, initializer=_belong_to_parent) as executor:
         running = [executor.submit(perform, trial) for trial in trials]

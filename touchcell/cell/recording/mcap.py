@@ -29,7 +29,7 @@ from mcap.writer import CompressionType, Writer
 
 from touchcell.cell.errors import RecordingError
 
-# A kill loses the open chunk at most: 16 KiB is a fraction of a second of a cell's usual 100 kB/s.
+# A kill loses at most the open chunk: 16 KiB is a fraction of a second of a cell's usual 100 kB/s.
 CHUNK_BYTES = 16 * 1024
 RECORDING = "run.mcap"
 """Name of the recording in a run folder."""
@@ -105,10 +105,10 @@ class _File:
 
 
 class Recorder:
-    """Writes one recording.
+    """Writer of one recording.
 
     Args:
-        path: the file, made anew.
+        path: the file; overwritten.
         stream: where to write instead of opening ``path``; the recorder closes it.
 
     Raises:
@@ -132,7 +132,7 @@ class Recorder:
 
     @property
     def failed(self) -> bool:
-        """Whether a write has failed; nothing more is written then."""
+        """True if a write has failed; nothing more is written then."""
         return self._failed
 
     def write(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
@@ -200,12 +200,12 @@ def read(path: Path, damage: list[Damage] | None = None) -> Iterator[Message]:
         damage: gets what could not be read; without it, that is logged.
 
     Raises:
-        RecordingError: ``path`` is missing or no MCAP file at all.
+        RecordingError: ``path`` is missing or not an MCAP file.
     """
     found: list[Damage] = [] if damage is None else damage
     with _opened(path) as stream:
         if stream.read(len(_MAGIC)) != _MAGIC:
-            raise RecordingError(path, "is no MCAP file")
+            raise RecordingError(path, "is not an MCAP file")
         yield from _Reader(stream, lambda: False, found).messages()
     if damage is None:
         for each in found:
@@ -213,14 +213,14 @@ def read(path: Path, damage: list[Damage] | None = None) -> Iterator[Message]:
 
 
 def follow(path: Path, wait: Callable[[], bool]) -> Iterator[Message]:
-    """All messages of a recording that may still be written, and those that are added to it, until it is finished.
+    """Yield all messages of a recording that may still be written, and those added to it, until it is finished.
 
     Args:
         path: the recording.
-        wait: called when there is nothing new; False gives up.
+        wait: called when there is nothing new; returns False to stop waiting.
 
     Raises:
-        RecordingError: ``path`` is missing or no MCAP file at all.
+        RecordingError: ``path`` is missing or not an MCAP file.
     """
     found: list[Damage] = []
     with _opened(path) as stream:
@@ -229,7 +229,7 @@ def follow(path: Path, wait: Callable[[], bool]) -> Iterator[Message]:
         if magic is None:
             return
         if magic != _MAGIC:
-            raise RecordingError(path, "is no MCAP file")
+            raise RecordingError(path, "is not an MCAP file")
         yield from reader.messages()
 
 
@@ -442,7 +442,7 @@ def _plain(value: Any) -> Any:
 
 
 def _finite(value: Any) -> Any:
-    """The same with None for what JSON cannot say."""
+    """Return the value with None in place of what JSON cannot represent."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, Mapping):

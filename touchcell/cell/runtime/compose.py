@@ -11,12 +11,13 @@ from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.devices import build_devices, build_world
 from touchcell.cell.runtime.planning_scene import build_planning_scene
 from touchcell.cell.runtime.sensor import build_sensor
+from touchcell.control.interlocks.always_on import always_on
 from touchcell.control.interlocks.config import build_interlocks
 from touchcell.control.latch import Latch
 from touchcell.control.supervisor import Supervisor
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.clock import Clock
-from touchcell.drivers.core.protocols import StopCategory
+from touchcell.drivers.core.protocols import StopCategory, TwistSink
 from touchcell.tasks.interface import Task, TaskContext
 
 
@@ -34,7 +35,7 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
     """
     role_of = _arm_roles(plan)
     world = build_world(plan, role_of, clock)
-    wanted = {name: device for name, device in {**plan.arms, **plan.sensors}.items() if name not in world.hosted}
+    wanted = {name: device for name, device in plan.built.items() if name not in world.hosted}
     devices = build_devices(plan, wanted, world.clock, world.scene, world.hosted)
     arms = {role: cast(Arm, devices[name]) for name, role in role_of.items()}
     sensors = {
@@ -42,7 +43,16 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
     }
     sensor_poses = {role: sensor.T_tcp_sensor for role, sensor in sensors.items()}
     planning_scene = build_planning_scene(plan, arms, {role: name for name, role in role_of.items()})
-    interlocks = build_interlocks(plan.cell.interlocks, sensor_poses, planning_scene)
+    interlocks = [
+        *always_on(
+            plan.cell.rate_hz,
+            plan.cell.interlocks.values(),
+            moved=any(isinstance(arm, TwistSink) for arm in arms.values()),
+            arms=arms.keys(),
+            sensors=sensors.keys(),
+        ),
+        *build_interlocks(plan.cell.interlocks, sensor_poses, planning_scene),
+    ]
     collection = _collection(plan)
     context = TaskContext(plan.cell.rate_hz, sensor_poses, 0 if collection is None else collection.kept)
 
@@ -58,6 +68,7 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
         supervisor=Supervisor(interlocks, Latch()),
         task=new_task(),
         new_task=new_task,
+        auxiliaries={role: devices[name] for role, name in plan.auxiliary_roles.items()},
         stop_categories={role: StopCategory(plan.cell.arms[name].stop_category) for name, role in role_of.items()},
         holding=frozenset(
             role_of[pair.follower] for pair in plan.cell.pairs if pair.on_stop == "hold" and pair.follower in role_of

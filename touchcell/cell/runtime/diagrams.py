@@ -9,7 +9,7 @@ from touchcell.cell.runtime.run_states import run_table
 from touchcell.paths import CHECKOUT
 from touchcell.tasks.diagrams import redraw
 
-PAGE: Final[Path] = CHECKOUT / "docs" / "architecture.md"
+PAGE: Final[Path] = CHECKOUT / "docs" / "explanation" / "architecture.md"
 
 
 def redrawn(page: str) -> str:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import cast
@@ -34,11 +34,11 @@ from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.control.latch import LatchState
 from touchcell.control.supervisor import Verdict
 from touchcell.drivers.core.commands import Sent, TwistCommand
-from touchcell.drivers.core.errors import DeviceError
+from touchcell.drivers.core.errors import ConnectError, DeviceError, DeviceGone
 from touchcell.drivers.core.lease import Lease
-from touchcell.drivers.core.protocols import ServoArm, TwistSink
+from touchcell.drivers.core.protocols import ServoArm, SettingSink, TwistSink
 from touchcell.errors import TouchcellError
-from touchcell.tasks.interface import Action, Observation, TransitionRecord
+from touchcell.tasks.interface import Action, Observation, Task, TransitionRecord
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, TaskMachine, state_name
 
 logger = logging.getLogger(__name__)
@@ -86,6 +86,7 @@ class RunLoop:
         self._cycles = 0
         self._sent: Mapping[str, Sent[TwistCommand]] = {}
         self._error: TouchcellError | None = None
+        self._lost = False
         self._reports: Mapping[str, StopReport] = {}
         self._final: RunResult | None = None
 
@@ -118,8 +119,7 @@ class RunLoop:
         """Wait for each camera's first frame, take the arms' leases, and be watched from now on."""
         cell = self._cell
         try:
-            for role, sensor in cell.sensors.items():
-                call_driver(cell.plan.sensor_roles[role], sensor.await_frame)
+            self._observer.await_frames()
             self._record.begin()
             for role, arm in self._arms.items():
                 self._leases[role] = call_driver(arm.name, partial(arm.acquire, cell.task_name))
@@ -171,6 +171,7 @@ class RunLoop:
             cell.task = cell.new_task()
             self._record.new_task()
             self._sent = {}
+            self._lost = False
             self._require_channel().close()
             self._pacing.restart()
 
@@ -179,9 +180,7 @@ class RunLoop:
         latch = self._cell.supervisor.latch
         if record.event == FAULT:
             self._error = self._error or TouchcellError(record.reason)
-            # The watchdog may know better why a device does not answer.
-            if alarms := self._alarms():
-                latch.update(alarms)
+            self._latch_alarms()
         self._stops.begin(tripped=record.event in (TRIP, FAULT) or latch.first_cause is not None)
 
     def enter_waiting(self, record: TransitionRecord) -> None:
@@ -228,6 +227,7 @@ class RunLoop:
             reading.contacts,
             operator_stop=self._stop.orderly,
             ended=self._observer.exhausted,
+            devices=reading.devices,
         )
         action = cell.task.tick(observation)
         thought = time.perf_counter_ns()
@@ -267,6 +267,9 @@ class RunLoop:
         for role, arm in self._arms.items():
             if role not in action.twists:
                 call_driver(arm.name, arm.stop)
+        for role, setting in action.settings.items():
+            device = self._cell.auxiliaries[role]
+            call_driver(device.name, partial(cast(SettingSink, device).apply, setting))
         return sent
 
     def _wait(self) -> None:
@@ -302,6 +305,7 @@ class RunLoop:
     def _fail(self, error: Exception) -> None:
         """Stop because of ``error``; a run that may wait for a reset treats a device's like any other trip."""
         logger.error("%s: %s", self.state.name.lower(), error, exc_info=error)
+        self._lost = self._lost or isinstance(error, DeviceGone | ConnectError)
         at_work = self.state in (RunState.RUNNING, RunState.WAITING_FOR_RESET)
         if isinstance(error, DeviceError) and self._reset is not None and at_work:
             self._distrust(error)
@@ -314,15 +318,21 @@ class RunLoop:
         cell = self._cell
         roles = {arm.name: role for role, arm in cell.arms.items()}
         now_ns, latch = cell.clock.now_ns(), cell.supervisor.latch
-        # The watchdog may know better why a device does not answer.
-        latch.update(self._alarms())
+        self._latch_alarms()
         fault = Violation("device", Severity.FAULT, roles.get(error.device, error.device), str(error), now_ns)
         is_new = (fault.interlock, fault.subject) not in {(cause.interlock, cause.subject) for cause in latch.causes}
         latch.update([fault])
         if is_new:
             self._fire(TRIP, str(error))
-        if not cell.task.finished:
-            cell.task.trip(now_ns, str(error))
+        with _logged("the task was not told of the trip"):
+            if not cell.task.finished:
+                cell.task.trip(now_ns, str(error))
+
+    def _latch_alarms(self) -> None:
+        """Latch what the watchdog has found, which may know better why a device does not answer."""
+        with _logged("the watchdog was not asked"):
+            if alarms := self._alarms():
+                self._cell.supervisor.latch.update(alarms)
 
     def _await_rest(self) -> None:
         """Watch the arms until they stand; a run that does not wait for a reset then ends."""
@@ -333,12 +343,13 @@ class RunLoop:
 
     def _finish(self) -> None:
         """Give the arms back and keep how it went."""
-        self._cell.watchdog.end()
+        with _logged("the watchdog was not told of the end"):
+            self._cell.watchdog.end()
         if self._channel is not None:
-            self._channel.close()
+            with _logged("the operator channel was not closed"):
+                self._channel.close()
         for role, lease in self._leases.items():
-            # What an arm that is gone answers has been reported already.
-            with suppress(DeviceError):
+            with _logged(f"{role} was not given back"):
                 self._arms[role].release(lease)
         self._final = self._result()
         self._record.event("end", self._final.reason, to=self._final.outcome.value)
@@ -352,14 +363,13 @@ class RunLoop:
         elif error is not None:
             outcome, reason = Outcome.ERROR, str(error)
         elif stop is not None and stop.event == FINISHED:
-            outcome = _OUTCOMES.get(cell.task.state, Outcome.DONE if cell.task.succeeded else Outcome.FAILED)
-            reason = _last_reason(cell.task.transitions)
+            outcome, reason = self._task_outcome(cell.task)
         else:
             outcome, reason = Outcome.STOPPED, "" if stop is None else self._why(stop)
         return RunResult(
             outcome,
             reason,
-            cell.task.state,
+            self._task_state(),
             (cell.clock.now_ns() - self._start_ns) * 1e-9,
             self._cycles,
             self._times,
@@ -367,7 +377,22 @@ class RunLoop:
             cell.supervisor.latch.causes,
             self._reports,
             () if self._reset is None else tuple(self._reset.resets),
+            lost=outcome in (Outcome.TRIPPED, Outcome.ERROR) and (self._lost or cell.watchdog.lost),
         )
+
+    def _task_outcome(self, task: Task) -> tuple[Outcome, str]:
+        """What a task that has finished says of itself."""
+        try:
+            outcome = _OUTCOMES.get(task.state, Outcome.DONE if task.succeeded else Outcome.FAILED)
+            return outcome, _reason(task.transitions, outcome)
+        except Exception as error:
+            return Outcome.ERROR, str(UnexpectedError(error))
+
+    def _task_state(self) -> str:
+        try:
+            return self._cell.task.state
+        except Exception:
+            return "unknown"
 
     def _why(self, stop: TransitionRecord) -> str:
         if stop.event == TIMEOUT and stop.source == _RUNNING:
@@ -385,6 +410,17 @@ class RunLoop:
         return self._channel
 
 
+@contextmanager
+def _logged(what: str) -> Iterator[None]:
+    """Log what is raised inside and do the next thing: nothing keeps a run from its end."""
+    try:
+        yield
+    except DeviceError as error:
+        logger.warning("%s: %s", what, error)
+    except Exception:
+        logger.exception(what)
+
+
 _RUNNING, _STOPPING, _WAITING = map(state_name, (RunState.RUNNING, RunState.STOPPING, RunState.WAITING_FOR_RESET))
 _OUTCOMES = {"stopped": Outcome.STOPPED, "tripped": Outcome.TRIPPED, "faulted": Outcome.ERROR}
 
@@ -395,5 +431,8 @@ def _has_waited(records: Sequence[TransitionRecord]) -> bool:
     return last is not None and last.target == _WAITING
 
 
-def _last_reason(transitions: Sequence[TransitionRecord]) -> str:
-    return transitions[-1].reason if transitions else ""
+def _reason(transitions: Sequence[TransitionRecord], outcome: Outcome) -> str:
+    """Why a task ended as it did: its latest transition that has a reason, unless it is simply done."""
+    if outcome is Outcome.DONE:
+        return transitions[-1].reason if transitions else ""
+    return next((f"{record.event}: {record.reason}" for record in reversed(transitions) if record.reason), "")

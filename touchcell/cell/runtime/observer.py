@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.sensor import Sensor
 from touchcell.cell.runtime.timing import CycleTimes
-from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
+from touchcell.control.interlocks.snapshot import ArmView, CellView, DeviceView, SensorView
 from touchcell.drivers.core.commands import Sent, TwistCommand
-from touchcell.drivers.core.errors import DeviceError, DeviceFault
+from touchcell.drivers.core.errors import DeviceFault
+from touchcell.drivers.core.protocols import ReadingSource
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
+from touchcell.errors import TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.finite import all_finite
 from touchcell.perception.runtime.estimate import ContactEstimate
@@ -32,17 +34,19 @@ class Reading:
         now_ns: time that it is for.
         states: of the arms, by role.
         contacts: of the sensors that have seen a frame, by role.
+        devices: of the other devices that are read, by role.
     """
 
     now_ns: int
     states: Mapping[str, Stamped[TcpState]]
     contacts: Mapping[str, ContactEstimate]
+    devices: Mapping[str, Stamped[Mapping[str, float]]] = field(default_factory=dict)
 
 
 class Observer:
     """Reads a cell's arms and sensors.
 
-    Whatever a driver raises comes out as a DeviceError that names the device.
+    What a driver raises that is no TouchcellError comes out as a DeviceFault that names the device.
 
     Args:
         cell: activated.
@@ -59,8 +63,13 @@ class Observer:
         sensors = self._cell.sensors
         return bool(sensors) and all(sensor.source.ended for sensor in sensors.values())
 
+    def await_frames(self) -> None:
+        """Wait for each camera's first frame, so that no control cycle has to. Raises DeviceError."""
+        for role, sensor in self._cell.sensors.items():
+            call_driver(self._device(role), sensor.await_frame)
+
     def read(self) -> Reading:
-        """Read the arms and perceive. Raises DeviceError."""
+        """Read the arms and perceive. Raises DeviceError, ImageError."""
         cell = self._cell
         self._times.begin()
         started = time.perf_counter_ns()
@@ -68,11 +77,17 @@ class Observer:
         self._times.add("read arms", time.perf_counter_ns() - started)
         contacts = {}
         for role, sensor in cell.sensors.items():
-            estimate = call_driver(cell.plan.sensor_roles[role], partial(self._perceive, sensor, states))
+            estimate = call_driver(self._device(role), partial(self._perceive, sensor, states))
             if estimate is not None:
                 contacts[role] = estimate
+        devices = {}
+        for role, device in cell.auxiliaries.items():
+            if device.fault is not None:
+                raise device.fault
+            if isinstance(device, ReadingSource):
+                devices[role] = call_driver(device.name, device.read)
         # Only now: what a device's own thread brought in the meantime would seem to come from the future.
-        return Reading(cell.clock.now_ns(), states, contacts)
+        return Reading(cell.clock.now_ns(), states, contacts, devices)
 
     def view(
         self,
@@ -87,17 +102,23 @@ class Observer:
             action: what the task asks for; None while no task is at work.
             sent: what was sent in the cycle before.
         """
-        twists, sent = ({} if action is None else action.twists), sent or {}
+        asked, sent = action or Action(), sent or {}
         return CellView(
             reading.now_ns,
             {
-                role: ArmView(state, twists.get(role), sent.get(role), self._joints(role))
+                role: ArmView(state, asked.twists.get(role), sent.get(role), self._joints(role))
                 for role, state in reading.states.items()
             },
             {role: _sensor_view(estimate, self._cell.sensors[role]) for role, estimate in reading.contacts.items()},
             self._cell.task.state,
             at_work=action is not None,
+            devices={
+                role: DeviceView(reading.devices.get(role), asked.settings.get(role)) for role in self._cell.auxiliaries
+            },
         )
+
+    def _device(self, sensor_role: str) -> str:
+        return self._cell.plan.sensor_roles.get(sensor_role, sensor_role)
 
     def _perceive(self, sensor: Sensor, states: Mapping[str, Stamped[TcpState]]) -> ContactEstimate | None:
         if sensor.arm_role is not None:
@@ -113,10 +134,10 @@ class Observer:
 
 
 def call_driver(device: str, call: Callable[[], _T]) -> _T:
-    """Call a driver; whatever it raises that is no DeviceError comes out as a DeviceFault of ``device``."""
+    """Call a driver; whatever it raises that is no TouchcellError comes out as a DeviceFault of ``device``."""
     try:
         return call()
-    except DeviceError:
+    except TouchcellError:
         raise
     except Exception as error:
         raise DeviceFault(device, f"its driver raised {error!r}") from error

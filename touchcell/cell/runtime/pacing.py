@@ -23,6 +23,9 @@ class Pacing:
         self._due_ns = self._clock.now_ns()
 
     def wait(self) -> None:
-        """Sleep until the next cycle is due."""
+        """Sleep until the next cycle is due; cycles that were missed are not made up for."""
         self._due_ns += self._period_ns
+        now_ns = self._clock.now_ns()
+        if now_ns - self._due_ns > self._period_ns:
+            self._due_ns = now_ns
         self._clock.sleep_until_ns(self._due_ns)

@@ -11,6 +11,7 @@ from touchcell.cell.runtime.watchdog import NOTES
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.drivers.core.protocols import TwistSink
 from touchcell.drivers.hosting.groups import Group, HostedDevice
+from touchcell.drivers.hosting.layouts import Reason
 
 if TYPE_CHECKING:
     from touchcell.cell.config.schema import CellPlan, DevicePlan
@@ -43,7 +44,7 @@ def process_lines(plan: CellPlan) -> list[str]:
     """What `touchcell check` says about the processes of a cell."""
     groups = hosted_groups(plan)
     hosted = {device.name for group in groups for device in group.devices}
-    local = [name for name in (*plan.arms, *plan.sensors) if name not in hosted]
+    local = [name for name in plan.built if name not in hosted]
     lines = [f"task: control at {plan.cell.rate_hz:g} Hz" + (f"; {', '.join(local)}: not moved" if local else "")]
     lines += [
         f"host {group.name!r}: {', '.join(each.name for each in group.devices)} at "
@@ -68,6 +69,12 @@ class ProcessWatchdog:
     def __init__(self, chain: Chain, role_of: Mapping[str, str]) -> None:
         self.chain = chain
         self._role_of = role_of
+        self._lost = False
+
+    @property
+    def lost(self) -> bool:
+        """Whether a host or the watchdog has gone or fallen silent since the latest start of a task."""
+        return self._lost
 
     def __enter__(self) -> Self:
         self.chain.__enter__()
@@ -86,6 +93,7 @@ class ProcessWatchdog:
 
     def begin(self) -> None:
         """Have the watchdog guard. Raises DeviceFault."""
+        self._lost = False
         self.chain.begin()
 
     def beat(self) -> None:
@@ -97,6 +105,7 @@ class ProcessWatchdog:
         cause = self.chain.alarm()
         if cause is None:
             return ()
+        self._lost = self._lost or cause.reason in (Reason.HOST_GONE, Reason.HOST_SILENT, Reason.WATCHDOG_SILENT)
         about_host = 0 <= cause.host < len(self.chain.groups)
         subject, severity = "task", Severity.TRIP
         if about_host or cause.reason.name.startswith("WATCHDOG"):
@@ -108,7 +117,7 @@ class ProcessWatchdog:
                 "watchdog",
                 severity,
                 subject,
-                cause.reason.words,
+                cause.reason.description,
                 cause.t_ns,
                 value=cause.value_s if timed else None,
                 limit=cause.limit_s if timed else None,

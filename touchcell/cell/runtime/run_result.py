@@ -51,6 +51,7 @@ class RunResult:
         causes: what the supervisor latched, the first cause first.
         stops: how each arm came to rest.
         resets: what was cleared on the way, and by whom, where the run waited for that.
+        lost: whether a device or a process was lost, by which the run ended.
     """
 
     outcome: Outcome
@@ -63,3 +64,4 @@ class RunResult:
     causes: tuple[Violation, ...] = ()
     stops: Mapping[str, StopReport] = field(default_factory=dict)
     resets: tuple[ResetDone, ...] = ()
+    lost: bool = False

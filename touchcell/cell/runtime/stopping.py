@@ -118,24 +118,25 @@ class Stopper:
         self._period_ns = round(1e9 * period_s)
         self._stopping: dict[str, _Stopping] = {}
 
-    def stop(self, *, tripped: bool, distrusted: Collection[str] = ()) -> Mapping[str, DeviceError]:
-        """Tell every arm to stop, whatever becomes of the others; returns what the arms answered that could not.
+    def stop(self, *, tripped: bool, distrusted: Collection[str] = ()) -> Mapping[str, Exception]:
+        """Tell every arm to stop, whatever the drivers of others raise; returns what was raised, by role.
 
         Args:
             tripped: whether something is wrong; an arm whose work is merely done stops and holds.
             distrusted: roles of arms that can no longer be trusted and get the strongest category that they offer.
         """
-        failed: dict[str, DeviceError] = {}
+        failed: dict[str, Exception] = {}
         told: dict[str, StopCategory] = {}
         for role, arm in self._arms.items():
             told[role] = StopCategory.STOP_AND_HOLD
             if role in distrusted:
-                told[role] = min(arm.stop_categories)
+                told[role] = _strongest(arm)
             elif tripped and role not in self._holding:
                 told[role] = self._categories.get(role, StopCategory.STOP_AND_HOLD)
             try:
                 arm.stop(told[role])
-            except DeviceError as error:
+            except Exception as error:
+                # Whatever it is: the next arm has to be told now.
                 failed[role] = error
         # Measured only now: reading one arm must not delay the stop of the next.
         for role, category in told.items():
@@ -165,12 +166,16 @@ class Stopper:
         return reports
 
     def _begin(self, arm: ServoArm, category: StopCategory) -> _Stopping:
-        now_ns, limits = self._clock.now_ns(), arm.limits
-        start = speed_m_s = None
+        now_ns, start, speed_m_s = self._clock.now_ns(), None, None
+        try:
+            limits = arm.limits
+        except Exception as error:
+            problem = f"cannot be watched, for its limits are not known: {error!r}"
+            return _Stopping(arm, category, now_ns, None, None, 0.0, 0.0, now_ns, None, problem=problem)
         turn_s = limits.rot_speed_rad_s / limits.rot_accel_rad_s2
         try:
             sample = arm.tcp()
-        except DeviceError:
+        except Exception:
             sample = None
         if sample is not None and self._tells(sample, now_ns):
             state = sample.value
@@ -210,6 +215,8 @@ class Stopper:
         except DeviceError as error:
             # An arm that cannot be seen is not known to stand.
             unseen = str(error)
+        except Exception as error:
+            unseen = f"its driver raised {error!r}"
         if now_ns < stopping.deadline_ns:
             return
         if stopping.escalated:
@@ -221,5 +228,13 @@ class Stopper:
         stopping.deadline_ns = now_ns + round(1e9 * stopping.declared_s)
         on_escalation(role, stopping.report(), (now_ns - stopping.told_ns) * 1e-9)
         # It has its second deadline all the same.
-        with suppress(DeviceError):
-            arm.stop(min(arm.stop_categories))
+        with suppress(Exception):
+            arm.stop(_strongest(arm))
+
+
+def _strongest(arm: ServoArm) -> StopCategory:
+    """The strongest category that an arm offers; one that cannot be asked is told to stop and hold."""
+    try:
+        return min(arm.stop_categories)
+    except Exception:
+        return StopCategory.STOP_AND_HOLD

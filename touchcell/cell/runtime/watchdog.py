@@ -1,4 +1,4 @@
-"""Who looks after the run loop from outside it: nobody in one process, the watchdog chain in several."""
+"""The watchdog of the run loop: none in one process, a chain of processes in several."""
 
 from __future__ import annotations
 
@@ -14,7 +14,12 @@ NOTES: Final = "watchdog.json"
 
 
 class Watchdog(Protocol):
-    """What a run loop tells and asks in every cycle. As a context manager it lives as long as the cell."""
+    """What a run loop notifies and polls in every cycle. As a context manager it lives as long as the cell."""
+
+    @property
+    def lost(self) -> bool:
+        """Whether one of its processes has gone or fallen silent."""
+        ...
 
     def __enter__(self) -> Self:
         """Start what it needs, before any device is connected."""
@@ -27,15 +32,15 @@ class Watchdog(Protocol):
         ...
 
     def self_test(self) -> None:
-        """Show that it stops moving arms; called with all devices active. Raises DeviceError if it does not."""
+        """Check that it stops moving arms; called with all devices active. Raises DeviceError if it does not."""
         ...
 
     def begin(self) -> None:
-        """Guard the arms from now on. Raises DeviceFault if nobody does."""
+        """Guard the arms from now on. Raises DeviceFault if that fails."""
         ...
 
     def beat(self) -> None:
-        """The loop goes on; called once a cycle."""
+        """The loop lives; called once a cycle."""
         ...
 
     def alarms(self, now_ns: int) -> Sequence[Violation]:
@@ -43,11 +48,11 @@ class Watchdog(Protocol):
         ...
 
     def end(self) -> None:
-        """The arms stand, or have been told all that can be told. From here on ``alarms`` tells what is still wrong."""
+        """Guard no longer: the arms stand. ``alarms`` then returns what is still wrong."""
         ...
 
     def clear(self) -> None:
-        """Forget why it has stopped the arms, on a person's reset: they stand and are nobody's. Raises DeviceError."""
+        """Clear its stop on an operator's reset, with all arms at rest and leased by no task. Raises DeviceError."""
         ...
 
     def note_to(self, folder: Path) -> None:
@@ -55,12 +60,14 @@ class Watchdog(Protocol):
         ...
 
     def describe(self) -> Sequence[str]:
-        """What there is, in lines for people."""
+        """Describe its processes, in lines for people."""
         ...
 
 
 class NullWatchdog:
-    """Nobody: the arms stop when their last command has expired."""
+    """No watchdog: the arms stop when their last command has expired."""
+
+    lost = False
 
     def __enter__(self) -> Self:
         return self
@@ -71,27 +78,27 @@ class NullWatchdog:
         return None
 
     def self_test(self) -> None:
-        """Nothing to prove."""
+        """Nothing to test."""
 
     def begin(self) -> None:
-        """Nobody watches."""
+        """Nothing is guarded."""
 
     def beat(self) -> None:
-        """Nobody listens."""
+        """No beat is needed."""
 
     def alarms(self, now_ns: int) -> Sequence[Violation]:
         """None ever."""
         return ()
 
     def end(self) -> None:
-        """Nobody watched."""
+        """Nothing was guarded."""
 
     def clear(self) -> None:
-        """Nobody has stopped anything."""
+        """Nothing was stopped."""
 
     def note_to(self, folder: Path) -> None:
-        """Nobody writes."""
+        """No note is written."""
 
     def describe(self) -> Sequence[str]:
-        """Nothing to say."""
+        """Nothing to describe."""
         return ()

@@ -321,5 +321,5 @@ class JointLimitsConfig(DriverConfig):
             singular_floor_m=1e-3 * self.singular_floor_mm,
             damping_m=0.0 if own_controller else 1e-3 * self.singular_value_mm,
             limit_margin_rad=float(np.deg2rad(self.margin_deg)),
-            goes_round=not own_controller,
+            uses_null_space=not own_controller,
         )

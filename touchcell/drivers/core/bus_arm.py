@@ -121,11 +121,11 @@ class BusArm(JointArm):
         self._closing = threading.Event()
         # Held by the loop for one cycle, and by any code that needs the bus or changes what the loop sends.
         self._lock = threading.RLock()
-        self._forget()
+        self._reset_state()
 
-    def _forget(self) -> None:
+    def _reset_state(self) -> None:
         """Discard samples and faults of an earlier connection."""
-        self._trouble: DeviceError | None = None
+        self._latched_fault: DeviceError | None = None
         self._enabled = [False] * self._chain.joint_count
         self._joints: Stamped[JointState] | None = None
         self._seq = 0
@@ -175,7 +175,7 @@ class BusArm(JointArm):
         """Let the motors hold their position by themselves, where supported."""
 
     def _open(self) -> None:
-        self._forget()
+        self._reset_state()
         self._open_bus()
         self._closing.clear()
         self._thread = threading.Thread(target=self._run, name=f"{self.name} bus", daemon=True)
@@ -183,7 +183,7 @@ class BusArm(JointArm):
         deadline_ns = self._clock.now_ns() + round(_FIRST_SAMPLE_S * 1e9)
         while self._joints is None:
             if self._clock.now_ns() >= deadline_ns or not self._thread.is_alive():
-                causes = [self._trouble] if self._trouble is not None else []
+                causes = [self._latched_fault] if self._latched_fault is not None else []
                 raise ConnectError(self.name, f"no complete state within {_FIRST_SAMPLE_S:g} s", causes)
             self._clock.sleep_until_ns(self._clock.now_ns() + 1_000_000)
 
@@ -218,8 +218,8 @@ class BusArm(JointArm):
         return DeactivatePolicy(self._config.on_disconnect)
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
-        if self._trouble is not None:
-            raise CommandRejected(self.name, Rejection.MODE, "device is faulted", hint=str(self._trouble))
+        if self._latched_fault is not None:
+            raise CommandRejected(self.name, Rejection.MODE, "device is faulted", hint=str(self._latched_fault))
         expires_ns = now_ns + round(ttl_s * 1e9)
         self._setpoint.follow(twist_base, expires_ns)
         self._follows_until_ns = expires_ns if twist_base.any() else 0
@@ -235,8 +235,8 @@ class BusArm(JointArm):
             )
         self._setpoint.go_to(np.deg2rad(self._config.park_deg), _PARK_SPEED_FRACTION)
         while not self.at_rest():
-            if self._trouble is not None:
-                raise self._trouble
+            if self._latched_fault is not None:
+                raise self._latched_fault
             self._clock.sleep_until_ns(self._clock.now_ns() + 5_000_000)
 
     def _parked(self) -> bool:
@@ -254,8 +254,8 @@ class BusArm(JointArm):
             try:
                 with self._lock:
                     now_ns = self._clock.now_ns()
-                    if self._trouble is not None:
-                        self._latch(self._trouble)
+                    if self._latched_fault is not None:
+                        self._latch(self._latched_fault)
                     self._cycle(now_ns, min(now_ns - last_ns, 2 * period_ns) * 1e-9, now_ns + period_ns * 3 // 4)
             except DeviceGone as error:
                 self._latch(error)

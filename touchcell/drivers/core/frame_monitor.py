@@ -39,18 +39,18 @@ class FrameMonitor:
         self._brightness = 0.0
 
     @property
-    def out_of_budget(self) -> bool:
+    def has_too_many_bad(self) -> bool:
         """Return whether more than 10 of the last 30 frames were bad."""
         return sum(self._recent_bad) > _BUDGET_BAD
 
-    def miss(self, frames: int, *, overrun: bool) -> None:
+    def count_lost(self, frames: int, *, overrun: bool) -> None:
         """Count ``frames`` that never arrived; ``overrun``: the queue was full, so the reader was too slow."""
         if overrun:
             self.unread += frames
         else:
             self.lost += frames
 
-    def admit(self, data: bytes) -> None:
+    def count_good(self, data: bytes) -> None:
         """Count a good frame; ``data``: its bytes as received."""
         self.good += 1
         # Sampled over the whole image, as its border may be black without noise; an odd stride hits both bytes of YUYV.
@@ -63,12 +63,12 @@ class FrameMonitor:
         self._fingerprint = fingerprint
         self._recent_bad.append(False)
 
-    def refuse(self, reason: str) -> None:
+    def count_bad(self, reason: str) -> None:
         """Count a frame rejected for ``reason``, a short name such as "short"."""
         self.bad[reason] = self.bad.get(reason, 0) + 1
         self._recent_bad.append(True)
 
-    def look(self, image: ImageArray) -> None:
+    def record_brightness(self, image: ImageArray) -> None:
         """Record the brightness of a frame that was read."""
         brightness = float(np.mean(image[::_BRIGHTNESS_STEP, ::_BRIGHTNESS_STEP]))
         if len(self._baseline) < _BASELINE_FRAMES:

@@ -78,7 +78,7 @@ class StateReader:
         self._failure: DeviceError | None = None
         self._aborted: str | None = None
         self._in_motion = False
-        self._looked_ns = 0
+        self._polled_ns = 0
         self._bad = 0
         self._bad_in_a_row = 0
         self._states = 0
@@ -99,7 +99,7 @@ class StateReader:
 
     @property
     def aborted(self) -> str | None:
-        """The message with which franky aborted a motion, until ``forget``."""
+        """The message with which franky aborted a motion, until ``clear_abort``."""
         return self._aborted
 
     @property
@@ -108,9 +108,9 @@ class StateReader:
         return self._in_motion
 
     @property
-    def looked_ns(self) -> int:
+    def polled_ns(self) -> int:
         """Time of the last poll for a running motion."""
-        return self._looked_ns
+        return self._polled_ns
 
     @property
     def bad(self) -> int:
@@ -133,7 +133,7 @@ class StateReader:
             self._thread.join(_JOIN_S)
         self._robot = None
 
-    def forget(self) -> None:
+    def clear_abort(self) -> None:
         """Discard an aborted motion."""
         self._aborted = None
 
@@ -152,21 +152,21 @@ class StateReader:
     def _read(self) -> None:
         last_ns, self._read_ns = self._read_ns, self._clock.now_ns()
         franky = self._franky
-        said = None
+        message = None
         try:
             self._robot.poll_motion()
         except (franky.ControlException, franky.CommandException, franky.ProtocolException) as error:
-            said = str(error)
-        looked_ns = self._clock.now_ns()
+            message = str(error)
+        polled_ns = self._clock.now_ns()
         self._in_motion = self._robot.is_in_control
-        self._looked_ns = looked_ns
+        self._polled_ns = polled_ns
         try:
             self._take(self._robot.state, last_ns)
         except franky.ProtocolException as error:
             self._count_bad(str(error))
         # Only now, so that the newest reading includes the reason of the abort.
-        if said is not None:
-            self._aborted = said
+        if message is not None:
+            self._aborted = message
 
     def _take(self, state: Any, t_ns: int) -> None:
         device_ms = state.time.to_msec()

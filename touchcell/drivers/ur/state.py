@@ -127,11 +127,11 @@ class StateReader:
         return bool(self._receive.isConnected())
 
     @property
-    def over_budget(self) -> bool:
+    def drops_too_many(self) -> bool:
         """Return whether more packets are dropped than on a healthy link: over 10 of the last 50."""
         return sum(self._misses) > _BUDGET_MISSES
 
-    def forget(self) -> None:
+    def reset_statistics(self) -> None:
         """Reset the drop counter and the clock offset, after an operator has acknowledged the fault."""
         with self._lock:
             self._misses.clear()
