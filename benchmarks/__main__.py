@@ -16,6 +16,7 @@ BENCHMARKS = {
     "emulated-push": "benchmarks.emulated_push",
     "faults": "tests.fault_injection.faults",
     "filter": "benchmarks.filter",
+    "findings": "tests.fault_injection.findings",
     "fuzz-cells": "tests.fault_injection.fuzz_cells",
     "fuzz-recordings": "tests.fault_injection.fuzz_recordings",
     "gdn-vs-cnn": "benchmarks.gdn_vs_cnn",

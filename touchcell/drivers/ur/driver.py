@@ -136,7 +136,9 @@ class UrArm(Arm):
     """
 
     def __init__(self, name: str, config: UrConfig, clock: Clock) -> None:
-        super().__init__(name, clock, config.limits.build(), stop_categories=_STOPS)
+        super().__init__(
+            name, clock, config.limits.build(), stop_categories=_STOPS, max_state_age_s=config.state_timeout_s
+        )
         self._config = config
         self._flange_to_tcp = _pose_vector(se3.from_euler_mm_deg(np.array(config.flange_to_tcp_mm_deg)))
         tool = Tool(
