@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.helpers.compiled import extension
 from touchcell.geometry import _plain_gaussian, gaussian, se3
 from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.gaussian import (
@@ -28,7 +29,7 @@ SEEDS = st.integers(0, 10_000)
 @pytest.fixture(params=["plain", "compiled"])
 def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     name: str = request.param
-    kernels: Any = _plain_gaussian if name == "plain" else pytest.importorskip("touchcell.geometry._se3c")
+    kernels: Any = _plain_gaussian if name == "plain" else extension("touchcell.geometry._se3c")
     monkeypatch.setattr(gaussian, "_kernels", kernels)
     return name
 
@@ -241,7 +242,7 @@ def test_fusion_ends_at_the_optimum(seed: int) -> None:
 
 
 def test_backends_fuse_equally() -> None:
-    compiled = pytest.importorskip("touchcell.geometry._se3c")
+    compiled = extension("touchcell.geometry._se3c")
     rng = np.random.default_rng(7)
     for _ in range(50):
         g1 = random_gaussian(rng, 0.1)

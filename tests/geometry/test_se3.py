@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.helpers.compiled import extension
 from touchcell.geometry import _plain, se3
 from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.types import Array
@@ -22,7 +23,7 @@ IDENTITY = np.eye(4)
 
 @pytest.fixture(params=["plain", "compiled"])
 def kernels(request: pytest.FixtureRequest) -> Any:
-    return _plain if request.param == "plain" else pytest.importorskip("touchcell.geometry._se3c")
+    return _plain if request.param == "plain" else extension("touchcell.geometry._se3c")
 
 
 def rotation_z(angle: float) -> Array:
@@ -90,7 +91,7 @@ def test_jacobians_are_inverse(xi: Array) -> None:
     "name", ["exp", "log", "compose", "inverse", "adjoint", "left_jacobian", "left_jacobian_inverse"]
 )
 def test_backends_agree(name: str) -> None:
-    compiled = getattr(pytest.importorskip("touchcell.geometry._se3c"), name)
+    compiled = getattr(extension("touchcell.geometry._se3c"), name)
     plain = getattr(_plain, name)
     xi = random_twists(2000)
     T = _plain.exp(xi)
@@ -319,7 +320,7 @@ def test_euler_of_the_identity_has_no_negative_zeros() -> None:
 
 
 def test_euler_is_the_same_in_both_backends() -> None:
-    compiled = pytest.importorskip("touchcell.geometry._se3c")
+    compiled = extension("touchcell.geometry._se3c")
     poses = np.random.default_rng(3).uniform(-170.0, 170.0, (500, 6)) * [1, 1, 1, 1, 0.5, 1]
     T = compiled.from_euler_mm_deg(poses)
     np.testing.assert_allclose(T, _plain.from_euler_mm_deg(poses), rtol=0.0, atol=4e-16)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.se3_reference import Library, Reference, errors, points, reference
+from tests.helpers.compiled import extension
 from touchcell.geometry import _plain
 
 LIMITS_EPS = {
@@ -32,7 +33,7 @@ def exact() -> Reference:
 @pytest.mark.parametrize("batched", [True, False])
 @pytest.mark.parametrize("backend", ["plain", "compiled"])
 def test_errors_are_a_few_eps(exact: Reference, backend: str, batched: bool) -> None:
-    kernels: Any = _plain if backend == "plain" else pytest.importorskip("touchcell.geometry._se3c")
+    kernels: Any = _plain if backend == "plain" else extension("touchcell.geometry._se3c")
     library = Library(
         backend,
         exp=kernels.exp,

@@ -12,13 +12,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from tests.helpers.compiled import extension
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception import kernels
 from touchcell.perception.errors import ArrayError, KernelsMissing
 from touchcell.perception.markers.matching import disc_density
 
-pytest.importorskip("touchcell.perception._kernelsc")
-from touchcell.perception import _kernelsc
+_kernelsc = extension("touchcell.perception._kernelsc")
 
 GREY = st.one_of(st.integers(0, 255), st.sampled_from([0, 1, 127, 128, 254, 255]))
 

@@ -11,6 +11,7 @@ import mpmath
 import numpy as np
 import pytest
 
+from tests.helpers.compiled import extension
 from tests.helpers.filter_stress import BLOCK, DRIFT_PER_STEP, SIGMA, STEP_NS, ExactFilter, LongRun, long_run
 from touchcell.errors import TouchcellError
 from touchcell.geometry import _plain_gaussian, gaussian, se3
@@ -46,7 +47,7 @@ FILTERS = pytest.mark.parametrize("make", [still, moving])
 @pytest.fixture(params=["plain", "compiled"])
 def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     name: str = request.param
-    kernels: Any = _plain_gaussian if name == "plain" else pytest.importorskip("touchcell.geometry._se3c")
+    kernels: Any = _plain_gaussian if name == "plain" else extension("touchcell.geometry._se3c")
     monkeypatch.setattr(gaussian, "_kernels", kernels)
     return name
 

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from touchcell.compiled import extension
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.errors import KernelsMissing
 
@@ -21,15 +22,7 @@ _MOST_OFFSET = 256.0
 _FACTORS = (4, 8, 16, 32, 64)
 
 
-def _find() -> ModuleType | None:
-    try:
-        from touchcell.perception import _kernelsc
-    except ImportError:
-        return None
-    return _kernelsc
-
-
-_FOUND = _find()
+_FOUND = extension("touchcell.perception._kernelsc")
 
 
 def _compiled() -> ModuleType:

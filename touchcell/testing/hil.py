@@ -116,6 +116,15 @@ def _ask(config: pytest.Config, device: str) -> None:
     with capture.global_and_fixture_disabled():
         print(f"\n{device} will be powered and, if it is an arm, move about 10 mm along and 2 deg about every axis.")
         print("Is the space around it free, are people away, and is a hand on the emergency stop? Type yes: ", end="")
-        answer = input()
+        try:
+            answer = input()
+        except (EOFError, OSError):
+            # Standard input is not a terminal, or belongs to a worker.
+            answer = None
+    if answer is None:
+        pytest.exit(
+            "tests on a bench ask a person first: run them in a terminal and without -n, or answer with --hil-yes",
+            returncode=pytest.ExitCode.USAGE_ERROR,
+        )
     if answer.strip().lower() != "yes":
         pytest.exit(f"the operator did not agree to test {device}", returncode=pytest.ExitCode.INTERRUPTED)

@@ -58,14 +58,14 @@ def test_a_trip_is_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert stop["distance_m"] == pytest.approx(0.4e-3, rel=0.5)
 
     assert main(["why", str(folder)]) == EXIT_OK
-    told = capsys.readouterr().out
-    assert "first cause" in told
-    assert "workspace (trip): arm: x = -71." in told
-    assert "limit -72 mm" in told
-    assert "settle -> run" in told
-    assert "mm deep, frames up to" in told
-    assert "stopped by category 2 from 2" in told
-    assert "at rest after 0.0" in told
+    output = capsys.readouterr().out
+    assert "first cause" in output
+    assert "workspace (trip): arm: x = -71." in output
+    assert "limit -72 mm" in output
+    assert "settle -> run" in output
+    assert "mm deep, frames up to" in output
+    assert "stopped by category 2 from 2" in output
+    assert "at rest after 0.0" in output
     assert (folder / "why.png").stat().st_size > 10_000
 
 

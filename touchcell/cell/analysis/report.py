@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from touchcell import compiled
 from touchcell.cell.analysis.run_data import STAGES, Run, Series, load_run
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.recording.messages import COMPONENTS
@@ -174,6 +175,7 @@ def _text(folder: Path, result: dict[str, Any], summary: dict[str, Any], picture
         ]
     if run.damage:
         lines.append(f"the recording is damaged in {len(run.damage)} places, first {run.damage[0]}")
+    lines += compiled.missing()
     lines.append(f"run folder: {folder}")
     lines += [f"  {picture.name}" for picture in pictures]
     return "\n".join(lines)

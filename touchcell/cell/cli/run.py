@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import json
+import logging
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from touchcell.cell.analysis.report import write_report
-from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
+from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
+from touchcell.cell.cli.output import say, warn
 from touchcell.cell.config.schema import CellPlan, plan_cell
-from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import RECORDING, Recorder
+from touchcell.cell.recording.reserved_file import ReservedFile
 from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, note_crashes, stop_record
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
@@ -29,6 +30,14 @@ from touchcell.cell.runtime.run_directory import RunFolderError, run_directory
 from touchcell.cell.runtime.run_result import Outcome, Progress, RunResult
 from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.drivers.core.clock import VirtualClock
+from touchcell.drivers.core.errors import DeviceError
+from touchcell.errors import TouchcellError
+from touchcell.logs import log_to_file
+
+logger = logging.getLogger(__name__)
+
+LOG = "run.log"
+"""Name of the log file in a run folder."""
 
 _EXIT = {
     Outcome.DONE: EXIT_OK,
@@ -46,12 +55,22 @@ class FinishedRun:
     Attributes:
         result: how it ended.
         folder: its run folder.
-        summary: the text of its report.
+        summary: the text of its report; empty where none could be written.
+        leaving: what was raised after the run, while its devices were given back or its recording was closed.
     """
 
     result: RunResult
     folder: Path
     summary: str
+    leaving: Exception | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of ``touchcell run``."""
+        if self.result.lost or isinstance(self.leaving, DeviceError):
+            return EXIT_DEVICE_LOST
+        code = _EXIT[self.result.outcome]
+        return EXIT_TASK_FAILED if code == EXIT_OK and self.leaving is not None else code
 
 
 def run_cell(
@@ -77,14 +96,17 @@ def run_cell(
         ConfigError, ModelError, RunFolderError, ConnectError: before anything moves.
     """
     run = run_plan(plan_cell(path, {} if data is None else {"data": data}, model=model), out=out, live=live)
-    print(run.summary)
+    if run.summary:
+        say(run.summary)
     if moving:
         from touchcell.cell.experiments.animation import animate
 
-        print(f"  {animate(run.folder).name}")
+        say(f"  {animate(run.folder).name}")
+    if run.result.outcome is not Outcome.DONE:
+        say(f"{run.result.outcome.value}: {run.result.reason or 'no reason was given'}")
     if run.result.outcome not in (Outcome.DONE, Outcome.STOPPED):
-        print(f"`touchcell why {run.folder}` explains")
-    return _EXIT[run.result.outcome]
+        say(f"`touchcell why {run.folder}` explains")
+    return run.exit_code
 
 
 def run_plan(plan: CellPlan, *, out: Path | None = None, live: bool = False) -> FinishedRun:
@@ -100,35 +122,67 @@ def run_plan(plan: CellPlan, *, out: Path | None = None, live: bool = False) -> 
     """
     cell = compose(plan)
     trim_heap()
-    with run_directory(plan.cell.name, out) as folder:
+    with run_directory(plan.cell.name, out) as folder, _log_and_result(folder, plan) as result_file:
+        logger.info("%s: task %s of %s, in %s", plan.cell.name, plan.task.name, plan.file, folder)
         try:
-            (folder / "cell.yaml").write_text(plan.text())
-        except OSError as error:
-            raise RunFolderError(folder, f"cannot be written: {error.strerror}") from None
-        result = _run(cell, folder, live)
+            result, leaving = _run(cell, folder, live, result_file)
+        except Exception as error:
+            _write_result(result_file, _not_started_json(plan, error))
+            raise
+        ended = f"{result.outcome.value} after {result.duration_s:.2f} s"
+        logger.info("%s: %s%s", plan.cell.name, ended, f" ({result.reason})" if result.reason else "")
+    return FinishedRun(result, folder, _report(folder), leaving)
+
+
+@contextlib.contextmanager
+def _log_and_result(folder: Path, plan: CellPlan) -> Iterator[ReservedFile]:
+    """Put the cell file and a log into the run folder, and take the room for ``result.json``."""
+    try:
+        (folder / "cell.yaml").write_text(plan.text())
+        result_file = ReservedFile(folder / "result.json")
+    except OSError as error:
+        raise RunFolderError(folder, f"cannot be written: {error.strerror}") from None
+    with log_to_file(folder / LOG):
         try:
-            (folder / "result.json").write_text(json.dumps(_result_json(plan, result), indent=1) + "\n")
-        except OSError as error:
-            print(f"touchcell: no result.json: {error.strerror}", file=sys.stderr)
-    return FinishedRun(result, folder, _report(folder))
+            yield result_file
+        finally:
+            result_file.discard()
 
 
 def _report(folder: Path) -> str:
-    """Write the report; a disk without room for it keeps the recording, which the report is made from."""
+    """Write the report; without room for it, or with a recording that is damaged, there is none."""
     try:
         return write_report(folder)
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+    except (OSError, TouchcellError) as error:
+        warn(f"no report: {error}; `touchcell report {folder}` makes it later")
+        return ""
+
+
+def _run(cell: Cell, folder: Path, live: bool, result_file: ReservedFile) -> tuple[RunResult, Exception | None]:
+    """Run to the end; returns how it ended, and what was raised when the devices were given back."""
+    result = None
+    try:
+        with _running(cell, folder, live, result_file) as run:
+            result = run()
+    except Exception as error:
+        if result is None:
             raise
-        return f"no report: {error.strerror}; `touchcell report {folder}` makes it later"
+        logger.exception("after the run")
+        warn(f"after the run: {error}")
+        _write_result(result_file, {**_result_json(cell.plan, result), "after_the_run": str(error)})
+        return result, error
+    return result, None
 
 
-def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
+@contextlib.contextmanager
+def _running(cell: Cell, folder: Path, live: bool, result_file: ReservedFile) -> Iterator[Callable[[], RunResult]]:
+    """Within reach of the operator, with everything open and all devices active; yields what runs the task."""
     stop, channel = StopRequest(), OperatorChannel(folder)
+    explained = False
     with (
         note_crashes(folder),
         BlackBox(folder, _about(cell, folder)) as box,
-        _recording(folder) as recorder,
+        Recorder(folder / RECORDING) as recorder,
         cell,
         stop_on_signals(stop),
         stop_on_keys(stop, channel=channel) as look_at_keys,
@@ -136,7 +190,7 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
     ):
         cell.watchdog.note_to(folder)
         if live:
-            print("\n".join(cell.watchdog.describe()))
+            say("\n".join(cell.watchdog.describe()))
 
         def after_cycle(progress: Progress) -> None:
             look_at_keys()
@@ -150,40 +204,31 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
             keep_earlier(folder)
             recorder.sync()
             _dump(box, folder, cell, so_far)
-            print(f"tripped: {so_far.reason}\n`touchcell why {folder}` explains; `touchcell reset {folder}` or r, when")
-            print("it is safe, then `touchcell resume` or g; `touchcell stop` or q ends the run")
+            say(f"tripped: {so_far.reason}\n`touchcell why {folder}` explains; `touchcell reset {folder}` or r, when")
+            say("it is safe, then `touchcell resume` or g; `touchcell stop` or q ends the run")
 
         loop = RunLoop(cell, recorder, box=box, stop=stop, on_cycle=after_cycle, channel=channel, on_trip=tripped)
-        result = loop.run()
-        # Before the devices are given back, which an arm that obeys nothing may not survive.
-        dumped = result.outcome is Outcome.DONE or loop.has_waited or _dump(box, folder, cell, result)
-        if result.outcome is Outcome.TRIPPED:
-            with contextlib.suppress(RecordingError):
+
+        def run() -> RunResult:
+            result = loop.run()
+            # Before the devices are given back, which an arm that obeys nothing may not survive.
+            _write_result(result_file, _result_json(cell.plan, result))
+            nonlocal explained
+            explained = result.outcome is Outcome.DONE or loop.has_waited or _dump(box, folder, cell, result)
+            if result.outcome is Outcome.TRIPPED:
                 recorder.sync()
-    if dumped:
+            return result
+
+        yield run
+    if explained:
         box.discard()
-    return result
-
-
-@contextlib.contextmanager
-def _recording(folder: Path) -> Iterator[Recorder]:
-    """The run's recording; one that cannot be finished changes nothing about how the run ended."""
-    recorder = Recorder(folder / RECORDING)
-    try:
-        yield recorder
-    finally:
-        try:
-            recorder.close()
-        except RecordingError as error:
-            print(f"touchcell: {error}", file=sys.stderr)
 
 
 def _about(cell: Cell, folder: Path) -> dict[str, Any]:
-    content = (folder / "cell.yaml").read_bytes()
     return {
         "cell": cell.plan.cell.name,
         "cell_file": "cell.yaml",
-        "cell_sha256": hashlib.sha256(content).hexdigest(),
+        "cell_sha256": hashlib.sha256((folder / "cell.yaml").read_bytes()).hexdigest(),
         "start_ns": cell.clock.now_ns(),
     }
 
@@ -192,10 +237,19 @@ def _dump(box: BlackBox, folder: Path, cell: Cell, result: RunResult) -> bool:
     """Write the black box; returns whether that succeeded. Its ring has everything where it did not."""
     try:
         box.dump(folder, result, cell.start_ns)
-    except RecordingError as error:
-        print(f"touchcell: {error}", file=sys.stderr)
+    except Exception as error:
+        logger.exception("no black box but its ring")
+        # What happened is reported all the same.
+        warn(f"the black box stays in its ring: {error}")
         return False
     return True
+
+
+def _write_result(result_file: ReservedFile, result: Mapping[str, Any]) -> None:
+    try:
+        result_file.write(json.dumps(result, indent=1) + "\n")
+    except OSError as error:
+        warn(f"no result.json: {error}")
 
 
 @contextlib.contextmanager
@@ -207,7 +261,9 @@ def _live_line(plan: CellPlan, live: bool) -> Iterator[Any]:
     from rich.text import Text
 
     started = time.monotonic()
-    with Live(Text("starting"), refresh_per_second=8, transient=True) as display:
+    display = Live(Text("starting"), refresh_per_second=8, transient=True)
+    try:
+        display.start()
 
         def show(progress: Progress) -> None:
             wall_s = time.monotonic() - started
@@ -223,6 +279,10 @@ def _live_line(plan: CellPlan, live: bool) -> Iterator[Any]:
             display.update(Text("  ".join(parts)))
 
         yield show
+    finally:
+        # A terminal that is gone needs no last line.
+        with contextlib.suppress(OSError, ValueError):
+            display.stop()
 
 
 def _result_json(plan: CellPlan, result: RunResult) -> dict[str, Any]:
@@ -242,6 +302,11 @@ def _result_json(plan: CellPlan, result: RunResult) -> dict[str, Any]:
         "skipped": list(plan.skipped),
         "stages_us": {stage: _quantiles_us(rows) for stage, rows in result.times.rows.items()},
     }
+
+
+def _not_started_json(plan: CellPlan, error: Exception) -> dict[str, Any]:
+    """The result of a run whose task never started."""
+    return {"cell": plan.cell.name, "task": plan.task.name, "outcome": Outcome.ERROR.value, "reason": str(error)}
 
 
 def _quantiles_us(rows: Iterable[int]) -> dict[str, float]:

@@ -72,6 +72,12 @@ class CapsuleSection(_Section):
 
     ``from_base_mm`` in place of ``from_mm`` is a place in the base's frame: for the forearm of an arm that tells only
     where its tool is.
+
+    Attributes:
+        from_mm: start of the segment in the tool's frame.
+        from_base_mm: start of the segment in the base's frame, in place of ``from_mm``.
+        to_mm: end of the segment in the tool's frame.
+        radius_mm: radius of the capsule.
     """
 
     from_mm: Three | None = None
@@ -87,7 +93,12 @@ class CapsuleSection(_Section):
 
 
 class BoxSection(_Section):
-    """Something that stands still: the pose of its centre in the world, and the lengths of its sides."""
+    """Something that stands still: the pose of its centre in the world, and the lengths of its sides.
+
+    Attributes:
+        pose_mm_deg: pose of its centre in the world frame.
+        size_mm: lengths of its sides.
+    """
 
     pose_mm_deg: Six
     size_mm: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
@@ -99,6 +110,14 @@ class ArmSection(_OpenSection):
 
     ``stop_category`` is by IEC 60204-1: 2 stops and holds with power, 1 stops and then removes it. ``base_pose_mm_deg``
     is in the world; ``body`` adds capsules to those of the arm's chain, for ``clearance``.
+
+    Attributes:
+        driver: name of the driver, as ``touchcell list`` shows it.
+        deactivate: what the arm does when it is deactivated at the end of a run, once it stands.
+        stop_category: how it stops when something is wrong, by IEC 60204-1: 2 stops and holds with power, 1 stops and
+            then removes it.
+        base_pose_mm_deg: pose of its base in the world frame.
+        body: capsules in addition to those of the arm's chain, for ``clearance``.
     """
 
     driver: str
@@ -114,7 +133,14 @@ class ArmSection(_OpenSection):
 
 
 class SensorSection(_OpenSection):
-    """A tactile sensor: its camera's driver, where it sits, and how frames become contacts."""
+    """A tactile sensor: its camera's driver, where it sits, and how frames become contacts.
+
+    Attributes:
+        driver: name of the camera's driver, as ``touchcell list`` shows it.
+        mounted_on: name of the arm that carries it; none where nothing moves it.
+        tcp_to_sensor_mm_deg: pose of the sensor in the tool frame of that arm.
+        estimator: how frames become contacts.
+    """
 
     driver: str
     mounted_on: str | None = None
@@ -130,6 +156,11 @@ class SensorSection(_OpenSection):
 class DeviceSection(_OpenSection):
     """A device that is neither an arm nor a tactile sensor, as a force-torque sensor or a gripper: its driver, the arm
     that carries it, what happens when it is deactivated, and the driver's own keys.
+
+    Attributes:
+        driver: name of the driver, as ``touchcell list`` shows it.
+        mounted_on: name of the arm that carries it; none where nothing moves it.
+        deactivate: what it does when it is deactivated.
     """
 
     driver: str
@@ -141,6 +172,12 @@ class TaskSection(_OpenSection):
     """The task, which arms, sensors and devices play its roles, and the task's own keys.
 
     ``steps:`` alone names the task too.
+
+    Attributes:
+        name: name of the task, as ``touchcell list`` shows it.
+        arms: name of the arm that plays each role; a role that is left out goes to the arm of its name.
+        sensors: name of the sensor that plays each role, likewise.
+        devices: name of the device that plays each role, likewise.
     """
 
     name: str
@@ -155,7 +192,11 @@ class TaskSection(_OpenSection):
 
 
 class RecordingSection(_Section):
-    """What is kept of a run besides numbers."""
+    """What is kept of a run besides numbers.
+
+    Attributes:
+        frames: whether camera images are recorded, and how they are compressed.
+    """
 
     frames: Literal["none", "jpeg", "png"] = "none"
 
@@ -165,6 +206,12 @@ class PairSection(_Section):
 
     All arms of a cell stop together. With ``on_stop: hold`` the follower then keeps its power, and so what it holds,
     whatever its ``stop_category`` says, unless it is itself what is wrong; with ``same`` it stops as that says.
+
+    Attributes:
+        leader: name of the arm that pushes.
+        follower: name of the arm that gives way and holds.
+        on_stop: what the follower does when all arms stop: ``hold`` keeps its power, ``same`` obeys its
+            ``stop_category``.
     """
 
     leader: str
@@ -173,7 +220,12 @@ class PairSection(_Section):
 
 
 class CollectSection(_Section):
-    """Where labelled frames go, and in which proportion to which split."""
+    """Where labelled frames go, and in which proportion to which split.
+
+    Attributes:
+        data: folder of the data set, made or continued.
+        shares: proportion of the frames that go to each split.
+    """
 
     data: Path
     shares: dict[Literal["train", "val", "test"], Annotated[int, Field(ge=1)]] = Field(
@@ -187,6 +239,28 @@ class CellFile(_Section):
     ``on_trip: end`` ends a run that has tripped; ``wait_for_reset`` keeps it up, with the arms stopped and watched,
     until a person has reset it and lets the task start again. ``emulated_scene`` is what `touchcell emulate cell` puts
     around the cell's arms and cameras; nothing else looks at it.
+
+    Attributes:
+        schema_: version of the format; 1.
+        name: name of the cell, which names its run folders.
+        time: ``simulated`` runs as fast as it can on a virtual clock, ``real`` in real time.
+        rate_hz: control cycles per second.
+        processes: ``separate`` runs devices in processes of their own with a watchdog, in real time only.
+        seed: of everything random.
+        max_duration_s: longest run; it is stopped then.
+        scene: what is simulated around the arms, for simulated devices.
+        emulated_scene: what ``touchcell emulate cell`` puts around the cell's arms and cameras; nothing else reads it.
+        obstacles: what stands still around the arms, by a name of one's own, for ``clearance``.
+        arms: the arms, by a name of one's own.
+        sensors: the tactile sensors, by a name of one's own.
+        devices: other devices, by a name of one's own.
+        pairs: arms that hold something between them.
+        interlocks: the rules that stop or slow the arms, by a name of one's own.
+        on_trip: what happens after a trip: ``end`` ends the run; ``wait_for_reset`` keeps the arms stopped and watched
+            until a person has reset it.
+        task: what the cell does.
+        recording: what is recorded of a run besides numbers.
+        collect: where a task that labels frames puts them.
     """
 
     schema_: Literal[1] = Field(alias="schema")
@@ -348,6 +422,7 @@ class _Planner:
             self._require_protocols(task, "devices", task.devices, auxiliary_roles, others)
             self._require_interlocks(cell, task)
             self._require_processes(cell, task, arm_roles)
+            self._require_data_is_used(cell, {**arms, **sensors})
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
         self._require_pairs(cell)
         self._require_use_of_data(cell, devices)
@@ -504,6 +579,20 @@ class _Planner:
                 f"no interlock of kind {kind!r} that stops, which a task that moves an arm must have",
                 hint=f"add one: {INTERLOCKS.load(kind).summary}",
             )
+
+    def _require_data_is_used(self, cell: CellFile, devices: Mapping[str, DevicePlan]) -> None:
+        """A data set that is given is there, and something reads it or writes it."""
+        data = self._overrides.get("data")
+        if data is None or cell.collect is not None:
+            return
+        readers = [name for name, device in devices.items() if "data" in type(device.config).model_fields]
+        if not readers:
+            reason, hint = "no driver of this cell replays a data set", "leave out --data"
+        elif not Path(data).is_dir():
+            reason, hint = f"{data}: there is no such folder", f"{', '.join(readers)} would replay it"
+        else:
+            return
+        self._problems.append(ConfigError(reason, key="--data", value=data, hint=hint))
 
     def _require_processes(self, cell: CellFile, task: AnyTask, arm_roles: Mapping[str, str]) -> None:
         """What devices in other processes cannot do is not asked of them."""

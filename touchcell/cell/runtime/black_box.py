@@ -81,6 +81,16 @@ class BlackBox:
         messages = self.messages()
         self._ring.add(_END_TOPIC, messages[-1].t_ns if messages else 0, encode(record))
         self._ring.sync()
+        try:
+            self._write(folder, messages, record)
+        except RecordingError:
+            # Half a black box would be read in place of the ring.
+            for name in (MESSAGES, ABOUT):
+                with contextlib.suppress(OSError):
+                    (folder / name).unlink()
+            raise
+
+    def _write(self, folder: Path, messages: list[Message], record: Mapping[str, Any]) -> None:
         with Recorder(folder / MESSAGES) as recorder:
             for message in messages:
                 recorder.write(message.topic, message.t_ns, message.data)

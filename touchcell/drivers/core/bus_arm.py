@@ -5,6 +5,7 @@ A control loop in a thread of the driver sends setpoints, collects replies, and 
 
 from __future__ import annotations
 
+import logging
 import threading
 from abc import abstractmethod
 from collections import deque
@@ -36,6 +37,9 @@ from touchcell.drivers.core.spec import DriverConfig
 from touchcell.drivers.kinematics.chain import ChainDescription, ChainFile, DifferentialIk, SerialChain, Tool
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
+from touchcell.logs import OncePerCause
+
+_logger = logging.getLogger(__name__)
 
 Positive = Annotated[float, Field(gt=0.0)]
 
@@ -50,6 +54,19 @@ class BusArmConfig(DriverConfig):
 
     A joint that deviates by ``tracking_error_deg`` from its setpoint, a reply older than ``max_silence_s``, or more
     than ``max_missed_fraction`` of the cycles without all replies is a fault.
+
+    Attributes:
+        chain: name of a chain description that ships, or path of a YAML file.
+        tool: tool on the flange.
+        rate_hz: cycles of the bus per second.
+        max_silence_s: oldest reply of a motor; an older one is a fault.
+        max_missed_fraction: share of cycles without all replies; more is a fault.
+        tracking_error_deg: largest deviation of a joint from its setpoint; more is a fault.
+        limits: limits of the tool centre point.
+        joint_limits: how joints are kept within their ranges.
+        park_deg: joint angles at which the arm may be switched off; none where it has no such pose.
+        park_tolerance_deg: how near to that pose counts as parked.
+        on_disconnect: what an energised arm does when it is disconnected.
     """
 
     chain: ChainFile
@@ -131,6 +148,7 @@ class BusArm(JointArm):
         self._seq = 0
         self._implausible = 0
         self._overruns = 0
+        self._delays = OncePerCause(_logger)
         self._latest_s = 0.0
         self._missed: deque[bool] = deque(maxlen=_MISS_WINDOW)
         self._follows_until_ns = 0
@@ -271,6 +289,7 @@ class BusArm(JointArm):
             self._latest_s = max(self._latest_s, late_ns * 1e-9)
             if late_ns > 0:
                 self._overruns += 1
+                self._delays.warning("overrun", "%s: bus cycle %.1f ms late", self.name, late_ns * 1e-6)
                 next_ns += late_ns
             self._clock.sleep_until_ns(next_ns)
 

@@ -119,7 +119,7 @@ class Camera(Device):
     def __init__(self, name: str, clock: Clock, config: CameraConfig) -> None:
         super().__init__(name, clock)
         self._config = config
-        self._monitor = FrameMonitor()
+        self._monitor = FrameMonitor(name)
         self._newest: RawFrame | None = None
         self._last_seq = -1
         self._decoded: Stamped[Frame] | None = None

@@ -7,6 +7,7 @@ polls.
 
 from __future__ import annotations
 
+import logging
 import threading
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,9 @@ from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import CorruptMessage, DeviceError, DeviceGone
 from touchcell.drivers.franka.errors import BY_NAME
 from touchcell.geometry.types import Array
+from touchcell.logs import OncePerCause
+
+_logger = logging.getLogger(__name__)
 
 PERIOD_S = 0.002
 _BAD_IN_A_ROW = 50
@@ -81,6 +85,7 @@ class StateReader:
         self._polled_ns = 0
         self._bad = 0
         self._bad_in_a_row = 0
+        self._losses = OncePerCause(_logger)
         self._states = 0
         self._device_ms = -1
         self._read_ns = clock.now_ns()
@@ -178,7 +183,9 @@ class StateReader:
         if not reading.is_finite():
             self._count_bad("state with non-finite numbers")
             return
-        self._bad_in_a_row = 0
+        if self._bad_in_a_row:
+            self._bad_in_a_row = 0
+            self._losses.forget()
         self._newest = reading
 
     def _convert(self, state: Any, t_ns: int, device_ms: int) -> Reading:
@@ -203,6 +210,7 @@ class StateReader:
     def _count_bad(self, what: str) -> None:
         self._bad += 1
         self._bad_in_a_row += 1
+        self._losses.warning("bad", "%s: dropped a bad state: %s", self._device, what)
         if self._bad_in_a_row >= _BAD_IN_A_ROW:
             raise CorruptMessage(self._device, f"{_BAD_IN_A_ROW} consecutive bad states, the last: {what}")
 

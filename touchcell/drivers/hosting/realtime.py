@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import logging
 import os
 import resource
 import signal
 from typing import Any, Final
+
+_logger = logging.getLogger(__name__)
 
 PRIORITY: Final = 40
 """Below the kernel's own interrupt threads (50), above all ordinary processes."""
@@ -19,7 +22,9 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 def request_realtime() -> str:
     """Request SCHED_FIFO and mlockall for this process; return a description of what was granted. Never fails."""
-    return f"{_scheduling()}, {_memory()}"
+    granted = f"{_scheduling()}, {_memory()}"
+    _logger.info("%s", granted)
+    return granted
 
 
 def _scheduling() -> str:

@@ -22,7 +22,13 @@ from touchcell.input_file import InputFile
 
 
 class ReplayArmConfig(DriverConfig):
-    """Data set and rate; equal to those of the replay camera."""
+    """Data set and rate; equal to those of the replay camera.
+
+    Attributes:
+        data: root of a data set in the public layout.
+        split: train, val or test.
+        rate_hz: images per second.
+    """
 
     data: Annotated[Path, InputFile("a data set", folder=True)]
     split: str

@@ -34,7 +34,8 @@ def onnx_runtime(model: Model) -> Runner:
     options.add_session_config_entry("session.disable_prepacking", "1")
     session = onnxruntime.InferenceSession(onnx_model(model), options, providers=["CPUExecutionProvider"])
     # The session keeps the serialised model for a fallback provider: 2 to 6 MB, and there is no other provider.
-    session._model_bytes = None
+    if hasattr(session, "_model_bytes"):
+        session._model_bytes = None
 
     def run(inputs: NDArray[np.float32]) -> NDArray[np.float32]:
         outputs: NDArray[np.float32] = session.run([OUTPUTS], {IMAGES: inputs})[0]
