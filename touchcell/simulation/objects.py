@@ -81,7 +81,11 @@ class FreeObject:
 
 
 class ObjectShapeConfig(Section):
-    """Base of the ``shape:`` section of a free object."""
+    """Base of the ``shape:`` section of a free object.
+
+    Attributes:
+        kind: which shape.
+    """
 
     kind: str
 
@@ -113,7 +117,11 @@ ObjectShapeSection: TypeAlias = Annotated[ObjectShapeConfig, PluginSection(OBJEC
 
 
 class BoxShape(ObjectShapeConfig):
-    """A box, its sides along the object's axes."""
+    """A box, its sides along the object's axes.
+
+    Attributes:
+        size_mm: lengths of its sides.
+    """
 
     kind: Literal["box"]
     size_mm: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
@@ -125,7 +133,11 @@ class BoxShape(ObjectShapeConfig):
 
 
 class HexagonShape(ObjectShapeConfig):
-    """A hexagonal prism, two of its faces across the object's x axis."""
+    """A hexagonal prism, two of its faces across the object's x axis.
+
+    Attributes:
+        height_mm: height.
+    """
 
     kind: Literal["hexagon"]
     width_mm: PositiveFloat = Field(description="across flats")
@@ -139,7 +151,12 @@ class HexagonShape(ObjectShapeConfig):
 
 
 class CylinderShape(ObjectShapeConfig):
-    """An upright cylinder."""
+    """An upright cylinder.
+
+    Attributes:
+        diameter_mm: diameter.
+        height_mm: height.
+    """
 
     kind: Literal["cylinder"]
     diameter_mm: PositiveFloat
@@ -151,7 +168,11 @@ class CylinderShape(ObjectShapeConfig):
 
 
 class BottleShape(ObjectShapeConfig):
-    """Stacked cylinders: [height, diameter] of each, from the bottom up."""
+    """Stacked cylinders: [height, diameter] of each, from the bottom up.
+
+    Attributes:
+        sections_mm: height and diameter of each cylinder, from the bottom up.
+    """
 
     kind: Literal["bottle"]
     sections_mm: tuple[tuple[PositiveFloat, PositiveFloat], ...] = Field(min_length=1)
@@ -162,7 +183,11 @@ class BottleShape(ObjectShapeConfig):
 
 
 class BallShape(ObjectShapeConfig):
-    """A ball; its frame is at its centre."""
+    """A ball; its frame is at its centre.
+
+    Attributes:
+        diameter_mm: diameter.
+    """
 
     kind: Literal["ball"]
     diameter_mm: PositiveFloat
@@ -173,7 +198,13 @@ class BallShape(ObjectShapeConfig):
 
 
 class ObjectConfig(Section):
-    """One free object of the ``scene:`` section. ``pose_mm_deg`` is in the world frame, its z above the table's top."""
+    """One free object of the ``scene:`` section. ``pose_mm_deg`` is in the world frame, its z above the table's top.
+
+    Attributes:
+        shape: its shape.
+        mass_g: its mass.
+        pose_mm_deg: initial pose in the world frame, z above the table's top.
+    """
 
     shape: ObjectShapeSection
     mass_g: PositiveFloat
@@ -187,7 +218,12 @@ class ObjectConfig(Section):
 
 
 class TableConfig(Section):
-    """The table under the objects: a level plane."""
+    """The table under the objects: a level plane.
+
+    Attributes:
+        height_mm: height of its top in the world.
+        friction: coefficient of sliding friction, or the name of one of the paper's tables.
+    """
 
     height_mm: float = 0.0
     friction: Literal["mdf", "foam"] | Annotated[float, Field(gt=0.0, le=2.0)] = "mdf"

@@ -22,7 +22,13 @@ _SI = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
 
 
 class GlideConfig(Section):
-    """One smooth move: translations along and at most one rotation about the start frame's axes."""
+    """One smooth move: translations along and at most one rotation about the start frame's axes.
+
+    Attributes:
+        displacement_mm_deg: translation along and rotation about the start frame's axes; about one axis at most.
+        start_s: when it begins.
+        duration_s: how long it takes.
+    """
 
     kind: Literal["glide"]
     displacement_mm_deg: PoseMmDeg
@@ -41,7 +47,14 @@ class GlideConfig(Section):
 
 
 class PeriodicConfig(Section):
-    """Sines in all pose components of the start frame, with a gentle start; see ``motions.Periodic``."""
+    """Sines in all pose components of the start frame, with a gentle start; see ``motions.Periodic``.
+
+    Attributes:
+        amplitude_mm_deg: amplitude of each component.
+        shift_deg: phase of each component.
+        period_s: period of all components.
+        ramp_s: time in which the amplitude grows at the start.
+    """
 
     kind: Literal["periodic"]
     amplitude_mm_deg: PoseMmDeg
@@ -64,6 +77,11 @@ class SurfaceConfig(Section):
     """Base of the section of a surface.
 
     ``pose_mm_deg`` is the pose of the shape's frame in the world, where its ``motion`` starts.
+
+    Attributes:
+        kind: which surface.
+        pose_mm_deg: pose of the shape's frame in the world, where its motion starts.
+        motion: how it moves; none for a surface that stands still.
     """
 
     kind: str

@@ -208,10 +208,12 @@ class RemoteArm(RemoteDevice):
             DeviceFault: the host has died or is silent; the arm is FAULTED.
         """
         link = self._check_host()
-        # The gate would say the same, but the block has no room for anything else.
+        # Same check as in the gate, because the block has no room for anything else.
         command = checked_twist_command(self.name, command)
         if abs(command.t_ns) >= 2**62:
-            raise CommandRejected(self.name, Rejection.EXPIRED, "its time stamp is no time", value=command.t_ns)
+            raise CommandRejected(
+                self.name, Rejection.EXPIRED, "its timestamp is not an integer in nanoseconds", value=command.t_ns
+            )
         value = self._commands.value
         value["number"] = self._next()
         value["lease"] = lease.epoch if self._lease is not None and lease is self._lease else 0
@@ -269,10 +271,11 @@ class RemoteArm(RemoteDevice):
             raise LifecycleError(self.name, "read its pose", self._state.value, ["passive"])
         # A stop that removes power ends in READY, and a driver may fault on its own.
         found = LIFECYCLES[int(record["lifecycle"])]
-        if found is Lifecycle.FAULTED and self._state is not Lifecycle.FAULTED and note:
-            self._fault_error = _device_error(note, self.name)
-        if found in (Lifecycle.READY, Lifecycle.FAULTED) and self._state is Lifecycle.ACTIVE:
-            self._state = found
+        with self._state_lock:
+            if found is Lifecycle.FAULTED and self._state is not Lifecycle.FAULTED and note:
+                self._fault_error = _device_error(note, self.name)
+            if found in (Lifecycle.READY, Lifecycle.FAULTED):
+                self._change_state(Lifecycle.ACTIVE, found)
         return record, note
 
     def _open(self) -> None:

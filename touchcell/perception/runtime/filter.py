@@ -92,7 +92,12 @@ def require_pose(T_base_sensor: Array) -> Array:
 
 
 class StillSurfaceConfig(FilterConfig):
-    """The SE(3) Bayesian filter: growth of the uncertainty while no frame comes (slip, curvature)."""
+    """The SE(3) Bayesian filter: growth of the uncertainty while no frame comes (slip, curvature).
+
+    Attributes:
+        drift_mm_per_sqrt_s: growth of the position's standard deviation between frames.
+        drift_deg_per_sqrt_s: growth of the orientation's standard deviation between frames.
+    """
 
     model: Literal["still_surface"] = "still_surface"
     drift_mm_per_sqrt_s: PositiveFloat

@@ -38,7 +38,11 @@ class ContactFilter(Protocol):
 
 
 class FilterConfig(Section):
-    """Base of a ``filter:`` section."""
+    """Base of a ``filter:`` section.
+
+    Attributes:
+        model: which filter.
+    """
 
     model: str
 

@@ -35,7 +35,7 @@ class ContactSource(Protocol):
 
     @property
     def ended(self) -> bool:
-        """Whether no further estimate will come (a recording has been played)."""
+        """True if no further estimate will come (the end of a recording)."""
         return False
 
     @property
