@@ -1,66 +1,22 @@
-"""Free rigid objects on a table: shape (group ``touchcell.objects``), mass and sliding friction."""
+"""Free rigid objects on a table: shape, mass and sliding friction."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal, TypeAlias
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, PositiveFloat
 
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.plugin_section import PluginSection, Section
-from touchcell.registry import Registry
-from touchcell.simulation.surface_spec import PoseMmDeg
+from touchcell.plugin_section import Section
+from touchcell.simulation.shape_spec import ObjectShapeConfig, ObjectShapeSection, ObjectSpec, PoseMmDeg
+from touchcell.simulation.shapes import Ball, Prism, Solid, Turned
 
 TABLES: dict[str, float] = {"mdf": 0.3, "foam": 0.6}
 """Coefficients of sliding friction of the paper's two tables, chosen within literature values."""
-
-
-@dataclass(frozen=True, slots=True)
-class Prism:
-    """A convex outline extruded along z; the origin is in the middle of its bottom.
-
-    Attributes:
-        outline_m: (n, 2) corners, anticlockwise.
-        height_m: along z.
-    """
-
-    outline_m: Array
-    height_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class Turned:
-    """A solid of revolution about z, made of stacked cylinders; the origin is in the middle of its bottom.
-
-    Attributes:
-        sections_m: (height, radius) of each, from the bottom up. One section is a plain cylinder.
-    """
-
-    sections_m: tuple[tuple[float, float], ...]
-
-    @property
-    def height_m(self) -> float:
-        """Height along z."""
-        return sum(height for height, _ in self.sections_m)
-
-
-@dataclass(frozen=True, slots=True)
-class Ball:
-    """A ball about its origin."""
-
-    radius_m: float
-
-    @property
-    def height_m(self) -> float:
-        """Diameter of the ball."""
-        return 2.0 * self.radius_m
-
-
-Solid = Prism | Turned | Ball
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,42 +34,6 @@ class FreeObject:
     mass_kg: float
     friction: float
     T_world_object: Array
-
-
-class ObjectShapeConfig(Section):
-    """Base of the ``shape:`` section of a free object.
-
-    Attributes:
-        kind: which shape.
-    """
-
-    kind: str
-
-    def build(self) -> Solid:
-        """Build the solid."""
-        raise NotImplementedError(f"{type(self).__name__} builds no solid")
-
-
-@dataclass(frozen=True, slots=True)
-class ObjectSpec:
-    """Entry point of one shape of free objects.
-
-    Attributes:
-        name: value of ``kind`` in the object's ``shape:``.
-        summary: one line for ``touchcell list``.
-        config: pydantic model of that section, which builds the solid.
-    """
-
-    name: str
-    summary: str
-    config: type[ObjectShapeConfig]
-
-
-OBJECTS: Final = Registry("touchcell.objects", "object", ObjectSpec)
-"""All installed shapes of free objects."""
-
-ObjectShapeSection: TypeAlias = Annotated[ObjectShapeConfig, PluginSection(OBJECTS)]
-"""The ``shape:`` of a free object."""
 
 
 class BoxShape(ObjectShapeConfig):

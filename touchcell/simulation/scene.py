@@ -21,7 +21,7 @@ from touchcell.plugin_section import Section
 from touchcell.simulation.contact import ContactLaw
 from touchcell.simulation.objects import ObjectConfig, TableConfig
 from touchcell.simulation.quasi_static import QuasiStaticWorld
-from touchcell.simulation.surface_spec import SurfaceConfig, SurfaceSection, SurfaceSpec
+from touchcell.simulation.shape_spec import SurfaceConfig, SurfaceSection, SurfaceSpec
 from touchcell.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
 from touchcell.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeline
 from touchcell.simulation.world import DeferredContact, KinematicWorld, World, computed

@@ -22,8 +22,7 @@ from touchcell.perception.runtime.estimator_spec import ESTIMATORS
 from touchcell.perception.runtime.filter_spec import FILTERS
 from touchcell.plugin_section import PLUGIN
 from touchcell.registry import Registry
-from touchcell.simulation.objects import OBJECTS
-from touchcell.simulation.surface_spec import SURFACES
+from touchcell.simulation.shape_spec import OBJECTS, SURFACES
 from touchcell.tasks.interface import TASKS
 from touchcell.units import unit_of
 

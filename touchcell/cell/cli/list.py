@@ -16,8 +16,7 @@ from touchcell.paths import CONFIGS
 from touchcell.perception.runtime.estimator_spec import ESTIMATORS
 from touchcell.perception.runtime.filter_spec import FILTERS
 from touchcell.registry import Registry
-from touchcell.simulation.objects import OBJECTS
-from touchcell.simulation.surface_spec import SURFACES
+from touchcell.simulation.shape_spec import OBJECTS, SURFACES
 from touchcell.tasks.interface import TASKS
 from touchcell.testing.emulation.launcher import EMULATORS
 

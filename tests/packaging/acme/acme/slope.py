@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from touchcell.geometry.types import Array
-from touchcell.simulation.surface_spec import SurfaceConfig, SurfaceSpec
+from touchcell.simulation.shape_spec import SurfaceConfig, SurfaceSpec
 from touchcell.simulation.surfaces import SurfacePoint
 
 

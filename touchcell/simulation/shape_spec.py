@@ -1,4 +1,4 @@
-"""Entry points of the surfaces in a simulated scene (group ``touchcell.surfaces``)."""
+"""Entry points of the shapes in a simulated scene (groups ``touchcell.surfaces`` and ``touchcell.objects``)."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from touchcell.geometry.types import Array
 from touchcell.plugin_section import PluginSection, Section
 from touchcell.registry import Registry
 from touchcell.simulation.motions import Glide, Motion, Periodic, Still
+from touchcell.simulation.shapes import Solid
 from touchcell.simulation.surfaces import Shape, Surface
 
 PoseMmDeg = tuple[float, float, float, float, float, float]
@@ -98,6 +99,20 @@ class SurfaceConfig(Section):
         return Surface(self.shape(), self.motion.build(T_world_body) if self.motion else Still(T_world_body))
 
 
+class ObjectShapeConfig(Section):
+    """Base of the ``shape:`` section of a free object.
+
+    Attributes:
+        kind: which shape.
+    """
+
+    kind: str
+
+    def build(self) -> Solid:
+        """Build the solid."""
+        raise NotImplementedError(f"{type(self).__name__} builds no solid")
+
+
 @dataclass(frozen=True, slots=True)
 class SurfaceSpec:
     """Entry point of one kind of surface.
@@ -113,8 +128,29 @@ class SurfaceSpec:
     config: type[SurfaceConfig]
 
 
+@dataclass(frozen=True, slots=True)
+class ObjectSpec:
+    """Entry point of one shape of free objects.
+
+    Attributes:
+        name: value of ``kind`` in the object's ``shape:``.
+        summary: one line for ``touchcell list``.
+        config: pydantic model of that section, which builds the solid.
+    """
+
+    name: str
+    summary: str
+    config: type[ObjectShapeConfig]
+
+
 SURFACES: Final = Registry("touchcell.surfaces", "surface", SurfaceSpec)
 """All installed kinds of surface."""
 
+OBJECTS: Final = Registry("touchcell.objects", "object", ObjectSpec)
+"""All installed shapes of free objects."""
+
 SurfaceSection: TypeAlias = Annotated[SurfaceConfig, PluginSection(SURFACES)]
 """A surface of the scene."""
+
+ObjectShapeSection: TypeAlias = Annotated[ObjectShapeConfig, PluginSection(OBJECTS)]
+"""The ``shape:`` of a free object."""
