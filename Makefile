@@ -4,7 +4,7 @@ TORCH ?= torch==2.13.0
 BIN := .venv/bin
 SOURCES := pyproject.toml setup.py $(wildcard touchcell/*/*.[ch] touchcell/*/*/*.[ch])
 
-.PHONY: demo test check fast stress clean
+.PHONY: demo test check fast stress docs clean
 
 demo: .venv/core
 	$(BIN)/touchcell run configs/dual_push_sim.yaml --animate
@@ -22,6 +22,10 @@ STEPS ?= 10000000
 stress: .venv/dev
 	OMP_NUM_THREADS=1 STRESS_STEPS=$(STEPS) $(BIN)/python -m pytest -vv --durations=10 -m "stress or not stress" \
 		tests/perception/test_stress_*.py
+
+# The site, into build/site; a broken link is an error.
+docs: .venv/dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 check: .venv/dev
 	$(BIN)/ruff check .

@@ -1,1 +1,1 @@
-"""Run time against error, printed by ``touchcell bench NAME``."""
+"""Developer benchmarks, printed by ``touchcell bench NAME``."""

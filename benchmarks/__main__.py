@@ -1,4 +1,4 @@
-"""``python -m benchmarks NAME [ARGUMENT ...]``: benchmarks that are for developers, and stay in the checkout.
+"""``python -m benchmarks NAME [ARGUMENT ...]``: developer benchmarks that are not part of the wheel.
 
 ``touchcell bench NAME`` starts the same where touchcell is installed from a checkout.
 """
@@ -29,7 +29,7 @@ BENCHMARKS = {
 
 
 def main() -> int:
-    """Run one benchmark, with the arguments behind its name."""
+    """Run one benchmark, with the arguments after its name."""
     parser = argparse.ArgumentParser("python -m benchmarks", description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("bench"), help="folder for tables and figures")
     parser.add_argument("name", choices=BENCHMARKS)

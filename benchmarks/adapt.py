@@ -1,8 +1,8 @@
-"""``touchcell bench adapt``: how many labelled images of another sensor bring an estimator to it.
+"""``touchcell bench adapt``: accuracy over the number of labelled images of another sensor used for adaptation.
 
-No second real sensor is at hand. One table is of real images that were turned, zoomed and shifted, with labels about
-other axes; the other of a simulated sensor with another camera, mount, stiffness, skin and grip than the one that a
-model was trained on.
+A second real sensor is not available. One table is of real images that were rotated, zoomed and shifted, with labels
+about other axes; the other of a simulated sensor with another camera, mount, stiffness, skin and grip than the one that
+a model was trained on.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.perception.calibration.adaptation import (
     AdaptSettings,
-    FewShotDataset,
     about_z,
     adapt_to,
     align_to_sensor,
@@ -36,6 +35,7 @@ from touchcell.perception.markers.estimator import matcher_of
 from touchcell.perception.models.labels import contact_from_xi, xi_from_contact
 from touchcell.perception.models.marker_architecture import MarkerArchitecture, MarkerSize
 from touchcell.perception.models.model_file import Model, load_model
+from touchcell.perception.networks.marker_training import LabelledDiscs
 from touchcell.simulation.mount import MountModel
 from touchcell.simulation.samples import Variation, contacts
 from touchcell.simulation.tip import TipParameters
@@ -54,24 +54,24 @@ class Case:
 
     Attributes:
         title: of the table.
-        model: that is adapted.
+        model: model to be adapted.
         few: images to adapt with.
         held_out: images to measure on.
         size: of its markers.
-        best: errors of a model that was trained on all images of this sensor, and what that was.
+        best: errors of a model that was trained on all images of this sensor, and its description.
     """
 
     title: str
     model: Model
-    few: FewShotDataset
-    held_out: FewShotDataset
+    few: LabelledDiscs
+    held_out: LabelledDiscs
     size: MarkerSize
     best: tuple[str, Array] | None = None
 
-    def some(self, count: int) -> FewShotDataset:
-        """So many of the images to adapt with, evenly chosen."""
+    def some(self, count: int) -> LabelledDiscs:
+        """Return that many of the images to adapt with, evenly chosen."""
         chosen = evenly(len(self.few.frames), count)
-        return FewShotDataset([self.few.frames[i] for i in chosen], self.few.xi[chosen])
+        return LabelledDiscs([self.few.frames[i] for i in chosen], self.few.xi[chosen])
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
@@ -124,13 +124,13 @@ def _adapted(case: Case, count: int) -> Model:
 
 
 def _scratch(case: Case, adapted: Model, count: int) -> Model:
-    """Networks that begin anew; camera and matching are given to them."""
+    """Return networks trained from scratch; camera and matching are given to them."""
     few = case.some(count)
     brought = align_to_sensor(case.model, few)
     rng = np.random.default_rng(0)
     layers = []
     for i, (weight, bias) in enumerate(layers_of(adapted)):
-        # First weights are per pixel: displacements are of eight.
+        # First weights are per pixel: displacements have a magnitude of eight.
         scale = 1.0 / np.sqrt(weight.shape[1]) / (8.0 if i == 0 else 1.0)
         layers.append((rng.uniform(-scale, scale, weight.shape), np.zeros_like(bias)))
     target = adapted.header.labels.targets(about_z(brought.turn_rad, few.xi[brought.matched]))
@@ -141,8 +141,11 @@ def _scratch(case: Case, adapted: Model, count: int) -> Model:
     return Model(adapted.header, tensors)
 
 
-def _errors(model: Model, contacts: FewShotDataset) -> tuple[Array, float]:
-    """MAE (6,) of x, y, z, alpha, beta, gamma, mm and deg; and the share of images whose markers were matched."""
+def _errors(model: Model, contacts: LabelledDiscs) -> tuple[Array, float]:
+    """Return the MAE (6,) of x, y, z, alpha, beta, gamma, mm and deg.
+
+    And the fraction of images with matched markers.
+    """
     architecture = model.header.architecture
     assert isinstance(architecture, MarkerArchitecture)
     matcher, camera = matcher_of(model, architecture), model.header.camera
@@ -171,13 +174,15 @@ def _real(data: Path, path: Path, held_out: int) -> Case:
         images = [model.header.preprocessing.reduce(read_image(split.images[i])) for i in chosen]
         xi = xi_from_contact(split.contact_mm_deg[chosen])
         if name == "val":
-            unchanged = FewShotDataset([detect_markers(image, architecture.size) for image in images], xi)
+            unchanged = LabelledDiscs([detect_markers(image, architecture.size) for image in images], xi)
         other = [changed(image, _ZOOM, _TURN_DEG, _SHIFT_PX) for image in images]
-        sets[name] = FewShotDataset(
+        sets[name] = LabelledDiscs(
             [detect_markers(image, architecture.size) for image in other], about_z(np.radians(_AXES_DEG), xi)
         )
     assert unchanged is not None
-    title = f"real images, turned by {_TURN_DEG:g} deg, zoomed {_ZOOM:g}, shifted {_SHIFT_PX:g} px; labels' axes turned"
+    title = (
+        f"real images, rotated by {_TURN_DEG:g} deg, zoomed {_ZOOM:g}, shifted {_SHIFT_PX:g} px; labels' axes turned"
+    )
     best = ("trained on all, unchanged images", _errors(model, unchanged)[0])
     return Case(title, model, sets["train"], sets["val"], architecture.size, best)
 
@@ -198,7 +203,7 @@ def _simulated(path: Path, tip: str, held_out: int) -> Case:
 
 
 def second_sensor(tip: TipParameters, rig: MountModel) -> tuple[TipParameters, MountModel]:
-    """Another sensor of the kind."""
+    """Return another sensor of the kind."""
     u, v = tip.centre_px
     other = replace(
         tip,
@@ -222,8 +227,8 @@ def second_sensor(tip: TipParameters, rig: MountModel) -> tuple[TipParameters, M
     return other, mounted
 
 
-def _drawn(tip: TipParameters, rig: MountModel, n: int, seed: int, model: Model) -> FewShotDataset:
-    """Discs of simulated contacts, deepest last."""
+def _drawn(tip: TipParameters, rig: MountModel, n: int, seed: int, model: Model) -> LabelledDiscs:
+    """Return discs of simulated contacts, deepest last."""
     still = Variation(0.0, 0.0, 0.0, 0.15, 0.0, 0.003, field=0.01, slip=0.15)
     height, width = model.header.preprocessing.output_size
     frames, labels = [], []
@@ -234,4 +239,4 @@ def _drawn(tip: TipParameters, rig: MountModel, n: int, seed: int, model: Model)
         labels.append(contact.T_f_s)
     order = np.argsort([T[2, 3] for T in labels])
     xi = se3.log(se3.inverse(np.stack(labels)))[order]
-    return FewShotDataset([frames[i] for i in order], xi)
+    return LabelledDiscs([frames[i] for i in order], xi)

@@ -1,6 +1,6 @@
-"""``touchcell bench calibration``: what another camera costs, and what zero-frame calibration gives back.
+"""``touchcell bench calibration``: cost of another camera, and recovery by zero-frame calibration.
 
-Every n-th validation image is zoomed, turned and shifted; so are the shallowest ones, which stand for images out of
+Every n-th validation image is zoomed, rotated and shifted; so are the shallowest ones, which stand for images out of
 contact. Where the model holds no lattice and no image out of contact, the shallowest training images stand for those.
 """
 
@@ -79,12 +79,12 @@ def run(arguments: Sequence[str], out: Path) -> None:
 
 
 def shallowest(contact_mm_deg: Array) -> list[int]:
-    """Numbers of the images that are pressed least."""
+    """Return the indices of the images with the least depth."""
     return [int(i) for i in np.argsort(contact_mm_deg[:, 2])[:_SHALLOWEST]]
 
 
 def changed(image: ImageArray, zoom: float, turn_deg: float, shift_px: float) -> ImageArray:
-    """A black and white image as another camera would have taken it."""
+    """Return a black and white image as another camera would have taken it."""
     height, width = image.shape
     matrix = cv2.getRotationMatrix2D((width / 2.0, height / 2.0), turn_deg, zoom)
     matrix[:, 2] += shift_px / np.sqrt(2.0)

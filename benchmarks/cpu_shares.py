@@ -1,4 +1,4 @@
-"""Where the processor's time goes, by looking at the running stack every few milliseconds of it."""
+"""CPU time by part of the program, from samples of the running stack every few milliseconds."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
 
-# Kernels deliver at their own tick, often 4 ms.
+# Kernels deliver the timer at their own tick, often 4 ms.
 _PERIOD_S = 0.001
 
 
@@ -17,8 +17,8 @@ def cpu_shares(parts: Mapping[str, str], other: str) -> Iterator[Counter[str]]:
     """Count samples by part, in the main thread.
 
     Args:
-        parts: part by what the path of a source file contains; the innermost frame that matches decides.
-        other: the part of whatever matches nothing.
+        parts: part by a substring of a source file's path; the innermost frame that matches decides.
+        other: the part of frames that match nothing.
     """
     counts: Counter[str] = Counter()
 

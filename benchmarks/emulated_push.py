@@ -1,9 +1,8 @@
-"""``touchcell bench emulated-push``: a push through real drivers on emulators, against the same on simulated devices.
+"""``touchcell bench emulated-push``: a push through real drivers on emulators, compared with simulated devices.
 
-``configs/dual_push_emulated.yaml`` runs as `touchcell run` runs it, on two emulated arms and two emulated cameras
-around one scene. Then the same cell with simulated arms and sensors, once without any latency and once with what was
-measured: from exposure to command, and from command to motion. What is true is asked of the emulators, and of the
-simulator.
+``dual_push_emulated.yaml`` runs by `touchcell run` on two emulated arms and two emulated cameras around one scene. Then
+the same cell runs with simulated arms and sensors, once without any latency and once with the measured latency: from
+exposure to command, and from command to motion. The ground truth comes from the emulators and from the simulator.
 """
 
 from __future__ import annotations
@@ -53,10 +52,10 @@ _GRID_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Of one arm and its sensor, on average over a push.
+    """Latency of one arm and its sensor, averaged over a push.
 
     Attributes:
-        sensing_s: from the exposure of a frame to a command that used it, waiting for the next cycle included.
+        sensing_s: from the exposure of a frame to a command that used it, including the wait for the next cycle.
         obeying_s: from a command to the motion.
     """
 
@@ -64,7 +63,7 @@ class Latency:
     obeying_s: float
 
     def beyond(self, own: Latency) -> Latency:
-        """What is left of it when ``own`` is there anyway."""
+        """Return the difference to the latency ``own``."""
         return Latency(max(0.0, self.sensing_s - own.sensing_s), max(0.0, self.obeying_s - own.obeying_s))
 
 
@@ -73,10 +72,10 @@ class Push:
     """One push, from when both contacts have settled until the leader has arrived.
 
     Attributes:
-        outcome: how the run ended.
+        outcome: outcome of the run.
         t_s: (n,) since the push began.
         object_mm_deg: (n, 3) x, y and heading of the object.
-        error_mm: from the target to the true contact normal at the end, from above.
+        error_mm: from the target to the true contact normal at the end, in top view.
         latency: by arm.
     """
 
@@ -88,7 +87,7 @@ class Push:
 
     @property
     def duration_s(self) -> float:
-        """How long it took."""
+        """Duration of the push."""
         return float(self.t_s[-1])
 
 
@@ -100,7 +99,7 @@ class _Truth:
 
 
 def cell_file(number: int) -> dict[str, Any]:
-    """The shipped cell, with emulators at addresses of their own, so that it runs beside another."""
+    """Return the shipped cell, with its own emulator addresses, so that several can run in parallel."""
     data: dict[str, Any] = yaml.safe_load(find_cell(Path(CELL)).read_text())
     for last, arm in enumerate(data["arms"].values(), start=2):
         arm["host"] = f"127.98.{number}.{last}"
@@ -137,7 +136,7 @@ def emulated(data: Mapping[str, Any], folder: Path) -> Push:
 def simulated(
     data: Mapping[str, Any], folder: Path, *, like: Path, late: Mapping[str, Latency] | None = None, seed: int = 1
 ) -> Push:
-    """The same cell with simulated devices, its arms where those of the run ``like`` began.
+    """Run the same cell with simulated devices, its arms where those of the run ``like`` began.
 
     Args:
         data: the emulated cell.
@@ -182,7 +181,7 @@ def simulated(
 
 
 class _Witness:
-    """Asks the emulated cell what is true, again and again, in a thread of its own until it is closed."""
+    """Polls the emulated cell's ground truth in a thread until it is closed."""
 
     def __init__(self, emulator: EmulatorProcess) -> None:
         self._emulator = emulator
@@ -197,7 +196,7 @@ class _Witness:
         self._thread.join()
 
     def truth(self) -> _Truth:
-        """What was seen."""
+        """The recorded ground truth."""
         return _Truth(*(np.array([each[i] for each in self._seen]) for i in range(3)))
 
     def _look(self) -> None:
@@ -237,7 +236,7 @@ def _sensing_s(run: RunFolder, role: str) -> float:
 
 
 def _obeying_s(run: RunFolder, role: str) -> float:
-    """By how much the commands, added up, have to be shifted to fit best how the tool has moved."""
+    """Return the delay by which the integrated commands best fit the tool's motion."""
     series, told = run.recording.series(f"/arms/{role}/command"), run.recording.series(f"/arms/{role}/tcp")
     assert series is not None
     assert told is not None
@@ -258,27 +257,27 @@ def _obeying_s(run: RunFolder, role: str) -> float:
     return float(min(_DELAYS_S, key=misfit))
 
 
-def median_way_mm(pushes: Sequence[Push]) -> Array:
-    """(n, 2) where the object's middle was in the median, every _GRID_S, for as long as the shortest push took.
+def median_path_mm(pushes: Sequence[Push]) -> Array:
+    """Return (n, 2) the median position of the object's centre, every _GRID_S, for the duration of the shortest push.
 
-    The median, because a machine that is busy elsewhere for a tenth of a second makes one push unlike the others.
+    The median, because a machine that is busy for a tenth of a second makes one push an outlier.
     """
     n = min(len(push.t_s) for push in pushes)
     median: Array = np.median([push.object_mm_deg[:n, :2] for push in pushes], axis=0)
     return median
 
 
-def differences_mm(push: Push, way_mm: Array) -> tuple[Array, Array]:
-    """(n,) each: how far the object's middle was from where ``way_mm`` (n, 2) is then, and from the nearest of it."""
-    points = push.object_mm_deg[: len(way_mm), :2]
-    then = _then(points, way_mm)
-    aside: Array = np.linalg.norm(points[:, None] - way_mm[None], axis=2).min(axis=1)
+def differences_mm(push: Push, path_mm: Array) -> tuple[Array, Array]:
+    """Return (n,) each: distance of the object's centre from ``path_mm`` (n, 2) at that time, and from all of it."""
+    points = push.object_mm_deg[: len(path_mm), :2]
+    then = _then(points, path_mm)
+    aside: Array = np.linalg.norm(points[:, None] - path_mm[None], axis=2).min(axis=1)
     return then, aside
 
 
-def _then(points_mm: Array, way_mm: Array) -> Array:
-    n = min(len(points_mm), len(way_mm))
-    away: Array = np.linalg.norm(points_mm[:n] - way_mm[:n], axis=1)
+def _then(points_mm: Array, path_mm: Array) -> Array:
+    n = min(len(points_mm), len(path_mm))
+    away: Array = np.linalg.norm(points_mm[:n] - path_mm[:n], axis=1)
     return away
 
 
@@ -287,9 +286,11 @@ def _rms(values: Array) -> float:
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Print the table; writes ``emulated-push.json`` and ``emulated-push.png`` into ``out``."""
+    """Print the table; write ``emulated-push.json`` and ``emulated-push.png`` into ``out``."""
     parser = argparse.ArgumentParser(prog="touchcell bench emulated-push", description=__doc__.partition("\n")[0])
-    parser.add_argument("--runs", type=int, default=3, help="of each kind: emulated ones differ as time is real")
+    parser.add_argument(
+        "--runs", type=int, default=3, help="of each kind: emulated ones vary because they run in real time"
+    )
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="touchcell-push-") as name:
         folder = Path(name)
@@ -307,15 +308,15 @@ def run(arguments: Sequence[str], out: Path) -> None:
             else:
                 failed.append(push.outcome)
         if not done:
-            raise DeviceError("emulated cell", "no push came to its end:\n" + "\n".join(failed))
+            raise DeviceError("emulated cell", "no push was completed:\n" + "\n".join(failed))
         seeds = range(1, options.runs + 1)
         prompt = [simulated(data, folder / f"prompt_{seed}", like=like, seed=seed) for seed in seeds]
         added = {role: _median(done, role).beyond(_median(prompt, role)) for role in _SENSORS}
         late = [simulated(data, folder / f"late_{seed}", like=like, late=added, seed=seed) for seed in seeds]
     kinds = {"emulated": done, "simulated": prompt, "simulated, latency added": late}
     pushes = {f"{kind}, {i}": push for kind, runs in kinds.items() for i, push in enumerate(runs, start=1)}
-    way_mm = median_way_mm(done)
-    medians = {kind: median_way_mm(runs) for kind, runs in kinds.items()}
+    path_mm = median_path_mm(done)
+    medians = {kind: median_path_mm(runs) for kind, runs in kinds.items()}
     apart_mm = {
         f"'{left}' and '{right}'": _rms(_then(medians[left], medians[right]))
         for left, right in combinations(medians, 2)
@@ -326,26 +327,26 @@ def run(arguments: Sequence[str], out: Path) -> None:
     )
     lines = [f"medians apart, RMS: {pair} {distance_mm:.2f} mm" for pair, distance_mm in apart_mm.items()]
     lines += [f"did not come to its end: {reason}" for reason in failed]
-    print("\n".join([table(pushes, way_mm), f"added: {words}", *lines]))
-    _plot(pushes, way_mm, out / "emulated-push.png")
+    print("\n".join([table(pushes, path_mm), f"added: {words}", *lines]))
+    _plot(pushes, path_mm, out / "emulated-push.png")
     report = {
         **provenance(),
         "added": {role: asdict(each) for role, each in added.items()},
         "medians_apart_mm": apart_mm,
-        "pushes": {title: _figures(push, way_mm) for title, push in pushes.items()},
+        "pushes": {title: _figures(push, path_mm) for title, push in pushes.items()},
     }
     (out / "emulated-push.json").write_text(json.dumps(report, indent=1) + "\n")
 
 
-def table(pushes: Mapping[str, Push], way_mm: Array) -> str:
-    """Every push, its latencies (leader / follower), and how far its object was from ``way_mm`` (n, 2)."""
+def table(pushes: Mapping[str, Push], path_mm: Array) -> str:
+    """Format every push, its latencies (leader / follower), and the distance of its object from ``path_mm`` (n, 2)."""
     heads = (
         ("", "error", "push", "frame to", "command to", "from the emulated median", "aside from its way"),
         ("", "mm", "s", "command, ms", "motion, ms", "RMS mm    worst", "RMS mm    worst"),
     )
     lines = [_line(head) for head in heads]
     for title, push in pushes.items():
-        found = _figures(push, way_mm)
+        found = _figures(push, path_mm)
         latencies = [push.latency[role] for role in _SENSORS]
         cells = [title, f"{push.error_mm:.2f}", f"{push.duration_s:.2f}"]
         cells.append(" / ".join(f"{1e3 * each.sensing_s:.0f}" for each in latencies))
@@ -361,8 +362,8 @@ def _line(cells: Sequence[str]) -> str:
     return first.ljust(widths[0]) + "".join(f"{cell:>{width}}" for cell, width in zip(others, widths[1:], strict=True))
 
 
-def _figures(push: Push, way_mm: Array) -> dict[str, Any]:
-    then, aside = differences_mm(push, way_mm)
+def _figures(push: Push, path_mm: Array) -> dict[str, Any]:
+    then, aside = differences_mm(push, path_mm)
     return {
         "outcome": push.outcome,
         "error_mm": push.error_mm,
@@ -383,7 +384,7 @@ def _median(pushes: Sequence[Push], role: str) -> Latency:
 _COLOURS: Final = {"emulated": "#1f77b4", "simulated": "#ff7f0e", "simulated, latency added": "#2ca02c"}
 
 
-def _plot(pushes: Mapping[str, Push], way_mm: Array, path: Path) -> None:
+def _plot(pushes: Mapping[str, Push], path_mm: Array, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, (above, away) = plt.subplots(1, 2, figsize=(11, 3.8), layout="constrained")
@@ -391,7 +392,7 @@ def _plot(pushes: Mapping[str, Push], way_mm: Array, path: Path) -> None:
         kind, _, number = title.rpartition(", ")
         style = {"color": _COLOURS[kind], "lw": 1.0, "label": kind if number == "1" else None}
         above.plot(push.object_mm_deg[:, 0], push.object_mm_deg[:, 1], **style)
-        then, _ = differences_mm(push, way_mm)
+        then, _ = differences_mm(push, path_mm)
         away.plot(push.t_s[: len(then)], then, **style)
     above.set(xlabel="x (mm)", ylabel="y (mm)", title="object's middle, from above")
     away.set(xlabel="time since the push began (s)", ylabel="mm", title="from the emulated median at the same time")

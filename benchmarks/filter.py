@@ -1,13 +1,13 @@
-"""``touchcell bench filter``: what the SE(3) filter gains, whether it knows how sure it is, and what it costs.
+"""``touchcell bench filter``: accuracy, consistency and cost of the SE(3) filter.
 
 Three parts, each with a table and a plot:
 
-- ``sequences`` (Lloyd & Lepora 2024, 5.3): contacts with known motion, four dynamics noise levels, MAE and predicted
-  sigma per component against the single frames, consistency (NEES and NIS), and corrections that bear slip. With
+* ``sequences`` (Lloyd & Lepora 2024, 5.3): contacts with known motion, four dynamics noise levels, MAE and predicted
+  sigma per component against the single frames, consistency (NEES and NIS), and corrections robust to slip. With
   ``--data`` and ``--model`` on a labelled split in its own and in shuffled orders, else on simulated contacts.
-- ``steps``: one correction by Gauss-Newton, one-step EKF and naively, and one prediction to second and to fourth order,
+* ``steps``: one correction by Gauss-Newton, one-step EKF and naively, and one prediction to second and to fourth order,
   run time against error.
-- ``tracking``: the shipped cell behind a moving plate, with the still and with the moving surface model in the loop.
+* ``tracking``: the shipped cell behind a moving plate, with the static and with the moving surface model in the loop.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from touchcell.perception.networks.figures import write_predictions
 from touchcell.perception.runtime.filter import PoseFilter
 
 LEVELS = (1.0, 0.3, 0.1, 0.03)
-"""Standard deviations of the dynamics noise per contact, mm and degrees alike."""
+"""Standard deviations of the dynamics noise per contact, mm and degrees equally."""
 
 SYNTHETIC_DRIFT = 0.1
 TORN_EVERY = 10
@@ -86,11 +86,11 @@ def _sequences(options: argparse.Namespace, out: Path) -> dict[str, Any]:
         kinds = {
             drift: [synthetic(options.contacts, seed, SYNTHETIC_DRIFT) for seed in range(options.orders)],
             f"{drift}, slips before 3 %": [
-                synthetic(options.contacts, 100 + seed, SYNTHETIC_DRIFT, slip_share=0.03)
+                synthetic(options.contacts, 100 + seed, SYNTHETIC_DRIFT, slip_fraction=0.03)
                 for seed in range(options.orders)
             ],
             f"{drift}, 5 % of frames err sixfold": [
-                synthetic(options.contacts, 200 + seed, SYNTHETIC_DRIFT, outlier_share=0.05)
+                synthetic(options.contacts, 200 + seed, SYNTHETIC_DRIFT, outlier_fraction=0.05)
                 for seed in range(options.orders)
             ],
         }
@@ -126,7 +126,7 @@ def _sequences(options: argparse.Namespace, out: Path) -> dict[str, Any]:
                 sequences, [single_frames(sequence) for sequence in sequences], out / "filter_single_frames.png"
             )
         result[kind] = rows
-    print("(MAE / mean predicted sigma; NEES and NIS are 6 on average where a filter knows how sure it is)")
+    print("(MAE / mean predicted sigma; NEES and NIS are 6 on average for a consistent filter)")
     _plot_noise(result, out / "filter_noise.png")
     _plot_consistency(result, out / "filter_consistency.png")
     return result

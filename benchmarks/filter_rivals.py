@@ -1,6 +1,6 @@
-"""What the filter could do instead: other corrections of a Gaussian by a Gaussian, and corrections that bear slip.
+"""Alternatives to the filter: other corrections of a Gaussian by a Gaussian, and corrections robust to slip.
 
-They live here and not in the product because they lost; docs/decisions/0007-filter.md has the figures.
+They performed worse than the product's; docs/decisions/0007-filter.md has the figures.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from touchcell.perception.runtime.filter import FilterState, PoseFilter
 
 
 def gauss_newton(prior: PoseGaussian, observation: PoseGaussian) -> PoseGaussian:
-    """The product's iteration in numpy, so that its run time compares with the others' here."""
+    """The product's iteration in numpy, for a comparison of run times."""
     roots = [np.linalg.inv(np.linalg.cholesky(g.covariance)) for g in (prior, observation)]
     inverses = [se3.inverse(g.mean) for g in (prior, observation)]
     T = prior.mean
@@ -35,7 +35,7 @@ def gauss_newton(prior: PoseGaussian, observation: PoseGaussian) -> PoseGaussian
 
 
 def extended_kalman(prior: PoseGaussian, observation: PoseGaussian) -> PoseGaussian:
-    """One linearisation at the prior, in gain form: the first step of Gauss-Newton."""
+    """Linearise once at the prior, in gain form: the first step of Gauss-Newton."""
     e = se3.log(se3.compose(prior.mean, se3.inverse(observation.mean)))
     H = se3.left_jacobian_inverse(e)
     PH = prior.covariance @ H.T
@@ -46,7 +46,7 @@ def extended_kalman(prior: PoseGaussian, observation: PoseGaussian) -> PoseGauss
 
 
 def naive(prior: PoseGaussian, observation: PoseGaussian) -> PoseGaussian:
-    """Exponential coordinates of the innovation treated as a vector: every Jacobian the identity."""
+    """Treat exponential coordinates of the innovation as a vector: every Jacobian the identity."""
     e = se3.log(se3.compose(observation.mean, se3.inverse(prior.mean)))
     K = np.linalg.solve(prior.covariance + observation.covariance, prior.covariance).T
     covariance = (np.eye(6) - K) @ prior.covariance
@@ -54,7 +54,7 @@ def naive(prior: PoseGaussian, observation: PoseGaussian) -> PoseGaussian:
 
 
 class StudentFilter(PoseFilter):
-    """A correction that trusts a surprising frame less: its covariance grows as under a Student-t of ``degrees``."""
+    """A filter that trusts a surprising frame less: its covariance grows as under a Student-t of ``degrees``."""
 
     degrees = 4.0
 
@@ -68,11 +68,13 @@ class StudentFilter(PoseFilter):
 
 
 class SlipFilter(PoseFilter):
-    """A correction that forgets under surprise: beyond ``threshold`` the contact has slipped, and the prior grows by
-    as much as makes the frame likely again."""
+    """A filter that detects slip: if the innovation exceeds ``threshold``, the prior's covariance is inflated.
+
+    It grows by as much as makes the frame likely again.
+    """
 
     threshold = 22.46
-    """Of the normalised innovation squared: 99.9 % of frames that agree are below."""
+    """Threshold of the normalised innovation squared: 99.9 % of consistent frames are below."""
 
     def predict(self, T_base_sensor: Array, t_ns: int) -> PoseGaussian:
         prior = super().predict(T_base_sensor, t_ns)

@@ -1,4 +1,4 @@
-"""Sequences of contacts with known motion, filtered (Lloyd & Lepora 2024, 5.3), and what comes of it."""
+"""Sequences of contacts with known motion, filtered (Lloyd & Lepora 2024, 5.3), and their statistics."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from touchcell.perception.runtime.estimators import load_estimator
 from touchcell.perception.runtime.filter import FilterState, PoseFilter
 
 STEP_NS = 1_000_000_000
-"""Between two contacts, so that a noise density per second is one per contact."""
+"""Time between two contacts, so that a noise density per second is one per contact."""
 
 SYNTHETIC_SIGMA = np.array([0.3, 0.3, 0.12, 0.8, 0.8, 1.0]) * XI_UNITS
-"""Standard deviations of the synthetic sensor's xi: about those of a good network without slip."""
+"""Standard deviations of the synthetic sensor's xi: similar to those of a good network without slip."""
 
 
 @dataclass(frozen=True)
 class ContactSequence:
-    """n contacts of one sensor with one surface, as a filter meets them.
+    """n contacts of one sensor with one surface, in order.
 
     Attributes:
-        T_base_s: (n, 4, 4) where the sensor was, exactly.
+        T_base_s: (n, 4, 4) true sensor poses.
         T_s_f: (n, 4, 4) true contacts.
         observed: Gaussians of the single frames.
         xi: (n, 6) and
         sigma: (n, 6), the means and standard deviations of xi that they came from, m and rad.
-        in_range: (n,) what the estimator said of itself.
+        in_range: (n,) as reported by the estimator.
     """
 
     T_base_s: Array
@@ -48,7 +48,10 @@ class ContactSequence:
     in_range: NDArray[np.bool_]
 
     def shuffled(self, seed: int) -> ContactSequence:
-        """The same contacts in another order. A labelled surface stands still, so any order is a possible motion."""
+        """Return the same contacts in another order.
+
+        A labelled surface is static, so any order is a possible motion.
+        """
         order = np.random.default_rng(seed).permutation(len(self.observed))
         return ContactSequence(
             self.T_base_s[order],
@@ -62,7 +65,7 @@ class ContactSequence:
 
 @dataclass(frozen=True)
 class Track:
-    """What a filter, or the single frames, made of a sequence.
+    """Estimates of a filter, or of the single frames, for a sequence.
 
     Attributes:
         contact: (n, 6) estimated contacts, mm and degrees, named as ``CONTACT_NAMES``.
@@ -80,9 +83,13 @@ class Track:
 def labelled(
     data: Path, split: str, model: Path, progress: Callable[[int, int], None], *, torn_every: int = 0
 ) -> ContactSequence:
-    """A labelled split as a sequence in the order of its images' names; the sensor moves as the labels say.
+    """Return a labelled split as a sequence in the order of its images' names; the sensor moves as the labels.
 
     Args:
+        data: data set.
+        split: train, val or test.
+        model: model file.
+        progress: called with the images done and the total.
         torn_every: of so many images, one arrives with its lower half black; 0 for none.
 
     Raises:
@@ -104,16 +111,16 @@ def labelled(
 
 
 def synthetic(
-    n: int, seed: int, drift: float, *, slip_share: float = 0.0, outlier_share: float = 0.0
+    n: int, seed: int, drift: float, *, slip_fraction: float = 0.0, outlier_fraction: float = 0.0
 ) -> ContactSequence:
-    """Random contacts over the public data's ranges, seen by a sensor with exactly Gaussian errors.
+    """Return random contacts over the public data's ranges, observed by a sensor with exactly Gaussian errors.
 
     Args:
         n: contacts.
         seed: of everything random.
         drift: standard deviation of the surface's own random walk per contact, in mm and degrees.
-        slip_share: share of contacts before which the surface frame jumps by 1 mm and 2 deg in x, y, gamma.
-        outlier_share: share of frames that err six times as much as they say.
+        slip_fraction: fraction of contacts before which the surface frame jumps by 1 mm and 2 deg in x, y, gamma.
+        outlier_fraction: fraction of frames whose errors are six times their predicted size.
     """
     rng = np.random.default_rng(seed)
     T_base_s = random_poses(n, rng)
@@ -122,19 +129,19 @@ def synthetic(
     for k in range(n):
         T = se3.compose(se3.inverse(T_base_s[k]), T_base_f)
         moves = drift * XI_UNITS * rng.normal(size=6)
-        if rng.random() < slip_share:
+        if rng.random() < slip_fraction:
             moves += np.array([1.0, 1.0, 0.0, 0.0, 0.0, 2.0]) * XI_UNITS * rng.normal(size=6)
         T_s_f[k] = se3.compose(se3.exp(moves), T)
         T_base_f = se3.project(T_base_s[k] @ T_s_f[k])
     sigma = np.broadcast_to(SYNTHETIC_SIGMA, (n, 6))
-    scale = np.where(rng.random(n) < outlier_share, 6.0, 1.0)
+    scale = np.where(rng.random(n) < outlier_fraction, 6.0, 1.0)
     xi = se3.log(T_s_f) + sigma * scale[:, None] * rng.normal(size=(n, 6))
     predictions = [Prediction(mean, np.diag(each**2), in_range=True) for mean, each in zip(xi, sigma, strict=True)]
     return _sequence(T_base_s, T_s_f, predictions)
 
 
 def single_frames(sequence: ContactSequence) -> Track:
-    """No filter."""
+    """Return the single frames' estimates, without a filter."""
     nees = [mahalanobis_squared(g, T) for g, T in zip(sequence.observed, sequence.T_s_f, strict=True)]
     return Track(contact_from_xi(sequence.xi), sequence.sigma, np.array(nees), np.empty(0))
 
@@ -146,13 +153,14 @@ def filtered(
     *,
     out_of_range_too: bool = False,
 ) -> Track:
-    """A filter over the sequence.
+    """Run a filter over the sequence.
 
     Args:
+        sequence: contacts.
         level: standard deviation of the dynamics noise per contact, in mm and degrees.
         make: builds the filter from its noise density.
-        out_of_range_too: fuse even what the estimator says it was not taught, which
-        ``touchcell.perception.runtime.pipeline`` does not.
+        out_of_range_too: fuse predictions outside the training range as well, unlike
+            ``touchcell.perception.runtime.pipeline``.
     """
     pose_filter = make(np.diag((level * XI_UNITS) ** 2))
     states: list[FilterState] = []
@@ -173,9 +181,9 @@ def filtered(
 
 
 def summary(sequences: list[ContactSequence], tracks: list[Track]) -> dict[str, Any]:
-    """MAE and mean sigma per component, NEES and NIS with 95 % bounds, over sequences of one kind.
+    """Return MAE and mean sigma per component, NEES and NIS with 95 % bounds, over sequences of one kind.
 
-    Consecutive errors of a filter are not independent, so the bounds count only as many values as are.
+    Consecutive errors of a filter are correlated, so the bounds use the effective number of independent values.
     """
     truth = np.concatenate([se3.to_euler_mm_deg(se3.inverse(sequence.T_s_f)) for sequence in sequences])
     contact = np.concatenate([track.contact for track in tracks])
@@ -204,7 +212,7 @@ def _consistency(series: list[Array]) -> dict[str, float]:
 
 
 def _correlation_length(series: list[Array]) -> float:
-    """1 + 2 (r_1 + r_2 + ...) with r_k the correlation of values k apart, summed while it is positive."""
+    """Return 1 + 2 (r_1 + r_2 + ...) with r_k the correlation of values k apart, summed while it is positive."""
     centred = [one - np.mean(np.concatenate(series)) for one in series]
     variance = np.mean(np.concatenate(centred) ** 2)
     length = 1.0

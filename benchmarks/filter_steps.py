@@ -1,4 +1,4 @@
-"""One correction and one prediction at a time: run time against error of the ways to compute them."""
+"""One correction and one prediction at a time: run time against error of several methods."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from touchcell.perception.runtime.moving_surface import MovingSurfaceFilter
 
 SIGMAS_RAD = (0.02, 0.05, 0.1, 0.2, 0.35)
 LEVER_M = 0.02
-"""Standard deviations of translation are those of rotation at this distance, about the radius of a tip."""
+"""Lever arm from rotation to translation standard deviations, about the radius of a tip."""
 
 Correction = Callable[[PoseGaussian, PoseGaussian], PoseGaussian]
 
@@ -31,7 +31,7 @@ CORRECTIONS: dict[str, Correction] = {
 
 
 def corrections(draws: int, seed: int = 0) -> list[dict[str, Any]]:
-    """Rows of method and sigma: time, distance from the optimum in posterior sigmas, and NEES of the truth.
+    """Return rows of method and sigma: time, distance from the optimum in posterior sigmas, and NEES of the truth.
 
     Prior and observation each miss the truth by a draw of their own covariance, so an exact product has a NEES of 6.
     """
@@ -57,9 +57,9 @@ def corrections(draws: int, seed: int = 0) -> list[dict[str, Any]]:
 
 
 def predictions(draws: int, seed: int = 0) -> list[dict[str, Any]]:
-    """Rows of order and sigma: time, and the covariance's relative Frobenius error against ``draws`` samples.
+    """Return rows of order and sigma: time, and the covariance's relative Frobenius error against ``draws`` samples.
 
-    The last columns tell what sampling itself leaves.
+    The last columns are the sampling error itself.
     """
     rows = []
     for sigma in SIGMAS_RAD:
@@ -69,7 +69,7 @@ def predictions(draws: int, seed: int = 0) -> list[dict[str, Any]]:
         moved_mean = se3.compose(U, mean)
         halves = [_sampled(moved_mean, U, mean, P, Q, draws // 2, rng) for _ in range(2)]
         exact = 0.5 * (halves[0] + halves[1])
-        # In units of the standard deviations, so that metres and radians count alike.
+        # In units of the standard deviations, so that metres and radians have equal weight.
         scale = 1.0 / np.sqrt(np.outer(np.diagonal(exact), np.diagonal(exact)))
         size = np.linalg.norm(exact * scale)
         left = 0.5 * float(np.linalg.norm((halves[0] - halves[1]) * scale) / size)
@@ -88,7 +88,7 @@ def predictions(draws: int, seed: int = 0) -> list[dict[str, Any]]:
 
 
 def updates() -> dict[str, float]:
-    """CPU time of one whole update of each filter that ships, microseconds, from Python."""
+    """Return the CPU time of one whole update of each shipped filter, microseconds, from Python."""
     rng = np.random.default_rng(0)
     noise = isotropic_noise(1e-3, 0.01)
     observation = PoseGaussian(se3.exp(rng.normal(0.0, 0.01, 6)), _covariance(0.01, rng))
@@ -106,7 +106,7 @@ def updates() -> dict[str, float]:
 
 
 def _pair(sigma: float, rng: np.random.Generator) -> tuple[Array, PoseGaussian, PoseGaussian]:
-    """Truth, and a prior and an observation that each miss it by a draw of their own covariance."""
+    """Return the truth, and a prior and an observation that each miss it by a draw of their own covariance."""
     truth = se3.exp(rng.normal(0.0, [0.02] * 3 + [0.5] * 3))
     beliefs = []
     for scale in (1.0, 0.8):
@@ -117,7 +117,7 @@ def _pair(sigma: float, rng: np.random.Generator) -> tuple[Array, PoseGaussian, 
 
 
 def _covariance(sigma: float, rng: np.random.Generator) -> Array:
-    """Random, not diagonal, with standard deviations of about ``sigma`` rad and ``sigma * LEVER_M`` m."""
+    """Return a random full covariance with standard deviations of about ``sigma`` rad and ``sigma * LEVER_M`` m."""
     axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]
     spread = axes @ np.diag(rng.uniform(0.5, 1.5, 6) ** 2) @ axes.T
     units = sigma * np.array([LEVER_M] * 3 + [1.0] * 3)
@@ -127,7 +127,7 @@ def _covariance(sigma: float, rng: np.random.Generator) -> Array:
 def _sampled(
     moved_mean: Array, U: Array, mean: Array, P: Array, Q: Array, draws: int, rng: np.random.Generator
 ) -> Array:
-    """Covariance of exp(w) U exp(e) mean about U mean."""
+    """Return the covariance of exp(w) U exp(e) mean about U mean."""
     e = rng.normal(size=(draws, 6)) @ np.linalg.cholesky(P).T
     w = rng.normal(size=(draws, 6)) @ np.linalg.cholesky(Q).T
     T = se3.compose(se3.compose(se3.exp(w), U), se3.compose(se3.exp(e), mean))
@@ -136,7 +136,7 @@ def _sampled(
 
 
 def _seconds(call: Callable[[], object], calls: int = 200) -> float:
-    """CPU time of one call, the best of five rounds."""
+    """Return the CPU time of one call, the best of five rounds."""
     best = float("inf")
     for _ in range(5):
         start = time.process_time()

@@ -1,5 +1,4 @@
-"""Tracking a moving plate with each surface model in the loop, behind a sensor whose errors are exactly Gaussian, or
-behind the simulated camera and a network."""
+"""Tracking of a moving plate with each surface model, with Gaussian errors or the simulated camera and a network."""
 
 from __future__ import annotations
 
@@ -15,22 +14,22 @@ from pydantic import TypeAdapter
 from touchcell.cell.analysis.report import summarise
 from touchcell.cell.analysis.run_data import load_run
 from touchcell.cell.config.find import find_cell
-from touchcell.cell.config.schema import FilterSection, plan_cell
+from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
-from touchcell.cell.runtime.sensor import build_filter
 from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.types import Array
 from touchcell.perception.models.labels import XI_UNITS
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.perception.runtime.filter import ContactFilter
+from touchcell.perception.runtime.filter_spec import FilterSection
 from touchcell.perception.runtime.motion import PoseHistory
 from touchcell.perception.runtime.pipeline import ContactSource
 
 SENSOR_SIGMA = np.array([0.1, 0.1, 0.1, 0.9, 0.9, 0.35]) * XI_UNITS
-"""Of xi: about the shipped network's errors on its own simulated validation images, as standard deviations."""
+"""Standard deviations of xi: similar to the shipped network's errors on its simulated validation images."""
 
 _FRAME_NS = 33_333_333
 
@@ -50,16 +49,14 @@ FILTERS: dict[str, Mapping[str, Any] | None] = {
 }
 
 
-class GaussianContact:
+class GaussianContact(ContactSource):
     """A ``ContactSource`` in place of camera and network: the true contact with Gaussian errors, a cycle late.
 
     Args:
-        truth: tells the contact as it is.
-        pose_filter: None takes each frame by itself.
+        truth: returns the true contact.
+        pose_filter: None treats each frame independently.
         seed: of the errors.
     """
-
-    ended = False
 
     def __init__(self, truth: ContactSource, pose_filter: ContactFilter | None, seed: int) -> None:
         self._truth = truth
@@ -101,21 +98,21 @@ class GaussianContact:
 
 
 def track(name: str, *, moving: bool, duration_s: float, seed: int, network: Path | None = None) -> dict[str, Any]:
-    """Run the shipped tracking cell with one of ``FILTERS``; the plate stands still unless ``moving``.
+    """Run the shipped tracking cell with one of ``FILTERS``.
 
     Args:
         name: of the filter.
-        moving: whether the plate does.
+        moving: True for a moving plate, False for a static one.
         duration_s: of the task.
         seed: of the sensor's errors.
-        network: model that sees the simulated camera's images, in place of the sensor with Gaussian errors.
+        network: model for the simulated camera's images, in place of the sensor with Gaussian errors.
 
     Returns:
         ``outcome``, and RMS errors of ``estimation`` (estimate - true) and ``control`` (true - reference), mm and deg.
     """
     cell_file = yaml.safe_load(find_cell(Path("configs/object_track_sim.yaml")).read_text())
     cell_file["task"]["duration_s"] = duration_s
-    # Interlocks that judge estimates and motion would end the runs of the worse filters, which are to be measured.
+    # Interlocks on estimates and motion would end the runs of the worse filters, which are measured too.
     cell_file["interlocks"] = {
         k: v for k, v in cell_file["interlocks"].items() if v["kind"] in REQUIRED_TO_MOVE | REQUIRED_TO_TOUCH
     }
@@ -127,7 +124,7 @@ def track(name: str, *, moving: bool, duration_s: float, seed: int, network: Pat
         estimator |= {"model": str(network), "filter": None if settings is None else dict(settings)}
     else:
         cell_file["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
-    pose_filter = None if settings is None else build_filter(TypeAdapter(FilterSection).validate_python(settings))
+    pose_filter = None if settings is None else TypeAdapter(FilterSection).validate_python(settings).build()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cell.yaml"
         path.write_text(yaml.safe_dump(cell_file))

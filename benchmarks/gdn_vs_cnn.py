@@ -1,9 +1,9 @@
 """``touchcell bench gdn-vs-cnn``: Gaussian-density networks against regression networks (Lloyd & Lepora 2024, 5.2).
 
 Both kinds share everything but the output layer and the loss: images, network, epochs, schedule, jitter, seeds and the
-split that chooses the epoch. Small images and few epochs keep twenty trainings within half an hour of a core.
+split that selects the epoch. Small images and few epochs keep twenty trainings within half an hour of a core.
 
-Trained networks are kept, so that an interrupted benchmark goes on where it was.
+Trained networks are stored, so that an interrupted benchmark resumes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ KINDS: tuple[Literal["gdn", "cnn"], ...] = ("gdn", "cnn")
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Train what is missing, print the table; write ``gdn-vs-cnn.json`` and ``gdn-vs-cnn.png`` into ``out``.
+    """Train missing networks, print the table; write ``gdn-vs-cnn.json`` and ``gdn-vs-cnn.png`` into ``out``.
 
     Raises:
         DataError: the data set is damaged.
@@ -63,7 +63,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
 
 
 def summary(rows: Sequence[dict[str, float]]) -> dict[str, dict[str, float]]:
-    """Mean and standard deviation over networks, of each figure."""
+    """Return mean and standard deviation over networks, of each figure."""
     spread = len(rows) > 1
     return {
         name: {

@@ -1,6 +1,6 @@
-"""``touchcell bench kinematics``: what our kinematics cost and how well they follow.
+"""``touchcell bench kinematics``: cost and accuracy of the kinematics.
 
-Prints the time per call, how far open-loop integration strays from an exact path, and what happens at a singularity.
+Prints the time per call, the deviation of open-loop integration from an exact path, and the behaviour at a singularity.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
         "reach_out": {
             "fastest_joint_rad_s": fastest,
             "smallest_singular_value_m": smallest_m,
-            "way_mm": reach_mm,
+            "path_mm": reach_mm,
             "off_mm": off_mm,
         },
     }
@@ -63,7 +63,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
 
 
 def _times(chain: SerialChain, ik: DifferentialIk, q: Array) -> dict[str, tuple[float, float]]:
-    """Median and 99th percentile of each call, microseconds."""
+    """Return median and 99th percentile of each call, microseconds."""
     twist = np.array([0.05, 0.02, 0.0, 0.1, 0.0, 0.2])
     near_singular = q * np.array([1.0, 1.0, 1.0, 1.0, 0.1, 1.0])
     setpoint = JointSetpoint(chain, ik, _LIMITS)
@@ -93,7 +93,7 @@ def _time(call: Callable[[], object]) -> tuple[float, float]:
 
 
 def _circle(chain: SerialChain, ik: DifferentialIk, q: Array) -> tuple[float, float]:
-    """Largest distance mm and angle deg from where the twists lead that the setpoint followed."""
+    """Return the largest distance mm and angle deg of the setpoint from the exact path of the twists."""
     dt_s, rate = 1.0 / _RATE_HZ, 2 * np.pi / _LAP_S
     speed_m_s = rate * _DIAMETER_M / 2
     setpoint = JointSetpoint(chain, ik, _LIMITS)
@@ -114,7 +114,7 @@ def _circle(chain: SerialChain, ik: DifferentialIk, q: Array) -> tuple[float, fl
 
 
 def _reach_out(chain: SerialChain, ik: DifferentialIk, q: Array) -> tuple[float, float, float, float]:
-    """Fastest joint rad/s, smallest singular value m, way mm, and largest distance mm from the straight line."""
+    """Return fastest joint rad/s, smallest singular value m, path mm, and largest distance mm from the line."""
     start_m = chain.forward(q)[:3, 3]
     fastest, smallest_m, off_m = 0.0, np.inf, 0.0
     for _ in range(round(10 * _RATE_HZ)):

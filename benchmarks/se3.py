@@ -1,8 +1,8 @@
-"""``touchcell bench se3``: error and run time of our SE(3) beside those of installed public libraries.
+"""``touchcell bench se3``: error and run time of our SE(3) compared with installed public libraries.
 
 Errors are relative to mpmath, per block, the worst of the 1035 points of ``benchmarks.se3_reference``. Times are CPU
 times, the best of several runs. Ours and pytransform3d take and return numpy arrays; pinocchio and scipy are timed on
-their own objects, which is how their users call them. Ours are timed with their checks, pytransform3d without.
+their own objects, as their users call them. Ours are timed with argument checks, pytransform3d without.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
 
 
 def _seconds(call: Call, count: int) -> float:
-    """CPU time of one call, the best of five rounds."""
+    """Return the CPU time of one call, the best of five rounds."""
     call()
     best = float("inf")
     for _ in range(5):
@@ -85,7 +85,7 @@ def _seconds(call: Call, count: int) -> float:
 
 
 def _filter_us() -> dict[str, float]:
-    """One prediction with noise and one correction, as a filter makes them at every image."""
+    """Return the time of one prediction with noise and one correction, as a filter makes per image."""
     rng = np.random.default_rng(0)
     A, B, Q = (1e-4 * (factor @ factor.T + np.eye(6)) for factor in rng.normal(size=(3, 6, 6)))
     motion, offset = se3.exp(0.1 * rng.normal(size=(2, 6)))
@@ -229,7 +229,7 @@ def _pytransform3d(xi: Array, T: Array, other: Array) -> Contender:
 
 
 def _swap(xi: Array) -> Array:
-    """[v, w] from [w, v], or back."""
+    """Return [v, w] from [w, v], or vice versa."""
     return np.concatenate([xi[..., 3:], xi[..., :3]], axis=-1)
 
 

@@ -1,4 +1,4 @@
-"""Exact SE(3) to measure against: closed forms of the textbooks in mpmath, with digits to spare for their cancellation.
+"""Exact SE(3) reference: closed forms of the textbooks in mpmath, with enough digits for their cancellation.
 
 They are not the formulas under test: the Jacobian's upper right block is Barfoot's Q (State Estimation for Robotics,
 2nd ed. 2024, chapter 8), that of its inverse -J^-1 Q J^-1.
@@ -34,7 +34,7 @@ class Exact:
     low: Array
 
     def error(self, value: Array, axes: tuple[int, ...], rows: slice, columns: slice = slice(None)) -> Array:
-        """Norm-wise relative error of one block of ``value``."""
+        """Return the norm-wise relative error of one block of ``value``."""
         block = (..., rows, columns) if len(axes) == 2 else (..., rows)
         difference = (value[block] - self.high[block]) - self.low[block]
         size = np.sqrt(np.sum(self.high[block] ** 2, axis=axes))
@@ -46,7 +46,7 @@ class Exact:
 
 @dataclass(frozen=True)
 class Reference:
-    """Exponential coordinates and what they exactly lead to.
+    """Exponential coordinates and their exact results.
 
     Attributes:
         xi: (n, 6) [v, w].
@@ -66,7 +66,7 @@ class Reference:
 
 
 def points() -> Array:
-    """(1035, 6): a grid of angles, distances and directions, and a dense sweep of angles from 1e-9 to pi."""
+    """Return (1035, 6): a grid of angles, distances and directions, and a dense sweep of angles from 1e-9 to pi."""
     rng = np.random.default_rng(7)
     axes = np.concatenate([np.eye(3), rng.normal(size=(9, 3))])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -114,7 +114,7 @@ def _evaluate(xi: list[float]) -> tuple[list[Any], ...]:
         R = mpmath.eye(3) + mpmath.sin(theta) / theta * W + (1 - mpmath.cos(theta)) / theta**2 * W * W
         J, Q = _jacobian(v, w)
         inverse = _inverse_jacobian(v, w)
-        # The same pose by the long way round.
+        # The same pose by the complementary rotation.
         w_other = w * (1 - 2 * mpmath.pi / theta)
         v_other = mpmath.lu_solve(_jacobian(v, w_other)[0], J * v)
         other, other_inverse = [*v_other, *w_other], _inverse_jacobian(v_other, w_other)
@@ -166,7 +166,7 @@ def _blocks(diagonal: Matrix, corner: Matrix) -> list[Any]:
 
 @dataclass(frozen=True)
 class Library:
-    """What a library offers of SE(3) to measure, in our order and conventions; None where it has nothing.
+    """SE(3) functions of a library, in our order and conventions; None where it has none.
 
     Each function takes a batch, or one element where ``batched`` is False.
     """
@@ -185,11 +185,11 @@ class Library:
 
 
 def errors(library: Library, exact: Reference) -> dict[str, Array]:
-    """Relative error at every point, per block: the columns of the accuracy table.
+    """Return the relative error at every point, per block: the columns of the accuracy table.
 
-    ``exp small`` is the antisymmetric part of R up to 1 rad: whether a tiny rotation is kept. ``round`` is
+    ``exp small`` is the antisymmetric part of R up to 1 rad: preservation of tiny rotations. ``round`` is
     log(exp(xi)). Of the two valid logarithms near a half turn the nearer one counts, and so for J^-1, which some
-    libraries offer of a pose only.
+    libraries offer for a pose only.
     """
     found: dict[str, Array] = {}
     xi, T = exact.xi.high, exact.T.high

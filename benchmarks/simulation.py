@@ -1,9 +1,9 @@
-"""``touchcell bench simulation``: how true the simulated scenes are, and how fast.
+"""``touchcell bench simulation``: accuracy and speed of the simulated scenes.
 
-First, numbers of the dynamic scene against theory. Second, scripted touches at every fidelity against MuJoCo at 0.1 ms.
-Third, whole cells in closed loop, dynamic ones told every 5 ms: simulated seconds per second of one core, and where
-that second went. Times are of the processor, not of the wall, because cores are shared; other load still makes them
-longer. ``--quick`` runs the first script and the first cell alone.
+First, numbers of the dynamic scene against theory. Second, scripted contacts at every fidelity against MuJoCo at
+0.1 ms. Third, whole cells in closed loop, dynamic ones commanded every 5 ms: simulated seconds per second of one core,
+and its CPU time by part. Times are CPU times, not wall times, because cores are shared; other load still makes them
+longer. ``--quick`` runs the first script and the first cell only.
 """
 
 from __future__ import annotations
@@ -73,15 +73,15 @@ _FIDELITIES = (
     _Fidelity("quasi-static", "quasi_static", 1.0),
     _Fidelity("dynamic 2 ms", "dynamic", 2.0),
     _Fidelity("dynamic 1 ms", "dynamic", 1.0),
-    _Fidelity("dynamic 1 ms, told every 5 ms", "dynamic", 1.0, _DYNAMIC_GRID_MS),
+    _Fidelity("dynamic 1 ms, commanded every 5 ms", "dynamic", 1.0, _DYNAMIC_GRID_MS),
     _Fidelity("dynamic 1 ms, Pandas", "dynamic", 1.0, joints=True),
 )
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Print three tables; writes ``simulation.json`` and ``simulation.png`` into ``out``."""
+    """Print three tables; write ``simulation.json`` and ``simulation.png`` into ``out``."""
     parser = argparse.ArgumentParser(prog="touchcell bench simulation")
-    parser.add_argument("--quick", action="store_true", help="the first script and the first cell alone")
+    parser.add_argument("--quick", action="store_true", help="the first script and the first cell only")
     quick = parser.parse_args(arguments).quick
     scripts = dict(list(SCRIPTS.items())[: 1 if quick else None])
     checked = [] if quick else _check()
@@ -131,7 +131,7 @@ def _compare(name: str, script: Script) -> dict[str, dict[str, float]]:
 
 
 def _offered(physics: str, scene: Mapping[str, Any]) -> bool:
-    """Whether this touchcell has such physics, and it can have such a scene."""
+    """Return True if this touchcell has such physics and supports such a scene."""
     if physics not in get_args(SceneConfig.model_fields["physics"].annotation):
         return False
     return physics == "dynamic" or (physics == "kinematic") == ("surfaces" in scene)
@@ -189,7 +189,7 @@ def _speed(cell_file: Mapping[str, Any], physics: str, *, images: bool, out: Pat
     if not images:
         for sensor in data["sensors"].values():
             sensor["estimator"] = {"kind": "true_contact"}
-        # Without images nobody can see a frozen one.
+        # Without images a frozen one cannot be detected.
         blind = ("frame_frozen", "exposure", "uncertain", "out_of_range", "inconsistent")
         data["interlocks"] = {key: item for key, item in data["interlocks"].items() if item["kind"] not in blind}
     with tempfile.TemporaryDirectory(dir=out) as folder:

@@ -1,4 +1,4 @@
-"""Numbers that the dynamic scene must get right, each against theory or against itself at 0.1 ms."""
+"""Checks of the dynamic scene against theory or against itself at 0.1 ms."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _FLOOR = {"surfaces": {"floor": {"kind": "plane"}}}
 _Twist = tuple[float, ...]
 
 
-class Hand:
-    """One tip that goes exactly where it is told, through a scene of its own.
+class CommandedTip:
+    """One tip that follows its command exactly, through its own scene.
 
     Args:
         scene: settings of the ``scene:`` section, without its physics.
@@ -38,11 +38,11 @@ class Hand:
         self.scene.mount("tip", lambda: self.poses["tip"])
 
     def move(self, twist_mm_deg: _Twist, seconds: float) -> ContactState:
-        """Go on by a twist along the tip's own axes, mm/s and deg/s; returns what it feels then."""
+        """Move by a twist along the tip's own axes, mm/s and deg/s; return the contact at the end."""
         return self.move_all({"tip": twist_mm_deg}, seconds)
 
     def move_all(self, twists_mm_deg: Mapping[str, _Twist], seconds: float) -> ContactState:
-        """The same with other tips, which ``poses`` holds and the caller has mounted."""
+        """Move with other tips, which ``poses`` holds and the caller has mounted."""
         step_s = self.scene.timeline.step_ns * 1e-9
         motions = {tip: se3.exp(np.array(twist) * _SI * step_s) for tip, twist in twists_mm_deg.items()}
         for _ in range(round(seconds / step_s)):
@@ -53,18 +53,18 @@ class Hand:
         return self.scene.contact("tip").value
 
     def object(self) -> Array:
-        """T_world_object (4, 4) of the first."""
+        """T_world_object (4, 4) of the first object."""
         return next(iter(self.scene.objects().value.values()))
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One number, what it should be, and whether it is.
+    """One number, its expected value, and the result.
 
     Attributes:
-        what: in words.
+        what: description.
         value, aim: as they are printed.
-        passed: whether the value meets the aim.
+        passed: True if the value meets the aim.
     """
 
     what: str
@@ -74,7 +74,7 @@ class Check:
 
 
 def checks() -> list[Check]:
-    """All of them; takes about five seconds of a core."""
+    """Return all checks; takes about five seconds of a core."""
     return [_deflection(), _creep(), *_push_force(), *_yaw(), *_toppling()]
 
 
@@ -83,17 +83,17 @@ def _deflection() -> Check:
     script += [((0, 0, 0, 20, 0, 0), 0.4), ((0, -20, 0, 0, 0, 0), 0.4), (_STILL, 0.2)]
     felt = []
     for step_ms in (1.0, 0.1):
-        hand = Hand({**_FLOOR, "physics_step_ms": step_ms}, _ABOVE)
-        felt.append([hand.move(twist, 0.02).T_f_s[:2, 3] for twist, s in script for _ in range(round(s / 0.02))])
+        tip = CommandedTip({**_FLOOR, "physics_step_ms": step_ms}, _ABOVE)
+        felt.append([tip.move(twist, 0.02).T_f_s[:2, 3] for twist, s in script for _ in range(round(s / 0.02))])
     worst_mm = 1e3 * float(np.abs(np.array(felt[0]) - np.array(felt[1])).max())
     return Check("tip deflection at 1 ms against 0.1 ms", f"{worst_mm:.3f} mm", "<= 0.1 mm", worst_mm <= 0.1)
 
 
 def _creep() -> Check:
-    hand = Hand(_FLOOR, _ABOVE)
-    hand.move((0, 0, 10, 0, 0, 0), 0.45)
-    hand.move((10, 0, 0, 0, 0, 0), 0.4)
-    before, after = hand.move(_STILL, 0.3), hand.move(_STILL, 2.0)
+    tip = CommandedTip(_FLOOR, _ABOVE)
+    tip.move((0, 0, 10, 0, 0, 0), 0.45)
+    tip.move((10, 0, 0, 0, 0, 0), 0.4)
+    before, after = tip.move(_STILL, 0.3), tip.move(_STILL, 2.0)
     creep_um_s = 1e6 * float(np.abs(after.T_f_s[:2, 3] - before.T_f_s[:2, 3]).max()) / 2.0
     return Check("creep of a 4 mm shear that sticks", f"{creep_um_s:.1f} um/s", "<= 10 um/s", creep_um_s <= 10.0)
 
@@ -102,9 +102,9 @@ def _push_force() -> list[Check]:
     found = []
     for friction, name in ((0.3, "MDF"), (0.6, "foam")):
         block = {"shape": {"kind": "box", "size_mm": [80, 80, 60]}, "mass_g": 479}
-        hand = Hand({"objects": {"block": block}, "table": {"friction": friction}}, (-60.5, 0, 30, 0, 90, 0))
-        hand.move((0, 0, 20, 0, 0, 0), 1.0)
-        forces = [hand.move((0, 0, 20, 0, 0, 0), 0.02).normal_force_n for _ in range(100)]
+        tip = CommandedTip({"objects": {"block": block}, "table": {"friction": friction}}, (-60.5, 0, 30, 0, 90, 0))
+        tip.move((0, 0, 20, 0, 0, 0), 1.0)
+        forces = [tip.move((0, 0, 20, 0, 0, 0), 0.02).normal_force_n for _ in range(100)]
         error = float(np.mean(forces)) / (friction * 0.479 * GRAVITY_M_S2) - 1.0
         found.append(
             Check(f"push force against mu m g, {name}", f"{100 * error:+.1f} %", "within 3 %", abs(error) <= 0.03)
@@ -115,12 +115,12 @@ def _push_force() -> list[Check]:
 def _yaw() -> list[Check]:
     found = []
     for size_mm in ((80, 80), (80, 140)):
-        # A small tip that does not slip is a point that pushes, 10 mm beside the middle; it gives way by 0.7 mm.
+        # A small tip that does not slip is a point contact, 10 mm beside the centre; it yields by 0.7 mm.
         block = {"shape": {"kind": "box", "size_mm": [*size_mm, 60]}, "mass_g": 400}
-        tip = {"radius_mm": 2, "friction": 1.5}
-        hand = Hand({"objects": {"block": block}, "tip": tip}, (-42.2, 10, 30, 0, 90, 0))
-        hand.move((0, 0, 20, 0, 0, 0), 3.045)
-        T = hand.object()
+        skin = {"radius_mm": 2, "friction": 1.5}
+        tip = CommandedTip({"objects": {"block": block}, "tip": skin}, (-42.2, 10, 30, 0, 90, 0))
+        tip.move((0, 0, 20, 0, 0, 0), 3.045)
+        T = tip.object()
         expected = uniform_pressure_yaw(1e-3 * np.array(size_mm), np.array([-0.042, 0.010]), 0.060)
         error = float(np.arctan2(T[1, 0], T[0, 0])) / expected - 1.0
         what = f"yaw of an off-centre push, {size_mm[0]} x {size_mm[1]} mm, against uniform pressure"
@@ -132,9 +132,9 @@ def _toppling() -> list[Check]:
     found = []
     for z_mm, falls in ((140, True), (50, False)):
         tall = {"shape": {"kind": "box", "size_mm": [60, 60, 200]}, "mass_g": 500}
-        hand = Hand({"objects": {"tall": tall}, "table": {"friction": 0.5}}, (-51, 0, z_mm, 0, 90, 0))
-        hand.move((0, 0, 30, 0, 0, 0), 2.0)
-        lean_deg = float(np.degrees(np.arccos(min(hand.object()[2, 2], 1.0))))
+        tip = CommandedTip({"objects": {"tall": tall}, "table": {"friction": 0.5}}, (-51, 0, z_mm, 0, 90, 0))
+        tip.move((0, 0, 30, 0, 0, 0), 2.0)
+        lean_deg = float(np.degrees(np.arccos(min(tip.object()[2, 2], 1.0))))
         passed = lean_deg > 60.0 if falls else lean_deg < 1.0
         aim = "falls" if falls else "stands"
         found.append(Check(f"lean of a tall prism pushed at {z_mm} mm", f"{lean_deg:.1f} deg", aim, passed))
@@ -142,9 +142,9 @@ def _toppling() -> list[Check]:
 
 
 def uniform_pressure_yaw(size_m: Array, point: Array, distance_m: float) -> float:
-    """Turn (rad) of a block (2,) m with uniform pressure under it, pushed along x by a point that sticks to it.
+    """Return the rotation (rad) of a block (2,) m with uniform pressure, pushed along x by a point that sticks to it.
 
-    Of all motions that carry ``point`` (2,) m along, friction takes the one about which it has no moment there.
+    Of all motions that move ``point`` (2,) m, friction selects the one about which it has no moment there.
     """
     cells = (np.arange(24) + 0.5) / 24 - 0.5
     bottom = np.stack(np.meshgrid(cells, cells), axis=-1).reshape(-1, 2) * size_m - point

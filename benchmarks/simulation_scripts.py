@@ -1,4 +1,4 @@
-"""Scripted touches of simulated scenes, open loop, so that fidelities can be held against each other."""
+"""Scripted contacts in simulated scenes, open loop, to compare fidelities."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _Twist = tuple[float, float, float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Script:
-    """What is touched and how.
+    """A scripted motion and its scene.
 
     Attributes:
         scene: settings of the ``scene:`` section, without its physics.
@@ -49,14 +49,14 @@ class Script:
 
 @dataclass(slots=True)
 class Trace:
-    """What came of a script.
+    """Result of a script.
 
     Attributes:
         shear_mm: (n, tips, 2) deflection of the tips.
         force_n: (n, tips).
         objects: T_world_object (4, 4) of each at the end.
         duration_s: simulated time.
-        cpu_s: time that it took.
+        cpu_s: CPU time.
     """
 
     shear_mm: Array
@@ -118,11 +118,11 @@ SCRIPTS: dict[str, Script] = {
 
 
 def perform(script: Script, physics: str, physics_step_ms: float = 1.0, *, joints: bool = False) -> Trace:
-    """Run ``script``, with arms that have joints or with tips that go where they are told."""
+    """Run ``script``, with jointed arms or with tips that follow their commands exactly."""
     clock = VirtualClock()
     settings = {**script.scene, "physics": physics, "physics_step_ms": physics_step_ms}
     scene = SceneConfig.model_validate(settings).build(clock)
-    hands = {tip: _Hand(tip, script, scene, clock, physics_step_ms, joints=joints) for tip in script.start_mm_deg}
+    hands = {tip: _TipArm(tip, script, scene, clock, physics_step_ms, joints=joints) for tip in script.start_mm_deg}
     shears, forces = [], []
     started = time.process_time()
     start_ns = clock.now_ns()
@@ -140,7 +140,7 @@ def perform(script: Script, physics: str, physics_step_ms: float = 1.0, *, joint
 
 
 @dataclass(slots=True)
-class _Hand:
+class _TipArm:
     """One arm with its tip at the tool centre point."""
 
     tip: str
@@ -167,7 +167,7 @@ class _Hand:
             config |= {"physics_step_ms": self.physics_step_ms}
         arm: Device = spec.build(self.tip, spec.config(**config), DriverContext(self.clock, {}, self.scene))
         assert isinstance(arm, SimArm | SimJointArm)
-        self.scene.mount(self.tip, arm.T_world_tcp, arm.bear if isinstance(arm, SimJointArm) else None)
+        self.scene.mount(self.tip, arm.T_world_tcp, arm.apply_force if isinstance(arm, SimJointArm) else None)
         arm.connect()
         arm.configure()
         arm.activate()

@@ -70,7 +70,7 @@ def _imports(name: str, path: Path, files: Mapping[str, Path]) -> set[str]:
 
 
 def cycles(graph: Mapping[str, Iterable[str]]) -> list[list[str]]:
-    """Strongly connected components of more than one node (Tarjan 1972)."""
+    """Return the strongly connected components of more than one node (Tarjan 1972)."""
     index: dict[str, int] = {}
     low: dict[str, int] = {}
     stack: list[str] = []
@@ -99,7 +99,7 @@ def cycles(graph: Mapping[str, Iterable[str]]) -> list[list[str]]:
 
 
 def rooms(tree: Tree) -> tuple[dict[str, int], dict[str, set[str]], int]:
-    """Files per room, the rooms that each imports, and the number of arrows between modules of different rooms."""
+    """Return the files per room, the rooms that each imports, and the number of imports between rooms."""
     # Modules at the package's root stand alone: a facade is no room.
     room = {
         name: name if path.name == "__init__.py" or (name.count(".") < 2 and name.startswith("touchcell.")) else
@@ -119,7 +119,7 @@ def rooms(tree: Tree) -> tuple[dict[str, int], dict[str, set[str]], int]:
 
 
 def dialect(tree: Tree) -> tuple[int, int]:
-    """Docstrings that contain a word of the old dialect, and all docstrings."""
+    """Return the number of docstrings that match ``_DIALECT``, and of all docstrings."""
     hit = count = 0
     for path in tree.files.values():
         for node in ast.walk(ast.parse(path.read_text())):
@@ -132,7 +132,7 @@ def dialect(tree: Tree) -> tuple[int, int]:
 
 
 def measure(root: Path) -> dict[str, Any]:
-    """All figures of one checkout."""
+    """Return all figures of one checkout."""
     tree = read_tree(root)
     files, graph, arrows = rooms(tree)
     hit, docstrings = dialect(tree)
@@ -151,7 +151,7 @@ def measure(root: Path) -> dict[str, Any]:
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Print the figures of each checkout; writes ``structure.json`` into ``out``."""
+    """Print the figures of each checkout; write ``structure.json`` into ``out``."""
     parser = argparse.ArgumentParser("touchcell bench structure", description=__doc__.partition("\n")[0])
     parser.add_argument("roots", nargs="*", type=Path, default=[Path(__file__).parent.parent], metavar="checkout")
     roots = parser.parse_args(arguments).roots

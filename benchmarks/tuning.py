@@ -1,9 +1,9 @@
-"""``touchcell bench tuning``: how far the controllers' gains are from instability, and how they answer a step.
+"""``touchcell bench tuning``: gain margins and step responses of the controllers.
 
 Each loop is closed around exact kinematics in control cycles of 10 ms: the contact is sampled at the frame rate and the
 estimate comes ``latency`` later, held until the next one, without a filter that would predict over it. The gain margin
-is by how much all gains of a loop may be multiplied before its answer to a step no longer dies away. The pushed object
-is that of the closed forms (limit surface, sticking point), an 80 mm square.
+is the factor on all gains of a loop up to which its step response decays. The pushed object is that of the closed forms
+(limit surface, sticking point), an 80 mm square.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ PERIOD_S: Final = 0.01
 FRAME_RATES_HZ: Final = (15.0, 30.0, 60.0)
 LATENCIES_MS: Final = (0.0, 10.0, 30.0, 50.0)
 NOMINAL: Final = (30.0, 10.0)
-"""Frame rate (Hz) and latency (ms) of the cells that ship."""
+"""Frame rate (Hz) and latency (ms) of the shipped cells."""
 _LARGEST: Final = 32.0
 _AXES: Final = ("x", "y", "z", "alpha", "beta", "gamma")
 
 Answer = Callable[[float, float, float], Array]
-"""From gain factor, frame rate (Hz) and latency (ms) to the error at each cycle after a step of 1."""
+"""Maps gain factor, frame rate (Hz) and latency (ms) to the error at each cycle after a step of 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A loop whose margins are found.
+    """A loop and its gains.
 
     Attributes:
         name: controller and axis.
-        gains: what they are, with units.
-        answer: to a step.
+        gains: with units.
+        answer: step response.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Line:
 
 
 class _Frames:
-    """What a loop sees of ``value``: sampled at the frame rate, late, held."""
+    """Measurements of ``value``: sampled at the frame rate, delayed, held."""
 
     def __init__(self, frame_rate_hz: float, latency_ms: float) -> None:
         self._period_s = 1.0 / frame_rate_hz
@@ -70,7 +70,7 @@ class _Frames:
         self.t_ns = -1
 
     def look(self, t_s: float, value: Any) -> bool:
-        """Take in the truth at ``t_s``; returns whether there is a new estimate."""
+        """Sample the truth at ``t_s``; return True if there is a new estimate."""
         if t_s >= self._next_s - 1e-9:
             self._taken.append((t_s, value))
             self._next_s += self._period_s
@@ -82,7 +82,7 @@ class _Frames:
 
 
 def servo_answer(config: ContactServoConfig, axis: int, duration_s: float = 4.0) -> Answer:
-    """Of one axis of a servo to a step of 1 mm or 1 deg in it."""
+    """Return the response of one axis of a servo to a step of 1 mm or 1 deg."""
     unit = 1e-3 if axis < 3 else math.radians(1.0)
 
     def answer(factor: float, frame_rate_hz: float, latency_ms: float) -> Array:
@@ -106,7 +106,7 @@ def servo_answer(config: ContactServoConfig, axis: int, duration_s: float = 4.0)
 
 
 def alignment_answer(config: PushConfig, duration_s: float = 20.0) -> Answer:
-    """Of the steering of a pushed square, as its distance from a straight way of which it stands 1 mm aside."""
+    """Return the cross-track error of a pushed square that starts 1 mm beside a straight path."""
     half_m = 0.04
     c = friction_radius_m(BoxShape(kind="box", size_mm=(80, 80, 60)).build())  # type: ignore[arg-type]
     turn_per_m = half_m / (half_m**2 + c**2)
@@ -146,7 +146,7 @@ def alignment_answer(config: PushConfig, duration_s: float = 20.0) -> Answer:
 
 
 def dies_away(errors: Array, cycles: int) -> bool:
-    """Whether the answer lasted all its ``cycles`` and swings less in its second half than in its first."""
+    """Return True if the response covers all ``cycles`` and swings less in its second half than in its first."""
     if len(errors) < cycles:
         return False
     half = len(errors) // 2
@@ -154,7 +154,7 @@ def dies_away(errors: Array, cycles: int) -> bool:
 
 
 def margin(answer: Answer, frame_rate_hz: float, latency_ms: float) -> float:
-    """Largest factor on the gains with which the loop is stable; at most 32."""
+    """Return the largest factor on the gains with which the loop is stable; at most 32."""
     cycles = len(answer(1e-3, frame_rate_hz, latency_ms))
     low, high = 1e-3, 0.25
     while dies_away(answer(high, frame_rate_hz, latency_ms), cycles):
@@ -171,7 +171,7 @@ def margin(answer: Answer, frame_rate_hz: float, latency_ms: float) -> float:
 
 
 def settling(errors: Array) -> dict[str, float]:
-    """Of a step's answer: time to stay within 5 % (s) and overshoot (%)."""
+    """Return the time to stay within 5 % (s) and the overshoot (%) of a step response."""
     outside = np.flatnonzero(np.abs(errors) > 0.05)
     overshoot = max(0.0, -float(errors.min()) / abs(float(errors[0])))
     return {
@@ -181,7 +181,7 @@ def settling(errors: Array) -> dict[str, float]:
 
 
 def lines() -> list[Line]:
-    """The loops of the tasks that ship, with their default gains."""
+    """Return the loops of the shipped tasks, with their default gains."""
     found = []
     for name, config, axes in (
         ("surface following", SurfaceFollowingConfig(), (2, 3)),
@@ -200,7 +200,7 @@ def lines() -> list[Line]:
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Print the table; writes ``tuning.json`` and ``tuning.png`` into ``out``."""
+    """Print the table; write ``tuning.json`` and ``tuning.png`` into ``out``."""
     heads = [f"{rate:g} Hz {late:g} ms" for rate in FRAME_RATES_HZ for late in LATENCIES_MS]
     print("gain margin (factor) by frame rate and latency; step at {:g} Hz, {:g} ms".format(*NOMINAL))
     print(f"{'loop':<24}{'gains':<36}{'settles s':>10}{'over %':>8}" + "".join(f"{head:>12}" for head in heads))
@@ -235,7 +235,7 @@ def _plot(rows: dict[str, dict[str, Any]], answers: dict[str, Array], path: Path
     for name, errors in answers.items():
         left.plot(PERIOD_S * np.arange(len(errors)), errors, label=name)
     left.set_xlim(0.0, 4.0)
-    left.set_title("answer to a step, {:g} Hz, {:g} ms".format(*NOMINAL))
+    left.set_title("step response, {:g} Hz, {:g} ms".format(*NOMINAL))
     left.set_xlabel("s")
     left.set_ylabel("error / step")
     left.grid(alpha=0.3)

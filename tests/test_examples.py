@@ -13,7 +13,7 @@ import pytest
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 PRINTS = {
-    "move_arm": r".*driver sim_arm, ready>\nat .* 49\.9 +150\.\d .*at .* 49\.9 +170\.\d .*",
+    "move_arm": r".*driver sim_arm, ready>\nat .* 49\.9 +150\.\d .*at .* 49\.9 +1(69|70)\.\d .*",
     "estimate_contact": r"(depth \d\.\d\d mm, standard deviation 0\.\d\d mm, in range: True\n){3}",
     "run_cell": r"<CellRun 'surface_follow_sim': done after .*",
     "compare_gains": r"gain 4 1/s: done, depth error \d\.\d+ mm RMS\ngain 8 1/s: done, depth error \d\.\d+ mm RMS\n",

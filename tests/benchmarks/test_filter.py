@@ -1,4 +1,4 @@
-"""``touchcell bench filter`` takes its options after ``--`` and measures what it says."""
+"""``touchcell bench filter`` takes its options after ``--`` and measures consistency and error."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_matched_noise_is_consistent_and_best() -> None:
         assert rows[0.1]["sigma"][name] < rows[1.0]["sigma"][name] < single["sigma"][name]
 
 
-def test_rivals_meet_where_nothing_is_curved() -> None:
+def test_rivals_agree_without_rotation() -> None:
     S = np.diag([1e-3] * 3 + [1e-4] * 3) ** 2
     prior, observation = (PoseGaussian(se3.exp(np.full(6, x)), S) for x in (1e-5, 3e-5))
     best = gaussian.fuse(prior, observation)[0]
@@ -44,7 +44,7 @@ def test_rivals_meet_where_nothing_is_curved() -> None:
         np.testing.assert_allclose(fused.covariance, best.covariance, rtol=1e-4, atol=1e-13, err_msg=name)
 
 
-def test_corrections_that_bear_slip_recover_sooner() -> None:
+def test_robust_corrections_recover_from_slip_sooner() -> None:
     S, jump = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2, se3.exp(np.array([2e-3, 0, 0, 0, 0, 0]))
     left = {}
     for make in (PoseFilter, filter_rivals.SlipFilter, filter_rivals.StudentFilter):

@@ -1,4 +1,4 @@
-"""``touchcell bench gdn-vs-cnn`` trains both kinds alike and goes on where it was interrupted."""
+"""``touchcell bench gdn-vs-cnn`` trains both kinds equally and resumes after an interruption."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from touchcell.perception.models.model_file import load_model
 from touchcell.perception.networks.scores import SCORE_NAMES
 
 
-def test_both_kinds_are_trained_alike_and_once(
+def test_both_kinds_are_trained_equally_and_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

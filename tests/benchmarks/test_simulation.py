@@ -35,14 +35,14 @@ def test_every_script_names_tips_that_it_moves() -> None:
             assert twists.keys() <= script.start_mm_deg.keys()
 
 
-def test_a_push_through_the_middle_turns_nothing() -> None:
+def test_a_push_through_the_centre_does_not_turn_the_object() -> None:
     assert uniform_pressure_yaw(np.array([0.08, 0.08]), np.array([-0.04, 0.0]), 0.05) == pytest.approx(0.0, abs=1e-6)
     to_the_left = uniform_pressure_yaw(np.array([0.08, 0.08]), np.array([-0.04, 0.01]), 0.05)
     assert to_the_left < -0.2
     assert uniform_pressure_yaw(np.array([0.08, 0.08]), np.array([-0.04, -0.01]), 0.05) == pytest.approx(-to_the_left)
 
 
-def test_time_is_counted_where_it_is_spent() -> None:
+def test_time_is_attributed_to_its_stage() -> None:
     with cpu_shares({"tests/benchmarks/test_simulation": "here", "simulation_checks": "there"}, "elsewhere") as counts:
         until = time.process_time() + 5.0
         while counts["here"] < 10 and time.process_time() < until:

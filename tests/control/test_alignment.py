@@ -20,7 +20,7 @@ FORWARD = se3.from_euler_mm_deg(np.array([-60.0, 0.0, 30.0, 0.0, 90.0, 0.0]))
 """T_base_sensor: z along x of the base, x down, y along y."""
 
 
-def test_a_path_is_told_by_its_length():
+def test_points_and_directions_of_a_path_by_arc_length():
     assert CORNER.length_m == pytest.approx(0.5)
     assert CORNER.point(0.1) == pytest.approx((0.1, 0.0))
     assert CORNER.point(0.4) == pytest.approx((0.3, 0.1))
@@ -39,12 +39,12 @@ def test_a_path_is_told_by_its_length():
         ((0.33, -0.04), 0.3, -0.05),
     ],
 )
-def test_a_place_is_how_far_along_and_how_far_aside(p, along, aside):
+def test_a_place_has_arc_length_and_cross_track_error(p, along, aside):
     place = CORNER.place(p, 0.0, 1.0)
     assert (place.along_m, place.cross_track_error_m) == pytest.approx((along, aside))
 
 
-def test_a_place_is_looked_for_near_where_one_was_last():
+def test_a_place_is_searched_near_the_previous_one():
     there_and_back = Path([(0.0, 0.0), (0.3, 0.0), (0.3, 0.01), (0.0, 0.01)])
     assert there_and_back.place((0.1, 0.009), 0.08, 0.05).along_m == pytest.approx(0.1)
     assert there_and_back.place((0.1, 0.001), 0.45, 0.1).along_m == pytest.approx(0.51)
@@ -60,7 +60,7 @@ def test_points_beside_a_path_are_found_again(s, off):
 
 
 @pytest.mark.parametrize("points", [[(0.0, 0.0)], [(0.0, 0.0), (0.0, 0.0)]])
-def test_what_is_no_path_is_refused(points):
+def test_invalid_paths_are_refused(points):
     with pytest.raises(ControlError):
         Path(points)
 
@@ -90,9 +90,11 @@ def test_heading_is_that_of_the_contact_normal_not_of_the_sensor():
 
 
 def steered(gains: AlignmentGains, points: list[tuple[float, float]], crab_rad: float, length_m: float) -> list[float]:
-    """Distance from the path at every mm of a push of the object that the closed forms describe: its middle goes where
-    it heads, turned by ``crab_rad`` since it is not pushed through its middle, and it turns by 15.8 rad per m of the
-    contact's sideways motion (an 80 mm square)."""
+    """Return the distance from the path at every mm of a push of an object with known closed-form motion.
+
+    Its centre moves along its heading, rotated by ``crab_rad`` since it is not pushed through its centre, and it turns
+    by 15.8 rad per m of the contact's lateral motion (an 80 mm square).
+    """
     alignment = TargetAlignment(lambda middle, heading: points, gains)
     x, y, heading, asides = 0.0, 0.0, 0.0, []
     for _ in range(round(length_m / 0.0002)):
@@ -108,18 +110,18 @@ def steered(gains: AlignmentGains, points: list[tuple[float, float]], crab_rad: 
 
 
 @pytest.mark.parametrize("crab_deg", [0.0, 4.0, -8.0])
-def test_an_object_that_goes_aside_still_comes_to_the_target(crab_deg):
+def test_an_object_that_drifts_sideways_still_reaches_the_target(crab_deg):
     asides = steered(GAINS, [(0.3, 0.06)], math.radians(crab_deg), 1.0)
     assert abs(asides[-1]) < 0.001
     assert 1400 < len(asides) < 1700
 
 
-def test_a_bent_path_is_followed():
+def test_a_curved_path_is_followed():
     asides = steered(GAINS, [(0.15, 0.0), (0.3, 0.06), (0.45, 0.06)], 0.0, 1.0)
     assert max(map(abs, asides)) < 0.008
     assert abs(asides[-1]) < 0.001
 
 
-def test_without_integral_action_the_object_arrives_aside():
+def test_without_integral_action_the_object_arrives_beside_the_target():
     asides = steered(AlignmentGains(0.17, 0.0, 0.0, 0.01, 0.04, 0.06), [(0.3, 0.0)], math.radians(4.0), 1.0)
     assert abs(asides[-1]) == pytest.approx(0.04 * math.tan(math.radians(4.0)), rel=0.1)

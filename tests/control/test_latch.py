@@ -1,4 +1,4 @@
-"""The latch, by hand and as a state machine against a model."""
+"""The latch: single cases, and as a state machine against a model."""
 
 from __future__ import annotations
 

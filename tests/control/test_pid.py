@@ -46,7 +46,7 @@ def test_an_axis_with_only_derivative_gain_is_controlled():
     assert gains(kd=np.array([0, 0, 1.0, 0, 0, 0])).controlled.tolist() == [False, False, True, False, False, False]
 
 
-def test_the_average_halves_what_is_left_of_a_step():
+def test_the_average_halves_the_remaining_step():
     pid = Pid(gains(kd=1.0))
     pid.step(ZERO, ZERO, 1.0)
     rates = [pid.step(np.ones(6), ZERO, 1.0)[0] for _ in range(4)]

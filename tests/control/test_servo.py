@@ -1,4 +1,4 @@
-"""Tactile servoing on exact kinematics: the surface stands still, the sensor moves as told."""
+"""Tactile servoing on exact kinematics: the surface is static, the sensor moves as commanded."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MOUNT = se3.from_euler_mm_deg(np.array([20.0, -10.0, 70.0, 30.0, -20.0, 45.0]))
 
 
 def contact(x=0.0, y=0.0, z=0.0, alpha=0.0, beta=0.0, gamma=0.0) -> np.ndarray:
-    """T_s_f of a contact in the labels' terms, mm and degrees."""
+    """Return T_s_f of a contact given as a label, mm and degrees."""
     return se3.inverse(se3.from_euler_mm_deg(np.array([x, y, z, alpha, beta, gamma])))
 
 
@@ -34,7 +34,7 @@ def servo(reference, axes=ALL, kp=8.0, ki=0.0, kd=0.0, T_tcp_sensor=MOUNT, outpu
 
 
 def run(control, T_w_tcp, T_w_f, V_ff, steps, T_tcp_sensor=MOUNT):
-    """Ideal arm: the tool moves along the twist exactly. Returns every pose of the sensor."""
+    """Run an ideal arm: the tool follows the twist exactly. Return every pose of the sensor."""
     poses = []
     for k in range(steps):
         T_w_s = se3.compose(T_w_tcp, T_tcp_sensor)
@@ -94,7 +94,7 @@ def test_feedforward_is_tangential_already_while_tilted():
     control = servo(contact(z=3.0), axes=np.array([0, 0, 1e-9, 0, 0, 0]), T_tcp_sensor=np.eye(4))
     present = contact(z=3.0, alpha=10.0, beta=-15.0)
     V = control.step(present, 0, np.array([0.02, 0, 0, 0, 0, 0]))
-    # Alpha and beta are left alone here, so the reference is tilted likewise and the motion is along the sensor's x.
+    # Alpha and beta are not controlled here: the reference is tilted likewise and the motion is along the sensor's x.
     np.testing.assert_allclose(V, [0.02, 0, 0, 0, 0, 0], atol=1e-10)
     control = servo(contact(z=3.0), axes=1e-9 * NORMAL, T_tcp_sensor=np.eye(4))
     V = control.step(present, 0, np.array([0.02, 0, 0, 0, 0, 0]))
@@ -103,7 +103,7 @@ def test_feedforward_is_tangential_already_while_tilted():
     assert abs(np.linalg.norm(V[:3]) - 0.02) < 1e-9
 
 
-def test_shear_that_nobody_controls_does_not_leak():
+def test_uncontrolled_shear_does_not_leak():
     axes = np.array([0, 0, 1.0, 1.0, 1.0, 0])
     plain = servo(contact(z=3.0), axes=axes, T_tcp_sensor=np.eye(4)).step(contact(z=3.0, alpha=5.0), 0, ZERO)
     sheared = servo(contact(z=3.0), axes=axes, T_tcp_sensor=np.eye(4)).step(
@@ -142,7 +142,7 @@ def test_derivative_uses_the_time_between_estimates():
     np.testing.assert_allclose(V, [0, 0, 0.5 * 0.001 / 0.05, 0, 0, 0], atol=1e-12)
 
 
-def test_without_a_valid_belief_nothing_moves_and_the_past_is_forgotten():
+def test_without_a_valid_estimate_nothing_moves_and_the_state_is_reset():
     control = servo(contact(z=3.0), ki=5.0)
     V_ff = np.array([0.02, 0, 0, 0, 0, 0])
     first = control.step(contact(z=1.0), 0, V_ff)

@@ -1,4 +1,4 @@
-"""The supervisor: order of the checks, the latch behind them, and what a reset does and does not."""
+"""The supervisor: order of the checks, the latch behind them, and the effects of a reset."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def view(now_ns=100, depth_m=0.003, measured=None, command=None) -> CellView:
 
 @dataclass(frozen=True)
 class Broken:
-    """A rule with a bug."""
+    """An interlock with a bug."""
 
     name: str = "broken"
     severity: Severity = Severity.TRIP
@@ -48,7 +48,7 @@ class Broken:
 
 @dataclass(frozen=True)
 class Warned:
-    """A rule that only limits."""
+    """An interlock that only limits."""
 
     name: str = "warned"
     severity: Severity = Severity.LIMIT
@@ -57,7 +57,7 @@ class Warned:
         return Violation(self.name, self.severity, "arm", "slow down", view.now_ns)
 
 
-def test_allows_what_breaks_no_rule():
+def test_allows_motion_without_violations():
     verdict = Supervisor([DEPTH, SPEED], Latch()).review(view(command=MOVE))
     assert verdict.allow
     assert verdict.violations == ()
@@ -79,7 +79,7 @@ def test_a_violation_stops_and_stays():
     assert later.trip.t_ns == 100
 
 
-def test_not_finite_is_asked_first_and_alone():
+def test_finite_is_checked_first_and_alone():
     verdict = Supervisor([Broken(), DEPTH], Latch()).review(view(depth_m=0.01, command=np.full(6, np.nan)))
     assert [v.interlock for v in verdict.violations] == ["finite"]
     assert not verdict.allow
@@ -89,7 +89,7 @@ def test_finite_is_always_on():
     assert not Supervisor([], Latch()).review(view(depth_m=float("nan"))).allow
 
 
-def test_a_rule_that_raises_is_a_fault():
+def test_an_interlock_that_raises_is_a_fault():
     latch = Latch()
     verdict = Supervisor([Broken()], latch).review(view())
     assert not verdict.allow
@@ -97,7 +97,7 @@ def test_a_rule_that_raises_is_a_fault():
     assert "no such arm" in verdict.trip.reason
 
 
-def test_a_limit_is_reported_and_motion_goes_on():
+def test_a_limit_is_reported_and_motion_continues():
     verdict = Supervisor([Warned()], Latch()).review(view(command=MOVE))
     assert verdict.allow
     assert [v.interlock for v in verdict.violations] == ["warned"]

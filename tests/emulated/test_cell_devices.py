@@ -10,7 +10,7 @@ import yaml
 from touchcell.cell.cli import discovery
 from touchcell.cell.cli.devices import print_devices, probe_cell
 from touchcell.cell.cli.discovery import Found
-from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED
+from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_OK
 from touchcell.cell.cli.main import main
 from touchcell.drivers.damiao import rig as damiao_can
 from touchcell.drivers.ur import rig as ur
@@ -58,7 +58,7 @@ def test_probe_energises_nothing_and_continues_after_a_missing_device(
         assert dict(arm.readings)["enabled"] == "0"
         assert camera.error is not None
         assert camera.error.device == "sensor"
-        assert main(["probe", str(path)]) == EXIT_TASK_FAILED
+        assert main(["probe", str(path)]) == EXIT_DEVICE_LOST
         assert "sensor (v4l2): DOES NOT ANSWER" in capsys.readouterr().out
     finally:
         emulator.stop()

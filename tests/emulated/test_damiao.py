@@ -471,7 +471,7 @@ def test_can_fd_works_as_well(channel: Path, emulator: EmulatorProcess) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("changes", "message"),
     [
         ({"rate_hz": 1000.0, "watchdog_s": 0.1}, "load the bus to 162%"),
         ({"watchdog_s": 0.0}, "watchdog_s"),
@@ -485,8 +485,8 @@ def test_can_fd_works_as_well(channel: Path, emulator: EmulatorProcess) -> None:
         ({"speed": 1}, "speed"),
     ],
 )
-def test_configurations_that_cannot_be_right_are_refused(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValidationError, match=words):
+def test_configurations_that_cannot_be_right_are_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
         config(tmp_path, **changes)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.fault_injection import faults
-from tests.fault_injection.emulated_cells import HURT
+from tests.fault_injection.emulated_cells import FAULT_ROLES
 from tests.fault_injection.emulated_matrix import (
     ARMS,
     CAMERAS,
@@ -47,7 +47,7 @@ def test_every_fault_of_the_emulator_is_in_the_matrix(driver: str, tmp_path: Pat
 def test_every_state_of_every_task_is_tested_or_equal_to_a_tested_one(tmp_path: Path) -> None:
     found = dict(places("franka", tmp_path))
     assert {(place.task, place.role, place.state) for place in found} == {
-        (task, role, state) for task, roles in HURT.items() for role in roles for state in states_of(task)[0]
+        (task, role, state) for task, roles in FAULT_ROLES.items() for role in roles for state in states_of(task)[0]
     }
     ending = [place for place, rule in found.items() if place.fault == "reflex" and not rule]
     tried = {
@@ -64,7 +64,7 @@ def test_every_state_of_every_task_is_tested_or_equal_to_a_tested_one(tmp_path: 
     }
     assert found[Place("franka", "reflex", "object_tracking", "arm", "settle")] == SERVO
     assert found[Place("franka", "reflex", "data_collection", "arm", "tilt")] == REACH
-    assert {place.task for place, _ in places("v4l2", tmp_path)} == {*HURT, "observe"}
+    assert {place.task for place, _ in places("v4l2", tmp_path)} == {*FAULT_ROLES, "observe"}
 
 
 @pytest.mark.parametrize("driver", ARMS)
@@ -114,4 +114,4 @@ def test_an_interrupted_run_continues_at_its_end(
     assert not (tmp_path / faults.PART).exists()
     report = json.loads((tmp_path / "faults.json").read_text())
     assert len(report["cases"]) == sum(not rule for place, rule in places("franka", tmp_path) if place.state == "press")
-    assert "as it has to be: 12 of 12 places tried" in capsys.readouterr().out
+    assert "as expected: 12 of 12 places tried" in capsys.readouterr().out

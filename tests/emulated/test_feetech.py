@@ -168,7 +168,7 @@ def test_motion_infeasible_for_five_joints_is_reported(arm: FeetechSerialArm, se
     sent = send(arm, lease, np.array([0.0, 0.03, 0.0, 0.1, 0.0, 0.0]))
     (lost,) = sent.adjustments
     assert lost.limit == "joints: angular"
-    assert lost.asked == pytest.approx(0.1)
+    assert lost.requested == pytest.approx(0.1)
     assert lost.allowed < 0.03
     np.testing.assert_allclose(sent.command.twist[:3], [0.0, 0.03, 0.0], atol=1e-9)
     assert "joints: angular" in str(arm.health()["not_followed"])

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
-from tests.helpers.franka_bench import OPERATOR, Bench, eventually
+from tests.helpers.franka_harness import OPERATOR, FrankaHarness, eventually
 from touchcell.drivers.core.clock import MonotonicClock
 from touchcell.drivers.core.commands import TwistFrame
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle
@@ -45,20 +45,20 @@ TTL_DISTANCE_M = 0.05 * (0.2 - UP_S / 2 + DOWN_S / 2)
 
 
 @pytest.fixture
-def benches() -> Iterator[Callable[..., Bench]]:
-    made: list[Bench] = []
+def benches() -> Iterator[Callable[..., FrankaHarness]]:
+    made: list[FrankaHarness] = []
 
-    def make(**config: Any) -> Bench:
-        made.append(Bench(**config))
+    def make(**config: Any) -> FrankaHarness:
+        made.append(FrankaHarness(**config))
         return made[-1]
 
     yield make
-    for bench in made:
-        bench.close()
+    for harness in made:
+        harness.close()
 
 
 @pytest.fixture
-def bench(benches: Callable[..., Bench]) -> Bench:
+def harness(benches: Callable[..., FrankaHarness]) -> FrankaHarness:
     return benches()
 
 
@@ -77,11 +77,11 @@ def until(kind: type[E], call: Callable[[], object]) -> E:
     return raised[0]
 
 
-def faulted(bench: Bench) -> DeviceFault:
+def faulted(harness: FrankaHarness) -> DeviceFault:
     """Wait until the driver has noticed, and return its fault."""
-    fault = until(DeviceFault, bench.arm.tcp)
-    assert bench.arm.state is Lifecycle.FAULTED
-    assert bench.arm.fault is fault
+    fault = until(DeviceFault, harness.arm.tcp)
+    assert harness.arm.state is Lifecycle.FAULTED
+    assert harness.arm.fault is fault
     return fault
 
 
@@ -119,92 +119,92 @@ def test_wrong_configurations_are_refused(wrong: dict[str, Any]) -> None:
         FrankaConfig.model_validate({"host": "127.0.0.1"} | wrong)
 
 
-def test_connecting_configuring_and_activating_energise_nothing(bench: Bench) -> None:
+def test_connecting_configuring_and_activating_energise_nothing(harness: FrankaHarness) -> None:
     own = os.sched_getscheduler(0)
-    bench.ready()
-    truth = bench.truth()
+    harness.ready()
+    truth = harness.truth()
     assert truth["energising"] == 0
     assert set(truth["received"]) == {"connect", "get_robot_model", "set_collision_behavior"}
     assert truth["force_threshold"] == [40, 40, 40, 10, 10, 10]
-    bench.arm.activate()
-    assert bench.truth()["energising"] == 0
-    assert bench.arm.health()["mode"] == "Idle"
+    harness.arm.activate()
+    assert harness.truth()["energising"] == 0
+    assert harness.arm.health()["mode"] == "Idle"
     assert os.sched_getscheduler(0) == own
 
 
-def test_it_has_its_declared_capabilities(bench: Bench) -> None:
+def test_it_has_its_declared_capabilities(harness: FrankaHarness) -> None:
     for protocol in CAPABILITIES.provides:
-        assert isinstance(bench.arm, protocol), protocol
-    assert bench.arm.watchdog_s() == bench.truth()["watchdog_s"] == CAPABILITIES.max_watchdog_s
+        assert isinstance(harness.arm, protocol), protocol
+    assert harness.arm.watchdog_s() == harness.truth()["watchdog_s"] == CAPABILITIES.max_watchdog_s
 
 
-def test_an_unreachable_controller_is_a_connect_error(bench: Bench) -> None:
-    bench.emulator.kill()
+def test_an_unreachable_controller_is_a_connect_error(harness: FrankaHarness) -> None:
+    harness.emulator.kill()
     with pytest.raises(ConnectError):
-        bench.arm.connect()
-    assert bench.arm.state is Lifecycle.DISCONNECTED
+        harness.arm.connect()
+    assert harness.arm.state is Lifecycle.DISCONNECTED
 
 
-def test_a_second_owner_is_turned_away(bench: Bench) -> None:
-    lease = bench.active()
-    other = bench.another()
+def test_a_second_owner_is_turned_away(harness: FrankaHarness) -> None:
+    lease = harness.active()
+    other = harness.another()
     with pytest.raises(ConnectError, match="one only"):
         other.connect()
-    bench.send([0.02, 0, 0, 0, 0, 0], lease)
-    bench.moved()
+    harness.send([0.02, 0, 0, 0, 0, 0], lease)
+    harness.moved()
 
 
 @pytest.mark.skipif(Path("/sys/kernel/realtime").exists(), reason="this kernel is a real-time one")
 @pytest.mark.skipif(Path("/sys/kernel/realtime").exists(), reason="this kernel is a real-time one")
-def test_a_missing_realtime_kernel_is_found_before_connecting(benches: Callable[..., Bench]) -> None:
-    bench = benches(enforce_realtime=True)
+def test_a_missing_realtime_kernel_is_found_before_connecting(benches: Callable[..., FrankaHarness]) -> None:
+    harness = benches(enforce_realtime=True)
     with pytest.raises(ConnectError, match="enforce_realtime: false"):
-        bench.arm.connect()
-    assert bench.truth()["requests"] == 0
+        harness.arm.connect()
+    assert harness.truth()["requests"] == 0
 
 
-def test_pose_and_joints_are_true(benches: Callable[..., Bench]) -> None:
-    bench = benches(flange_to_tcp_mm_deg=TOOL_MM_DEG)
-    bench.ready()
-    truth = bench.truth()
+def test_pose_and_joints_are_true(benches: Callable[..., FrankaHarness]) -> None:
+    harness = benches(flange_to_tcp_mm_deg=TOOL_MM_DEG)
+    harness.ready()
+    truth = harness.truth()
     np.testing.assert_allclose(truth["F_T_EE"], se3.from_euler_mm_deg(TOOL_MM_DEG), atol=1e-7)
-    np.testing.assert_allclose(bench.arm.tcp(1.0).value.T_base_tcp, truth["T_base_ee"], atol=1e-6)
-    np.testing.assert_allclose(bench.arm.joints(1.0).value.q, truth["q"], atol=1e-6)
+    np.testing.assert_allclose(harness.arm.tcp(1.0).value.T_base_tcp, truth["T_base_ee"], atol=1e-6)
+    np.testing.assert_allclose(harness.arm.joints(1.0).value.q, truth["q"], atol=1e-6)
 
 
-def test_a_pure_rotation_keeps_the_tool_centre_point_in_place(benches: Callable[..., Bench]) -> None:
-    bench = benches(flange_to_tcp_mm_deg=TOOL_MM_DEG)
-    lease = bench.active()
-    T_before = np.array(bench.truth()["T_base_ee"])
-    bench.send([0, 0, 0, 0.1, -0.2, 0.05], lease, 0.5)
-    bench.moved()
-    eventually(lambda: np.linalg.norm(bench.arm.tcp().value.twist[3:]) > 0.2)
-    np.testing.assert_allclose(bench.arm.tcp().value.twist[:3], 0, atol=1e-4)
-    bench.rested()
-    T_after = np.array(bench.truth()["T_base_ee"])
+def test_a_pure_rotation_keeps_the_tool_centre_point_in_place(benches: Callable[..., FrankaHarness]) -> None:
+    harness = benches(flange_to_tcp_mm_deg=TOOL_MM_DEG)
+    lease = harness.active()
+    T_before = np.array(harness.truth()["T_base_ee"])
+    harness.send([0, 0, 0, 0.1, -0.2, 0.05], lease, 0.5)
+    harness.moved()
+    eventually(lambda: np.linalg.norm(harness.arm.tcp().value.twist[3:]) > 0.2)
+    np.testing.assert_allclose(harness.arm.tcp().value.twist[:3], 0, atol=1e-4)
+    harness.rested()
+    T_after = np.array(harness.truth()["T_base_ee"])
     np.testing.assert_allclose(T_after[:3, 3], T_before[:3, 3], atol=5e-5)
     turn = se3.log(T_after @ se3.inverse(T_before))[3:]
     np.testing.assert_allclose(turn / np.linalg.norm(turn), np.array([0.1, -0.2, 0.05]) / 0.2291288, atol=1e-3)
 
 
-def test_a_twist_along_tool_axes_moves_along_the_tool(benches: Callable[..., Bench]) -> None:
-    bench = benches(flange_to_tcp_mm_deg=TOOL_MM_DEG)
-    lease = bench.active()
-    T_before = np.array(bench.truth()["T_base_ee"])
-    bench.send([0, 0, 0.05, 0, 0, 0], lease, frame=TwistFrame.TCP)
-    bench.moved()
-    bench.rested()
-    moved = bench.position() - T_before[:3, 3]
+def test_a_twist_along_tool_axes_moves_along_the_tool(benches: Callable[..., FrankaHarness]) -> None:
+    harness = benches(flange_to_tcp_mm_deg=TOOL_MM_DEG)
+    lease = harness.active()
+    T_before = np.array(harness.truth()["T_base_ee"])
+    harness.send([0, 0, 0.05, 0, 0, 0], lease, frame=TwistFrame.TCP)
+    harness.moved()
+    harness.rested()
+    moved = harness.position() - T_before[:3, 3]
     np.testing.assert_allclose(moved, TTL_DISTANCE_M * T_before[:3, 2], atol=1e-4)
 
 
-def test_the_time_to_live_ends_the_motion_while_python_hangs(bench: Bench) -> None:
-    lease = bench.active()
-    before = bench.position()
-    bench.send([0.05, 0, 0, 0, 0, 0], lease)
+def test_the_time_to_live_ends_the_motion_while_python_hangs(harness: FrankaHarness) -> None:
+    lease = harness.active()
+    before = harness.position()
+    harness.send([0.05, 0, 0, 0, 0, 0], lease)
     # A C call that keeps the interpreter lock: no Python thread of this process can do anything meanwhile.
     ctypes.PyDLL(None).usleep(700_000)
-    truth = bench.truth()
+    truth = harness.truth()
     assert not truth["moving"]
     assert truth["mode"] == "idle"
     np.testing.assert_allclose(np.array(truth["position_m"]) - before, [TTL_DISTANCE_M, 0, 0], atol=1e-4)
@@ -228,12 +228,12 @@ while True:
 
 
 @pytest.mark.parametrize("death", [signal.SIGKILL, signal.SIGSTOP])
-def test_the_arm_stops_when_its_client_is_killed_or_frozen(bench: Bench, death: signal.Signals) -> None:
-    with subprocess.Popen([sys.executable, "-c", CLIENT, bench.config.host]) as client:
+def test_the_arm_stops_when_its_client_is_killed_or_frozen(harness: FrankaHarness, death: signal.Signals) -> None:
+    with subprocess.Popen([sys.executable, "-c", CLIENT, harness.config.host]) as client:
         try:
-            eventually(lambda: bench.truth()["twist"][0] > 0.049)
+            eventually(lambda: harness.truth()["twist"][0] > 0.049)
             client.send_signal(death)
-            truth = bench.emulator.wait_for(moving=False)
+            truth = harness.emulator.wait_for(moving=False)
         finally:
             client.kill()
     assert truth["last_errors"] == ["communication_constraints_violation"]
@@ -242,14 +242,14 @@ def test_the_arm_stops_when_its_client_is_killed_or_frozen(bench: Bench, death: 
     assert overrun <= 0.05 * 0.0211
 
 
-def test_a_stream_at_50_hz_is_followed_without_reflex(bench: Bench) -> None:
-    lease = bench.active()
-    before = bench.position()
+def test_a_stream_at_50_hz_is_followed_without_reflex(harness: FrankaHarness) -> None:
+    lease = harness.active()
+    before = harness.position()
     for step in range(50):
-        bench.send([0.03 * np.sin(2 * np.pi * step / 50), 0.02, 0, 0, 0, 0.1], lease)
-        bench.clock.sleep_until_ns(bench.clock.now_ns() + 20_000_000)
-    bench.rested()
-    truth = bench.truth()
+        harness.send([0.03 * np.sin(2 * np.pi * step / 50), 0.02, 0, 0, 0, 0.1], lease)
+        harness.clock.sleep_until_ns(harness.clock.now_ns() + 20_000_000)
+    harness.rested()
+    truth = harness.truth()
     assert truth["reflexes"] == 0
     assert truth["received"]["move"] <= 3
     moved = np.array(truth["position_m"]) - before
@@ -257,69 +257,69 @@ def test_a_stream_at_50_hz_is_followed_without_reflex(bench: Bench) -> None:
     assert abs(moved[2]) < 1e-4
 
 
-def test_stop_ends_a_motion_and_keeps_the_lease(bench: Bench) -> None:
-    lease = bench.active()
-    bench.send([0.05, 0, 0, 0, 0, 0], lease, 1.0)
-    bench.moved()
-    bench.arm.stop()
-    bench.rested()
-    assert bench.arm.state is Lifecycle.ACTIVE
-    assert bench.truth()["reflexes"] == 0
-    bench.send([0.02, 0, 0, 0, 0, 0], lease)
-    bench.moved()
+def test_stop_ends_a_motion_and_keeps_the_lease(harness: FrankaHarness) -> None:
+    lease = harness.active()
+    harness.send([0.05, 0, 0, 0, 0, 0], lease, 1.0)
+    harness.moved()
+    harness.arm.stop()
+    harness.rested()
+    assert harness.arm.state is Lifecycle.ACTIVE
+    assert harness.truth()["reflexes"] == 0
+    harness.send([0.02, 0, 0, 0, 0, 0], lease)
+    harness.moved()
 
 
-def test_disconnecting_stops_first(bench: Bench) -> None:
-    lease = bench.active()
-    bench.send([0.05, 0, 0, 0, 0, 0], lease, 1.0)
-    bench.moved()
-    bench.arm.disconnect()
-    truth = bench.emulator.wait_for(connected=False)
+def test_disconnecting_stops_first(harness: FrankaHarness) -> None:
+    lease = harness.active()
+    harness.send([0.05, 0, 0, 0, 0, 0], lease, 1.0)
+    harness.moved()
+    harness.arm.disconnect()
+    truth = harness.emulator.wait_for(connected=False)
     assert (truth["moving"], truth["reflexes"], truth["mode"]) == (False, 0, "idle")
 
 
-def test_only_holding_is_offered_when_it_is_deactivated(bench: Bench) -> None:
-    bench.active()
+def test_only_holding_is_offered_when_it_is_deactivated(harness: FrankaHarness) -> None:
+    harness.active()
     with pytest.raises(LifecycleError, match="brakes"):
-        bench.arm.deactivate(DeactivatePolicy.BRAKE)
-    bench.arm.deactivate(DeactivatePolicy.HOLD)
-    assert bench.arm.state is Lifecycle.READY
+        harness.arm.deactivate(DeactivatePolicy.BRAKE)
+    harness.arm.deactivate(DeactivatePolicy.HOLD)
+    assert harness.arm.state is Lifecycle.READY
 
 
-def test_joint_goals_arrive(bench: Bench) -> None:
-    lease = bench.active()
+def test_joint_goals_arrive(harness: FrankaHarness) -> None:
+    lease = harness.active()
     goal = np.array([0.05, -0.75, 0.05, -2.3, 0.05, 1.6, 0.75])
-    bench.arm.go_to_joints(goal, lease, speed_fraction=1.0)
-    assert not bench.arm.at_rest()
+    harness.arm.go_to_joints(goal, lease, speed_fraction=1.0)
+    assert not harness.arm.at_rest()
     with pytest.raises(CommandRejected) as rejected:
-        bench.send([0.02, 0, 0, 0, 0, 0], lease)
+        harness.send([0.02, 0, 0, 0, 0, 0], lease)
     assert rejected.value.reason is Rejection.MODE
-    bench.rested()
-    np.testing.assert_allclose(bench.truth()["q"], goal, atol=1e-6)
+    harness.rested()
+    np.testing.assert_allclose(harness.truth()["q"], goal, atol=1e-6)
 
 
-def test_a_goal_that_was_aborted_does_not_look_reached(bench: Bench) -> None:
-    lease = bench.active()
-    bench.arm.go_to_joints(np.array([0.3, -0.75, 0.05, -2.3, 0.05, 1.6, 0.75]), lease)
-    bench.moved()
-    bench.emulator.fault("reflex", "joint_reflex")
-    assert until(DeviceFault, bench.rested).name == "joint_reflex"
+def test_a_goal_that_was_aborted_does_not_look_reached(harness: FrankaHarness) -> None:
+    lease = harness.active()
+    harness.arm.go_to_joints(np.array([0.3, -0.75, 0.05, -2.3, 0.05, 1.6, 0.75]), lease)
+    harness.moved()
+    harness.emulator.fault("reflex", "joint_reflex")
+    assert until(DeviceFault, harness.rested).name == "joint_reflex"
 
 
-def test_pose_goals_arrive_and_keep_the_speed_limit(benches: Callable[..., Bench]) -> None:
-    bench = benches(dynamics_factor=0.3, limits={"tcp_speed_m_s": 0.05})
-    lease = bench.active()
-    goal = bench.arm.tcp().value.T_base_tcp @ se3.from_euler_mm_deg([10, -20, 5, 2, -3, 4])
-    bench.arm.go_to_pose(goal, lease, speed_fraction=1.0)
+def test_pose_goals_arrive_and_keep_the_speed_limit(benches: Callable[..., FrankaHarness]) -> None:
+    harness = benches(dynamics_factor=0.3, limits={"tcp_speed_m_s": 0.05})
+    lease = harness.active()
+    goal = harness.arm.tcp().value.T_base_tcp @ se3.from_euler_mm_deg([10, -20, 5, 2, -3, 4])
+    harness.arm.go_to_pose(goal, lease, speed_fraction=1.0)
     fastest = 0.0
-    while not bench.arm.at_rest():
-        fastest = max(fastest, float(np.linalg.norm(bench.truth()["twist"][:3])))
-    np.testing.assert_allclose(bench.truth()["T_base_ee"], goal, atol=1e-5)
+    while not harness.arm.at_rest():
+        fastest = max(fastest, float(np.linalg.norm(harness.truth()["twist"][:3])))
+    np.testing.assert_allclose(harness.truth()["T_base_ee"], goal, atol=1e-5)
     assert 0.02 < fastest < 0.0501
 
 
-def test_impossible_joint_goals_are_refused(bench: Bench) -> None:
-    lease = bench.active()
+def test_impossible_joint_goals_are_refused(harness: FrankaHarness) -> None:
+    lease = harness.active()
     goals = [
         (np.full(7, np.nan), Rejection.NON_FINITE),
         (np.zeros(6), Rejection.SHAPE),
@@ -327,170 +327,170 @@ def test_impossible_joint_goals_are_refused(bench: Bench) -> None:
     ]
     for goal, reason in goals:
         with pytest.raises(CommandRejected) as rejected:
-            bench.arm.go_to_joints(goal, lease)
+            harness.arm.go_to_joints(goal, lease)
         assert rejected.value.reason is reason
-    bench.arm.release(lease)
+    harness.arm.release(lease)
     with pytest.raises(CommandRejected) as rejected:
-        bench.arm.go_to_joints(np.array([0, -0.7, 0, -2.3, 0, 1.6, 0.7]), lease)
+        harness.arm.go_to_joints(np.array([0, -0.7, 0, -2.3, 0, 1.6, 0.7]), lease)
     assert rejected.value.reason is Rejection.LEASE
-    assert bench.truth()["energising"] == 0
+    assert harness.truth()["energising"] == 0
 
 
-def test_every_error_is_reported_by_the_table_and_cleared_only_on_request(bench: Bench) -> None:
+def test_every_error_is_reported_by_the_table_and_cleared_only_on_request(harness: FrankaHarness) -> None:
     assert len(ERRORS) == len({error.name for error in ERRORS}) == 41
-    bench.active()
+    harness.active()
     for code, error in enumerate(ERRORS):
-        bench.emulator.fault("reflex", error.name)
-        fault = faulted(bench)
+        harness.emulator.fault("reflex", error.name)
+        fault = faulted(harness)
         assert (fault.vendor_code, fault.name) == (code, error.name)
         assert (fault.fault_class, fault.needs, fault.hint) == (error.fault_class, error.needs, error.hint)
-        assert bench.truth()["mode"] == "reflex"
-        bench.arm.recover(OPERATOR)
-        assert bench.arm.state is Lifecycle.READY
-        assert bench.truth()["mode"] == "idle"
-        bench.arm.activate()
+        assert harness.truth()["mode"] == "reflex"
+        harness.arm.recover(OPERATOR)
+        assert harness.arm.state is Lifecycle.READY
+        assert harness.truth()["mode"] == "idle"
+        harness.arm.activate()
 
 
-def test_a_dead_motion_is_not_silent(bench: Bench) -> None:
-    lease = bench.active()
-    bench.send([0.03, 0, 0, 0, 0, 0], lease, 1.0)
-    bench.moved()
-    bench.emulator.fault("drop", 25)
-    fault = faulted(bench)
+def test_a_dead_motion_is_not_silent(harness: FrankaHarness) -> None:
+    lease = harness.active()
+    harness.send([0.03, 0, 0, 0, 0, 0], lease, 1.0)
+    harness.moved()
+    harness.emulator.fault("drop", 25)
+    fault = faulted(harness)
     assert fault.name == "communication_constraints_violation"
     assert fault.fault_class is FaultClass.COMMUNICATION
     with pytest.raises(CommandRejected):
-        bench.send([0.03, 0, 0, 0, 0, 0], lease)
+        harness.send([0.03, 0, 0, 0, 0, 0], lease)
     # Reading continues.
-    assert bench.arm.tcp(0.5).value.twist[0] == pytest.approx(0, abs=1e-6)
+    assert harness.arm.tcp(0.5).value.twist[0] == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize(("button", "name"), [("user_stop", "user stop"), ("locked", "joints locked")])
-def test_stops_by_a_person_need_a_person(bench: Bench, button: str, name: str) -> None:
-    lease = bench.active()
-    bench.send([0.03, 0, 0, 0, 0, 0], lease, 1.0)
-    bench.moved()
-    bench.emulator.fault(button)
-    fault = faulted(bench)
+def test_stops_by_a_person_need_a_person(harness: FrankaHarness, button: str, name: str) -> None:
+    lease = harness.active()
+    harness.send([0.03, 0, 0, 0, 0, 0], lease, 1.0)
+    harness.moved()
+    harness.emulator.fault(button)
+    fault = faulted(harness)
     assert fault.name.startswith(name)
     assert (fault.fault_class, fault.needs) == (FaultClass.SAFETY_STOP, Remedy.OPERATOR)
     with pytest.raises(DeviceFault, match=name):
-        bench.arm.recover(OPERATOR)
-    assert bench.arm.state is Lifecycle.FAULTED
-    bench.emulator.clear(button)
-    eventually(lambda: bench.arm.health()["mode"] == "Idle")
-    bench.arm.recover(OPERATOR)
-    assert bench.arm.state is Lifecycle.READY
-    assert not bench.truth()["moving"]
+        harness.arm.recover(OPERATOR)
+    assert harness.arm.state is Lifecycle.FAULTED
+    harness.emulator.clear(button)
+    eventually(lambda: harness.arm.health()["mode"] == "Idle")
+    harness.arm.recover(OPERATOR)
+    assert harness.arm.state is Lifecycle.READY
+    assert not harness.truth()["moving"]
 
 
-def test_an_arm_that_is_locked_cannot_be_activated(bench: Bench) -> None:
-    bench.emulator.fault("locked")
-    bench.ready()
+def test_an_arm_that_is_locked_cannot_be_activated(harness: FrankaHarness) -> None:
+    harness.emulator.fault("locked")
+    harness.ready()
     with pytest.raises(DeviceFault, match="Desk"):
-        bench.arm.activate()
-    assert bench.arm.state is Lifecycle.FAULTED
-    assert bench.truth()["energising"] == 0
+        harness.arm.activate()
+    assert harness.arm.state is Lifecycle.FAULTED
+    assert harness.truth()["energising"] == 0
 
 
-def test_the_contact_backstop_stops_the_arm_and_stays(bench: Bench) -> None:
-    lease = bench.active()
-    bench.send([0.05, 0, 0, 0, 0, 0], lease, 1.0)
-    eventually(lambda: bench.truth()["twist"][0] > 0.049)
-    before = bench.emulator.fault("external_wrench", [12, 0, 17, 0, 0, 0])["position_m"]
-    fault = faulted(bench)
+def test_the_contact_backstop_stops_the_arm_and_stays(harness: FrankaHarness) -> None:
+    lease = harness.active()
+    harness.send([0.05, 0, 0, 0, 0, 0], lease, 1.0)
+    eventually(lambda: harness.truth()["twist"][0] > 0.049)
+    before = harness.emulator.fault("external_wrench", [12, 0, 17, 0, 0, 0])["position_m"]
+    fault = faulted(harness)
     assert fault.fault_class is FaultClass.CONTACT
-    truth = bench.emulator.wait_for(moving=False)
+    truth = harness.emulator.wait_for(moving=False)
     # By libfranka's thread: no reflex, and much less than the time-to-live was worth.
     assert truth["reflexes"] == 0
     assert truth["position_m"][0] - before[0] < 0.005
-    np.testing.assert_allclose(bench.arm.wrench(1.0).value, [12, 0, 17, 0, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(harness.arm.wrench(1.0).value, [12, 0, 17, 0, 0, 0], atol=1e-5)
     with pytest.raises(DeviceFault, match="still in contact"):
-        bench.arm.recover(OPERATOR)
-    bench.emulator.clear("external_wrench")
-    eventually(lambda: bench.arm.health()["external_force_n"] == 0.0)
-    bench.arm.recover(OPERATOR)
-    assert bench.arm.state is Lifecycle.READY
+        harness.arm.recover(OPERATOR)
+    harness.emulator.clear("external_wrench")
+    eventually(lambda: harness.arm.health()["external_force_n"] == 0.0)
+    harness.arm.recover(OPERATOR)
+    assert harness.arm.state is Lifecycle.READY
 
 
-def test_a_torque_is_left_to_the_controller(bench: Bench) -> None:
-    lease = bench.active()
-    bench.send([0.02, 0, 0, 0, 0, 0], lease, 1.0)
-    bench.moved()
-    bench.emulator.fault("external_wrench", [0, 0, 0, 0, 0, 11])
-    assert faulted(bench).name == "cartesian_reflex"
+def test_a_torque_is_left_to_the_controller(harness: FrankaHarness) -> None:
+    lease = harness.active()
+    harness.send([0.02, 0, 0, 0, 0, 0], lease, 1.0)
+    harness.moved()
+    harness.emulator.fault("external_wrench", [0, 0, 0, 0, 0, 11])
+    assert faulted(harness).name == "cartesian_reflex"
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_a_few_bad_states_pass(bench: Bench, moving: bool) -> None:
-    lease = bench.active()
-    seen = [bench.arm.tcp().seq]
+def test_a_few_bad_states_pass(harness: FrankaHarness, moving: bool) -> None:
+    lease = harness.active()
+    seen = [harness.arm.tcp().seq]
     for fault in ("nan", "out_of_order", "drop_states"):
         if moving:
-            bench.send([0.02, 0, 0, 0, 0, 0], lease, 1.0)
-            bench.moved()
-        bench.emulator.fault(fault, 6)
+            harness.send([0.02, 0, 0, 0, 0, 0], lease, 1.0)
+            harness.moved()
+        harness.emulator.fault(fault, 6)
         begin = seen[-1]
         while seen[-1] < begin + 30:
-            sample = bench.arm.tcp(1.0)
+            sample = harness.arm.tcp(1.0)
             assert np.isfinite(sample.value.T_base_tcp).all()
             seen.append(sample.seq)
-            bench.clock.sleep_until_ns(bench.clock.now_ns() + 1_000_000)
+            harness.clock.sleep_until_ns(harness.clock.now_ns() + 1_000_000)
     assert seen == sorted(seen)
-    assert bench.arm.state is Lifecycle.ACTIVE
-    assert 1 <= bench.arm.health()["bad_states"] <= 6
+    assert harness.arm.state is Lifecycle.ACTIVE
+    assert 1 <= harness.arm.health()["bad_states"] <= 6
 
 
-def test_states_that_stay_bad_are_a_fault(bench: Bench) -> None:
-    bench.active()
-    bench.emulator.fault("nan", 1_000_000)
-    until(StaleData, lambda: bench.arm.tcp(0.02))
-    until(CorruptMessage, bench.arm.tcp)
-    assert bench.arm.state is Lifecycle.FAULTED
+def test_states_that_stay_bad_are_a_fault(harness: FrankaHarness) -> None:
+    harness.active()
+    harness.emulator.fault("nan", 1_000_000)
+    until(StaleData, lambda: harness.arm.tcp(0.02))
+    until(CorruptMessage, harness.arm.tcp)
+    assert harness.arm.state is Lifecycle.FAULTED
     with pytest.raises(CorruptMessage):
-        bench.arm.recover(OPERATOR)
+        harness.arm.recover(OPERATOR)
 
 
-def test_short_packets_are_counted_while_it_rests(bench: Bench) -> None:
-    bench.active()
-    bench.emulator.fault("corrupt", 3)
-    eventually(lambda: bench.arm.health()["bad_states"] >= 1)
-    assert bench.arm.tcp(1.0).seq > 0
-    assert bench.arm.state is Lifecycle.ACTIVE
+def test_short_packets_are_counted_while_it_rests(harness: FrankaHarness) -> None:
+    harness.active()
+    harness.emulator.fault("corrupt", 3)
+    eventually(lambda: harness.arm.health()["bad_states"] >= 1)
+    assert harness.arm.tcp(1.0).seq > 0
+    assert harness.arm.state is Lifecycle.ACTIVE
 
 
 @pytest.mark.parametrize("fault", ["pause", "unplug"])
 @pytest.mark.parametrize("moving", [False, True])
-def test_a_silent_arm_is_stale_and_then_a_fault(bench: Bench, fault: str, moving: bool) -> None:
-    lease = bench.active()
+def test_a_silent_arm_is_stale_and_then_a_fault(harness: FrankaHarness, fault: str, moving: bool) -> None:
+    lease = harness.active()
     if moving:
-        bench.send([0.02, 0, 0, 0, 0, 0], lease, 1.0)
-        bench.moved()
-    bench.emulator.fault(fault)
-    until(StaleData, lambda: bench.arm.tcp(0.3))
-    until(TransportError, bench.arm.at_rest)
-    assert bench.arm.state is Lifecycle.FAULTED
-    assert not bench.arm.at_rest()
+        harness.send([0.02, 0, 0, 0, 0, 0], lease, 1.0)
+        harness.moved()
+    harness.emulator.fault(fault)
+    until(StaleData, lambda: harness.arm.tcp(0.3))
+    until(TransportError, harness.arm.at_rest)
+    assert harness.arm.state is Lifecycle.FAULTED
+    assert not harness.arm.at_rest()
     if fault == "unplug":
-        truth = bench.emulator.wait_for(moving=False)
+        truth = harness.emulator.wait_for(moving=False)
         assert truth["mode"] == ("reflex" if moving else "idle")
 
 
-def test_a_link_that_is_late_still_moves_it(bench: Bench) -> None:
-    lease = bench.active()
-    bench.emulator.fault("delay", 0.005)
-    before = bench.position()
-    bench.send([0.05, 0, 0, 0, 0, 0], lease)
-    bench.moved()
-    bench.rested()
-    assert bench.truth()["reflexes"] == 0
-    assert (bench.position() - before)[0] == pytest.approx(TTL_DISTANCE_M, abs=2e-4)
+def test_a_link_that_is_late_still_moves_it(harness: FrankaHarness) -> None:
+    lease = harness.active()
+    harness.emulator.fault("delay", 0.005)
+    before = harness.position()
+    harness.send([0.05, 0, 0, 0, 0, 0], lease)
+    harness.moved()
+    harness.rested()
+    assert harness.truth()["reflexes"] == 0
+    assert (harness.position() - before)[0] == pytest.approx(TTL_DISTANCE_M, abs=2e-4)
 
 
-def test_after_a_restart_it_connects_anew(bench: Bench) -> None:
-    bench.active()
-    bench.emulator.fault("restart")
-    until(TransportError, bench.arm.tcp)
-    bench.arm.disconnect()
-    bench.active()
-    assert bench.arm.tcp(1.0).value.T_base_tcp[0, 3] == pytest.approx(bench.position()[0], abs=1e-6)
+def test_after_a_restart_it_connects_anew(harness: FrankaHarness) -> None:
+    harness.active()
+    harness.emulator.fault("restart")
+    until(TransportError, harness.arm.tcp)
+    harness.arm.disconnect()
+    harness.active()
+    assert harness.arm.tcp(1.0).value.T_base_tcp[0, 3] == pytest.approx(harness.position()[0], abs=1e-6)

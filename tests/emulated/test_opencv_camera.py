@@ -160,7 +160,7 @@ def test_refused_settings_are_named(run: Callable[[str], Program]) -> None:
 try:
     ready(width_px=700)
 except UnsupportedSetting as refused:
-    say([refused.setting, refused.asked, refused.given])
+    say([refused.setting, refused.requested, refused.given])
 """)
     assert program.last_reply() == ["width_px", 700, 640]
 

@@ -117,7 +117,7 @@ def test_a_remote_arm_is_as_an_arm_is(tmp_path: Path) -> None:
         np.testing.assert_allclose(sent.command.twist, [0.1, 0, 0, 0, 0, 0], atol=1e-12)
         assert sent.command.t_cause_ns == 5
         assert [a.limit for a in sent.adjustments] == ["tcp linear speed"]
-        assert sent.adjustments[0].asked == 5.0
+        assert sent.adjustments[0].requested == 5.0
         for bad, reason in (
             (twist(cell, np.nan), Rejection.NON_FINITE),
             (twist(cell, ttl_s=0.0), Rejection.LIMIT),
@@ -212,7 +212,7 @@ def test_activation_is_refused_when_the_chain_does_not_stop_in_time(
     assert caught.value.declared_s < 2.5 / RATE_HZ
 
 
-def hurt(tmp_path: Path, fault: ProcessFault) -> ProcessCase:
+def inject(tmp_path: Path, fault: ProcessFault) -> ProcessCase:
     """The fault in a cell that ran until then; where this machine starves it, the watchdog has done its work before."""
     for k in range(TRIES - 1):
         with contextlib.suppress(TooBusy):
@@ -221,24 +221,24 @@ def hurt(tmp_path: Path, fault: ProcessFault) -> ProcessCase:
 
 
 @pytest.mark.parametrize(
-    ("name", "told_by"),
+    ("name", "reported_as"),
     [
         ("task killed", "TASK_GONE"),
         ("task stopped", "TASK_SILENT"),
         ("watchdog killed", None),
     ],
 )
-def test_both_arms_stop_in_time_whichever_process_dies(tmp_path: Path, name: str, told_by: str | None) -> None:
+def test_both_arms_stop_in_time_whichever_process_dies(tmp_path: Path, name: str, reported_as: str | None) -> None:
     """The others of ``FAULTS`` are in ``touchcell bench safety -- --processes``."""
     fault = next(fault for fault in FAULTS if fault.name == name)
-    case = hurt(tmp_path, fault)
+    case = inject(tmp_path, fault)
     assert list(case.problems) == []
     assert len(case.arms) == 2
-    assert case.notes.get("reason") == told_by
+    assert case.notes.get("reason") == reported_as
     for arm in case.notes.get("arms", {}).values():
         assert arm["speed_m_s"] == pytest.approx(SPEED_M_S)
         assert arm["time_s"] == pytest.approx(SPEED_M_S / 0.5, abs=0.02)
-        assert arm["last_obeyed_ns"] <= arm["stopped_ns"]
+        assert arm["last_executed_ns"] <= arm["stopped_ns"]
     if fault.name != "task killed":
         assert case.outcome["outcome"] == "tripped"
         assert case.outcome["causes"][0][0] == "watchdog"
@@ -434,5 +434,5 @@ def test_why_reports_the_watchdogs_record_of_a_run_whose_process_died(tmp_path: 
     (tmp_path / NOTES).write_text(json.dumps(note))
     assert explain(tmp_path).splitlines()[1:] == [
         "  the task's process has ended",
-        "  left: told to stop at 30.0 mm/s; at rest after 0.058 s and 1.00 mm",
+        "  left: commanded to stop at 30.0 mm/s; at rest after 0.058 s and 1.00 mm",
     ]

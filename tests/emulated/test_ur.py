@@ -330,7 +330,7 @@ def test_bad_packets_are_counted_and_never_substituted(field: str, value: Any) -
     setattr(receive, field, value)
     assert reader.poll() is good
     assert reader.corrupt == 1
-    assert not reader.over_budget
+    assert not reader.drops_too_many
 
 
 def test_an_older_packet_is_out_of_order() -> None:
@@ -349,15 +349,15 @@ def test_eleven_bad_packets_of_fifty_are_over_the_budget() -> None:
         receive.timestamp += 0.002
         receive.robot_mode = 99 if i % 5 == 0 else 7
         reader.poll()
-    assert not reader.over_budget
+    assert not reader.drops_too_many
     receive.timestamp += 0.002
     receive.robot_mode = 99
     reader.poll()
     receive.timestamp += 0.002
     reader.poll()
-    assert reader.over_budget
-    reader.forget()
-    assert not reader.over_budget
+    assert reader.drops_too_many
+    reader.reset_statistics()
+    assert not reader.drops_too_many
 
 
 # Connecting
@@ -421,10 +421,10 @@ def test_activation_is_refused(arm: UrArm, emulator: EmulatorProcess) -> None:
         ("registers_in_use", True, "in use"),
         ("speed_slider", 0, "slider"),
     )
-    for fault, value, words in refusals:
+    for fault, value, message in refusals:
         emulator.fault(fault, value)
         wait_until(lambda fault=fault: fault != "speed_slider" or arm.health()["speed_fraction"] == 0, "slider")  # type: ignore[misc]
-        with pytest.raises(DeviceError, match=words):
+        with pytest.raises(DeviceError, match=message):
             arm.activate()
         assert arm.state is Lifecycle.READY
         emulator.clear(fault)

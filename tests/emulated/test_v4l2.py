@@ -196,7 +196,7 @@ def test_a_setting_that_the_camera_changes_is_refused(
     with pytest.raises(UnsupportedSetting) as caught:
         camera.configure()
     assert caught.value.setting == setting
-    assert caught.value.asked == settings[setting]
+    assert caught.value.requested == settings[setting]
     assert caught.value.given == given
     assert str(given) in str(caught.value)
     assert camera.state is Lifecycle.PASSIVE
@@ -211,7 +211,7 @@ def test_a_control_that_silently_keeps_its_value_is_refused(
     camera.connect()
     with pytest.raises(UnsupportedSetting) as caught:
         camera.configure()
-    assert (caught.value.setting, caught.value.asked, caught.value.given) == ("gain", 30, 20)
+    assert (caught.value.setting, caught.value.requested, caught.value.given) == ("gain", 30, 20)
     emulator.clear("stuck_controls")
     camera.configure()
     assert camera.latest().value.gain == 30.0

@@ -1,8 +1,8 @@
-"""The wall clock of all processes of a cell is set an hour ahead and back, while two arms work: nothing may happen.
+"""The wall clock of all processes of a cell is set an hour ahead and back while two arms work: nothing may happen.
 
-By ``clock_shim.c``, which stands between programs and the kernel: it steps CLOCK_REALTIME and leaves CLOCK_MONOTONIC
-alone, as ``date --set`` does, but for the cell only. (libfaketime 0.9.10 cannot: with the monotonic clock left alone
-its ``clock_nanosleep`` fails with EINVAL, and so does every ``time.sleep``.)
+``clock_shim.c``, between programs and the kernel, steps CLOCK_REALTIME and leaves CLOCK_MONOTONIC unchanged, as
+``date --set`` does, but for the cell only. (libfaketime 0.9.10 cannot: with the monotonic clock unchanged its
+``clock_nanosleep`` fails with EINVAL, and so does every ``time.sleep``.)
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ _SOURCE: Final = Path(__file__).with_name("clock_shim.c")
 
 @dataclass(frozen=True, slots=True)
 class StepCase:
-    """What became of one cell whose clock was set twice.
+    """Result of one cell whose clock was set twice.
 
     Attributes:
-        stepped_s: by how much the task's wall clock differed from its monotonic one at the end.
-        fastest_m_s: the slower arm's highest speed after the steps, each.
+        stepped_s: difference of the task's wall clock and its monotonic one at the end.
+        fastest_m_s: the slower arm's highest speed after each step.
         outcome: last line of the task's process.
-        problems: what happened, where nothing should have.
+        problems: deviations from the expected behaviour.
     """
 
     stepped_s: float
@@ -43,7 +43,7 @@ class StepCase:
 
 
 def clock_shim(folder: Path) -> Path | None:
-    """The shim, built in ``folder``; None where there is no C compiler."""
+    """Build the shim in ``folder``; None where there is no C compiler."""
     compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
         return None
@@ -56,8 +56,8 @@ def run_steps(folder: Path, library: Path, rate_hz: float, what: str = "sway") -
     """Let two arms ``sway`` or ``push`` and step the clock of all processes.
 
     Raises:
-        TooBusy: the cell did not run long enough to be hurt, or was stopped for its loop's lateness, as cells on a
-            machine like this are without a step.
+        TooBusy: the cell did not run long enough for the step, or was stopped for its loop's lateness, as happens on a
+            busy machine without a step.
     """
     folder.mkdir(parents=True, exist_ok=True)
     offset = folder / "offset"
@@ -67,7 +67,7 @@ def run_steps(folder: Path, library: Path, rate_hz: float, what: str = "sway") -
     fastest: list[float] = []
     with (
         running_cell(folder, rate_hz, what, environment) as (process, who, states),
-        # Written in place: everybody has mapped it.
+        # Written in place: all processes have mapped it.
         offset.open("r+b", buffering=0) as setting,
     ):
         pids = [who["task"], who["watchdog"], *who["hosts"].values()]
@@ -96,7 +96,7 @@ def run_steps(folder: Path, library: Path, rate_hz: float, what: str = "sway") -
 
 
 def _fastest(states: Mapping[str, RecordReader]) -> float:
-    """Highest speed (m/s) of the slower arm in the time after a step."""
+    """Return the highest speed (m/s) of the slower arm in the time after a step."""
     highest = dict.fromkeys(states, 0.0)
     deadline_s = time.monotonic() + _WATCHED_S
     while time.monotonic() < deadline_s:

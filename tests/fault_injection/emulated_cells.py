@@ -1,8 +1,8 @@
-"""Cell files for ``touchcell bench faults``: every task, built around the place where an emulated arm has its tool.
+"""Cell files for ``touchcell bench faults``: every task, built around the tool pose of an emulated arm.
 
-Where an arm is hurt its sensor is simulated and feels a scene that stands before its tool. Where a camera is hurt it
-sits on a simulated arm, and the contact is taken from that arm's pose: what the emulated camera shows does not depend
-on what it touches.
+Where a fault is injected into an arm, its sensor is simulated and touches a scene in front of its tool. Where it is
+injected into a camera, the camera is mounted on a simulated arm, and the contact is computed from that arm's pose: the
+emulated camera's images do not depend on the contact.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.testing.emulation.rig import DeviceFixture
 
-HURT: Final = {
+FAULT_ROLES: Final = {
     "surface_following": ("arm",),
     "object_tracking": ("arm",),
     "single_arm_pushing": ("arm",),
@@ -57,19 +57,19 @@ _TASKS: Final[Mapping[str, Mapping[str, Any]]] = {
 
 
 def sensor_of(role: str) -> str:
-    """Role of the sensor that the arm in ``role`` carries."""
+    """Return the role of the sensor that the arm in ``role`` carries."""
     return "sensor" if role == "arm" else f"{role}_sensor"
 
 
 def arm_cell(task: str, role: str, rig: DeviceFixture, T_base_tcp: Array, collected: str) -> dict[str, Any]:
-    """A cell in which the emulated arm of ``rig``, its tool at ``T_base_tcp`` (4, 4), plays ``role`` in ``task``.
+    """Return a cell in which the emulated arm of ``rig`` has ``role`` in ``task``, its tool at ``T_base_tcp``.
 
     Args:
-        task: of ``HURT``.
-        role: of the arm that is hurt; another one is simulated.
+        task: of ``FAULT_ROLES``.
+        role: of the arm with the fault; another one is simulated.
         rig: of the emulated arm.
-        T_base_tcp: (4, 4) its tool in its base, which stands in the world's origin.
-        collected: folder for what data collection keeps.
+        T_base_tcp: (4, 4) its tool in its base, which is the world frame.
+        collected: folder for data collection.
     """
     assert rig.config is not None
     emulated = {"driver": rig.spec.name, "deactivate": "hold", **rig.config.model_dump(mode="json", exclude_unset=True)}
@@ -86,7 +86,7 @@ def arm_cell(task: str, role: str, rig: DeviceFixture, T_base_tcp: Array, collec
     sensors = {sensor_of(role): _simulated_sensor(role, _across(T_base_tcp, ahead), {"kind": "true_contact"})}
     tips = {role: tip}
     if task == "dual_arm_pushing":
-        other = next(name for name in HURT[task] if name != role)
+        other = next(name for name in FAULT_ROLES[task] if name != role)
         T_other = se3.from_euler_mm_deg(np.array([*(1e3 * (2.0 * middle - tip)), *_DOWN]))
         arms[other] = _simulated_arm(T_other)
         sensors[sensor_of(other)] = _simulated_sensor(other, _across(T_other, -ahead), {"kind": "true_contact"})
@@ -111,8 +111,8 @@ def arm_cell(task: str, role: str, rig: DeviceFixture, T_base_tcp: Array, collec
 
 
 def camera_cell(task: str, cameras: Mapping[str, DeviceFixture], collected: str) -> dict[str, Any]:
-    """A cell in which the emulated cameras, by role of their sensor, sit on simulated arms."""
-    roles = HURT.get(task, ())
+    """Return a cell in which the emulated cameras, by role of their sensor, are mounted on simulated arms."""
+    roles = FAULT_ROLES.get(task, ())
     arms, sensors, tips = {}, {}, {}
     settings: dict[str, Any] = {}
     for number, role in enumerate(roles):
@@ -126,7 +126,7 @@ def camera_cell(task: str, cameras: Mapping[str, DeviceFixture], collected: str)
         surface = _known_surface(T_base_tcp @ T_tcp_s @ _GAP)
         sensors[sensor_of(role)] = _emulated_sensor(cameras[sensor_of(role)], surface, role, T_tcp_s)
     if not roles:
-        # Without an arm nothing but the picture tells of a contact.
+        # Without an arm only the image shows a contact.
         sensors["sensor"] = _emulated_sensor(cameras["sensor"], {"kind": "network", "model": "builtin:sim_gdn"})
     extra = _collect(task, collected)
     data = _cell(task, arms, sensors, tips, extra, settings)
@@ -168,7 +168,7 @@ def _cell(
         "schema": 1,
         "name": f"matrix_{task}",
         "time": "real",
-        # Objects that are pushed are computed beside a driver and what watches it.
+        # Pushed objects are simulated in parallel to a driver and its watchdog.
         "rate_hz": 25 if task.endswith("pushing") else 50,
         "arms": dict(arms),
         "sensors": dict(sensors),
@@ -188,13 +188,13 @@ def _plate(T_base_tcp: Array, *, moves: bool) -> dict[str, Any]:
 
 
 def _ahead(T_base_tcp: Array) -> Array:
-    """(3,) The horizontal direction in which the tool lies from the base."""
+    """Return the (3,) horizontal direction from the base to the tool."""
     out = T_base_tcp[:2, 3]
     return np.array([*(out / np.linalg.norm(out)), 0.0])
 
 
 def _across(T_base_tcp: Array, ahead: Array) -> Array:
-    """(4, 4) A sensor in the tool that looks along ``ahead`` (3,) in the base, its own x axis down."""
+    """Return the (4, 4) sensor in the tool that faces along ``ahead`` (3,) in the base, its own x axis down."""
     down = np.array([0.0, 0.0, -1.0])
     T_tcp_s = np.eye(4)
     T_tcp_s[:3, :3] = T_base_tcp[:3, :3].T @ np.column_stack([down, np.cross(ahead, down), ahead])
@@ -246,5 +246,5 @@ def _collect(task: str, folder: str) -> dict[str, Any]:
 
 
 def sensors_of(task: str) -> Sequence[str]:
-    """Roles of the sensors of a task."""
-    return [sensor_of(role) for role in HURT[task]] if task in HURT else ["sensor"]
+    """Return the roles of the sensors of a task."""
+    return [sensor_of(role) for role in FAULT_ROLES[task]] if task in FAULT_ROLES else ["sensor"]

@@ -1,7 +1,7 @@
-"""One place of the matrix of ``touchcell bench faults``: an emulated device is hurt in one state of a task.
+"""One case of the matrix of ``touchcell bench faults``: a fault of an emulated device in one state of a task.
 
-The device is the real driver on its emulator, in real time. Whether an emulated arm stands is asked of the emulator,
-which knows the truth.
+The device is the real driver on its emulator, in real time. Whether an emulated arm is at rest is read from the
+emulator's ground truth.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
-from tests.fault_injection.emulated_cells import HURT, arm_cell, camera_cell, sensor_of, sensors_of
+from tests.fault_injection.emulated_cells import FAULT_ROLES, arm_cell, camera_cell, sensor_of, sensors_of
 from tests.fault_injection.sent_commands import SentCommands
 from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.cell.runtime.cell import Cell
@@ -77,37 +77,37 @@ MORE_FAULTS: Final[Mapping[str, Mapping[str, tuple[Any, str]]]] = {
         "no_monotonic": (True, "transient"),
     },
 }
-"""Faults that the conformance suite does not try, or not so, with a value and the lawful answer in a running task."""
+"""Faults that the conformance suite lacks or tests differently, with a value and the reaction in a running task."""
 
 UNSEEN: Final[Mapping[tuple[str, str], Mapping[str, str]]] = {
     ("franka", "drop"): {"prepare": "the controller waits for the first command of a motion"},
     ("feetech_serial", "carry"): {"retract": "the tool is carried farther than it has to withdraw: the task has ended"},
 }
-"""States in which a fault ends nothing, and why."""
+"""States in which a fault does not end the run, and why."""
 
 _WATCHED_S: Final = 3.0
 _CALM_S: Final = 0.6
 _SETTLED_CYCLES: Final = 5
 _STILL_M: Final = 2e-4
 _STILL_S: Final = 0.12
-# Whoever does not run for so long has not been let run.
+# A process that does not run for so long was starved.
 _STALL_S: Final = 0.15
 _TRIES: Final = 3
-# The last state; asked for the end, a task comes there from the one before, in which it presses.
+# The last state; on a stop request, a task enters it from the previous one, in which it presses.
 _AFTER_STOP: Final = "retract"
 _RATE_HZ: Final = 50.0
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """One place of the matrix.
+    """One case of the matrix.
 
     Attributes:
-        driver: whose emulator is hurt.
-        fault: how.
-        task: what the cell does.
-        role: of the arm or sensor that is hurt.
-        state: of the task in which it happens.
+        driver: its emulator gets the fault.
+        fault: name of the fault.
+        task: task of the cell.
+        role: of the arm or sensor with the fault.
+        state: of the task in which it is injected.
     """
 
     driver: str
@@ -122,22 +122,22 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class EmulatedCase:
-    """What was found in one place of the matrix.
+    """Result of one case of the matrix.
 
     Attributes:
-        place: which.
-        lawful: the driver's lawful answer: "fault" or "stale" ends the run, "transient" and "unseen" need not.
+        place: the case.
+        reaction: the driver's expected reaction: "fault" or "stale" ends the run, "transient" and "unseen" need not.
         ended_by: interlock or error that ended the run; empty if none did.
-        detection_s: from the fault until the run ended; None if it went on.
-        rest_s: from the end of the run until the arm truly stood; None where it cannot be told.
-        distance_m: way of the tool in that time.
-        reached: whether the fault was made to happen.
-        stalled_s: longest time for which this process was not let run from the fault on.
-        problem: what was not as it has to be; empty if all was.
+        detection_s: from the fault until the run ended; None if it continued.
+        rest_s: from the end of the run until the arm was truly at rest; None where that is unknown.
+        distance_m: path length of the tool in that time.
+        reached: True if the fault was injected.
+        stalled_s: longest time for which this process was starved from the fault on.
+        problem: deviation from the expected behaviour; empty if none.
     """
 
     place: Place
-    lawful: str
+    reaction: str
     ended_by: str = ""
     detection_s: float | None = None
     rest_s: float | None = None
@@ -148,7 +148,7 @@ class EmulatedCase:
 
 
 def states_of(task: str) -> tuple[tuple[str, ...], bool]:
-    """The states of a task by its own table, and whether it is one of those that share ``ServoTask``."""
+    """Return the states of a task by its own table, and whether it is one of those that share ``ServoTask``."""
     spec = TASKS.load(task)
     required = {"target_mm": (0.0, 0.0)} if "target_mm" in spec.config.model_fields else {}
     poses = {sensor: np.eye(4) for sensor in sensors_of(task)}
@@ -158,37 +158,39 @@ def states_of(task: str) -> tuple[tuple[str, ...], bool]:
 
 
 def faults_of(driver: str, folder: Path) -> dict[str, tuple[Any, str]]:
-    """Every fault of the driver's emulator with its value and the lawful answer, and what befalls its process."""
+    """Return every fault of the driver's emulator with its value and expected reaction, and those of its process."""
     ends = {HANG: (True, "fault"), VANISH: (True, "fault")}
     return {**RIGS.load(driver)(folder, 0).faults, **MORE_FAULTS[driver], **ends}
 
 
 SERVO: Final = (
-    "prepare, approach, settle and retract are one code, whatever the task that servoes and however many hands it has: "
+    "prepare, approach, settle and retract are one code, for every servoing task and any number of arms: "
     "tried in surface_following"
 )
 REACH: Final = "lift, tilt, press and shear of data_collection are one code, motion to a place: tried in press"
-HIDDEN: Final = "what a driver takes in without a word reaches no task: faults that end nothing are tried in one task"
+HIDDEN: Final = (
+    "a fault that a driver tolerates silently reaches no task: faults that do not end a run are tried in one task"
+)
 RULES: Final = (SERVO, REACH, HIDDEN)
-"""Why a place is the same as another by construction."""
+"""Why a case is equivalent to another by construction."""
 
 LEFT_OUT: Final = (
     "data_collection asks an arm to repeat to 20 um, which damiao_can and feetech_serial cannot by their encoders",
-    "what becomes of a camera's fault does not depend on the arm that carries it: v4l2 sits on simulated arms",
+    "the effect of a camera's fault does not depend on the arm that carries it: v4l2 is mounted on simulated arms",
 )
-"""What is no part of the matrix."""
+"""Cases that are not part of the matrix."""
 
 _COARSE: Final = ("damiao_can", "feetech_serial")
 
 
 def places(driver: str, folder: Path) -> Iterator[tuple[Place, str]]:
-    """Every place of ``driver``, with which of ``RULES`` makes it the same as another one; empty for none.
+    """Yield every case of ``driver``, with the one of ``RULES`` that makes it equivalent to another; empty for none.
 
     Args:
         driver: of ``ARMS`` or ``CAMERAS``.
-        folder: for the rig, of which only the faults are looked at.
+        folder: for the rig, of which only the faults are used.
     """
-    tasks: list[str] = [*HURT]
+    tasks: list[str] = [*FAULT_ROLES]
     if driver in CAMERAS:
         tasks.append("observe")
     elif driver in _COARSE:
@@ -196,13 +198,13 @@ def places(driver: str, folder: Path) -> Iterator[tuple[Place, str]]:
     faults = faults_of(driver, folder)
     for task in tasks:
         states, servoes = states_of(task)
-        for role in HURT.get(task, ("",)):
-            hurt = role if driver in ARMS else sensor_of(role or "arm")
+        for role in FAULT_ROLES.get(task, ("",)):
+            target = role if driver in ARMS else sensor_of(role or "arm")
             for state in states:
                 rule = _rule(task, state, servoes=servoes)
-                for fault, (_, lawful) in faults.items():
-                    hidden = lawful in ("transient", "unseen") and task != "surface_following"
-                    yield Place(driver, fault, task, hurt, state), HIDDEN if hidden else rule
+                for fault, (_, reaction) in faults.items():
+                    hidden = reaction in ("transient", "unseen") and task != "surface_following"
+                    yield Place(driver, fault, task, target, state), HIDDEN if hidden else rule
 
 
 def _rule(task: str, state: str, *, servoes: bool) -> str:
@@ -213,11 +215,11 @@ def _rule(task: str, state: str, *, servoes: bool) -> str:
 
 @dataclass
 class Bench:
-    """Runs places of the matrix, one after another.
+    """Run cases of the matrix, one after another.
 
     Args:
-        folder: for sockets, cell files and what tasks collect.
-        address: from which on addresses are free.
+        folder: for sockets, cell files and collected data.
+        address: first free address.
     """
 
     folder: Path
@@ -225,7 +227,7 @@ class Bench:
     _poses: dict[str, Array] = field(default_factory=dict, init=False)
 
     def run(self, place: Place) -> EmulatedCase:
-        """Let the fault happen and judge what comes of it; tried again where this machine does not let it be."""
+        """Inject the fault and judge the reaction; repeated where the machine starved it."""
         for _ in range(_TRIES):
             case = self._run_once(place)
             if case.reached and case.stalled_s < _STALL_S:
@@ -233,10 +235,10 @@ class Bench:
         return case
 
     def _run_once(self, place: Place) -> EmulatedCase:
-        value, lawful = faults_of(place.driver, self.folder)[place.fault]
+        value, reaction = faults_of(place.driver, self.folder)[place.fault]
         if place.state in UNSEEN.get((place.driver, place.fault), {}):
-            lawful = "unseen"
-        case = EmulatedCase(place, lawful)
+            reaction = "unseen"
+        case = EmulatedCase(place, reaction)
         self.address += 10
         rig = RIGS.load(place.driver)(self.folder, self.address)
         with ExitStack() as exits:
@@ -248,9 +250,9 @@ class Bench:
                 return replace(case, reached=False, problem=f"before the fault: {error}")
 
     def _arm_plan(self, place: Place, rig: DeviceFixture) -> CellPlan:
-        # Every fresh emulator has its tool at the same place.
+        # Every fresh emulator has its tool at the same pose.
         if place.driver not in self._poses:
-            self._poses[place.driver] = _told_pose(rig)
+            self._poses[place.driver] = _reported_pose(rig)
         collected = self._collected()
         return self._planned(arm_cell(place.task, place.role, rig, self._poses[place.driver], str(collected)))
 
@@ -263,7 +265,7 @@ class Bench:
             rigs[sensor] = RIGS.load(place.driver)(self.folder, self.address + number)
             _started(rigs[sensor], exits)
         plan = self._planned(camera_cell(place.task, rigs, str(self._collected())))
-        # No kernel module is needed: this process asks the emulator in place of the kernel.
+        # No kernel module is needed: this process queries the emulator instead of the kernel.
         sensors = {
             name: replace(device, spec=replace(device.spec, build=_on_shim(rigs[name])))
             for name, device in plan.sensors.items()
@@ -318,7 +320,7 @@ def _run(case: EmulatedCase, rig: DeviceFixture, emulator: Emulated, plan: CellP
                     if asked and rig.pose is not None and not rig.spec.capabilities.falls_on_power_loss:
                         witness = watch.enter_context(closing(_Witness(rig, emulator)))
             if injected_s is not None and given_up_ns is None:
-                for_s = _CALM_S if case.lawful in ("transient", "unseen") else _WATCHED_S
+                for_s = _CALM_S if case.reaction in ("transient", "unseen") else _WATCHED_S
                 if time.monotonic() > injected_s + for_s:
                     given_up_ns = cell.clock.now_ns()
                     stop.ask_at_once()
@@ -328,7 +330,7 @@ def _run(case: EmulatedCase, rig: DeviceFixture, emulator: Emulated, plan: CellP
         if injected_s is None or stalls is None:
             case = replace(case, reached=False, problem=f"the state was not reached: {result.reason}")
         else:
-            # What the stop at the end brings about is no answer to the fault.
+            # Effects of the stop at the end are not a reaction to the fault.
             causes = [cause for cause in result.causes if given_up_ns is None or cause.t_ns < given_up_ns]
             case = _judged(case, cell, replace(result, causes=tuple(causes)), sent, ended_s - injected_s)
             case = replace(case, stalled_s=stalls.longest_s)
@@ -341,7 +343,7 @@ def _run(case: EmulatedCase, rig: DeviceFixture, emulator: Emulated, plan: CellP
 
 
 def _inject(emulator: Emulated, fault: str, value: Any) -> bool:
-    """Make it happen; whether the emulator can still be asked."""
+    """Inject the fault; return True if the emulator still answers."""
     if fault == VANISH:
         emulator.kill()
     elif fault == HANG:
@@ -352,7 +354,7 @@ def _inject(emulator: Emulated, fault: str, value: Any) -> bool:
 
 
 def _mend(emulator: Emulated, fault: str) -> None:
-    """All has been seen: a device that answers again is left sooner."""
+    """Remove the fault after the observation: a device that answers again is closed sooner."""
     if fault == HANG:
         emulator.thaw()
     elif fault != VANISH:
@@ -366,8 +368,8 @@ def _judged(case: EmulatedCase, cell: Cell, result: RunResult, sent: SentCommand
     by = "" if result.error is None else type(result.error).__name__
     by = by if first is None else first.interlock
     by = by or ("retreat" if result.outcome is Outcome.FAILED else "")
-    if case.lawful in ("fault", "stale") and not by:
-        problems.append(f"nothing ended the run, which went on for {_WATCHED_S:g} s ({result.outcome.value})")
+    if case.reaction in ("fault", "stale") and not by:
+        problems.append(f"nothing ended the run, which continued for {_WATCHED_S:g} s ({result.outcome.value})")
     if first is not None and sent.since(first.t_ns):
         problems.append("a command was sent after the trip")
     simulated = {role: stop for role, stop in result.stops.items() if cell.arms[role].name != _emulated_arm(case)}
@@ -394,7 +396,7 @@ def _with_rest(case: EmulatedCase, witness: _Witness, ended_s: float) -> Emulate
 
 
 class _Stalls:
-    """How long a thread of this process that only wants to sleep was kept from running, until it is closed."""
+    """Measures how long a sleeping thread of this process was kept from running, until it is closed."""
 
     def __init__(self) -> None:
         self.longest_s = 0.0
@@ -417,9 +419,9 @@ class _Stalls:
 
 
 class _Witness:
-    """Asks the emulator where the tool truly is, again and again, in a thread of its own until it is closed.
+    """Polls the emulator's true tool pose in a thread until it is closed.
 
-    Nobody else may talk to the emulator in that time.
+    No other thread may use the emulator in that time.
     """
 
     def __init__(self, rig: DeviceFixture, emulator: Emulated) -> None:
@@ -436,7 +438,7 @@ class _Witness:
         self._thread.join()
 
     def _look(self) -> None:
-        # An emulator that a fault has ended is asked no more.
+        # An emulator that a fault has ended is not polled any more.
         with suppress(DeviceError, OSError):
             self._look_on()
 
@@ -445,7 +447,7 @@ class _Witness:
             self.seen.append((time.monotonic(), _true_pose(self._rig, self._emulator)[:3, 3]))
 
     def last_moved(self, since_s: float) -> tuple[float, float]:
-        """When the tool was last seen in another place than at last, and how far it went after ``since_s``."""
+        """Return when the tool last moved, and how far it went after ``since_s``."""
         last = self.seen[-1][1]
         moved_s = max((t for t, p in self.seen if np.linalg.norm(p - last) > _STILL_M), default=since_s)
         start = next((p for t, p in self.seen if t >= since_s), last)
@@ -458,12 +460,12 @@ def _true_pose(rig: DeviceFixture, emulator: Emulated) -> Array:
     return np.array(emulator.state()[rig.pose], dtype=np.float64).reshape(4, 4)
 
 
-def _told_pose(rig: DeviceFixture) -> Array:
+def _reported_pose(rig: DeviceFixture) -> Array:
     device = rig.build(MonotonicClock())
     assert isinstance(device, Arm)
     with device:
         device.configure()
-        # Some tell their tool only then; others would fall when they are let go.
+        # Some report their tool pose only then; others would fall when they are de-energised.
         if not rig.spec.capabilities.falls_on_power_loss:
             device.activate()
         return device.tcp().value.T_base_tcp

@@ -1,7 +1,7 @@
-"""Runs places of ``tests.fault_injection.emulated_matrix`` in a process that a vendor's library may take with it.
+"""Run cases of ``tests.fault_injection.emulated_matrix`` in a process that a vendor's library may crash.
 
-``python -m tests.fault_injection.emulated_worker ADDRESS`` reads a place from each line of its standard input and
-answers with what was found, as JSON. Addresses of emulators count on from ADDRESS.
+``python -m tests.fault_injection.emulated_worker ADDRESS`` reads a case from each line of its standard input and
+writes the result as JSON. Addresses of emulators count up from ADDRESS.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from tests.fault_injection.emulated_matrix import Bench, Place
 
 
 def main() -> None:
-    """Until the input ends."""
-    # What libraries print is none of the answers.
+    """Run cases until the input ends."""
+    # Output of libraries is kept apart from the results.
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     with tempfile.TemporaryDirectory(prefix="touchcell-faults-") as folder:

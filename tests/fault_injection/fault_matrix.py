@@ -28,28 +28,28 @@ from touchcell.tasks.state_machine_task import MachineTask
 
 _WATCHED_S = 3.0
 _SETTLED_CYCLES = 3
-# By then the camera has shown enough for its brightness to be known.
+# By then the camera has delivered enough frames for a brightness reference.
 _NOT_BEFORE_S = 0.4
-# Some tasks withdraw only when they are asked to end.
+# Some tasks withdraw only on a stop request.
 _AFTER_STOP = ("retract", "withdraw")
 _ASKED_AFTER_S = 0.8
 
 Inject = Callable[[Cell, StopRequest, str], None]
-"""Hurts the device with that name (a camera) or in that role (an arm)."""
+"""Injects a fault into the device with that name (a camera) or in that role (an arm)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Something that goes wrong, and what has to come of it.
+    """A fault and its expected reaction.
 
     Attributes:
         name: in tables.
-        device: what it belongs to; a task without an arm has no faults of one.
-        inject: makes it happen.
-        expected: kinds of interlock, or of error, of which one has to end the run; empty: it ends without.
-        unseen: states in which it has no effect that could be seen, and why.
-        obeys: whether the arm still does what its stop category asks for; if not, it takes twice as long ...
-        extra_m_s: ... and moves at this speed besides.
+        device: kind of the device; a task without an arm has no faults of one.
+        inject: injects it.
+        expected: kinds of interlock or error, one of which has to end the run; empty if the run has to end without.
+        unseen: states in which it has no observable effect, and why.
+        obeys: True if the arm still stops by its category; if not, it takes twice as long ...
+        extra_m_s: ... and moves at this speed in addition.
     """
 
     name: str
@@ -83,7 +83,7 @@ def _camera(**changes: Any) -> Inject:
 
 
 def _and_stop(inject: Inject) -> Inject:
-    """The fault, and a stop by the operator at the same time, without which it would not show."""
+    """Combine the fault with an operator's stop, without which it would have no effect."""
 
     def both(cell: Cell, stop: StopRequest, device: str) -> None:
         inject(cell, stop, device)
@@ -98,7 +98,7 @@ _STANDS = {
     "keep": "the arm stands still",
     "note": "the arm stands still",
 }
-_NO_BASELINE = {"prepare": "the first frames are the measure", "wait": "the first frames are the measure"}
+_NO_BASELINE = {"prepare": "the first frames are the reference", "wait": "the first frames are the reference"}
 
 FAULTS: Final = (
     Fault("operator's stop", "arm", _and_stop(lambda cell, stop, device: None), frozenset(), {}),
@@ -119,7 +119,7 @@ FAULTS: Final = (
     ),
     Fault("camera: frozen", "camera", _camera(frozen=True), frozenset({"frame_frozen"}), {}),
     Fault("camera: last_seq", "camera", _camera(last_seq=0), frozenset({"frame_age"}), {}),
-    # Where the loop waits for the first frame, the arm's state is too old when it comes; a task without an arm sees the
+    # Where the loop waits for the first frame, the arm's state is too old when it comes; a task without an arm gets the
     # same picture for too long.
     Fault(
         "camera: extra_latency_s",
@@ -134,16 +134,16 @@ FAULTS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One place in the matrix and what was found there.
+    """One case of the matrix and its result.
 
     Attributes:
-        task, device, fault, state: which place.
+        task, device, fault, state: the case.
         ended_by: kind of the interlock that came first, "stop" for an arm that had to be stopped by stronger means, the
             kind of the error that was raised, or empty if none.
         detection_s: from the fault to the trip.
-        stop_s, distance_m: until the arm stood, of two the later; None where there is no arm, or nothing to be read.
-        declared_s, declared_m: what that may take.
-        problem: what was not as it has to be; empty if all was.
+        stop_s, distance_m: until the arm was at rest, of two the later; None where there is no arm or no reading.
+        declared_s, declared_m: their declared limits.
+        problem: deviation from the expected behaviour; empty if none.
     """
 
     task: str
@@ -170,7 +170,7 @@ _STEPS: Final = (
 
 
 def cells() -> dict[str, dict[str, Any]]:
-    """A short cell file for every task, by the task's name."""
+    """Return a short cell file for every task, by the task's name."""
     following, tracking = _shipped("surface_follow_sim.yaml"), _shipped("object_track_sim.yaml")
     following["task"] |= {"distance_mm": 10, "retract_mm": 10}
     tracking["task"] |= {"duration_s": 0.6, "retract_mm": 12}
@@ -199,12 +199,12 @@ def cells() -> dict[str, dict[str, Any]]:
 def matrix(
     folder: Path, devices: Sequence[str] = ("arm", "camera"), tasks: Sequence[str] | None = None
 ) -> Iterator[Case]:
-    """Run every place of the matrix and yield what was found.
+    """Run every case of the matrix and yield the results.
 
     Args:
-        folder: for cell files, and for what tasks collect.
-        devices: whose faults; those of cameras need a model, those of arms run on the true contact.
-        tasks: of which; None for all.
+        folder: for cell files and collected data.
+        devices: kinds of device with faults; those of cameras need a model, those of arms run on the true contact.
+        tasks: names; None for all.
     """
     for task, data in cells().items():
         if tasks is not None and task not in tasks:
@@ -214,15 +214,15 @@ def matrix(
             path.write_text(yaml.safe_dump(on_true_contact(data) if kind == "arm" else data))
             probe = compose(plan_anew(path))
             assert isinstance(probe.task, MachineTask)
-            hurt = probe.plan.arm_roles if kind == "arm" else probe.cameras
+            targets = probe.plan.arm_roles if kind == "arm" else probe.cameras
             for fault in (fault for fault in FAULTS if fault.device == kind):
-                for device in hurt:
+                for device in targets:
                     for state in probe.task.states:
                         yield run_case(path, fault, device, state)
 
 
 def on_true_contact(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The cell file ``data`` with the scene's own contact in place of a network's estimate."""
+    """Return the cell file ``data`` with the scene's own contact in place of a network's estimate."""
     sensors = {name: dict(sensor) for name, sensor in data["sensors"].items()}
     for sensor in sensors.values():
         if sensor["estimator"]["kind"] == "network":
@@ -231,15 +231,15 @@ def on_true_contact(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def plan_anew(path: Path) -> CellPlan:
-    """Its plan; a task that collects begins anew, in a folder beside the file."""
+    """Return its plan; a task that collects starts again, in a folder beside the file."""
     collected = path.with_suffix(".collected")
     shutil.rmtree(collected, ignore_errors=True)
-    # Only a cell that collects has something to be overridden.
+    # Only a collecting cell has something to override.
     return plan_cell(path, {"data": collected})
 
 
 def run_case(path: Path, fault: Fault, device: str, state: str) -> Case:
-    """Run the cell, let the fault happen to ``device`` in ``state``, and judge what comes of it."""
+    """Run the cell, inject the fault into ``device`` in ``state``, and judge the reaction."""
     cell, stop, sent = compose(plan_anew(path)), StopRequest(), SentCommands()
     case = Case(cell.plan.task.name, device, fault.name, state)
     injected_ns: int | None = None
@@ -284,18 +284,18 @@ def _judged(
     if first is not None and sent.since(first.t_ns):
         problems.append("a command was sent after the trip")
     if not at_rest:
-        problems.append("the arm does not stand")
+        problems.append("the arm is not at rest")
     case = replace(case, ended_by=by, detection_s=None if first is None else (first.t_ns - injected_ns) * 1e-9)
     for role, report in result.stops.items():
-        hurt = role == case.device
-        times = 2 if hurt and not fault.obeys else 1
+        faulty = role == case.device
+        times = 2 if faulty and not fault.obeys else 1
         longest_s = times * report.declared_s + 1.0 / cell.rate_hz
-        farthest_m = times * report.declared_m + (fault.extra_m_s * longest_s if hurt else 0.0)
+        farthest_m = times * report.declared_m + (fault.extra_m_s * longest_s if faulty else 0.0)
         if report.time_s is None or report.time_s > longest_s:
             problems.append(f"{role} at rest after {report.time_s} s, declared {report.declared_s:.3f} s")
         if report.distance_m is not None and report.distance_m > farthest_m:
             problems.append(
-                f"{role} stood after {1e3 * report.distance_m:.2f} mm, declared {1e3 * report.declared_m:.2f} mm"
+                f"{role} was at rest after {1e3 * report.distance_m:.2f} mm, declared {1e3 * report.declared_m:.2f} mm"
             )
         if case.stop_s is None or (report.time_s or 0.0) > case.stop_s:
             case = replace(
@@ -314,7 +314,7 @@ def _shipped(name: str) -> dict[str, Any]:
 
 
 def median_and_worst(values: Sequence[float], first: int, second: int, digits: int) -> str:
-    """Two columns of the given widths; dashes where there is nothing."""
+    """Format two columns of the given widths; dashes where there is no value."""
     if not values:
         return f"{'-':>{first}}{'-':>{second}}"
     return f"{np.median(values):{first}.{digits}f}{max(values):{second}.{digits}f}"

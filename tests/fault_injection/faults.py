@@ -1,7 +1,7 @@
-"""``touchcell bench faults``: every fault of every emulated device in every state of every task, and what comes of it.
+"""``touchcell bench faults``: every fault of every emulated device in every state of every task, and the reaction.
 
-It works in real time. What has been found is kept in ``faults.part.jsonl`` after each place, so that a run that was
-interrupted, or that a busy machine kept from reaching some places, goes on where it ended.
+It runs in real time. Results are stored in ``faults.part.jsonl`` after each case, so that a run that was interrupted,
+or starved of some cases by a busy machine, continues where it ended.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _ADDRESSES: Final = 100_000
 
 
 class _Worker:
-    """One ``tests.fault_injection.emulated_worker``, started again where it has died."""
+    """One ``tests.fault_injection.emulated_worker``, restarted when it has died."""
 
     def __init__(self, address: int, log: Path) -> None:
         self._address = address
@@ -39,7 +39,7 @@ class _Worker:
         self._process: subprocess.Popen[str] | None = None
 
     def run(self, place: Place) -> EmulatedCase:
-        """Have it run one place; a process that dies is what was found there."""
+        """Run one case; the death of the process is a result too."""
         if self._process is None:
             self._process = self._start()
         process = self._process
@@ -71,14 +71,14 @@ class _Worker:
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Print the table; writes ``faults.json`` into ``out``. Takes about two seconds for each place."""
+    """Print the table; write ``faults.json`` into ``out``. Takes about two seconds per case."""
     parser = argparse.ArgumentParser(prog="touchcell bench faults", description=__doc__.partition("\n")[0])
     parser.add_argument("names", nargs="*", metavar="driver", help=f"of {', '.join((*ARMS, *CAMERAS))}; default: all")
     parser.add_argument("--state", action="append", help="only in this state of the tasks")
     parser.add_argument("--task", action="append", help="only in this task")
-    parser.add_argument("--all", action="store_true", help="also places that are the same as another by rule")
-    parser.add_argument("--jobs", type=int, default=2, help="places at a time")
-    parser.add_argument("--again", action="store_true", help="forget what an interrupted run has found")
+    parser.add_argument("--all", action="store_true", help="also cases that are equivalent to another by rule")
+    parser.add_argument("--jobs", type=int, default=2, help="cases in parallel")
+    parser.add_argument("--again", action="store_true", help="discard the results of an interrupted run")
     options = parser.parse_args(arguments)
     part = out / PART
     if options.again:
@@ -92,7 +92,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
             and (options.task is None or place.task in options.task)
         ]
         faults = {driver: faults_of(driver, Path(folder)) for driver in dict.fromkeys(p.driver for p, _ in everything)}
-        # Where this machine did not let the fault happen it is tried again.
+        # Cases in which the machine was too busy for the fault are repeated.
         found = {case.place: case for case in _kept(part) if case.reached}
         wanted = [place for place, rule in everything if options.all or not rule]
         missing = [place for place in wanted if place not in found]
@@ -110,7 +110,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
 
 
 def _run_all(missing: Sequence[Place], jobs: int, part: Path, folder: Path) -> Iterator[EmulatedCase]:
-    """What is found, as it is found; ends early where a person interrupts it."""
+    """Yield results as they arrive; ends early on Ctrl-C."""
     with _workers(jobs, folder) as workers, ThreadPoolExecutor(jobs) as pool, part.open("a") as kept:
 
         def run_one(place: Place) -> EmulatedCase:
@@ -129,7 +129,7 @@ def _run_all(missing: Sequence[Place], jobs: int, part: Path, folder: Path) -> I
                 print(f"\r{number} of {len(missing)}: {case.place}".ljust(110), end="", file=sys.stderr, flush=True)
                 yield case
         except KeyboardInterrupt:
-            print("\ninterrupted: what follows is of the places so far; the same command goes on", file=sys.stderr)
+            print("\ninterrupted: results of the cases so far; the same command continues", file=sys.stderr)
             pool.shutdown(wait=False, cancel_futures=True)
     print(file=sys.stderr)
 
@@ -160,7 +160,7 @@ def _case(data: dict[str, Any]) -> EmulatedCase:
 def _print_table(cases: Sequence[EmulatedCase], faults: Mapping[str, Mapping[str, tuple[Any, str]]]) -> None:
     print(f"{'':<43}{'places':>7}{'fault to end, ms':>17}{'then at rest, ms':>17}{'way, mm':>14}")
     print(
-        f"{'driver, fault, lawful answer':<43}{'':>7}"
+        f"{'driver, fault, reaction':<43}{'':>7}"
         + f"{'median':>10}{'worst':>7}" * 2
         + f"{'median':>8}{'worst':>6}  ended by"
     )
@@ -180,12 +180,12 @@ def _row(name: str, cases: Sequence[EmulatedCase]) -> str:
 
 def _print_coverage(cases: Sequence[EmulatedCase], wanted: int, everything: int, same: Mapping[str, int]) -> None:
     bad = [case for case in cases if case.problem]
-    print(f"\nas it has to be: {len(cases) - len(bad)} of {len(cases)} places tried, {wanted} to be tried")
+    print(f"\nas expected: {len(cases) - len(bad)} of {len(cases)} places tried, {wanted} to be tried")
     for case in bad:
         print(f"  {case.place}: {case.problem}")
-    print(f"the same by construction: {sum(same.values())} of all {everything} places (--all tries them)")
+    print(f"equivalent by construction: {sum(same.values())} of all {everything} places (--all tries them)")
     for rule in RULES:
         print(f"  {same[rule]:>4}: {rule}")
-    print("no part of the matrix:")
+    print("not part of the matrix:")
     for reason in LEFT_OUT:
         print(f"        {reason}")

@@ -1,7 +1,7 @@
 """``touchcell bench safety -- --processes``: every fault of a whole process while two arms move, and the cost.
 
-For each fault, over all arms and repeats: the time until the arms were told to stop, from then to rest, the way they
-went since the fault, and what was declared; then the cost of having arms in other processes.
+For each fault, over all arms and repeats: the time until the arms were commanded to stop, from then to rest, the path
+length since the fault, and the declared limits; then the cost of having arms in other processes.
 """
 
 from __future__ import annotations
@@ -23,29 +23,27 @@ from tests.fault_injection.process_faults import FAULTS, ProcessCase, ProcessFau
 from touchcell.cell.bench.provenance import provenance
 
 CELLS: Final = {
-    "sway": (50.0, "two arms to and fro at 50 Hz, each in a process of its own"),
-    "push": (12.5, "an emulated Franka and an emulated UR push an object at 12.5 Hz, each in a process of its own"),
+    "sway": (50.0, "two arms to and fro at 50 Hz, each in its own process"),
+    "push": (12.5, "an emulated Franka and an emulated UR push an object at 12.5 Hz, each in its own process"),
 }
 """Rate and description of each."""
 
 _TRIES: Final = 8
-# How soon a loop counts as late is not the question there.
+# The loop's deadline is not tested there.
 _CLOCK_HZ: Final = 25.0
 
 T = TypeVar("T")
 
 
 def run(repeats: int, out: Path) -> None:
-    """Print both tables; writes ``processes.json`` into ``out``."""
+    """Print both tables; write ``processes.json`` into ``out``."""
     reports: list[dict[str, Any]] = []
     problems: list[str] = []
     not_run = 0
     with tempfile.TemporaryDirectory() as folder:
         for what, (rate_hz, description) in CELLS.items():
             print(f"\n{description}; {repeats} times each; median and worst of all arms")
-            print(
-                f"{'':<20}{'told to stop, ms':>18}{'stop time, ms':>16}{'way, mm':>16}{'rest, ms':>10}{'declared':>10}"
-            )
+            print(f"{'':<20}{'detection, ms':>18}{'stop time, ms':>16}{'way, mm':>16}{'rest, ms':>10}{'declared':>10}")
             for fault in FAULTS:
                 tried = [_case(Path(folder) / f"{what} {fault.name} {k}", fault, rate_hz, what) for k in range(repeats)]
                 cases = [case for case in tried if case is not None]
@@ -57,7 +55,7 @@ def run(repeats: int, out: Path) -> None:
             problems += [f"{what}, clock step: {problem}" for step in steps for problem in step.problems]
             reports += [{"cell": what, "rate_hz": rate_hz, "fault": "clock step", **asdict(step)} for step in steps]
         if not_run:
-            print(f"\nnot run, because this machine starved the cell before anything was done to it: {not_run}")
+            print(f"\nnot run, because the machine starved the cell before the fault: {not_run}")
         print(f"\n{len(problems)} problems" + "".join(f"\n  {problem}" for problem in problems))
         costs = {kind: measure(Path(folder), kind) for kind in ("one", "separate")}
     print(f"\n{'two arms at 100 Hz, us':<32}{'one process':>18}{'separate':>18}")
@@ -69,7 +67,7 @@ def run(repeats: int, out: Path) -> None:
 
 
 def _clock_steps(folder: Path, rate_hz: float, what: str, repeats: int) -> list[StepCase]:
-    """The clock of all processes is stepped; prints what became of it."""
+    """Step the clock of all processes and print the results."""
     library = clock_shim(folder)
     if library is None:
         print("clock of all processes set: not run, there is no C compiler for tests/fault_injection/clock_shim.c")
@@ -91,7 +89,7 @@ def _clock_steps(folder: Path, rate_hz: float, what: str, repeats: int) -> list[
 
 
 def _case(folder: Path, fault: ProcessFault, rate_hz: float, what: str) -> ProcessCase | None:
-    """One case; tried again where the machine did not let the cell run, None where it never did."""
+    """Run one case; repeated where the machine starved the cell, None where it always did."""
     return _tried(lambda place: run_fault(place, fault, rate_hz, what), folder)
 
 
@@ -104,17 +102,17 @@ def _tried(attempt: Callable[[Path], T], folder: Path) -> T | None:
 
 def _row(fault: ProcessFault, cases: Sequence[ProcessCase]) -> str:
     arms = [arm for case in cases for arm in case.arms]
-    told = _pair([1e3 * arm.detected_s for arm in arms if arm.detected_s is not None], 18, 0)
+    detection = _pair([1e3 * arm.detected_s for arm in arms if arm.detected_s is not None], 18, 0)
     stop = _pair([1e3 * arm.stop_s for arm in arms if arm.stop_s is not None], 16, 0)
     way = _pair([1e3 * arm.travelled_m for arm in arms], 16, 2)
     rest = max((1e3 * arm.rest_s for arm in arms if arm.rest_s is not None), default=None)
     declared = max((1e3 * case.declared_s for case in cases), default=0.0)
-    return f"{fault.name:<20}{told}{stop}{way}{'-' if rest is None else f'{rest:.0f}':>10}{declared:>10.0f}"
+    return f"{fault.name:<20}{detection}{stop}{way}{'-' if rest is None else f'{rest:.0f}':>10}{declared:>10.0f}"
 
 
 def _pair(values: Sequence[float], width: int, digits: int) -> str:
-    words = f"{np.median(values):.{digits}f} / {max(values):.{digits}f}" if values else "-"
-    return f"{words:>{width}}"
+    text = f"{np.median(values):.{digits}f} / {max(values):.{digits}f}" if values else "-"
+    return f"{text:>{width}}"
 
 
 def _record(case: ProcessCase) -> dict[str, Any]:

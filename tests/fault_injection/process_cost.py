@@ -1,4 +1,4 @@
-"""What it costs to have an arm in another process: the way of a command to it, and a cycle's reading and sending."""
+"""Cost of an arm in another process: latency of a command, and time of a cycle's reading and sending."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 _CYCLES: Final = 500
 _RATE_HZ: Final = 100.0
 _GUARDED_HZ: Final = 20.0
-"""Slower than it is driven: a busy machine is not what is measured."""
+"""Slower than commanded: the load of the machine is not measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +26,8 @@ class ProcessCost:
     """Times of two arms at 100 Hz, microseconds.
 
     Attributes:
-        one_way: from before a twist is sent until the arm's gate has let it pass.
-        cycle: both arms read and sent to, one after the other.
+        one_way: from before a twist is sent until the arm's gate has passed it.
+        cycle: reading and commanding both arms, one after the other.
     """
 
     one_way: Mapping[str, float]
@@ -60,7 +60,7 @@ def _drive(cell: Cell, name: str, lease: Any) -> int:
     arm.tcp()
     now_ns = time.monotonic_ns()
     twist = np.array([0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
-    # It lives long: a pause of this machine is not what is measured.
+    # A long time-to-live: pauses of the machine are not measured.
     sent = arm.send_twist(TwistCommand(twist, TwistFrame.BASE, now_ns, 0.5), lease)
     return int(sent.t_ns) - now_ns
 

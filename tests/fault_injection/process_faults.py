@@ -1,7 +1,7 @@
-"""Faults of whole processes, each while two arms move, and what the hosts' own records say became of the arms.
+"""Faults of whole processes while two arms move, judged by the hosts' own records of the arms.
 
-The cells are those of ``tests.fault_injection.two_arms``, in a process tree of their own. Nothing that the tree says of
-itself is believed but the records of the hosts, which are read from their memory, also when the processes have gone.
+The cells are those of ``tests.fault_injection.two_arms``, in their own process tree. Only the records of the hosts are
+trusted; they are read from shared memory, also when the processes have ended.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ _AFTERWARDS_S: Final = 0.3
 _END_S: Final = 30.0
 _STEADY_S: Final = 0.1
 MARGIN_S: Final = {"sway": 0.1, "push": 0.2}
-"""What a stop may take besides: an emulated arm rounds its corners, and takes its time to say that it stands."""
+"""Extra time of a stop: an emulated arm blends its motion, and reports rest with a delay."""
 
 _numbers = itertools.count(os.getpid())
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessFault:
-    """What goes wrong.
+    """A fault of a process.
 
     Attributes:
-        name: in words.
+        name: description.
         who: "task", "watchdog", or "host" for the first of these.
-        signal: what it is sent.
-        inner: word for ``process_victim``, for faults within the task's process.
-        at_once: whether it takes effect when it is injected; a full disk is only met by the next write.
+        signal: signal that it is sent.
+        inner: command for ``process_victim``, for faults within the task's process.
+        at_once: True if it takes effect when injected; a full disk takes effect at the next write.
     """
 
     name: str
@@ -76,14 +76,14 @@ FAULTS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class ArmCase:
-    """What became of one arm.
+    """Result of one arm.
 
     Attributes:
         arm: its name.
-        detected_s: from the fault until it was told to stop; None if nobody had to tell it.
-        stop_s: from then until it stood; None if it never did.
-        rest_s: from the fault until it stood.
-        travelled_m: how far it went from where it was at the fault.
+        detected_s: from the fault until it was commanded to stop; None if no stop was needed.
+        stop_s: from then until it was at rest; None if it never was.
+        rest_s: from the fault until it was at rest.
+        travelled_m: distance from its position at the fault.
     """
 
     arm: str
@@ -95,15 +95,15 @@ class ArmCase:
 
 @dataclass(frozen=True, slots=True)
 class ProcessCase:
-    """One fault, once.
+    """Result of one fault.
 
     Attributes:
-        fault: which.
-        arms: those whose host was not the one hurt.
+        fault: the fault.
+        arms: those whose host did not get the fault.
         declared_s: from the fault to rest, at most.
         outcome: last line of the task's process, empty if it had none.
-        notes: what the watchdog left, empty if nothing.
-        problems: what was not as it has to be.
+        notes: the watchdog's note, empty if none.
+        problems: deviations from the expected behaviour.
     """
 
     fault: ProcessFault
@@ -115,20 +115,20 @@ class ProcessCase:
 
 
 class TooBusy(RuntimeError):
-    """The cell stopped before anything was done to it: this machine does not let it run."""
+    """The cell stopped before the fault: the machine starved it."""
 
 
 def declared_s(rate_hz: float, fastest_m_s: float, what: str = "sway") -> float:
-    """Longest time (s) from a fault until both arms stand: two missed beats, a cycle of everybody, braking, margin."""
+    """Return the longest time (s) from a fault to rest: two missed beats, a cycle each, braking, margin."""
     limits = LimitsConfig().build()
     return silence_s(1.0 / rate_hz) + 1.0 / rate_hz + fastest_m_s / limits.accel_m_s2 + MARGIN_S[what]
 
 
 def run_fault(folder: Path, fault: ProcessFault, rate_hz: float, what: str = "sway") -> ProcessCase:
-    """Let two arms ``sway`` or ``push``, let ``fault`` happen, and judge what the hosts' records say.
+    """Let two arms ``sway`` or ``push``, inject ``fault``, and judge by the hosts' records.
 
     Raises:
-        TooBusy: the cell did not run long enough to be hurt.
+        TooBusy: the cell did not run long enough for the fault.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "fault").write_text(fault.inner)
@@ -136,11 +136,11 @@ def run_fault(folder: Path, fault: ProcessFault, rate_hz: float, what: str = "sw
         await_motion(process, states)
         host = next(iter(who["hosts"]))
         victim = {"task": who["task"], "watchdog": who["watchdog"], "host": who["hosts"][host]}[fault.who]
-        hurt_arms = set(who["arms"][host]) if fault.who == "host" else set()
+        faulty_arms = set(who["arms"][host]) if fault.who == "host" else set()
         before = {name: state.read() for name, state in states.items()}
-        hurt_ns = time.monotonic_ns()
+        fault_ns = time.monotonic_ns()
         os.kill(victim, fault.signal)
-        survivors = {name: state for name, state in states.items() if name not in hurt_arms}
+        survivors = {name: state for name, state in states.items() if name not in faulty_arms}
         _await_rest(survivors)
         at_rest = {name: state.read() for name, state in survivors.items()}
         if fault.signal is signal.SIGSTOP:
@@ -153,17 +153,17 @@ def run_fault(folder: Path, fault: ProcessFault, rate_hz: float, what: str = "sw
         process.send_signal(signal.SIGTERM)
         outcome = last_line(process)
         problems = left_over([who["task"], who["watchdog"], *who["hosts"].values()])
-        arms = [_arm_case(name, before[name], record, hurt_ns) for name, record in at_rest.items()]
+        arms = [_arm_case(name, before[name], record, fault_ns) for name, record in at_rest.items()]
         longest_s = declared_s(rate_hz, max(speed_m_s(record) for record in before.values()), what)
         for case in arms:
             problems += _judged(case, fault, longest_s)
         for name, record in afterwards.items():
-            # A killed host obeys nothing any more, and its record ends where it was killed.
-            if fault.signal is signal.SIGKILL and name in hurt_arms:
+            # A killed host executes no command any more, and its record ends where it was killed.
+            if fault.signal is signal.SIGKILL and name in faulty_arms:
                 continue
             if not record["at_rest"]:
                 problems.append(f"{name} moved afterwards")
-            if record["obeyed_ns"] > record["stop_ns"] > hurt_ns or (
+            if record["obeyed_ns"] > record["stop_ns"] > fault_ns or (
                 name in at_rest and record["obeyed"] != at_rest[name]["obeyed"]
             ):
                 problems.append(f"{name} obeyed a command after the stop")
@@ -176,18 +176,18 @@ def _judged(case: ArmCase, fault: ProcessFault, longest_s: float) -> list[str]:
         return [f"{case.arm} did not come to rest"]
     # From its detection on, where that does not follow the fault at once.
     took_s = case.rest_s if fault.at_once else case.stop_s
-    return [f"{case.arm} stood after {took_s:.3f} s, declared {longest_s:.3f} s"] if took_s > longest_s else []
+    return [f"{case.arm} was at rest after {took_s:.3f} s, declared {longest_s:.3f} s"] if took_s > longest_s else []
 
 
-def _arm_case(name: str, before: Any, record: Any, hurt_ns: int) -> ArmCase:
-    told = [int(record[key]) for key in ("asked_ns", "stop_ns") if record[key] > hurt_ns]
+def _arm_case(name: str, before: Any, record: Any, fault_ns: int) -> ArmCase:
+    commanded = [int(record[key]) for key in ("asked_ns", "stop_ns") if record[key] > fault_ns]
     rested_ns = int(record["moved_ns"]) if record["at_rest"] else None
-    detected_ns = min(told, default=None)
+    detected_ns = min(commanded, default=None)
     return ArmCase(
         name,
-        None if detected_ns is None else (detected_ns - hurt_ns) * 1e-9,
-        None if rested_ns is None else max(0, rested_ns - (detected_ns or hurt_ns)) * 1e-9,
-        None if rested_ns is None else max(0, rested_ns - hurt_ns) * 1e-9,
+        None if detected_ns is None else (detected_ns - fault_ns) * 1e-9,
+        None if rested_ns is None else max(0, rested_ns - (detected_ns or fault_ns)) * 1e-9,
+        None if rested_ns is None else max(0, rested_ns - fault_ns) * 1e-9,
         math.dist(record["T_base_tcp"][:3, 3], before["T_base_tcp"][:3, 3]),
     )
 
@@ -196,7 +196,7 @@ def _arm_case(name: str, before: Any, record: Any, hurt_ns: int) -> ArmCase:
 def running_cell(
     folder: Path, rate_hz: float, what: str, environment: Mapping[str, str] | None = None
 ) -> Iterator[tuple[subprocess.Popen[bytes], dict[str, Any], dict[str, RecordReader]]]:
-    """The running cell, who takes part in it, and the records of its arms."""
+    """Yield the running cell, its processes, and the records of its arms."""
     command = [sys.executable, "-m", "tests.fault_injection.process_victim", str(folder), f"{rate_hz:g}", what]
     with ExitStack() as exits, (folder / "stderr").open("wb") as stderr:
         if what == "push":
@@ -226,7 +226,7 @@ def running_cell(
 
 
 def await_motion(process: subprocess.Popen[bytes], states: Mapping[str, RecordReader]) -> None:
-    """Return when both arms are at work, and going as fast as they do."""
+    """Return when both arms are at work, at full speed."""
     assert process.stdout is not None
     if not select.select([process.stdout], [], [], _MOVING_S)[0]:
         raise TooBusy(f"not at work within {_MOVING_S:g} s")
@@ -245,12 +245,12 @@ def await_motion(process: subprocess.Popen[bytes], states: Mapping[str, RecordRe
 
 
 def speed_m_s(record: Any) -> float:
-    """Speed of the tool that a host's record tells."""
+    """Return the speed of the tool in a host's record."""
     return float(np.linalg.norm(record["twist"][:3]))
 
 
 def _await_rest(states: Mapping[str, RecordReader]) -> None:
-    """Return when all arms have stood for a while, or have had their time; a person would wait no longer either."""
+    """Return when all arms have been at rest for a while, or after a timeout."""
     deadline_s = time.monotonic() + _WATCHED_S
     standing_s = None
     while time.monotonic() < deadline_s and (standing_s is None or time.monotonic() < standing_s + _AFTERWARDS_S):
@@ -262,7 +262,7 @@ def _await_rest(states: Mapping[str, RecordReader]) -> None:
 
 
 def last_line(process: subprocess.Popen[bytes]) -> dict[str, Any]:
-    """What the cell says at its end; empty if it says nothing."""
+    """Return the cell's last output line; empty if there is none."""
     with suppress(subprocess.TimeoutExpired):
         process.wait(_END_S)
     process.kill()
@@ -272,7 +272,7 @@ def last_line(process: subprocess.Popen[bytes]) -> dict[str, Any]:
 
 
 def left_over(pids: Sequence[int]) -> list[str]:
-    """Processes of the cell that are still there when it has ended; they are ended then."""
+    """Return processes of the cell that still exist after its end; they are killed."""
     deadline_s = time.monotonic() + _END_S
     left = [pid for pid in pids if _alive(pid)]
     while left and time.monotonic() < deadline_s:

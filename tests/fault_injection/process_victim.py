@@ -1,8 +1,8 @@
-"""The process in which ``process_faults`` injects faults: a cell with two arms that runs until something stops it.
+"""The process into which ``process_faults`` injects faults: a cell with two arms that runs until it is stopped.
 
-``python -m tests.fault_injection.process_victim FOLDER RATE_HZ sway|push`` tells on standard output who takes part,
-then that the arms move, and at the end how the run ended. SIGUSR1 and a word in the file ``fault`` of the folder make
-something go wrong inside.
+``python -m tests.fault_injection.process_victim FOLDER RATE_HZ sway|push`` prints its participants, then that the arms
+move, and at the end the outcome of the run. SIGUSR1 and a command in the file ``fault`` of the folder cause a fault
+inside.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _MOVING_S: Final = 0.5
 
 
 def _participants(cell: Cell) -> dict[str, Any]:
-    """Processes and descriptors, by which somebody outside can hurt them and read the hosts' records."""
+    """Return processes and descriptors, with which another process can inject faults and read the hosts' records."""
     watch = cell.watchdog
     assert isinstance(watch, ProcessWatchdog)
     return {
@@ -48,7 +48,7 @@ def _participants(cell: Cell) -> dict[str, Any]:
 
 
 class _InnerFault:
-    """What goes wrong inside the task's process when SIGUSR1 comes."""
+    """Fault inside the task's process, caused by SIGUSR1."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -70,7 +70,7 @@ class _InnerFault:
 
 
 class _Announce:
-    """Says once that the arms have been at work for a while."""
+    """Prints once that the arms have been at work for a while."""
 
     def __init__(self) -> None:
         self._since_s: float | None = None
@@ -87,7 +87,7 @@ class _Announce:
 
 
 def main() -> None:
-    """Run the cell; the last line on standard output tells how it ended."""
+    """Run the cell; the last line on standard output is the outcome."""
     folder, rate_hz, what = Path(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
     stop = StopRequest()
     signal.signal(signal.SIGTERM, lambda *_: stop.ask())
@@ -101,8 +101,8 @@ def main() -> None:
         causes = [[cause.interlock, cause.subject, cause.reason] for cause in result.causes]
         kind = type(result.error).__name__ if result.error else ""
         stepped_s = time.time() - time.monotonic() - wall_s
-        told = {"outcome": result.outcome.value, "causes": causes, "error": kind, "clock_stepped_s": stepped_s}
-        print(json.dumps(told), flush=True)
+        report = {"outcome": result.outcome.value, "causes": causes, "error": kind, "clock_stepped_s": stepped_s}
+        print(json.dumps(report), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""``touchcell bench safety``: the fault matrix of simulated devices, and what the interlocks cost per cycle.
+"""``touchcell bench safety``: the fault matrix of simulated devices, and the cost of the interlocks per cycle.
 
-For each fault the time from its beginning to the trip, and the arm's time and way to rest, over all tasks and states;
-the worst stop of each fault in each state; then what gate and interlocks cost (``tests.fault_injection.safety_cost``).
+For each fault the time from its injection to the trip, and the arm's time and distance to rest, over all tasks and
+states; the worst stop of each fault in each state; then the cost of gate and interlocks
+(``tests.fault_injection.safety_cost``).
 """
 
 from __future__ import annotations
@@ -23,15 +24,15 @@ _PERIOD_NS = 10_000_000
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Print both tables; writes ``safety.json`` into ``out``.
+    """Print both tables; write ``safety.json`` into ``out``.
 
-    ``--processes``: see ``tests.fault_injection.process_bench``. ``--cost``: only what a cycle costs, into
+    ``--processes``: see ``tests.fault_injection.process_bench``. ``--cost``: only the cost of a cycle, into
     ``safety_cost.json``.
     """
     parser = argparse.ArgumentParser("touchcell bench safety --")
     parser.add_argument("--processes", action="store_true", help="faults of whole processes, with two arms")
-    parser.add_argument("--repeats", type=int, default=3, help="how often each fault of a process is tried")
-    parser.add_argument("--cost", action="store_true", help="only what gate and interlocks cost in a cycle")
+    parser.add_argument("--repeats", type=int, default=3, help="repetitions of each fault of a process")
+    parser.add_argument("--cost", action="store_true", help="only the cost of gate and interlocks per cycle")
     options = parser.parse_args(arguments)
     if options.processes:
         from tests.fault_injection import process_bench
@@ -55,7 +56,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
         print(f"{fault.name:<26}" + "".join(_worst([c for c in of_fault if c.state == state]) for state in states))
     bad = [case for case in cases if case.problem]
     seconds = time.perf_counter() - started
-    print(f"\nas it has to be: {len(cases) - len(bad)} of {len(cases)} places of the matrix, in {seconds:.0f} s")
+    print(f"\nas expected: {len(cases) - len(bad)} of {len(cases)} places of the matrix, in {seconds:.0f} s")
     for case in bad:
         print(f"  {case.task}, {case.device}, {case.state}, {case.fault}: {case.problem}")
     print()
@@ -83,5 +84,5 @@ def _row(name: str, cases: Sequence[Case]) -> str:
 def _worst(cases: Sequence[Case]) -> str:
     times = [case.stop_s for case in cases if case.stop_s is not None]
     ways = [case.distance_m for case in cases if case.distance_m is not None]
-    words = f"{1e3 * max(times):.0f}" if times else "-"
-    return f"{words + (f' / {1e3 * max(ways):.2f}' if ways else ' / -' if times else ''):>14}"
+    text = f"{1e3 * max(times):.0f}" if times else "-"
+    return f"{text + (f' / {1e3 * max(ways):.2f}' if ways else ' / -' if times else ''):>14}"

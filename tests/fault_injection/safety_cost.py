@@ -1,6 +1,6 @@
-"""What safety costs in every cycle, in microseconds of the processor: gate, interlocks by number and kind, collisions.
+"""CPU time of safety per cycle, in microseconds: gate, interlocks by number and kind, collisions.
 
-Besides, what a scene does not pay for that has no sensor, no second arm, or no interlock of a kind.
+Also the savings of a cell without a sensor, a second arm, or an interlock of a kind.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _PAIR: Final[Mapping[str, Mapping[str, Any]]] = {
 
 
 def costs() -> dict[str, float]:
-    """Microseconds by what is done, in the order in which they are printed."""
+    """Return microseconds by item, in the order in which they are printed."""
     found = {
         "gate: tool speed, acceleration, jerk": _time_us(_Gate(None)),
         "gate: and six joints": _time_us(_Gate(_WORKING)),
@@ -90,7 +90,7 @@ def costs() -> dict[str, float]:
 
 
 def _time_us(call: Callable[[int], object]) -> float:
-    """Per call: the lower quartile of batches of the thread's own time, so that a busy machine counts less."""
+    """Return the time per call: the lower quartile of batches of thread time, so that other load counts less."""
     times = []
     for first in range(0, _REPEATS, _BATCH):
         started = time.thread_time_ns()
@@ -111,7 +111,7 @@ def _review_us(
 
 
 def _for_two(shipped: Mapping[str, Any]) -> dict[str, Any]:
-    """The same interlocks for leader and follower: those about one arm twice, the others once."""
+    """Return the same interlocks for leader and follower: those about one arm twice, the others once."""
     section: dict[str, Any] = {}
     for name, entry in shipped.items():
         if "arm" not in entry:
@@ -123,7 +123,7 @@ def _for_two(shipped: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _views(roles: Sequence[str]) -> list[CellView]:
-    """Moving arms, each with a sensor in contact, cycle after cycle, with nothing wrong."""
+    """Return snapshots of moving arms, each with a sensor in contact, without violations."""
     T = se3.from_euler_mm_deg(np.array([0.0, 0.0, 25.0, 180.0, 0.0, 0.0]))
     T_s_f = se3.inverse(se3.from_euler_mm_deg(np.array([1.0, 0.0, 3.0, 0.0, 0.0, 0.0])))
     views = []
@@ -142,7 +142,7 @@ def _views(roles: Sequence[str]) -> list[CellView]:
 
 
 def _clearance_us(pairs: int, views: Sequence[CellView], bare_us: float, *, slow_mm: float) -> float:
-    """Of a review with ``pairs`` pairs of two arms' capsules, half a metre apart, going aside."""
+    """Return the time of a review with ``pairs`` pairs of two arms' capsules, half a metre apart, moving sideways."""
     if pairs == 0:
         return 0.0
     number = round(pairs**0.5)
@@ -157,7 +157,7 @@ def _clearance_us(pairs: int, views: Sequence[CellView], bare_us: float, *, slow
 
 
 def _links_us() -> tuple[float, int]:
-    """Of a review of two jointed arms that stand apart, and how many pairs there are."""
+    """Return the time of a review of two jointed arms that are apart, and the number of pairs."""
     ik = DifferentialIk(_CHAIN)
     parts = link_capsules(_CHAIN.description)
     away = se3.from_euler_mm_deg(np.array([0.0, 3000.0, 0.0, 0.0, 0.0, 0.0]))
@@ -180,7 +180,10 @@ def _links_us() -> tuple[float, int]:
 
 
 def _picture_us() -> float:
-    """Checksum and mean of a frame, which only those two interlocks ask for; once a frame, not once a cycle."""
+    """Return the time of checksum and mean of a frame, which only those two interlocks need.
+
+    Per frame, not per cycle.
+    """
     image = np.random.default_rng(0).integers(0, 255, (480, 640), dtype=np.uint8)
 
     def look(k: int) -> float:
@@ -191,7 +194,7 @@ def _picture_us() -> float:
 
 
 class _Gate:
-    """A gate that turns a twist along tool axes, and limits nothing of it."""
+    """A gate that transforms a twist along tool axes, and limits nothing of it."""
 
     def __init__(self, q: Array | None) -> None:
         self._clock = VirtualClock()

@@ -1,4 +1,4 @@
-"""When the last command was sent, as a run loop tells it to its black box."""
+"""Time of the last sent command, from the run loop's messages to its black box."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from touchcell.cell.runtime.run_record import Box
 
 
 class SentCommands:
-    """A black box that remembers when the last command was sent.
+    """A black box that records when the last command was sent.
 
     Args:
-        box: gets everything too.
+        box: receives all messages too.
     """
 
     def __init__(self, box: Box | None = None) -> None:
@@ -20,12 +20,12 @@ class SentCommands:
         self._last_ns: int | None = None
 
     def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
-        """Take in one message."""
+        """Record one message."""
         if topic.endswith("/command"):
             self._last_ns = t_ns
         if self._box is not None:
             self._box.add(topic, t_ns, data)
 
     def since(self, t_ns: int) -> bool:
-        """Whether a command was sent at ``t_ns`` or later."""
+        """Return True if a command was sent at ``t_ns`` or later."""
         return self._last_ns is not None and self._last_ns >= t_ns

@@ -1,8 +1,8 @@
-"""``touchcell bench soak``: hours of cell time with random faults and operators, and what has leaked by the end.
+"""``touchcell bench soak``: hours of cell time with random faults and operators, and resource leaks at the end.
 
-Cells are run one after another in this process, each recorded and with a black box, as ``touchcell run`` does it. After
-each run its arms must stand, no command may have been sent after a trip, and what the process holds is counted: memory,
-file descriptors, threads, segments of shared memory.
+Cells are run one after another in this process, each recorded and with a black box, as by ``touchcell run``. After
+each run its arms must be at rest, no command may have been sent after a trip, and the process's resources are counted:
+memory, file descriptors, threads, segments of shared memory.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _WARM_UP = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """What a process holds."""
+    """Resources of a process."""
 
     memory_mb: float
     descriptors: int
@@ -56,10 +56,10 @@ class Lap:
 
     Attributes:
         cell_s: cell time of all runs up to its end.
-        outcome: how it ended.
-        fault: what was injected; empty if nothing.
-        held: what the process held afterwards.
-        problem: what must not happen and did; empty if nothing.
+        outcome: outcome of the run.
+        fault: the injected fault; empty if none.
+        held: the process's resources afterwards.
+        problem: deviation from the expected behaviour; empty if none.
     """
 
     cell_s: float
@@ -70,7 +70,7 @@ class Lap:
 
 
 def held() -> Held:
-    """What this process holds now, after a garbage collection."""
+    """Return the resources of this process after a garbage collection."""
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     shm = Path("/dev/shm")
@@ -88,12 +88,12 @@ def lap(path: Path, folder: Path, rng: np.random.Generator, before_s: float = 0.
     Args:
         path: the cell file, of simulated devices.
         folder: for the recording, which is overwritten.
-        rng: decides which fault comes when.
+        rng: selects fault and time.
         before_s: cell time of earlier runs.
     """
     cell, stop, box = compose(plan_anew(path)), StopRequest(), BlackBox()
     sent = SentCommands(box)
-    places = [(fault, device) for fault in FAULTS for device in _hurt(fault, cell)]
+    places = [(fault, device) for fault in FAULTS for device in _targets(fault, cell)]
     fault, device = places[rng.integers(len(places))] if places and rng.random() < 0.75 else (None, "")
     after = int(rng.integers(1, 1500))
     with Recorder(folder / "run.mcap") as recorder, cell:
@@ -108,15 +108,15 @@ def lap(path: Path, folder: Path, rng: np.random.Generator, before_s: float = 0.
         stands = all(arm.at_rest() for arm in cell.arms.values())
         if result.outcome is Outcome.TRIPPED:
             box.dump(folder, result, {"cell": path.name})
-    problem = "" if stands else "an arm does not stand"
+    problem = "" if stands else "an arm is not at rest"
     if result.causes and sent.since(result.causes[0].t_ns):
         problem = "a command was sent after the trip"
     injected = fault.name if fault is not None and cycles >= after else ""
     return Lap(before_s + result.duration_s, result.outcome.value, injected, held(), problem or _unexpected(result))
 
 
-def _hurt(fault: Fault, cell: Cell) -> list[str]:
-    """Devices that can have it: arms with joints are simulated without faults of their own."""
+def _targets(fault: Fault, cell: Cell) -> list[str]:
+    """Return the devices that can have the fault: jointed arms are simulated without faults."""
     if fault.device == "camera":
         return list(cell.cameras)
     return [role for role, arm in cell.arms.items() if isinstance(arm, SimArm)]
@@ -128,11 +128,11 @@ def _unexpected(result: RunResult) -> str:
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Run for ``--hours`` of cell time; prints a table, writes ``soak.json`` and ``soak.png`` into ``out``."""
+    """Run for ``--hours`` of cell time; print a table, write ``soak.json`` and ``soak.png`` into ``out``."""
     parser = argparse.ArgumentParser("touchcell bench soak")
     parser.add_argument("--hours", type=float, default=1.0, help="of cell time")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--cell", type=Path, action="append", help="cell file (default: all simulated that ship)")
+    parser.add_argument("--cell", type=Path, action="append", help="cell file (default: all shipped simulated ones)")
     parser.add_argument(
         "--learned", action="store_true", help="keep the cells' estimators in place of the true contact"
     )
@@ -153,7 +153,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
                     shown = int(_ROWS * laps[-1].cell_s / end_s) + 1
                     _print_row(laps)
         except KeyboardInterrupt:
-            print("interrupted: what follows is of the runs so far")
+            print("interrupted: results of the runs so far")
     summary = judged(laps)
     print()
     for what, value in summary.items():
@@ -167,7 +167,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
 
 
 def judged(laps: Sequence[Lap]) -> dict[str, float | int]:
-    """What has grown since the warm-up, and how often something happened that must not."""
+    """Return the growth since the warm-up, and the number of problems."""
     warm = laps[int(_WARM_UP * len(laps)) :]
     hours = np.array([each.cell_s for each in warm]) / 3600.0
     memory = np.array([each.held.memory_mb for each in warm])
@@ -195,7 +195,7 @@ def _print_row(laps: Sequence[Lap]) -> None:
 
 
 def simulated_cells() -> list[Path]:
-    """Every cell file that ships and runs in simulated time by itself."""
+    """Return every shipped cell file that runs in simulated time by itself."""
     files = {path: yaml.safe_load(path.read_text()) for path in sorted(CONFIGS.glob("*.yaml"))}
     return [path for path, data in files.items() if data.get("time") == "simulated" and "scene" in data]
 

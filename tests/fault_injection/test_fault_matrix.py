@@ -34,7 +34,7 @@ MOVING = (
 
 
 def run_all(folder: Path, kind: Literal["arm", "camera"], task: str) -> list[Case]:
-    """All places of one task, none of them with a problem, and none left out."""
+    """Run all cases of one task; none has a problem, and none is left out."""
     cases = list(matrix(folder, [kind], [task]))
     assert [f"{c.state}, {c.device}, {c.fault}: {c.problem}" for c in cases if c.problem] == []
     faults = {fault.name for fault in FAULTS if fault.device == kind}
@@ -53,14 +53,14 @@ def test_faults_of_arms_in_every_state(task: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not (MODELS / "sim_gdn.safetensors").exists(), reason="needs the model that ships")
+@pytest.mark.skipif(not (MODELS / "sim_gdn.safetensors").exists(), reason="needs the shipped model")
 @pytest.mark.parametrize("task", ["surface_following", "object_tracking", "observe", "data_collection", "steps"])
 def test_faults_of_cameras_in_every_state(task: str, tmp_path: Path) -> None:
-    """Those of the pushing tasks take minutes; ``touchcell bench safety`` has them."""
+    """Those of the pushing tasks take minutes; ``touchcell bench safety`` runs them."""
     run_all(tmp_path, "camera", task)
 
 
-def test_the_matrix_would_notice_a_missing_interlock(tmp_path: Path) -> None:
+def test_the_matrix_detects_a_missing_interlock(tmp_path: Path) -> None:
     data = cells()["surface_following"]
     data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
     for name, entry in list(data["interlocks"].items()):

@@ -1,4 +1,4 @@
-"""The robustness experiment makes the same things worse for one arm and for two, and changes nothing else."""
+"""The robustness experiment changes the same conditions for one arm and for two, and nothing else."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CELLS = {trial.row: trial.cell_data() for trial in SPEC.trials(Scale(trials=1))}
 
 
 def differences(left: Any, right: Any, key: str = "") -> set[str]:
-    """Dotted keys in which two cell files differ."""
+    """Return dotted keys in which two cell files differ."""
     if isinstance(left, dict) and isinstance(right, dict):
         keys = left.keys() | right.keys()
         return {found for each in keys for found in differences(left.get(each), right.get(each), f"{key}.{each}")}
@@ -22,7 +22,7 @@ def differences(left: Any, right: Any, key: str = "") -> set[str]:
 
 @pytest.mark.parametrize("arms", ["one arm", "two arms"])
 @pytest.mark.parametrize("what", [each for each in CHANGES if each != "as it is"])
-def test_a_row_differs_from_the_cell_as_it_is_in_what_it_names_only(arms: str, what: str) -> None:
+def test_a_row_differs_from_the_unchanged_cell_in_its_named_condition_only(arms: str, what: str) -> None:
     as_it_is, changed = CELLS[f"as it is, {arms}"], CELLS[f"{what}, {arms}"]
     expected = {key.replace("*", sensor) for key in CHANGES[what] for sensor in as_it_is["sensors"]}
     assert differences(as_it_is, changed) == expected

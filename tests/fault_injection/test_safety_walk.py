@@ -1,6 +1,6 @@
-"""Random operators, faults and timing against a running simulated cell: what must never happen does not.
+"""Random operators, faults and timing against a running simulated cell: safety invariants always hold.
 
-The bound of the walk is set for CI; ``TOUCHCELL_WALK`` multiplies it (with ``--timeout 0``).
+The length of the walk is set for CI; ``TOUCHCELL_WALK`` multiplies it (with ``--timeout 0``).
 """
 
 from __future__ import annotations
@@ -32,7 +32,10 @@ SLACK_S = 0.05
 
 
 class SafetyWalk(RuleBasedStateMachine):
-    """A cell on true contacts, stepped by rules. The arms' own simulation is what is believed, not what they tell."""
+    """A cell on true contacts, stepped by rules.
+
+    The arms' own simulation is the ground truth, not their reported state.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -66,7 +69,7 @@ class SafetyWalk(RuleBasedStateMachine):
         self.loop.begin()
 
     def watch(self, role: str) -> None:
-        """See every twist that the arm in ``role`` is given."""
+        """Record every twist that the arm in ``role`` receives."""
         arm = self.arms[role]
         follow = arm._body.follow
 
@@ -80,10 +83,10 @@ class SafetyWalk(RuleBasedStateMachine):
 
         arm._body.follow = watched  # type: ignore[method-assign]
 
-    def going_on(self) -> bool:
+    def running(self) -> bool:
         return self.result is None
 
-    @precondition(going_on)
+    @precondition(running)
     @rule(cycles=st.integers(1, 60))
     def run_on(self, cycles: int) -> None:
         for _ in range(cycles):
@@ -94,7 +97,7 @@ class SafetyWalk(RuleBasedStateMachine):
             if self.latched_ns is None and self.cell.supervisor.latch.first_cause is not None:
                 self.latched_ns = self.cell.clock.now_ns()
 
-    @precondition(going_on)
+    @precondition(running)
     @rule(now=st.booleans())
     def operator(self, now: bool) -> None:
         if now:
@@ -102,7 +105,7 @@ class SafetyWalk(RuleBasedStateMachine):
         else:
             self.stop.ask()
 
-    @precondition(going_on)
+    @precondition(running)
     @rule(
         which=st.integers(0, 1),
         change=st.sampled_from(
@@ -110,9 +113,9 @@ class SafetyWalk(RuleBasedStateMachine):
                 {"nan_state": True},
                 {"stale": True},
                 {"stale": False},
-                {"deaf": True},
-                {"runs_on": True},
-                {"runs_on": False, "deaf": False},
+                {"ignores_stops": True},
+                {"ignores_expiry": True},
+                {"ignores_expiry": False, "ignores_stops": False},
                 {"drift_m_s": 0.03},
                 {"drift_m_s": 0.0},
             ]
@@ -121,10 +124,10 @@ class SafetyWalk(RuleBasedStateMachine):
     def fault(self, which: int, change: dict[str, Any]) -> None:
         role = sorted(self.arms)[which % len(self.arms)]
         self.arms[role].faults = replace(self.arms[role].faults, **change)
-        if any(change.get(name) for name in ("runs_on", "drift_m_s")):
+        if any(change.get(name) for name in ("ignores_expiry", "drift_m_s")):
             self.disobeyed.add(role)
 
-    @precondition(going_on)
+    @precondition(running)
     @rule(pause_ms=st.integers(1, 400))
     def late(self, pause_ms: int) -> None:
         """The machine is busy: no cycle for a while."""
@@ -133,7 +136,7 @@ class SafetyWalk(RuleBasedStateMachine):
     @precondition(lambda self: self.result is not None)
     @rule(seconds=st.floats(0.01, 1.0))
     def look_on(self, seconds: float) -> None:
-        """Once a run has ended nothing moves, whatever it was."""
+        """Once a run has ended nothing moves."""
         before = {role: arm.T_world_tcp() for role, arm in self.arms.items()}
         self.cell.clock.sleep_until_ns(self.cell.clock.now_ns() + round(1e9 * seconds))
         for role, arm in self.arms.items():
@@ -150,10 +153,10 @@ class SafetyWalk(RuleBasedStateMachine):
         assert (self.result.outcome is Outcome.TRIPPED) == (trip is not None)
         for role, arm in self.arms.items():
             report = self.result.stops[role]
-            if not (faults[role].deaf or faults[role].runs_on or faults[role].drift_m_s):
+            if not (faults[role].ignores_stops or faults[role].ignores_expiry or faults[role].drift_m_s):
                 assert report.kept or report.time_s <= report.declared_s + 1.0 / self.cell.rate_hz
                 assert not report.escalated
-            if not faults[role].deaf:
+            if not faults[role].ignores_stops:
                 assert arm.at_rest()
                 assert report.time_s is not None
             assert arm.owner is None
@@ -181,7 +184,7 @@ class SafetyWalk(RuleBasedStateMachine):
             if self.result is None:
                 self.end()
             for arm in self.arms.values():
-                arm.faults = replace(arm.faults, deaf=False, runs_on=False, drift_m_s=0.0)
+                arm.faults = replace(arm.faults, ignores_stops=False, ignores_expiry=False, drift_m_s=0.0)
             self.cell.__exit__(None, None, None)
         self.folder.cleanup()
 

@@ -1,4 +1,4 @@
-"""What ``touchcell bench soak`` counts, and a soak of half a minute."""
+"""The counters of ``touchcell bench soak``, and a soak of half a minute."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ def test_what_leaks_is_counted(tmp_path: Path) -> None:
     assert held().descriptors == before.descriptors
 
 
-def test_growth_is_told_per_hour_after_the_warm_up() -> None:
+def test_growth_is_reported_per_hour_after_the_warm_up() -> None:
     laps = [Lap(360.0 * k, "done", "", Held(100.0 + 0.5 * k, 10 + (k > 5), 1, 0)) for k in range(1, 11)]
-    laps[4] = Lap(laps[4].cell_s, "tripped", "arm: stale", laps[4].held, "an arm does not stand")
+    laps[4] = Lap(laps[4].cell_s, "tripped", "arm: stale", laps[4].held, "an arm is not at rest")
     summary = judged(laps)
     assert summary["memory growth after warm-up, MB per hour"] == 5.0
     assert summary["descriptors more than after warm-up"] == 1
     assert (summary["runs with a fault"], summary["runs that tripped"], summary["runs with a problem"]) == (1, 1, 1)
 
 
-def test_a_short_soak_holds_nothing_and_breaks_nothing(tmp_path: Path) -> None:
+def test_a_short_soak_leaks_nothing_and_has_no_problem(tmp_path: Path) -> None:
     arguments = ["--", "--hours", "0.012", "--cell", "configs/surface_follow_sim.yaml"]
     assert main(["bench", "soak", "--out", str(tmp_path), *arguments]) == EXIT_OK
     summary = json.loads((tmp_path / "soak.json").read_text())["summary"]

@@ -1,4 +1,4 @@
-"""Cells with two simulated arms in processes of their own, for faults of the watchdog chain: they sway, or push."""
+"""Cells with two simulated arms in separate processes, for faults of the watchdog chain: they sway, or push."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EMULATORS: Final = "emulators.json"
 
 
 class Sway:
-    """Both arms to and fro along x; finished when a person asks, or when the supervisor trips."""
+    """Both arms to and fro along x; finished on an operator's stop, or when the supervisor trips."""
 
     def __init__(self, config: TaskConfig, context: TaskContext) -> None:
         self._ttl_s = 3.0 / context.rate_hz
@@ -36,12 +36,12 @@ class Sway:
         self.transitions: tuple[TransitionRecord, ...] = ()
 
     def tick(self, observation: Observation) -> Action:
-        """A twist for each arm, in opposite directions."""
+        """Return a twist for each arm, in opposite directions."""
         now_ns = observation.now_ns
         if observation.operator_stop:
             self.finished = self.succeeded = True
             return Action()
-        # A square wave is fastest almost always, which is the worst moment for a fault.
+        # A square wave is almost always at full speed, which is the worst moment for a fault.
         speed_m_s = math.copysign(SPEED_M_S, math.sin(2.0 * math.pi * now_ns * 1e-9 / PERIOD_S))
         twist = np.array([speed_m_s, 0.0, 0.0, 0.0, 0.0, 0.0])
         return Action(
@@ -52,7 +52,7 @@ class Sway:
         )
 
     def trip(self, now_ns: int, reason: str) -> None:
-        """Nothing moves from here on."""
+        """Enter the tripped state: nothing moves."""
         self.state, self.finished = "tripped", True
 
 
@@ -74,7 +74,7 @@ def two_arm_plan(
     categories: Mapping[str, int] | None = None,
     on_trip: str = "end",
 ) -> CellPlan:
-    """The plan of the cell: no scene, so that each arm is a group by itself."""
+    """Return the plan of the cell: no scene, so that each arm is its own group."""
     driver = DRIVERS.load("sim_arm")
     places = {"left": -300.0, "right": 300.0}
     arms = {
@@ -107,19 +107,19 @@ def two_arm_plan(
 
 
 def pushing_plan(folder: Path, rate_hz: float) -> CellPlan:
-    """The cell in which two emulated arms push, on the true contact, in several processes, at this rate.
+    """Return the plan of a cell in which two emulated arms push, on the true contact, in several processes.
 
-    Each arm has a host of its own; the scene, which nothing moves by, is in the task's process. The file ``EMULATORS``
-    in ``folder`` tells the address of each arm.
+    Each arm has its own host; the scene, which moves nothing, is in the task's process. The file ``EMULATORS``
+    in ``folder`` contains the address of each arm.
 
     Raises:
-        ConfigError: the cell cannot run so slowly.
+        ConfigError: the cell cannot run that slowly.
     """
     data = yaml.safe_load(find_cell(Path("configs/dual_push_emulated.yaml")).read_text())
     data |= {"processes": "separate", "rate_hz": rate_hz}
     for arm, host in json.loads((folder / EMULATORS).read_text()).items():
         data["arms"][arm]["host"] = host
-    # Pictures would keep this machine from being told apart from what is done to the cell.
+    # Rendering images would load the machine and confound the effect of the fault.
     data["scene"] = data.pop("emulated_scene")
     data["sensors"] = {
         name: {
@@ -138,7 +138,7 @@ def pushing_plan(folder: Path, rate_hz: float) -> CellPlan:
 
 @contextmanager
 def pushing_emulators(folder: Path, number: int) -> Iterator[None]:
-    """The emulated arms of ``pushing_plan``, at addresses that differ by ``number``."""
+    """Run the emulated arms of ``pushing_plan``, at addresses that differ by ``number``."""
     hosts = {arm: f"127.99.{number % 250}.{k}" for k, arm in enumerate(("leader", "follower"), start=2)}
     (folder / EMULATORS).write_text(json.dumps(hosts))
     with (

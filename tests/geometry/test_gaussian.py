@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.helpers.compiled import extension
 from touchcell.geometry import _plain_gaussian, gaussian, se3
 from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.gaussian import (
@@ -28,7 +29,7 @@ SEEDS = st.integers(0, 10_000)
 @pytest.fixture(params=["plain", "compiled"])
 def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     name: str = request.param
-    kernels: Any = _plain_gaussian if name == "plain" else pytest.importorskip("touchcell.geometry._se3c")
+    kernels: Any = _plain_gaussian if name == "plain" else extension("touchcell.geometry._se3c")
     monkeypatch.setattr(gaussian, "_kernels", kernels)
     return name
 
@@ -71,7 +72,7 @@ def test_from_exponential_matches_sampling(backend: str) -> None:
     samples = se3.exp(xi + perturbations(rng, S, 200_000))
     assert np.array_equal(g.mean, se3.exp(xi))
     assert relative(g.covariance, sampled_covariance(samples, g.mean)) < 1e-2
-    # Without the Jacobian it would be far off, so the comparison means something.
+    # Without the Jacobian it would be far off, so the comparison is meaningful.
     assert relative(S, g.covariance) > 0.2
 
 
@@ -158,13 +159,13 @@ def test_noise_may_leave_axes_out(backend: str) -> None:
         np.triu(np.ones((6, 6))),
     ],
 )
-def test_compound_refuses_noise_that_is_no_covariance(backend: str, noise: Array) -> None:
+def test_compound_refuses_noise_that_is_not_a_covariance(backend: str, noise: Array) -> None:
     with pytest.raises(NotPositiveDefinite) as caught:
         compound(np.eye(4), PoseGaussian(np.eye(4), 10.0 * np.eye(6)), noise)
     assert (caught.value.function, caught.value.argument) == ("compound", "noise")
 
 
-def test_compound_refuses_other_nonsense(backend: str) -> None:
+def test_compound_refuses_other_invalid_arguments(backend: str) -> None:
     g = PoseGaussian(np.eye(4), np.eye(6))
     for arguments, argument in (
         ((np.full((4, 4), np.nan), g), "T"),
@@ -240,8 +241,8 @@ def test_fusion_ends_at_the_optimum(seed: int) -> None:
         assert cost(se3.compose(se3.exp(x), fused.mean)) > lowest
 
 
-def test_backends_fuse_alike() -> None:
-    compiled = pytest.importorskip("touchcell.geometry._se3c")
+def test_backends_fuse_equally() -> None:
+    compiled = extension("touchcell.geometry._se3c")
     rng = np.random.default_rng(7)
     for _ in range(50):
         g1 = random_gaussian(rng, 0.1)
@@ -296,7 +297,7 @@ def test_far_apart_and_tilted_still_converges(backend: str) -> None:
     assert mahalanobis_squared(one, other.mean) < 1e-8
 
 
-def test_not_converged_says_so(backend: str) -> None:
+def test_not_converged_raises(backend: str) -> None:
     g1 = PoseGaussian(np.eye(4), np.eye(6))
     g2 = PoseGaussian(se3.exp([1.0, 0.0, 0.0, 0.0, 0.5, 1.0]), np.eye(6))
     with pytest.raises(NotConverged) as caught:
@@ -311,7 +312,7 @@ def test_not_converged_says_so(backend: str) -> None:
 @pytest.mark.parametrize("condition", [1e8, 1e12, 1e14])
 def test_ill_conditioned_covariances_against_mpmath(backend: str, condition: float) -> None:
     rng = np.random.default_rng(11)
-    rounding = condition * float(np.finfo(float).eps)  # what storing such a covariance already costs
+    rounding = condition * float(np.finfo(float).eps)  # error of storing such a covariance
     for _ in range(5):
         S1, S2 = ill_conditioned(rng, condition), ill_conditioned(rng, condition)
         mean = se3.exp(rng.normal(size=6))
@@ -324,8 +325,10 @@ def test_ill_conditioned_covariances_against_mpmath(backend: str, condition: flo
 
 
 def _exact_check(g1: PoseGaussian, g2: PoseGaussian, fused: PoseGaussian) -> tuple[float, float]:
-    """Length of the exact Gauss-Newton step left at the fused mean, in standard deviations, and the largest entry of
-    the error of the covariance, whitened by the exact one."""
+    """Return the remaining Gauss-Newton step at the fused mean and the error of the covariance, both exact.
+
+    The step is in standard deviations; the error is the largest entry after whitening by the exact covariance.
+    """
     with mpmath.workdps(60):
         information, gradient = mpmath.zeros(6), mpmath.zeros(6, 1)
         for g in (g1, g2):
@@ -388,7 +391,7 @@ def asymmetric(size: float) -> Array:
     ],
     ids=repr,
 )
-def test_refuses_what_is_no_covariance(backend: str, bad: Array) -> None:
+def test_refuses_invalid_covariances(backend: str, bad: Array) -> None:
     with pytest.raises(NotPositiveDefinite) as caught:
         PoseGaussian(np.eye(4), bad)
     assert (caught.value.function, caught.value.argument) == ("PoseGaussian", "covariance")

@@ -1,4 +1,4 @@
-"""touchcell.geometry.se3: conventions, laws, shapes, refusals; both backends."""
+"""touchcell.geometry.se3: conventions, laws, shapes, errors; both backends."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.helpers.compiled import extension
 from touchcell.geometry import _plain, se3
 from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.types import Array
@@ -22,7 +23,7 @@ IDENTITY = np.eye(4)
 
 @pytest.fixture(params=["plain", "compiled"])
 def kernels(request: pytest.FixtureRequest) -> Any:
-    return _plain if request.param == "plain" else pytest.importorskip("touchcell.geometry._se3c")
+    return _plain if request.param == "plain" else extension("touchcell.geometry._se3c")
 
 
 def rotation_z(angle: float) -> Array:
@@ -68,7 +69,7 @@ def test_inverse_undoes(xi: Array) -> None:
 
 
 @given(xi=TWISTS, other=TWISTS)
-def test_adjoint_carries_twists(xi: Array, other: Array) -> None:
+def test_adjoint_transforms_twists(xi: Array, other: Array) -> None:
     T = se3.exp(other)
     carried = se3.exp(se3.adjoint(T) @ xi)
     assert np.allclose(carried, T @ se3.exp(xi) @ se3.inverse(T), atol=1e-12)
@@ -90,7 +91,7 @@ def test_jacobians_are_inverse(xi: Array) -> None:
     "name", ["exp", "log", "compose", "inverse", "adjoint", "left_jacobian", "left_jacobian_inverse"]
 )
 def test_backends_agree(name: str) -> None:
-    compiled = getattr(pytest.importorskip("touchcell.geometry._se3c"), name)
+    compiled = getattr(extension("touchcell.geometry._se3c"), name)
     plain = getattr(_plain, name)
     xi = random_twists(2000)
     T = _plain.exp(xi)
@@ -104,7 +105,7 @@ def test_backends_agree(name: str) -> None:
 
     assert distance_eps(np.array([compiled(*one) for one in zip(*arguments, strict=True)])) == 0.0
     assert distance_eps(np.array([plain(*one) for one in zip(*arguments, strict=True)])) <= 2.0
-    # numpy's vectorised sin, cos and arctan2 are not the C library's: one unit more.
+    # numpy's vectorised sin, cos and arctan2 differ from the C library's: one ulp more.
     assert distance_eps(plain(*arguments)) <= 3.0
 
 
@@ -239,7 +240,7 @@ BAD_POSES = [
 
 @pytest.mark.parametrize("bad", BAD_TWISTS, ids=repr)
 @pytest.mark.parametrize("name", ["exp", "left_jacobian", "left_jacobian_inverse"])
-def test_refuses_what_is_no_twist(kernels: Any, name: str, bad: Any) -> None:
+def test_refuses_invalid_twists(kernels: Any, name: str, bad: Any) -> None:
     with pytest.raises(GeometryError) as caught:
         getattr(kernels, name)(bad)
     assert (caught.value.function, caught.value.argument) == (name, "xi")
@@ -247,7 +248,7 @@ def test_refuses_what_is_no_twist(kernels: Any, name: str, bad: Any) -> None:
 
 @pytest.mark.parametrize("bad", BAD_POSES, ids=repr)
 @pytest.mark.parametrize("name", ["log", "inverse", "adjoint"])
-def test_refuses_what_is_no_pose(kernels: Any, name: str, bad: Any) -> None:
+def test_refuses_invalid_poses(kernels: Any, name: str, bad: Any) -> None:
     with pytest.raises(GeometryError) as caught:
         getattr(kernels, name)(bad)
     assert (caught.value.function, caught.value.argument) == (name, "T")
@@ -319,7 +320,7 @@ def test_euler_of_the_identity_has_no_negative_zeros() -> None:
 
 
 def test_euler_is_the_same_in_both_backends() -> None:
-    compiled = pytest.importorskip("touchcell.geometry._se3c")
+    compiled = extension("touchcell.geometry._se3c")
     poses = np.random.default_rng(3).uniform(-170.0, 170.0, (500, 6)) * [1, 1, 1, 1, 0.5, 1]
     T = compiled.from_euler_mm_deg(poses)
     np.testing.assert_allclose(T, _plain.from_euler_mm_deg(poses), rtol=0.0, atol=4e-16)
@@ -359,7 +360,7 @@ def test_project_in_batches_leaves_its_input_alone() -> None:
 @pytest.mark.parametrize(
     "bad", [np.zeros((4, 4)), 2.0 * np.eye(4), mirrored(), with_entry(3, 0, 0.1), with_entry(0, 0, np.nan), np.eye(3)]
 )
-def test_project_refuses_the_hopeless(bad: Array) -> None:
+def test_project_refuses_matrices_far_from_a_pose(bad: Array) -> None:
     with pytest.raises(GeometryError) as caught:
         se3.project(bad)
     assert caught.value.function == "project"

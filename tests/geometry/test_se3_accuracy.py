@@ -1,4 +1,4 @@
-"""Errors against mpmath over the whole grid and sweep: random twists never find where formulas cancel."""
+"""Errors against mpmath over the whole grid and sweep: random twists never hit the points of cancellation."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.se3_reference import Library, Reference, errors, points, reference
+from tests.helpers.compiled import extension
 from touchcell.geometry import _plain
 
 LIMITS_EPS = {
@@ -32,7 +33,7 @@ def exact() -> Reference:
 @pytest.mark.parametrize("batched", [True, False])
 @pytest.mark.parametrize("backend", ["plain", "compiled"])
 def test_errors_are_a_few_eps(exact: Reference, backend: str, batched: bool) -> None:
-    kernels: Any = _plain if backend == "plain" else pytest.importorskip("touchcell.geometry._se3c")
+    kernels: Any = _plain if backend == "plain" else extension("touchcell.geometry._se3c")
     library = Library(
         backend,
         exp=kernels.exp,
@@ -49,7 +50,7 @@ def test_errors_are_a_few_eps(exact: Reference, backend: str, batched: bool) -> 
     assert not too_large, f"in eps: {too_large}"
 
 
-def test_the_measure_sees_a_fault(exact: Reference) -> None:
+def test_the_error_measure_detects_a_fault(exact: Reference) -> None:
     def careless(xi: Any) -> Any:
         T = _plain.exp(xi)
         T[:, :3, 3] *= 1.0 + 1e-14

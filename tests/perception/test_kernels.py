@@ -1,4 +1,4 @@
-"""The compiled kernels against OpenCV and plain NumPy, and what they refuse."""
+"""The compiled kernels against OpenCV and plain NumPy, and the arguments that they refuse."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from tests.helpers.compiled import extension
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception import kernels
 from touchcell.perception.errors import ArrayError, KernelsMissing
 from touchcell.perception.markers.matching import disc_density
 
-pytest.importorskip("touchcell.perception._kernelsc")
-from touchcell.perception import _kernelsc
+_kernelsc = extension("touchcell.perception._kernelsc")
 
 GREY = st.one_of(st.integers(0, 255), st.sampled_from([0, 1, 127, 128, 254, 255]))
 
 
 def images(largest: int = 70) -> st.SearchStrategy[ImageArray]:
-    """Noise, few grey levels, or nearly one colour, of any shape; now and then a view into a larger frame."""
+    """Noise, few grey levels, or nearly one colour, of any shape; sometimes a view into a larger frame."""
     shapes = st.tuples(st.integers(1, largest), st.integers(1, largest))
 
     def drawn(shape: tuple[int, int], seed: int, levels: int, view: bool) -> ImageArray:
@@ -68,7 +68,7 @@ def test_threshold_is_opencvs(image: ImageArray, block_px: int, offset: float, o
     if block_px < 129:
         np.testing.assert_array_equal(found, expected)
     else:
-        # OpenCV multiplies by a rounded inverse of the area, which for large blocks can be off near one half.
+        # OpenCV multiplies by a rounded inverse of the area, which for large blocks can be wrong near one half.
         assert np.mean(found != expected) < 0.01
 
 
@@ -124,14 +124,14 @@ def test_discs_are_opencvs_components(image: ImageArray, level: int, smallest: i
 
 
 def points(least: int = 1, most: int = 40) -> st.SearchStrategy[Array]:
-    """Places of a few whole pixels, where many are equally far, or anywhere."""
+    """Positions of a few whole pixels, with many equal distances, or anywhere."""
     shapes = st.tuples(st.integers(least, most), st.just(2))
     coarse = hnp.arrays(np.float64, shapes, elements=st.integers(-8, 8).map(float))
     return coarse | hnp.arrays(np.float64, shapes, elements=st.floats(-600.0, 600.0, width=32))
 
 
 def paired(places: Array, others: Array) -> tuple[Array, Array, Array]:
-    """What ``kernels.pair`` should give, in plain NumPy."""
+    """Reference for ``kernels.pair`` in plain NumPy."""
     square = ((others[None] - places[:, None]) ** 2)[..., 0] + ((others[None] - places[:, None]) ** 2)[..., 1]
     partner = square.argmin(axis=1)
     nearest = square[np.arange(len(places)), partner]
@@ -149,7 +149,7 @@ def test_pairs_are_those_of_all_distances(places: Array, others: Array) -> None:
 
 
 def problem(seed: int, modes: int, markers: int) -> tuple[np.random.Generator, Array, Array]:
-    """A basis of orthonormal rows and the undeformed places of a grid of markers."""
+    """A basis of orthonormal rows and the undeformed positions of a grid of markers."""
     rng = np.random.default_rng(seed)
     basis = np.linalg.qr(rng.normal(size=(2 * markers, modes)))[0].T
     side = math.isqrt(markers - 1) + 1
@@ -184,7 +184,7 @@ def settled(
     reach: float,
     least: float,
 ) -> Array:
-    """What ``Modes.settle`` should give after 12 turns or a shift below 0.1 px, in plain NumPy."""
+    """Reference for ``Modes.settle`` in plain NumPy: 12 iterations or a shift below 0.1 px."""
     for _ in range(12):
         predicted = (base + coefficients @ basis).reshape(-1, 2)
         partner, square, owns = paired(predicted, others)
@@ -202,7 +202,7 @@ def settled(
 
 @given(st.integers(0, 999), st.floats(0.0, 20.0), st.floats(4.0, 15.0))
 @settings(max_examples=60)
-def test_settling_takes_the_turns_of_the_reference(seed: int, far_px: float, reach: float) -> None:
+def test_settling_takes_the_iterations_of_the_reference(seed: int, far_px: float, reach: float) -> None:
     rng, base, basis = problem(seed, modes=6, markers=50)
     truth = rng.normal(0.0, far_px, 6)
     others = (base + truth @ basis).reshape(-1, 2) + rng.normal(0.0, 0.2, (50, 2))
@@ -216,7 +216,7 @@ def test_settling_takes_the_turns_of_the_reference(seed: int, far_px: float, rea
     np.testing.assert_allclose(found, settled(base, basis, begin, start, ridge, others, reach, 4.0), atol=1e-7)
 
 
-def test_settling_finds_what_moved_and_repeats_itself() -> None:
+def test_settling_recovers_the_motion_and_is_deterministic() -> None:
     rng, base, basis = problem(5, modes=6, markers=331)
     truth = rng.normal(0.0, 30.0, 6)
     others = (base + truth @ basis).reshape(-1, 2)
@@ -230,7 +230,7 @@ def test_settling_finds_what_moved_and_repeats_itself() -> None:
     np.testing.assert_array_equal(found(), found())
 
 
-def test_density_is_shared_among_four_cells() -> None:
+def test_density_is_distributed_over_four_cells() -> None:
     low = np.array([10.0, 20.0])
     centres = np.array([[[10.0 + 2.5 * 4.0, 20.0 + 1.5 * 4.0], [12.0 + 3.0, 22.0 + 1.0], [-50.0, 0.0]]])
     density = disc_density(centres, np.array([[1.0, 2.0, 1.0]]), low, 4.0, 5).reshape(5, 5)
@@ -295,7 +295,7 @@ def test_other_arrays_are_refused_or_computed(kernel: Callable[..., object], dat
         return
     given_in, other = GOOD[kernel][at], arguments[at]
     if isinstance(given_in, np.ndarray):
-        # Other lengths may fit, other types and ranks never.
+        # Other lengths may be valid, other types and ranks never.
         assert isinstance(other, np.ndarray)
         assert (other.dtype, other.ndim) == (given_in.dtype, given_in.ndim)
 
@@ -310,7 +310,7 @@ def test_other_arrays_are_refused_or_computed(kernel: Callable[..., object], dat
         *((_kernelsc.density, at) for at in range(3)),
     ],
 )
-def test_what_is_not_finite_is_refused_by_name(kernel: Callable[..., object], at: int, poison: float) -> None:
+def test_non_finite_arguments_are_refused_by_name(kernel: Callable[..., object], at: int, poison: float) -> None:
     arguments = list(GOOD[kernel])
     array = np.array(arguments[at])
     array.flat[-1] = poison
@@ -320,7 +320,7 @@ def test_what_is_not_finite_is_refused_by_name(kernel: Callable[..., object], at
     assert caught.value.function == kernel.__name__
 
 
-def test_arrays_that_are_not_in_order_are_refused() -> None:
+def test_non_contiguous_arrays_are_refused() -> None:
     for kernel, at in [(_kernelsc.pair, 0), (_kernelsc.fit, 0), (_kernelsc.affine, 0)]:
         arguments = list(GOOD[kernel])
         arguments[at] = np.asfortranarray(np.ones((6, 8)))[::2, ::2]

@@ -1,4 +1,4 @@
-"""The model that ships is the one that the documented command makes, and it is good enough to be servoed on."""
+"""The shipped model is the one that the documented command makes, and it is accurate enough for servoing."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_it_reads_the_simulated_sensor(model: ContactModel) -> None:
     assert (mae < [0.15, 0.15, 0.15, 1.2, 1.2, 0.6]).all(), mae
 
 
-def test_its_gate_knows_rest_from_touch(model: ContactModel) -> None:
+def test_its_gate_detects_contact(model: ContactModel) -> None:
     assert model.reference is not None
     gate = ContactGate(model.reference)
     renderer = FrameRenderer(seed=7)

@@ -1,4 +1,4 @@
-"""No input makes the filter lie: no NaN out, covariances positive definite, errors bounded, or a typed error."""
+"""For any input the filter stays valid: no NaN, covariances positive definite, errors bounded, or a typed error."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import mpmath
 import numpy as np
 import pytest
 
+from tests.helpers.compiled import extension
 from tests.helpers.filter_stress import BLOCK, DRIFT_PER_STEP, SIGMA, STEP_NS, ExactFilter, LongRun, long_run
 from touchcell.errors import TouchcellError
 from touchcell.geometry import _plain_gaussian, gaussian, se3
@@ -46,7 +47,7 @@ FILTERS = pytest.mark.parametrize("make", [still, moving])
 @pytest.fixture(params=["plain", "compiled"])
 def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     name: str = request.param
-    kernels: Any = _plain_gaussian if name == "plain" else pytest.importorskip("touchcell.geometry._se3c")
+    kernels: Any = _plain_gaussian if name == "plain" else extension("touchcell.geometry._se3c")
     monkeypatch.setattr(gaussian, "_kernels", kernels)
     return name
 
@@ -68,7 +69,7 @@ def require_bounded(run: LongRun, steps: int) -> None:
     assert run.orthogonality < 1e-9
     assert np.isfinite(run.covariance).all()
     np.linalg.cholesky(run.covariance)
-    # 6 for a perfect filter; the surface's walk is drawn back once in a block, which neither model expects.
+    # 6 for a perfect filter; the surface's walk is pulled back once per block, which neither model includes.
     assert 4.0 < run.nees < 7.0
     assert run.worst_nees < 80.0
 
@@ -81,10 +82,8 @@ def test_ten_thousand_steps(make: Callable[[], Filter]) -> None:
 @pytest.mark.stress
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize(("make", "share"), [(still, 1), (moving, 10)])
-def test_as_many_steps_as_make_stress_says(
-    make: Callable[[], Filter], share: int, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """STRESS_STEPS, ten million if nobody says otherwise, and a tenth of that for the slower filter."""
+def test_many_steps_of_make_stress(make: Callable[[], Filter], share: int, capsys: pytest.CaptureFixture[str]) -> None:
+    """STRESS_STEPS, ten million by default, and a tenth of that for the slower filter."""
     steps = max(BLOCK, int(os.environ.get("STRESS_STEPS", "10_000_000")) // share)
     twentieth = max(1, steps // BLOCK // 20)
 
@@ -120,8 +119,7 @@ def test_sigmas_of_eighteen_orders(backend: str, prior_sigma: float, observed_si
 @pytest.mark.parametrize("sigma", SIGMAS)
 @pytest.mark.parametrize("kind", ["still", "moving"])
 def test_filters_of_eighteen_orders(kind: str, sigma: float) -> None:
-    """Noise and motion of one size, whatever that is: as consistent as ever where a standard deviation is small, and
-    sound where it is larger than a turn."""
+    """Noise and motion of one size: consistent where a standard deviation is small, valid where it exceeds a turn."""
     drift = isotropic_noise(sigma, sigma)
     pose_filter: Filter = PoseFilter(drift) if kind == "still" else MovingSurfaceFilter(drift, drift, drift)
     rng = np.random.default_rng(13)
@@ -141,7 +139,7 @@ def test_filters_of_eighteen_orders(kind: str, sigma: float) -> None:
 
 
 def test_axes_of_any_two_precisions_side_by_side(backend: str) -> None:
-    """Standard deviations from 1e-12 to 1e6 in one covariance: sound, or refused as not positive definite."""
+    """Standard deviations from 1e-12 to 1e6 in one covariance: valid, or refused as not positive definite."""
     rng, sound = np.random.default_rng(8), 0
     for _ in range(300):
         variances = 10.0 ** rng.uniform(-24.0, 12.0, (2, 6))
@@ -163,7 +161,7 @@ def test_axes_of_any_two_precisions_side_by_side(backend: str) -> None:
 @pytest.mark.parametrize("condition", [1e8, 1e12, 1e14])
 @FILTERS
 def test_condition_of_1e14(backend: str, make: Callable[[], Filter], condition: float) -> None:
-    """A filter fed with such covariances from a turning sensor goes on, or says that it cannot."""
+    """A filter with such covariances from a turning sensor continues, or raises a typed error."""
     rng = np.random.default_rng(9)
     pose_filter, refused = make(), 0
     for k in range(60):
@@ -189,7 +187,7 @@ ANGLES = [0.0, 1e-300, 1e-12, 1e-8, 1e-4, np.pi / 2, np.pi - 1e-4, np.pi - 1e-8,
 @pytest.mark.parametrize("angle", ANGLES)
 @FILTERS
 def test_rotations_at_0_and_pi_change_nothing(make: Callable[[], Filter], angle: float) -> None:
-    """Left perturbations do not see a fixed turn of the surface frame, so every angle gives the same filter."""
+    """Left perturbations are independent of a fixed rotation of the surface frame: every angle gives equal results."""
     axis = np.array([2.0, -1.0, 2.0]) / 3.0
     turn = se3.exp(np.concatenate([[0.01, 0.02, -0.03], angle * axis]))
     plain, turned = make(), make()
@@ -221,7 +219,7 @@ def test_a_frame_half_a_turn_off_is_fused_or_refused(backend: str, axis: int) ->
 
 
 def test_float64_and_float32_against_mpmath() -> None:
-    """Six updates: doubles agree with forty digits, and poses rounded to float32 cost what their rounding is worth."""
+    """Six updates: doubles agree with forty digits, and poses rounded to float32 cost as much as their rounding."""
     rng = np.random.default_rng(12)
     double, single, exact = still(), still(), ExactFilter(DRIFT)
     for k in range(6):
@@ -251,8 +249,8 @@ BAD = [np.nan, np.inf, -np.inf, 1e300]
 
 @pytest.mark.parametrize("bad", BAD)
 @FILTERS
-def test_nothing_that_is_no_number_gets_in(make: Callable[[], Filter], bad: float) -> None:
-    """Every entry of every argument in turn: a typed error, and the state stays as it was."""
+def test_non_finite_input_is_refused(make: Callable[[], Filter], bad: float) -> None:
+    """Every entry of every argument in turn: a typed error, and the state is unchanged."""
     S = np.diag(SIGMA**2)
     fresh, used = make(), make()
     used.update(PoseGaussian(CONTACT, S), np.eye(4), 0)
@@ -286,7 +284,7 @@ def test_nothing_that_is_no_number_gets_in(make: Callable[[], Filter], bad: floa
 
 
 @FILTERS
-def test_a_refused_frame_leaves_the_filter_as_it_was(make: Callable[[], Filter]) -> None:
+def test_a_refused_frame_leaves_the_filter_unchanged(make: Callable[[], Filter]) -> None:
     pose_filter = make()
     S = np.diag(SIGMA**2)
     pose_filter.update(PoseGaussian(CONTACT, S), np.eye(4), STEP_NS)
@@ -298,7 +296,7 @@ def test_a_refused_frame_leaves_the_filter_as_it_was(make: Callable[[], Filter])
 
 @FILTERS
 def test_years_without_a_frame(make: Callable[[], Filter]) -> None:
-    """Certainty is lost, and what comes out is a covariance or a typed error, never a number that is none."""
+    """Certainty is lost, and the result is a covariance or a typed error, never a non-finite number."""
     pose_filter = make()
     S = np.diag(SIGMA**2)
     pose_filter.update(PoseGaussian(CONTACT, S), np.eye(4), 0)

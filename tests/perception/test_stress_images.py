@@ -1,4 +1,4 @@
-"""Whatever a camera delivers, what comes out of preprocessing, network and filter is a belief or a typed error."""
+"""For any frame a camera delivers, preprocessing, network and filter return a valid estimate or a typed error."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CHAIN = Preprocessing(
     mask_radius_px=214.0,
     output_size=(32, 32),
 )
-"""Every step that a preprocessing can have."""
+"""All steps of a preprocessing."""
 
 FILTERS = {
     "still": lambda: PoseFilter(isotropic_noise(1e-3, 0.01)),
@@ -38,7 +38,7 @@ FILTERS = {
 
 
 def ill_frames(size: tuple[int, int]) -> dict[str, ImageArray]:
-    """Frames as a failing camera, cable or lamp makes them."""
+    """Frames of a failing camera, cable or lamp."""
     rng = np.random.default_rng(0)
     good, other = (draw(contact, size) for contact in contacts(2, seed=3))
     height = size[0]
@@ -63,7 +63,7 @@ def ill_frames(size: tuple[int, int]) -> dict[str, ImageArray]:
 
 
 class Playback:
-    """A camera that has these frames, one every 30 ms."""
+    """A camera with these frames, one every 30 ms."""
 
     def __init__(self, images: list[ImageArray]) -> None:
         self._images = images
@@ -77,7 +77,7 @@ class Playback:
 
 
 @pytest.mark.parametrize("name", sorted(ill_frames(SIZE)))
-def test_preprocessing_bears_every_frame(name: str) -> None:
+def test_preprocessing_accepts_every_frame(name: str) -> None:
     reduced = CHAIN.reduce(ill_frames(RAW_SIZE)[name])
     assert reduced.shape == (32, 32)
     assert reduced.dtype == np.uint8
@@ -87,8 +87,8 @@ def test_preprocessing_bears_every_frame(name: str) -> None:
 
 @pytest.mark.parametrize("kind", FILTERS)
 @pytest.mark.parametrize("weights", [0.1, 1.0, 1e3])
-def test_beliefs_stay_sound_through_bad_frames(kind: str, weights: float) -> None:
-    """Bad frames between good ones, before a network whose outputs lie at their bounds for the larger weights."""
+def test_estimates_stay_valid_through_bad_frames(kind: str, weights: float) -> None:
+    """Bad frames between good ones, with a network whose outputs are at their bounds for the larger weights."""
     model = make_model(reference=False)
     for tensor in model.tensors.values():
         tensor *= np.float32(weights)
@@ -112,7 +112,7 @@ def test_beliefs_stay_sound_through_bad_frames(kind: str, weights: float) -> Non
             assert 0.0 <= estimate.nis < np.inf
 
 
-def test_the_contact_gate_bears_every_frame() -> None:
+def test_the_contact_gate_accepts_every_frame() -> None:
     frames = ill_frames((32, 32))
     gate = ContactGate(frames["black"])
     for image in frames.values():
@@ -135,14 +135,17 @@ def test_the_contact_gate_bears_every_frame() -> None:
     ],
     ids=["nan", "inf", "half", "empty", "colour", "four axes", "uint16", "bool", "none"],
 )
-def test_what_is_no_such_image_is_refused(image: object) -> None:
+def test_other_images_are_refused(image: object) -> None:
     with pytest.raises(ImageError):
         ContactModel(make_model()).predict(image)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("output", [1e30, 3e38, np.inf, -np.inf, np.nan])
-def test_a_network_that_runs_wild_is_a_typed_error(output: float) -> None:
-    """A plain network's outputs are free; what is no contact ends before the filter, whose state it leaves alone."""
+def test_unbounded_network_output_is_a_typed_error(output: float) -> None:
+    """A plain network's outputs are unbounded.
+
+    An invalid contact never reaches the filter, whose state is unchanged.
+    """
     image = draw(contacts(1, seed=0)[0])
     pose_filter = PoseFilter(isotropic_noise(1e-3, 0.01))
     good, wild = ContactModel(constant_model("cnn", [0.0] * 6)), ContactModel(constant_model("cnn", [output] * 6))
@@ -163,8 +166,8 @@ def test_a_network_that_runs_wild_is_a_typed_error(output: float) -> None:
         assert np.isfinite(estimate.belief.mean).all()
 
 
-def test_a_density_network_cannot_claim_what_no_filter_bears() -> None:
-    """Both ends of the inverse standard deviations give covariances that a filter takes."""
+def test_covariances_of_a_density_network_are_valid_for_a_filter() -> None:
+    """Both bounds of the inverse standard deviations give covariances that a filter accepts."""
     image = draw(contacts(1, seed=0)[0])
     beliefs = []
     for log_precision in (-1e6, 0.0, 1e6):

@@ -1,4 +1,4 @@
-"""Training on what nobody should train on: finite numbers that claim no more than they know, or a typed error."""
+"""Training on unsuitable data: finite outputs with honest uncertainty, or a typed error."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ def sets() -> Sets:
 
 
 def trained(sets: Sets, out: Path, kind: str, learning_rate: float = 3e-3) -> tuple[Array, Array]:
-    """Train briefly; means and standard deviations of xi that the written file predicts for the validation set."""
+    """Train briefly.
+
+    Return means and standard deviations of xi that the written file predicts for the validation set.
+    """
     settings = Settings(epochs=2, batch_size=16, learning_rate=learning_rate)
     train_on_arrays(
         *sets,
@@ -58,8 +61,8 @@ def relabelled(sets: Sets, change: object) -> Sets:
 
 
 @pytest.mark.parametrize("kind", ["gdn", pytest.param("cnn", marks=pytest.mark.stress)])
-def test_labels_that_are_noise_are_known_to_be(sets: Sets, tmp_path: Path, kind: str) -> None:
-    """Nothing can be learned, and the predicted standard deviations say so."""
+def test_noise_labels_give_large_predicted_standard_deviations(sets: Sets, tmp_path: Path, kind: str) -> None:
+    """Nothing can be learned, and the predicted standard deviations show it."""
     noise = relabelled(sets, lambda xi, rng: rng.permutation(xi))
     means, sigmas = trained(noise, tmp_path / "model.safetensors", kind)
     standardised = (noise[1].xi - means) / sigmas
@@ -103,7 +106,7 @@ def test_one_constant_label_is_named(sets: Sets, tmp_path: Path, component: int)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_one_label_that_is_no_number(sets: Sets, tmp_path: Path, bad: float) -> None:
+def test_one_label_that_is_not_finite(sets: Sets, tmp_path: Path, bad: float) -> None:
     def spoil(xi: Array, rng: np.random.Generator) -> Array:
         spoiled = xi.copy()
         spoiled[7, 3] = bad
@@ -121,7 +124,7 @@ def test_labels_of_any_size(sets: Sets, tmp_path: Path, size: float) -> None:
 
 
 @pytest.mark.parametrize("level", [0, pytest.param(255, marks=LONG)])
-def test_images_that_show_nothing(sets: Sets, tmp_path: Path, level: int) -> None:
+def test_blank_images(sets: Sets, tmp_path: Path, level: int) -> None:
     first, second = (dataclasses.replace(images, images=np.full_like(images.images, level)) for images in sets)
     means, _ = trained((first, second), tmp_path / "model.safetensors", "gdn")
     np.testing.assert_allclose(means, np.broadcast_to(means[0], means.shape), atol=1e-9)

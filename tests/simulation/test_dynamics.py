@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from benchmarks.simulation_checks import GRAVITY_M_S2, Hand, uniform_pressure_yaw
+from benchmarks.simulation_checks import GRAVITY_M_S2, CommandedTip, uniform_pressure_yaw
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.scene import ContactState
 from touchcell.errors import ConfigError
@@ -30,7 +30,7 @@ BEHIND = (-60.5, 0, 30, 0, 90, 0)
 def test_a_sticking_contact_equals_that_of_the_kinematic_scene() -> None:
     script = [((0, 0, 10, 0, 0, 0), 0.45), ((4, 0, 0, 0, 0, 0), 0.4), ((0, 0, 0, 0, 0, 5), 0.5)]
     script += [((0, 0, 0, 20, 0, 0), 0.4), ((0, -5, 0, 0, 0, 0), 0.2), (STILL, 0.2)]
-    hands = [Hand(FLOOR, ABOVE, physics) for physics in ("kinematic", "dynamic")]
+    hands = [CommandedTip(FLOOR, ABOVE, physics) for physics in ("kinematic", "dynamic")]
     for twist, seconds in script:
         law, physics = (hand.move(twist, seconds) for hand in hands)
         assert law.in_contact
@@ -41,7 +41,7 @@ def test_a_sticking_contact_equals_that_of_the_kinematic_scene() -> None:
 
 
 def test_a_sliding_contact_keeps_the_shear_that_friction_holds() -> None:
-    hand = Hand({**FLOOR, "tip": {"friction": 0.5}}, ABOVE)
+    hand = CommandedTip({**FLOOR, "tip": {"friction": 0.5}}, ABOVE)
     hand.move((0, 0, 10, 0, 0, 0), 0.35)
     assert hand.move((20, 0, 0, 0, 0, 0), 0.5).slipping
     state = hand.move((2, 0, 0, 0, 0, 0), 0.3)
@@ -64,7 +64,7 @@ def test_a_tip_slides_over_curved_surfaces(kind: str) -> None:
     z_mm = 80 if kind == "dome" else 20
     poses = []
     for physics in ("kinematic", "dynamic"):
-        hand = Hand({"surfaces": {"it": shape}}, (0, 0, z_mm - 3, 180, 0, 0), physics)
+        hand = CommandedTip({"surfaces": {"it": shape}}, (0, 0, z_mm - 3, 180, 0, 0), physics)
         hand.move(STILL, 0.2)
         poses.append(parts(hand.move((20, 0, 0, 0, 0, 0), 0.9)))
     law, physics = poses
@@ -78,7 +78,7 @@ def test_a_turning_plate_drags_the_tip_along() -> None:
         "kind": "plane",
         "motion": {"kind": "glide", "displacement_mm_deg": [0, 0, 0, 0, 0, 4], "start_s": 0.2, "duration_s": 1.0},
     }
-    hand = Hand({"surfaces": {"plate": plate}}, (10, 0, 16, 180, 0, 0))
+    hand = CommandedTip({"surfaces": {"plate": plate}}, (10, 0, 16, 180, 0, 0))
     state = hand.move(STILL, 1.6)
     x, y, z, *_, gamma = parts(state)
     # {f} looks down: what turns by +4 deg about the world's z leaves the sensor turned by +4 deg about {f}'s.
@@ -88,7 +88,7 @@ def test_a_turning_plate_drags_the_tip_along() -> None:
 
 
 def test_a_pushed_prism_resists_with_the_friction_of_its_weight() -> None:
-    hand = Hand({"objects": {"prism": PRISM}}, BEHIND)
+    hand = CommandedTip({"objects": {"prism": PRISM}}, BEHIND)
     hand.move((0, 0, 20, 0, 0, 0), 1.0)
     forces = [hand.move((0, 0, 20, 0, 0, 0), 0.02).normal_force_n for _ in range(50)]
     assert np.mean(forces) == pytest.approx(0.3 * 0.479 * GRAVITY_M_S2, rel=0.03)
@@ -101,7 +101,7 @@ def test_an_off_centre_push_rotates_as_uniform_pressure_predicts(width_mm: tuple
     block = {"shape": {"kind": "box", "size_mm": [*width_mm, 60]}, "mass_g": 400}
     # A small tip that does not slip is a point that pushes: 10 mm beside the middle.
     point = {"radius_mm": 2, "friction": 1.5}
-    hand = Hand({"objects": {"block": block}, "tip": point}, (-42.2, 10, 30, 0, 90, 0))
+    hand = CommandedTip({"objects": {"block": block}, "tip": point}, (-42.2, 10, 30, 0, 90, 0))
     # It gives way by 0.7 mm.
     hand.move((0, 0, 20, 0, 0, 0), 3.045)
     T = hand.object()
@@ -114,7 +114,7 @@ def test_a_tall_prism_pushed_high_falls_and_pushed_low_does_not() -> None:
     leans = {}
     for z_mm in (50, 140):
         tall = {"shape": {"kind": "box", "size_mm": [60, 60, 200]}, "mass_g": 500}
-        hand = Hand({"objects": {"tall": tall}, "table": {"friction": 0.5}}, (-51, 0, z_mm, 0, 90, 0))
+        hand = CommandedTip({"objects": {"tall": tall}, "table": {"friction": 0.5}}, (-51, 0, z_mm, 0, 90, 0))
         hand.move((0, 0, 30, 0, 0, 0), 2.0)
         leans[z_mm] = np.degrees(np.arccos(min(hand.object()[2, 2], 1.0)))
     assert leans[50] < 1.0
@@ -122,7 +122,7 @@ def test_a_tall_prism_pushed_high_falls_and_pushed_low_does_not() -> None:
 
 
 def test_two_tips_carry_a_prism_off_the_table() -> None:
-    hand = Hand({"objects": {"prism": PRISM}}, BEHIND)
+    hand = CommandedTip({"objects": {"prism": PRISM}}, BEHIND)
     hand.poses["other"] = se3.from_euler_mm_deg(np.array([60.5, 0, 30, 0, -90, 0], dtype=float))
     hand.scene.mount("other", lambda: hand.poses["other"])
     hand.move_all({"tip": (0, 0, 10, 0, 0, 0), "other": (0, 0, 10, 0, 0, 0)}, 0.65)
@@ -139,7 +139,7 @@ def test_two_tips_carry_a_prism_off_the_table() -> None:
 
 
 def test_a_sticking_contact_does_not_creep() -> None:
-    hand = Hand(FLOOR, ABOVE)
+    hand = CommandedTip(FLOOR, ABOVE)
     hand.move((0, 0, 10, 0, 0, 0), 0.45)
     hand.move((10, 0, 0, 0, 0, 0), 0.4)
     before = parts(hand.move(STILL, 0.3))
@@ -153,7 +153,7 @@ def test_a_millisecond_is_fine_enough() -> None:
     script += [((0, 0, 0, 20, 0, 0), 0.4), ((0, -20, 0, 0, 0, 0), 0.4), (STILL, 0.2)]
     felt = []
     for step_ms in (1.0, 0.1):
-        hand = Hand({**FLOOR, "physics_step_ms": step_ms}, ABOVE)
+        hand = CommandedTip({**FLOOR, "physics_step_ms": step_ms}, ABOVE)
         felt.append(np.array([parts(hand.move(twist, s / 4)) for twist, s in script for _ in range(4)]))
     np.testing.assert_allclose(felt[0][:, :2], felt[1][:, :2], atol=0.1)
 
@@ -164,7 +164,7 @@ def test_a_snapshot_brings_back_the_very_same_future(physics: str) -> None:
     scene = {"surfaces": {"plate": plate}}
     if physics == "dynamic":
         scene["objects"] = {"prism": PRISM | {"pose_mm_deg": [200, 0, 0, 0, 0, 0]}}
-    hand = Hand(scene, ABOVE, physics)
+    hand = CommandedTip(scene, ABOVE, physics)
     hand.move((0, 5, 10, 0, 0, 0), 0.3)
     restore, pose = hand.scene.snapshot(), hand.poses["tip"].copy()
     before = hand.scene.contact("tip", hand.clock.now_ns() - 100_000_000).value
@@ -189,7 +189,7 @@ def test_a_snapshot_brings_back_the_very_same_future(physics: str) -> None:
 def test_non_finite_numbers_raise_an_error() -> None:
     from touchcell.simulation.dynamics import PhysicsError
 
-    hand = Hand(FLOOR, ABOVE)
+    hand = CommandedTip(FLOOR, ABOVE)
     hand.move(STILL, 0.01)
     hand.poses["tip"] = np.full((4, 4), np.nan)
     with pytest.raises(PhysicsError, match="pose of 'tip' is not finite") as error:

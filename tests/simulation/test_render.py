@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.helpers.compiled import extension
 from touchcell.drivers.replay.dataset import PUBLIC_CROP
 from touchcell.geometry import se3
 from touchcell.simulation import _plain_paint
@@ -49,7 +50,7 @@ def test_touching_discs_do_not_erase_or_add_up() -> None:
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_compiled_kernels_draw_the_same_as_plain_ones(seed: int) -> None:
-    compiled = pytest.importorskip("touchcell.simulation._paint")
+    compiled = extension("touchcell.simulation._paint")
     rng = np.random.default_rng(seed)
     centres = rng.uniform(-30.0, 110.0, (60, 2))
     centres[:4] = [[np.nan, 5.0], [np.inf, 5.0], [5.0, -1e300], [80.0, 60.0]]
@@ -66,7 +67,7 @@ def test_compiled_kernels_draw_the_same_as_plain_ones(seed: int) -> None:
 
 
 def test_compiled_kernels_refuse_unsupported_arrays() -> None:
-    compiled = pytest.importorskip("touchcell.simulation._paint")
+    compiled = extension("touchcell.simulation._paint")
     image = np.zeros((60, 80), np.uint8)
     frozen = image.copy()
     frozen.flags.writeable = False

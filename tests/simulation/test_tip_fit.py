@@ -39,16 +39,16 @@ def contacts(n: int, seed: int, sensor: Sensor = TRUE) -> MarkedContacts:
     return MarkedContacts(poses, pixels, seen)
 
 
-def test_a_score_of_contacts_identify_camera_mount_and_skin() -> None:
-    told: list[tuple[int, int]] = []
-    fitted = fit_tip(contacts(24, 1), REFERENCE, 10, told=lambda done, total: told.append((done, total)))
+def test_twenty_contacts_determine_camera_mount_and_skin() -> None:
+    calls: list[tuple[int, int]] = []
+    fitted = fit_tip(contacts(24, 1), REFERENCE, 10, progress=lambda done, total: calls.append((done, total)))
     held_out = contacts(40, 2)
     assert np.nanmean(Sensor(TipParameters(), MountModel()).errors(held_out)) > 10.0
     assert np.nanmean(fitted.errors(held_out)) < 0.8
     assert np.isnan(fitted.errors(held_out)).sum() == (~held_out.seen).sum()
     assert fitted.tip.image_rotation_rad == pytest.approx(1.1, abs=0.03)
     np.testing.assert_allclose(fitted.rig.offset_m, TRUE.rig.offset_m, atol=0.4e-3)
-    assert told[-1][0] >= 5
+    assert calls[-1][0] >= 5
 
 
 def test_a_mirrored_image_is_reported() -> None:

@@ -101,7 +101,7 @@ def test_frames_match_their_labels(tmp_path):
 
 def test_a_folder_with_other_samples_is_refused(tmp_path):
     Collection(tmp_path / "data", {"train": 3, "val": 1}, {"seed": 1})
-    with pytest.raises(ConfigError, match="taken otherwise"):
+    with pytest.raises(ConfigError, match="other settings"):
         run(cell_file(tmp_path))
     (tmp_path / "more").mkdir()
     (tmp_path / "more" / "thesis.txt").write_text("precious")

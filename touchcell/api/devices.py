@@ -13,7 +13,7 @@ import numpy as np
 
 from touchcell.api.cells import load_cell
 from touchcell.cell.config.schema import CellPlan
-from touchcell.cell.config.yaml_file import YamlFile
+from touchcell.cell.config.yaml_file import KeyPath, YamlFile
 from touchcell.cell.runtime.devices import build_devices
 from touchcell.control.reach import Reach, is_there
 from touchcell.drivers.core.arm import Arm
@@ -389,7 +389,8 @@ def connect_cell(cell: str | PathLike[str] | CellPlan) -> ConnectedCell:
 def _build(driver: str, name: str, settings: Mapping[str, Any]) -> tuple[Device, Clock]:
     spec = DRIVERS.load(driver)
     # No file and no line: a mistake is reported by its key.
-    config = YamlFile(Path(driver), dict(settings), {(): 0}).validate(spec.config, _plain(settings))
+    lines: dict[KeyPath, int] = dict.fromkeys([(), *((key,) for key in settings)], 0)
+    config = YamlFile(Path(driver), dict(settings), lines).validate(spec.config, _plain(settings))
     clock: Clock = VirtualClock() if spec.capabilities.virtual_time else MonotonicClock()
     return spec.build(name, config, DriverContext(clock)), clock
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
-from touchcell.cell.runtime.sensor import model_path
 from touchcell.perception.models.prediction import ContactEstimator
 from touchcell.perception.runtime import estimators
+from touchcell.perception.runtime.network_estimator import model_path
 
 
 def load_estimator(

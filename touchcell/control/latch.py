@@ -8,12 +8,15 @@ itself a start. It is not safety-rated: the hard-wired emergency stop and the ar
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.drivers.core.device import OperatorToken
+
+_logger = logging.getLogger(__name__)
 
 
 class LatchState(Enum):
@@ -96,7 +99,11 @@ class Latch:
         latching = [violation for violation in violations if violation.severity is not Severity.LIMIT]
         self._present = bool(latching)
         for violation in latching:
-            self._causes.setdefault((violation.interlock, violation.subject), violation)
+            key = (violation.interlock, violation.subject)
+            if key not in self._causes:
+                self._causes[key] = violation
+                kind = violation.severity.name.lower()
+                _logger.warning("%s: %s: %s: %s", kind, violation.interlock, violation.subject, violation.reason)
             self._latest_ns = max(self._latest_ns, violation.t_ns)
             if violation.severity is Severity.FAULT:
                 self._state = LatchState.FAULTED
@@ -122,6 +129,7 @@ class Latch:
             if applies:
                 return ResetRefused(reason)
         done = ResetDone(token.operator, self.causes)
+        _logger.info("reset by %s", token.operator)
         self._state = LatchState.CLEAR
         self._causes.clear()
         self._used = token

@@ -16,10 +16,11 @@ Robotics (2nd ed. 2024), chapter 8, with the coefficients and the Jacobian block
 from __future__ import annotations
 
 import os
-from typing import Literal, Protocol
+from typing import Literal, Protocol, cast
 
 import numpy as np
 
+from touchcell import compiled
 from touchcell.geometry import _check, _plain
 from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.types import Array, ArrayLike
@@ -54,14 +55,8 @@ class _Kernels(Protocol):
 
 
 def _choose() -> tuple[_Kernels, Literal["compiled", "python"]]:
-    if not os.environ.get("TOUCHCELL_PURE_PYTHON"):
-        try:
-            from touchcell.geometry import _se3c
-
-            return _se3c, "compiled"
-        except ImportError:
-            pass
-    return _plain, "python"
+    found = None if os.environ.get("TOUCHCELL_PURE_PYTHON") else compiled.extension("touchcell.geometry._se3c")
+    return (_plain, "python") if found is None else (cast(_Kernels, found), "compiled")
 
 
 _kernels, BACKEND = _choose()

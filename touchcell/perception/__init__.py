@@ -1,1 +1,1 @@
-"""From a tactile image to a Gaussian over contact pose and shear, and its Bayesian filter on SE(3)."""
+"""Tactile perception: from an image to a Gaussian over contact pose and shear, with a Bayesian filter on SE(3)."""

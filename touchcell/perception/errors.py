@@ -1,4 +1,4 @@
-"""What can go wrong with data sets, images, models and trainings, as types with attributes."""
+"""Errors of data sets, images, models and trainings."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from touchcell.errors import TouchcellError
 
 
 class ImageError(TouchcellError, ValueError):
-    """An image is not the kind that a preprocessing was made for.
+    """An image does not match the preprocessing.
 
     Attributes:
         attribute: "size", "channels", "dtype" or "type".
-        expected: what the preprocessing wants.
-        found: what the image has.
+        expected: value that the preprocessing requires.
+        found: value of the image.
     """
 
     def __init__(self, attribute: str, expected: Any, found: Any, *, hint: str = "") -> None:
@@ -25,11 +25,11 @@ class ImageError(TouchcellError, ValueError):
 
 
 class ArrayError(TouchcellError, ValueError):
-    """An array is not what a compiled kernel can work on.
+    """An array does not meet the requirements of a compiled kernel.
 
     Attributes:
-        function: the kernel that refused.
-        argument: the name of the offending argument.
+        function: name of the kernel.
+        argument: name of the offending argument.
     """
 
     def __init__(self, function: str, argument: str, reason: str, *, hint: str = "") -> None:
@@ -39,12 +39,12 @@ class ArrayError(TouchcellError, ValueError):
 
 
 class KernelsMissing(TouchcellError):
-    """The C extension that markers are found and matched with was not built."""
+    """The C extension for marker detection and matching was not built."""
 
     def __init__(self) -> None:
         super().__init__(
             "perception's C extension was not built",
-            hint="install a C compiler and install touchcell again; models of kind gdn and cnn do without",
+            hint="install a C compiler and install touchcell again; models of kind gdn and cnn work without it",
         )
 
 
@@ -63,7 +63,7 @@ class ModelError(TouchcellError, ValueError):
 
 
 class TrainingError(TouchcellError):
-    """A training cannot start or go on; no model was written.
+    """A training cannot start or continue; no model was written.
 
     Attributes:
         epoch: the epoch (1-based) in which it stopped, or 0 when it never started.

@@ -1,8 +1,7 @@
-"""The inner loops of perception, in C: arrays in, new arrays out.
+"""Inner loops of perception, in C: arrays in, new arrays out.
 
-Each raises ``ArrayError`` where an argument has another shape or type than it says, or is not finite. Without a
-compiler there is no extension: the image filters then are OpenCV's, whose results are the same to the bit, and the
-others raise ``KernelsMissing``.
+Each raises ``ArrayError`` where an argument has another shape or type than documented, or is not finite. Without the
+compiled extension the image filters use OpenCV, with bit-identical results, and the others raise ``KernelsMissing``.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from touchcell.compiled import extension
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.errors import KernelsMissing
 
@@ -22,15 +22,7 @@ _MOST_OFFSET = 256.0
 _FACTORS = (4, 8, 16, 32, 64)
 
 
-def _find() -> ModuleType | None:
-    try:
-        from touchcell.perception import _kernelsc
-    except ImportError:
-        return None
-    return _kernelsc
-
-
-_FOUND = _find()
+_FOUND = extension("touchcell.perception._kernelsc")
 
 
 def _compiled() -> ModuleType:
@@ -44,7 +36,7 @@ def _in_rows(image: ImageArray) -> ImageArray:
 
 
 def median_5(image: ImageArray) -> ImageArray:
-    """Median of 5x5 pixels of a grey image, its border repeated outwards; half the time of OpenCV's."""
+    """Return the median of 5x5 pixels of a grey image, its border replicated; takes half the time of OpenCV's."""
     if _FOUND is None:
         return np.asarray(cv2.medianBlur(np.ascontiguousarray(image), 5), np.uint8)
     medians = np.empty(image.shape, np.uint8)
@@ -53,13 +45,13 @@ def median_5(image: ImageArray) -> ImageArray:
 
 
 def threshold(image: ImageArray, block_px: int, offset: float, *, of_median_5: bool) -> ImageArray:
-    """255 where a grey pixel exceeds the mean of its neighbourhood less ``offset``, 0 elsewhere.
+    """Return 255 where a grey pixel exceeds the mean of its neighbourhood less ``offset``, 0 elsewhere.
 
     Args:
         image: uint8 (height, width).
-        block_px: side of the square neighbourhood, odd, 3 to 255; the image's border is repeated outwards.
+        block_px: side of the square neighbourhood, odd, 3 to 255; the image's border is replicated.
         offset: grey levels.
-        of_median_5: take the medians of 5x5 pixels first, which then are never held all at once.
+        of_median_5: take the medians of 5x5 pixels first, without storing the whole filtered image.
     """
     if _FOUND is None:
         image = median_5(image) if of_median_5 else np.ascontiguousarray(image)
@@ -72,7 +64,7 @@ def threshold(image: ImageArray, block_px: int, offset: float, *, of_median_5: b
 
 
 def area_means(image: ImageArray, size: tuple[int, int]) -> ImageArray:
-    """A grey image as means over the area of each new pixel, rounded.
+    """Resize a grey image by averaging over the area of each new pixel, rounded.
 
     Args:
         image: uint8 (height, width).
@@ -93,7 +85,7 @@ def area_means(image: ImageArray, size: tuple[int, int]) -> ImageArray:
 
 
 def discs(image: ImageArray, smallest_px: int, largest_px: int, longest_side_px: int) -> tuple[Array, Array]:
-    """Connected components (8 neighbours) of what is not zero, in the order of their first pixels.
+    """Find connected components (8 neighbours) of non-zero pixels, in the order of their first pixels.
 
     Args:
         image: uint8 (height, width).
@@ -109,14 +101,14 @@ def discs(image: ImageArray, smallest_px: int, largest_px: int, longest_side_px:
 
 
 def pair(places: Array, points: Array) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
-    """The point nearest to each place, the squared distance, and whether no other place is nearer to that point.
+    """Return the nearest point to each place, its squared distance, and whether no other place is nearer to that point.
 
     Args:
         places: (m, 2), one or more.
         points: (n, 2), one or more.
 
     Returns:
-        (m,) each; of equals the first counts.
+        (m,) each; among equals the first.
     """
     m = len(places)
     partner, square, owns = np.empty(m, np.int64), np.empty(m), np.empty(m, np.bool_)
@@ -125,11 +117,11 @@ def pair(places: Array, points: Array) -> tuple[NDArray[np.int64], Array, NDArra
 
 
 class Modes:
-    """Ways in which markers move together, laid out for ``settle`` and ``fit``.
+    """Displacement modes of the markers, laid out for ``settle`` and ``fit``.
 
     Args:
         base: (2 m,) px, markers (u, v, u, v, ...) with all coefficients zero.
-        basis: (k, 2 m), a row for each way.
+        basis: (k, 2 m), one row per mode.
     """
 
     def __init__(self, base: Array, basis: Array) -> None:
@@ -140,12 +132,12 @@ class Modes:
         self._basis[:, :modes] = basis.T
 
     def fit(self, weight: Array, off: Array, from_start: Array, ridge: Array) -> Array:
-        """(k,) change d of the coefficients that solves (B' W B + R) d = B' W off + R from_start.
+        """Return the (k,) change d of the coefficients that solves (B' W B + R) d = B' W off + R from_start.
 
         Args:
             weight: (m,) of the markers.
-            off: (m, 2) px, where each marker should move.
-            from_start: (k,) px, what leads back to the coefficients to stay near to.
+            off: (m, 2) px, desired displacement of each marker.
+            from_start: (k,) px, difference back to the prior coefficients.
             ridge: (k,) diagonal of R.
         """
         change = np.empty(self._modes)
@@ -164,17 +156,17 @@ class Modes:
         settled_px: float,
         turns: int,
     ) -> Array:
-        """(k,) coefficients after markers were paired with points and fitted by turns, until none moves.
+        """Return the (k,) coefficients after alternately pairing markers with points and fitting, until convergence.
 
         Args:
-            coefficients: (k,) px, where to begin.
-            start: (k,) px, what to stay near to.
-            ridge: (k,) how strongly.
+            coefficients: (k,) px, initial value.
+            start: (k,) px, prior.
+            ridge: (k,) weight of the prior.
             points: (n, 2) px.
-            reach_px: pairs further apart are not used at first.
-            least_reach_px: nor those in the end.
-            settled_px: shifts below this end it.
-            turns: of pairing and fitting, at most.
+            reach_px: initial limit on the distance of a pair.
+            least_reach_px: final limit.
+            settled_px: shifts below this count as converged.
+            turns: largest number of iterations.
         """
         settled = np.array(coefficients, dtype=np.float64)
         _compiled().settle(
@@ -193,12 +185,12 @@ class Modes:
 
 
 def density(centres: Array, weights: Array, low: Array, cell_px: float, grid: int) -> Array:
-    """How much lies in each cell of a grid, each point shared bilinearly among the four cells around it.
+    """Return the density of points in each cell of a grid, each distributed bilinearly over four cells.
 
     Args:
         centres: (b, n, 2) px.
         weights: (b, n).
-        low: (2,) px, where the grid begins.
+        low: (2,) px, corner of the grid.
         cell_px: side of a cell.
         grid: cells along each side.
 
@@ -211,14 +203,14 @@ def density(centres: Array, weights: Array, low: Array, cell_px: float, grid: in
 
 
 def bytes_apart(rows: NDArray[np.uint8], one: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """(b,) squared distances of rows (b, n) from one more (n,), n at most 32768."""
+    """Return (b,) squared distances of rows (b, n) from another row (n,), n at most 32768."""
     apart = np.empty(len(rows), np.int32)
     _compiled().bytes_apart(rows, one, apart)
     return apart
 
 
 def affine(weight: NDArray[np.float32], bias: NDArray[np.float32], x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """x W + b on the thread that calls it: (outputs,) of a weight (inputs, outputs)."""
+    """Return x W + b computed on the calling thread: (outputs,) of a weight (inputs, outputs)."""
     result = np.empty(len(bias), np.float32)
     _compiled().affine(weight, bias, x, result)
     return result

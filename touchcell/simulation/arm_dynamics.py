@@ -82,7 +82,7 @@ class ArmDynamics:
         """Set the servo target ``q`` (n,) rad, with velocity feed-forward ``dq`` (n,) rad/s."""
         self._data.ctrl[:] = q + _DAMPING_S * dq
 
-    def bear(self, force: Array, point: Array) -> None:
+    def apply_force(self, force: Array, point: Array) -> None:
         """Apply ``force`` (3,) N at ``point`` (3,) m on the last link from now on, both in the base frame."""
         self._data.xfrc_applied[self._last, :3] = force
         self._data.xfrc_applied[self._last, 3:] = cross(point - self._data.xipos[self._last], force)

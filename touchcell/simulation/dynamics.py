@@ -29,7 +29,7 @@ from touchcell.simulation.objects import FreeObject
 from touchcell.simulation.solids import shape_of
 from touchcell.simulation.surfaces import Surface, SurfacePoint
 from touchcell.simulation.timeline import Restore
-from touchcell.simulation.world import Feeling
+from touchcell.simulation.world import DeferredContact
 
 # A carriage that would rotate faster than this in one step has reached another face: it is placed there, not swung.
 _SWING_RAD = 0.1
@@ -141,9 +141,9 @@ class DynamicWorld:
         self._mounted[sensor] = _Mounted(T_world_s, R_world_c, R_world_c, np.zeros(6), normal)
         self._t_s = t_s
         self._build(self.objects())
-        return self._feel(sensor, T_world_s, t_s)()
+        return self._contact_of(sensor, T_world_s, t_s)()
 
-    def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, Feeling]:
+    def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, DeferredContact]:
         """Advance to ``t_s``. Raises PhysicsError."""
         span_s = t_s - self._t_s
         for sensor, pose in T_world_s.items():
@@ -154,8 +154,8 @@ class DynamicWorld:
         if not math.isfinite(float(self._qpos.sum())):
             raise PhysicsError("the state", t_s)
         self._t_s = t_s
-        self._look()
-        return {sensor: self._feel(sensor, pose, t_s) for sensor, pose in T_world_s.items()}
+        self._copy_object_poses()
+        return {sensor: self._contact_of(sensor, pose, t_s) for sensor, pose in T_world_s.items()}
 
     def objects(self) -> Mapping[str, Array]:
         """Return the present T_world_object (4, 4) of every free object."""
@@ -171,11 +171,11 @@ class DynamicWorld:
         def restore() -> None:
             mujoco.mj_setState(model, data, state, _STATE)
             self._t_s, self._mounted = t_s, {sensor: replace(each) for sensor, each in mounted.items()}
-            self._look()
+            self._copy_object_poses()
 
         return restore
 
-    def _look(self) -> None:
+    def _copy_object_poses(self) -> None:
         """Copy the poses of objects, anew each time, so that published ones stay unchanged."""
         self._T_world_object = {name: self._pose(name) for name in self._things}
 
@@ -206,7 +206,7 @@ class DynamicWorld:
         }
         for name, pose in T_world_object.items():
             self._place(self._at.objects[name].qpos, pose[:3, 3], pose[:3, :3])
-        self._look()
+        self._copy_object_poses()
 
     def _carry(self, sensor: str, T_world_s: Array, span_s: float) -> None:
         """Move the carriage from its pose to ``T_world_s``, and place the surface in front of its tip.
@@ -260,7 +260,7 @@ class DynamicWorld:
         else:
             self._qvel[at.qvel : at.qvel + 6] = 0.0
 
-    def _feel(self, sensor: str, T_world_s: Array, t_s: float) -> Feeling:
+    def _contact_of(self, sensor: str, T_world_s: Array, t_s: float) -> DeferredContact:
         nearest, tip = self._nearest(T_world_s[:3, 3], t_s), self._tips[sensor]
         self._mounted[sensor].normal = nearest.normal
         dx, dy, dz, _, _, turned = tip.q.tolist()

@@ -28,14 +28,14 @@ class ArmFaults:
 
     Attributes:
         nan_state: it reports a pose and a twist that are NaN.
-        deaf: it ignores stops; twists still expire.
-        runs_on: it keeps following its last twist, stopped or expired; only removing its power stops it.
+        ignores_stops: it ignores stops; twists still expire.
+        ignores_expiry: it keeps following its last twist, stopped or expired; only removing its power stops it.
         drift_m_s: it sinks along -z of its base at this speed while it has power.
         stale: it keeps reporting the state at the start of the fault, with that timestamp.
     """
 
     nan_state: bool = False
-    deaf: bool = False
-    runs_on: bool = False
+    ignores_stops: bool = False
+    ignores_expiry: bool = False
     drift_m_s: float = 0.0
     stale: bool = False

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+from pydantic import Field, PositiveFloat
 
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-
-PoseMmDeg = tuple[float, float, float, float, float, float]
+from touchcell.plugin_section import Section
+from touchcell.simulation.shape_spec import ObjectShapeConfig, ObjectShapeSection, ObjectSpec, PoseMmDeg
 
 TABLES: dict[str, float] = {"mdf": 0.3, "foam": 0.6}
 """Coefficients of sliding friction of the paper's two tables, chosen within literature values."""
@@ -79,11 +79,7 @@ class FreeObject:
     T_world_object: Array
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class BoxShape(_Part):
+class BoxShape(ObjectShapeConfig):
     """A box, its sides along the object's axes."""
 
     kind: Literal["box"]
@@ -95,7 +91,7 @@ class BoxShape(_Part):
         return Prism(np.array([[-x, -y], [x, -y], [x, y], [-x, y]]), 2.0 * z)
 
 
-class HexagonShape(_Part):
+class HexagonShape(ObjectShapeConfig):
     """A hexagonal prism, two of its faces across the object's x axis."""
 
     kind: Literal["hexagon"]
@@ -109,7 +105,7 @@ class HexagonShape(_Part):
         return Prism(corner_m * np.column_stack([np.cos(angles), np.sin(angles)]), 1e-3 * self.height_mm)
 
 
-class CylinderShape(_Part):
+class CylinderShape(ObjectShapeConfig):
     """An upright cylinder."""
 
     kind: Literal["cylinder"]
@@ -121,7 +117,7 @@ class CylinderShape(_Part):
         return Turned(((1e-3 * self.height_mm, 0.5e-3 * self.diameter_mm),))
 
 
-class BottleShape(_Part):
+class BottleShape(ObjectShapeConfig):
     """Stacked cylinders: [height, diameter] of each, from the bottom up."""
 
     kind: Literal["bottle"]
@@ -132,7 +128,7 @@ class BottleShape(_Part):
         return Turned(tuple((1e-3 * height, 0.5e-3 * diameter) for height, diameter in self.sections_mm))
 
 
-class BallShape(_Part):
+class BallShape(ObjectShapeConfig):
     """A ball; its frame is at its centre."""
 
     kind: Literal["ball"]
@@ -143,13 +139,10 @@ class BallShape(_Part):
         return Ball(0.5e-3 * self.diameter_mm)
 
 
-class ObjectConfig(_Part):
+class ObjectConfig(Section):
     """One free object of the ``scene:`` section. ``pose_mm_deg`` is in the world frame, its z above the table's top."""
 
-    shape: Annotated[
-        BoxShape | HexagonShape | CylinderShape | BottleShape | BallShape,
-        Field(discriminator="kind"),
-    ]
+    shape: ObjectShapeSection
     mass_g: PositiveFloat
     pose_mm_deg: PoseMmDeg = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -160,7 +153,7 @@ class ObjectConfig(_Part):
         return FreeObject(self.shape.build(), 1e-3 * self.mass_g, table.coefficient, T_world_object)
 
 
-class TableConfig(_Part):
+class TableConfig(Section):
     """The table under the objects: a level plane."""
 
     height_mm: float = 0.0
@@ -170,3 +163,10 @@ class TableConfig(_Part):
     def coefficient(self) -> float:
         """Coefficient of sliding friction."""
         return TABLES[self.friction] if isinstance(self.friction, str) else self.friction
+
+
+BOX = ObjectSpec("box", "a box", BoxShape)
+HEXAGON = ObjectSpec("hexagon", "a hexagonal prism", HexagonShape)
+CYLINDER = ObjectSpec("cylinder", "an upright cylinder", CylinderShape)
+BOTTLE = ObjectSpec("bottle", "stacked cylinders", BottleShape)
+BALL = ObjectSpec("ball", "a ball", BallShape)

@@ -26,7 +26,7 @@ from touchcell.simulation.objects import Ball, FreeObject
 from touchcell.simulation.solids import friction_radius_m, plain_shape_of
 from touchcell.simulation.surfaces import Surface
 from touchcell.simulation.timeline import Restore
-from touchcell.simulation.world import Feeling
+from touchcell.simulation.world import DeferredContact
 
 GRAVITY_M_S2: Final = 9.81
 
@@ -134,7 +134,7 @@ class QuasiStaticWorld:
         model = self._models[sensor] = ContactModel(self.law)
         return model.step(T_world_s, self._nearest(T_world_s, t_s), t_s)
 
-    def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, Feeling]:
+    def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, DeferredContact]:
         """Let the tips push the objects until friction holds; return the contact of each sensor then."""
         dt_s, self._t_s = t_s - self._t_s, t_s
         touched = {sensor: self._nearest(pose, t_s) for sensor, pose in T_world_s.items()}

@@ -4,21 +4,37 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol, cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from touchcell.compiled import extension
 from touchcell.drivers.replay.dataset import FRAME_SIZE, PUBLIC_CROP
 from touchcell.geometry.types import Array, ImageArray
+from touchcell.simulation import _plain_paint
 
-try:
-    from touchcell.simulation import _paint as _kernels
-except ImportError:
-    from touchcell.simulation import _plain_paint as _kernels  # type: ignore[no-redef]
+
+class _Kernels(Protocol):
+    """What the compiled and the plain module offer."""
+
+    def paint(self, image: ImageArray, centres: Array, stamps: ImageArray, /) -> None: ...
+    def expose(
+        self,
+        cover: ImageArray,
+        contrast: ImageArray,
+        background: ImageArray,
+        noise: NDArray[np.int8],
+        top: int,
+        left: int,
+        /,
+    ) -> ImageArray: ...
+
+
+_kernels = cast(_Kernels, extension("touchcell.simulation._paint") or _plain_paint)
 
 Seed = int | tuple[int, ...]
-
 
 _ROWS = 4
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Annotated, Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import DeviceError
@@ -16,15 +16,15 @@ from touchcell.drivers.core.protocols import TcpSource
 from touchcell.drivers.core.samples import Stamped
 from touchcell.drivers.core.scene import ContactState, SceneSection, SceneSpec
 from touchcell.errors import ConfigError, TouchcellError
-from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.plugin_section import Section
 from touchcell.simulation.contact import ContactLaw
-from touchcell.simulation.motions import Glide, Motion, Periodic, Still
-from touchcell.simulation.objects import ObjectConfig, PoseMmDeg, TableConfig
+from touchcell.simulation.objects import ObjectConfig, TableConfig
 from touchcell.simulation.quasi_static import QuasiStaticWorld
+from touchcell.simulation.shape_spec import SurfaceConfig, SurfaceSection, SurfaceSpec
 from touchcell.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
 from touchcell.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeline
-from touchcell.simulation.world import Feeling, KinematicWorld, World, known
+from touchcell.simulation.world import DeferredContact, KinematicWorld, World, computed
 
 HISTORY_S = 5.0
 
@@ -54,10 +54,10 @@ class Carrier(Protocol):
 
 
 @runtime_checkable
-class LoadBearer(Protocol):
+class LoadReceiver(Protocol):
     """A simulated arm that yields to contact forces on its sensors."""
 
-    def bear(self, force_world: Array, point_world: Array) -> None:
+    def apply_force(self, force_world: Array, point_world: Array) -> None:
         """Apply ``force_world`` (3,) N at ``point_world`` (3,) m from now on."""
         ...
 
@@ -108,30 +108,32 @@ class Scene:
         self.timeline = Timeline(clock, step_s)
         self._start_ns = self.timeline.t_ns
         self._poses: dict[str, Callable[[], Array]] = {}
-        self._bearers: dict[str, Callable[[Array, Array], None]] = {}
+        self._load_receivers: dict[str, Callable[[Array, Array], None]] = {}
         # The last entry is of the timeline's present step, the one before it of the previous step.
-        self._felt: dict[str, deque[Feeling]] = {}
+        self._contacts: dict[str, deque[DeferredContact]] = {}
         self._kept = round(HISTORY_S * 1e9 / self.timeline.step_ns)
         self.timeline.add(Phase.CONTACT, self._step)
         self.timeline.keep(self._snapshot)
 
-    def mount(self, sensor: str, pose: Callable[[], Array], bear: Callable[[Array, Array], None] | None = None) -> None:
+    def mount(
+        self, sensor: str, pose: Callable[[], Array], apply_force: Callable[[Array, Array], None] | None = None
+    ) -> None:
         """Mount ``sensor``.
 
         Args:
             sensor: name of the sensor.
             pose: returns T_world_s (4, 4) at the present step and must not advance time.
-            bear: called after every step with the contact force (3,) N on the sensor and its point of application (3,)
-                m, both in the world frame.
+            apply_force: called after every step with the contact force (3,) N on the sensor and its point of
+                application (3,) m, both in the world frame.
         """
         if sensor in self._poses:
             raise ConfigError(f"sensor {sensor!r} is mounted already", key="scene", value=sensor)
         t_ns = self.timeline.t_ns
         state = self.world.mount(sensor, pose(), self.seconds(t_ns))
         self._poses[sensor] = pose
-        if bear is not None:
-            self._bearers[sensor] = bear
-        self._felt[sensor] = deque([known(state)], maxlen=self._kept)
+        if apply_force is not None:
+            self._load_receivers[sensor] = apply_force
+        self._contacts[sensor] = deque([computed(state)], maxlen=self._kept)
 
     def has(self, sensor: str) -> bool:
         """Return whether ``sensor`` is mounted."""
@@ -144,17 +146,17 @@ class Scene:
             ConfigError: no such sensor.
             ContactNotKept: ``t_ns`` is in the future or older than the history.
         """
-        if sensor not in self._felt:
+        if sensor not in self._contacts:
             raise ConfigError(f"no sensor {sensor!r} is mounted", key="scene", value=sensor)
         now_ns = self.timeline.advance()
-        felt, step_ns = self._felt[sensor], self.timeline.step_ns
+        contacts, step_ns = self._contacts[sensor], self.timeline.step_ns
         newest = now_ns // step_ns
         seq = newest if t_ns is None else t_ns // step_ns
-        if not 0 <= newest - seq < len(felt):
-            raise ContactNotKept(seq * step_ns, (newest - len(felt) + 1) * step_ns, now_ns)
+        if not 0 <= newest - seq < len(contacts):
+            raise ContactNotKept(seq * step_ns, (newest - len(contacts) + 1) * step_ns, now_ns)
         at = seq - newest - 1
-        state = felt[at]()
-        felt[at] = known(state)
+        state = contacts[at]()
+        contacts[at] = computed(state)
         return Stamped(state, seq * step_ns, seq)
 
     def objects(self) -> Stamped[Mapping[str, Array]]:
@@ -180,20 +182,20 @@ class Scene:
 
     def _step(self, t_ns: int) -> None:
         poses = {sensor: pose() for sensor, pose in self._poses.items()}
-        for sensor, felt in self.world.step(poses, self.seconds(t_ns)).items():
-            self._felt[sensor].append(felt)
-            if sensor in self._bearers:
-                self._bearers[sensor](felt().force_world_n, poses[sensor][:3, 3])
+        for sensor, contacts in self.world.step(poses, self.seconds(t_ns)).items():
+            self._contacts[sensor].append(contacts)
+            if sensor in self._load_receivers:
+                self._load_receivers[sensor](contacts().force_world_n, poses[sensor][:3, 3])
 
     def _snapshot(self) -> Callable[[int], None]:
         start_ns, world = self._start_ns, self.world.snapshot()
-        felt = {sensor: kept.copy() for sensor, kept in self._felt.items()}
+        contacts = {sensor: kept.copy() for sensor, kept in self._contacts.items()}
 
         def restore(later_ns: int) -> None:
-            if felt.keys() != self._felt.keys():
+            if contacts.keys() != self._contacts.keys():
                 raise ConfigError("a sensor was mounted after the snapshot was taken", key="scene")
             self._start_ns = start_ns + later_ns
-            self._felt = {sensor: kept.copy() for sensor, kept in felt.items()}
+            self._contacts = {sensor: kept.copy() for sensor, kept in contacts.items()}
             world()
 
         return restore
@@ -213,73 +215,17 @@ def physics_engine(key: str, value: str) -> Iterator[None]:
         ) from None
 
 
-_HERE: PoseMmDeg = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-_SI = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class GlideConfig(_Part):
-    """One smooth move: translations along and at most one rotation about the start frame's axes."""
-
-    kind: Literal["glide"]
-    displacement_mm_deg: PoseMmDeg
-    start_s: float = Field(ge=0.0)
-    duration_s: float = Field(gt=0.0)
-
-    @model_validator(mode="after")
-    def _one_rotation(self) -> GlideConfig:
-        if sum(angle != 0.0 for angle in self.displacement_mm_deg[3:]) > 1:
-            raise ValueError("displacement_mm_deg may rotate about one axis only; use kind: periodic for more")
-        return self
-
-    def build(self, T_start: Array) -> Motion:
-        return Glide(T_start, np.array(self.displacement_mm_deg) * _SI, self.start_s, self.duration_s)
-
-
-class PeriodicConfig(_Part):
-    """Sines in all pose components of the start frame, with a gentle start; see ``motions.Periodic``."""
-
-    kind: Literal["periodic"]
-    amplitude_mm_deg: PoseMmDeg
-    shift_deg: PoseMmDeg = (0.0, 90.0, 0.0, 0.0, 90.0, 45.0)
-    period_s: float = Field(gt=0.0)
-    ramp_s: float = Field(default=1.0, gt=0.0)
-
-    def build(self, T_start: Array) -> Motion:
-        return Periodic(
-            T_start,
-            np.array(self.amplitude_mm_deg) * _SI,
-            np.radians(self.shift_deg),
-            self.period_s,
-            self.ramp_s,
-        )
-
-
-class _SurfaceConfig(_Part):
-    pose_mm_deg: PoseMmDeg = _HERE
-    motion: Annotated[GlideConfig | PeriodicConfig, Field(discriminator="kind")] | None = None
-
-    def shape(self) -> Shape:
-        raise NotImplementedError
-
-    def build(self) -> Surface:
-        T_world_body = se3.from_euler_mm_deg(self.pose_mm_deg)
-        return Surface(self.shape(), self.motion.build(T_world_body) if self.motion else Still(T_world_body))
-
-
-class PlaneConfig(_SurfaceConfig):
+class PlaneConfig(SurfaceConfig):
     """A flat plate: the plane z = 0 of its pose, outside towards +z."""
 
     kind: Literal["plane"]
 
     def shape(self) -> Shape:
+        """Return the shape in its own frame."""
         return Plane()
 
 
-class RampConfig(_SurfaceConfig):
+class RampConfig(SurfaceConfig):
     """Flat, then bent over an arc to an incline along the pose's +x; see ``surfaces.Ramp``."""
 
     kind: Literal["ramp"]
@@ -287,30 +233,33 @@ class RampConfig(_SurfaceConfig):
     incline_deg: float = Field(gt=-90.0, lt=90.0)
 
     def shape(self) -> Shape:
+        """Return the shape in its own frame."""
         return Ramp(self.bend_radius_mm * 1e-3, float(np.radians(self.incline_deg)))
 
 
-class DomeConfig(_SurfaceConfig):
+class DomeConfig(SurfaceConfig):
     """A hemisphere on a plane, its centre at the pose's origin, rising towards +z."""
 
     kind: Literal["dome"]
     radius_mm: float = Field(gt=0.0)
 
     def shape(self) -> Shape:
+        """Return the shape in its own frame."""
         return Dome(self.radius_mm * 1e-3)
 
 
-class SphereConfig(_SurfaceConfig):
+class SphereConfig(SurfaceConfig):
     """A ball about the pose's origin."""
 
     kind: Literal["sphere"]
     radius_mm: float = Field(gt=0.0)
 
     def shape(self) -> Shape:
+        """Return the shape in its own frame."""
         return Sphere(self.radius_mm * 1e-3)
 
 
-class TipLawConfig(_Part):
+class TipLawConfig(Section):
     """Contact law of every simulated tip of the scene; see ``contact.ContactLaw``."""
 
     radius_mm: float = Field(default=20.0, gt=0.0)
@@ -321,7 +270,7 @@ class TipLawConfig(_Part):
         return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3, self.friction)
 
 
-class SceneConfig(_Part, SceneSection):
+class SceneConfig(Section, SceneSection):
     """The ``scene:`` section of a cell file. Poses are in the world frame.
 
     ``physics`` is the fidelity (docs/explanation/simulation.md). ``kinematic``: surfaces with prescribed motion,
@@ -331,11 +280,8 @@ class SceneConfig(_Part, SceneSection):
     """
 
     physics: Literal["kinematic", "quasi_static", "dynamic"] = "kinematic"
-    surfaces: dict[
-        str,
-        Annotated[PlaneConfig | RampConfig | DomeConfig | SphereConfig, Field(discriminator="kind")],
-    ] = {}
-    objects: dict[str, ObjectConfig] = {}
+    surfaces: dict[str, SurfaceSection] = Field(default={})
+    objects: dict[str, ObjectConfig] = Field(default={})
     table: TableConfig = TableConfig()
     tip: TipLawConfig = TipLawConfig()
     step_ms: float = Field(default=2.0, ge=0.1, le=10.0)
@@ -375,3 +321,8 @@ class SceneConfig(_Part, SceneSection):
 
 
 SPEC = SceneSpec("simulated", "surfaces and free objects, kinematic, quasi-static or dynamic", SceneConfig)
+
+PLANE = SurfaceSpec("plane", "a flat plate", PlaneConfig)
+RAMP = SurfaceSpec("ramp", "a flat that bends over an arc to an incline", RampConfig)
+DOME = SurfaceSpec("dome", "a hemisphere on a plane", DomeConfig)
+SPHERE = SurfaceSpec("sphere", "a ball", SphereConfig)

@@ -116,7 +116,7 @@ def fit_tip(
     rings: int,
     *,
     start: Sensor | None = None,
-    told: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Sensor:
     """Fit the simulated sensor to the markers of a real one.
 
@@ -125,7 +125,7 @@ def fit_tip(
         reference: (m, 2) px lattice of the undeformed tip, markers in the order of ``markers.lattice``.
         rings: number of rings of the lattice.
         start: prior parameters for tips of this kind; its camera is mapped to the lattice anew.
-        told: progress callback with the orientations tried so far and their total.
+        progress: called with the orientations tried so far and their total.
 
     Raises:
         TrainingError: fewer than 8 contacts, or no orientation of the camera explains them.
@@ -147,7 +147,7 @@ def fit_tip(
             "no orientation of the camera explains the observed marker motion",
             hint="check that labels and images match, and that the image is not mirrored",
         )
-    return _fitted(best, contacts, list(_FREE), _TURNS, _PRIOR_PX, told)
+    return _fitted(best, contacts, list(_FREE), _TURNS, _PRIOR_PX, progress)
 
 
 def _laid_onto(tip: TipParameters, reference: Array) -> TipParameters:
@@ -175,7 +175,7 @@ def _fitted(
     free: list[_Key],
     turns: int,
     prior_px: float,
-    told: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Sensor:
     seen = contacts.seen[:, ::_EVERY, None]
     measured = contacts.pixels[:, ::_EVERY]
@@ -187,7 +187,9 @@ def _fitted(
 
     scale, low, high = np.array([_FREE[key] for key in free]).T
     at = np.array([_value(start, key) for key in free])
-    x = robust_fit(residuals, at, scale, low=low, high=high, prior=prior_px, soft=_SOFT_PX, turns=turns, told=told)
+    x = robust_fit(
+        residuals, at, scale, low=low, high=high, prior=prior_px, soft=_SOFT_PX, turns=turns, progress=progress
+    )
     return _with(start, free, x)
 
 

@@ -12,11 +12,11 @@ from touchcell.simulation.contact import ContactLaw, ContactModel
 from touchcell.simulation.surfaces import Surface
 from touchcell.simulation.timeline import Restore
 
-Feeling = Callable[[], ContactState]
+DeferredContact = Callable[[], ContactState]
 """Contact of a tip at one step, computed on demand: most are never read."""
 
 
-def known(state: ContactState) -> Feeling:
+def computed(state: ContactState) -> DeferredContact:
     """Return a contact that is already computed."""
     return lambda: state
 
@@ -28,7 +28,7 @@ class World(Protocol):
         """Add ``sensor`` at ``T_world_s`` (4, 4) at ``t_s`` seconds of the scene; return its contact there."""
         ...
 
-    def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, Feeling]:
+    def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, DeferredContact]:
         """Advance to ``t_s`` with each mounted sensor at its ``T_world_s`` (4, 4); return the contact of each."""
         ...
 
@@ -62,11 +62,11 @@ class KinematicWorld:
     def mount(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
         """Add ``sensor``; return its contact at ``T_world_s`` (4, 4) at ``t_s``."""
         self._models[sensor] = ContactModel(self.law)
-        return self._feel(sensor, T_world_s, t_s)()
+        return self._contact_of(sensor, T_world_s, t_s)()
 
-    def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, Feeling]:
+    def step(self, T_world_s: Mapping[str, Array], t_s: float) -> Mapping[str, DeferredContact]:
         """Return the contact of each sensor at ``t_s``."""
-        return {sensor: self._feel(sensor, pose, t_s) for sensor, pose in T_world_s.items()}
+        return {sensor: self._contact_of(sensor, pose, t_s) for sensor, pose in T_world_s.items()}
 
     def objects(self) -> Mapping[str, Array]:
         """Return an empty mapping: there are no free objects."""
@@ -82,7 +82,7 @@ class KinematicWorld:
 
         return restore
 
-    def _feel(self, sensor: str, T_world_s: Array, t_s: float) -> Feeling:
+    def _contact_of(self, sensor: str, T_world_s: Array, t_s: float) -> DeferredContact:
         surfaces = list(self.surfaces.values())
         surface = surfaces[0]
         if len(surfaces) > 1:

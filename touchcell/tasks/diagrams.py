@@ -42,7 +42,11 @@ def redraw(page: str, known: Mapping[str, Table]) -> str:
 
 
 def redrawn(page: str) -> str:
-    """``page`` with every diagram between its markers drawn from the tasks. Raises KeyError for an unknown one."""
+    """Return ``page`` with every diagram between its markers drawn from the tasks.
+
+    Raises:
+        KeyError: a marker names an unknown diagram.
+    """
     return redraw(page, tables())
 
 

@@ -35,6 +35,7 @@ class Observation:
         arms: newest state of each arm, by role in the task ("arm", "leader", ...).
         contacts: newest estimate of each tactile sensor, by role ("sensor", ...); a role is missing until its first
             frame has been processed.
+        devices: newest reading of each other device that is read, by role or, without one, by name.
         operator_stop: True if the operator requested an orderly end.
         ended: True if no sensor will deliver further frames, because the recordings have ended.
     """
@@ -44,6 +45,7 @@ class Observation:
     contacts: Mapping[str, ContactEstimate]
     operator_stop: bool = False
     ended: bool = False
+    devices: Mapping[str, Stamped[Mapping[str, float]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +56,13 @@ class Action:
         twists: a command for each arm that shall move; an arm without one is stopped.
         telemetry: named numbers for recording and plots, units in the names.
         labels: contact T_f_s (4, 4) shown by the newest frame of a sensor, by role: the frame is stored with it.
+        settings: named set values for each other device that shall change, by role; the others keep what they have.
     """
 
     twists: Mapping[str, TwistCommand] = field(default_factory=dict)
     telemetry: Mapping[str, float] = field(default_factory=dict)
     labels: Mapping[str, Array] = field(default_factory=dict)
+    settings: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +138,7 @@ class TaskSpec(Generic[TaskConfigT]):
         sensors: roles of the tactile sensors it needs.
         build: builds the task from its parameters and the context.
         labels_frames: True if it labels frames, which the cell has to store.
+        devices: roles of other devices, and the Protocols that each driver must provide.
     """
 
     name: str
@@ -143,9 +148,10 @@ class TaskSpec(Generic[TaskConfigT]):
     sensors: frozenset[str]
     build: Callable[[TaskConfigT, TaskContext], Task]
     labels_frames: bool = False
+    devices: Mapping[str, frozenset[type]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for protocols in self.arms.values():
+        for protocols in (*self.arms.values(), *self.devices.values()):
             require_protocols(protocols)
 
 

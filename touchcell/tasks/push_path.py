@@ -127,16 +127,16 @@ def _shortest(
     return min(clear, key=lambda path: path[1], default=None)
 
 
-def _dubins(start: Pose, goal: Pose, turn_m: float, word: str, side: int) -> tuple[list[Point], float] | None:
-    """Return the points and length of the Dubins path given by ``word``, or None where it does not exist.
+def _dubins(start: Pose, goal: Pose, turn_m: float, kind: str, side: int) -> tuple[list[Point], float] | None:
+    """Return the points and length of the Dubins path of one kind, or None where it does not exist.
 
     L and R are arcs to the left and right, S is a straight segment.
     """
-    first, last = _turning(word[0]), _turning(word[2])
+    first, last = _turning(kind[0]), _turning(kind[2])
     ax, ay = _centre(start, first, turn_m)
     bx, by = _centre(goal, last, turn_m)
     apart, towards = math.hypot(bx - ax, by - ay), math.atan2(by - ay, bx - ax)
-    if word[1] == "S":
+    if kind[1] == "S":
         if first == last:
             straight, heading = apart, towards
         else:
@@ -157,10 +157,10 @@ def _dubins(start: Pose, goal: Pose, turn_m: float, word: str, side: int) -> tup
         meet = math.atan2(by - my, bx - mx) - first * 0.5 * math.pi
         turns = (_arc(start[2], leave, first), _arc(leave, meet, -first), _arc(meet, goal[2], last))
     points, pose = [], start
-    for kind, amount in zip(word, turns, strict=True):
+    for letter, amount in zip(kind, turns, strict=True):
         count = max(math.ceil(amount * turn_m / STEP_M), 1) if amount > 1e-9 else 0
         for _ in range(count):
-            pose = _go(pose, _turning(kind), amount / count, turn_m)
+            pose = _go(pose, _turning(letter), amount / count, turn_m)
             points.append(pose[:2])
     if not points or math.hypot(pose[0] - goal[0], pose[1] - goal[1]) > 1e-6:
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, model_validator
@@ -47,6 +47,8 @@ class PushConfig(ContactServoConfig):
         align_max_mm_s: largest lateral speed.
         push_timeout_s: longest duration of the push.
     """
+
+    renamed_keys: ClassVar[Mapping[str, str]] = {"middle_mm": "object_center_offset_mm"}
 
     reference_mm_deg: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     kp_per_s: SixGains = (0.0, 0.0, 0.0, 8.0, 0.0, 0.0)

@@ -7,6 +7,7 @@ guard that fails silently.
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from transitions import EventData, Machine, MachineError, State
 
 from touchcell.tasks.errors import TaskDefinitionError
 from touchcell.tasks.interface import TransitionRecord
+
+_logger = logging.getLogger(__name__)
 
 STOP: Final = "stop"
 """The operator requests an orderly end."""
@@ -133,6 +136,7 @@ class TaskMachine:
     def __init__(self, table: Table, model: object) -> None:
         if problems := lint(table, model):
             raise TaskDefinitionError(table.task, problems)
+        self._name = table.task
         self._model = model
         self._definitions = {definition.state: definition for definition in table.states}
         self._events = {row.event for row in table.transitions}
@@ -259,6 +263,14 @@ class TaskMachine:
         source, target = self._source, self.state
         record = TransitionRecord(self._now_ns, state_name(source), posted.event, state_name(target), posted.reason)
         self._records.append(record)
+        _logger.info(
+            "%s: %s -> %s by %s%s",
+            self._name,
+            record.source,
+            record.target,
+            record.event,
+            f" ({record.reason})" if record.reason else "",
+        )
         callback = self._definitions[self.state].on_enter
         if callback is None:
             return
@@ -273,6 +285,7 @@ class TaskMachine:
 
     def _refuse(self, event: str, reason: str) -> Refused:
         refused = Refused(event, reason)
+        _logger.debug("%s: %s refused: %s", self._name, event, reason)
         self._refusals.append(refused)
         return refused
 

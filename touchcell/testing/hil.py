@@ -38,9 +38,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Deselect `hil` tests without a cell file."""
     if config.getoption("--cell"):
         return
-    on_bench = [item for item in items if item.get_closest_marker("hil")]
-    if on_bench:
-        config.hook.pytest_deselected(items=on_bench)
+    on_hardware = [item for item in items if item.get_closest_marker("hil")]
+    if on_hardware:
+        config.hook.pytest_deselected(items=on_hardware)
         items[:] = [item for item in items if not item.get_closest_marker("hil")]
 
 
@@ -49,7 +49,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
     cell = parent.config.getoption("--cell")
     if cell is None or file_path != cell.resolve():
         return None
-    return BenchModule.from_parent(parent, path=file_path)
+    return CellModule.from_parent(parent, path=file_path)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -63,7 +63,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     confirmed.add(device)
 
 
-class BenchModule(pytest.Module):
+class CellModule(pytest.Module):
     """A cell file, with one suite for each of its devices."""
 
     def _getobj(self) -> ModuleType:
@@ -116,6 +116,15 @@ def _ask(config: pytest.Config, device: str) -> None:
     with capture.global_and_fixture_disabled():
         print(f"\n{device} will be powered and, if it is an arm, move about 10 mm along and 2 deg about every axis.")
         print("Is the space around it free, are people away, and is a hand on the emergency stop? Type yes: ", end="")
-        answer = input()
+        try:
+            answer = input()
+        except (EOFError, OSError):
+            # Standard input is no terminal, or a worker's.
+            answer = None
+    if answer is None:
+        pytest.exit(
+            "tests on a bench ask a person first: run them in a terminal and without -n, or answer with --hil-yes",
+            returncode=pytest.ExitCode.USAGE_ERROR,
+        )
     if answer.strip().lower() != "yes":
         pytest.exit(f"the operator did not agree to test {device}", returncode=pytest.ExitCode.INTERRUPTED)

@@ -1,4 +1,4 @@
-"""Markers in the pictures of a run: followed from its first image, in the report and live in a browser."""
+"""Markers in the images of a run: tracked from its first image, in the report and live in a browser."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path / "run"
 
 
-def test_discs_are_followed_into_a_contact() -> None:
+def test_discs_are_tracked_into_a_contact() -> None:
     tip, renderer, corner = Tip(), FrameRenderer(), np.array([105.0, 20.0])
     rest = tip.project(tip.rest_positions)
     tracker = MarkerTracker(renderer.processed(rest))
@@ -58,7 +58,7 @@ def test_discs_are_followed_into_a_contact() -> None:
     assert np.linalg.norm(markers.positions - markers.reference, axis=1).max() > 8.0
 
 
-def test_a_jump_is_not_believed() -> None:
+def test_a_jump_is_not_tracked() -> None:
     tip, renderer = Tip(), FrameRenderer()
     rest = tip.project(tip.rest_positions)
     tracker = MarkerTracker(renderer.processed(rest))
@@ -68,14 +68,14 @@ def test_a_jump_is_not_believed() -> None:
         MarkerTracker(np.zeros((440, 445), np.uint8))
 
 
-def test_following_a_recording_reads_what_reading_it_reads(folder: Path) -> None:
+def test_following_and_reading_a_recording_give_the_same(folder: Path) -> None:
     def never() -> bool:
         raise AssertionError("a finished recording has an end")
 
     assert list(follow(folder / RECORDING, never)) == list(read(folder / RECORDING))
 
 
-def test_following_waits_for_what_is_written_meanwhile(tmp_path: Path) -> None:
+def test_following_waits_for_further_messages(tmp_path: Path) -> None:
     path = tmp_path / RECORDING
     written = 0
     with Recorder(path) as recorder:
@@ -114,7 +114,7 @@ def test_a_run_without_images_has_no_pictures(tmp_path: Path, capsys: pytest.Cap
     assert "recording: {frames: jpeg}" in capsys.readouterr().err
 
 
-def test_a_browser_sees_the_newest_picture(folder: Path) -> None:
+def test_the_web_page_serves_the_newest_image(folder: Path) -> None:
     clock = VirtualClock()
     with Page(0) as page:
         connection = http.client.HTTPConnection(page.url.removeprefix("http://").rstrip("/"), timeout=20)
@@ -128,7 +128,7 @@ def test_a_browser_sees_the_newest_picture(folder: Path) -> None:
     newest = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     assert (status, newest.shape) == (200, (440, 890, 3))
     assert np.abs(newest.astype(int) - shown[-1].astype(int)).mean() < 6.0
-    # At the pace of the recording, and no more pictures than ten in a second.
+    # At the pace of the recording, and at most ten images per second.
     duration_s = clock.now_ns() * 1e-9
     assert duration_s == pytest.approx(json.loads((folder / "result.json").read_text())["duration_s"], abs=0.3)
     assert len(shown) <= 10 * duration_s + 2 < pictures

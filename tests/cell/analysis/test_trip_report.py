@@ -1,4 +1,4 @@
-"""A trip leaves a black box, and ``touchcell why`` explains it in words and a picture."""
+"""A trip leaves a black box, and ``touchcell why`` explains it with text and a plot."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHIPPED = CONFIGS / "surface_follow_sim.yaml"
 
 
 def run_into_the_wall(folder: Path, **arm: Any) -> Path:
-    """The shipped cell on true contacts, with a workspace that ends 8 mm after the start."""
+    """Run the shipped cell on true contacts, with a workspace that ends 8 mm after the start."""
     data = yaml.safe_load(SHIPPED.read_text())
     data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
     data["interlocks"]["workspace"]["max_mm"] = [-72, 50, 150]
@@ -92,14 +92,14 @@ def test_a_run_without_a_black_box(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "holds no black box" in capsys.readouterr().err
 
 
-def test_an_arm_that_obeys_nothing_still_leaves_a_black_box(
+def test_an_arm_that_ignores_every_command_still_leaves_a_black_box(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     honest = SimArm.__init__
 
     def broken(arm: SimArm, *arguments: Any, **more: Any) -> None:
         honest(arm, *arguments, **more)
-        arm.faults = ArmFaults(deaf=True, drift_m_s=0.004)
+        arm.faults = ArmFaults(ignores_stops=True, drift_m_s=0.004)
 
     monkeypatch.setattr(SimArm, "__init__", broken)
     data = yaml.safe_load(SHIPPED.read_text())

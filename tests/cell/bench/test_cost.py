@@ -1,4 +1,4 @@
-"""``touchcell bench cost`` measures a process that does what ``touchcell run`` does."""
+"""``touchcell bench cost`` measures a process that does the same as ``touchcell run``."""
 
 from __future__ import annotations
 

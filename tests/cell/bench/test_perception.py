@@ -1,4 +1,4 @@
-"""``touchcell bench perception`` measures what it says: every estimator in a process of its own."""
+"""``touchcell bench perception`` measures every estimator in its own process."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from touchcell.simulation.samples import contacts as simulated_contacts
 PUBLIC = Preprocessing(input_size=(440, 445), output_size=(440, 445))
 
 
-def test_without_data_the_shipped_model_sees_simulated_frames(
+def test_without_data_the_shipped_model_is_run_on_simulated_frames(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--", "--images", "12", "--frames", "4", "--runtimes", "onnxruntime"]
@@ -66,7 +66,7 @@ def test_figures_are_those_of_evaluate(tmp_path: Path) -> None:
 
 
 def compare(name: str) -> None:
-    """A runtime computes what ONNX Runtime does."""
+    """Compare a runtime's outputs with those of ONNX Runtime."""
     for kind in ("gdn", "cnn"):
         base = make_model()
         outputs = [0.3] * (12 if kind == "gdn" else 6)
@@ -81,7 +81,7 @@ def compare(name: str) -> None:
 
 @pytest.mark.parametrize("name", [name for name in RUNTIMES if name != "onnxruntime"])
 def test_runtimes_compute_the_same(name: str) -> None:
-    """In a process of its own: one in which OpenVINO 2026.4 has compiled a network dies of the next signal."""
+    """In its own process: one in which OpenVINO 2026.4 has compiled a network dies of the next signal."""
     if name not in installed():
         pytest.skip(f"{name} is not installed")
     process = multiprocessing.get_context("spawn").Process(target=compare, args=(name,))
@@ -96,7 +96,7 @@ def test_a_thresholded_image_survives_the_camera() -> None:
     frame = camera_frame(image, seed=1)
     assert (frame.shape, frame.dtype) == (FRAME_SIZE, np.uint8)
     back = from_camera(PUBLIC).reduce(frame)
-    # What changes are pixels of the discs' edges.
+    # Only pixels of the discs' edges change.
     assert (back != image).mean() < 0.03
     assert set(np.unique(back)) == {0, 255}
     assert camera_frame(frame, seed=2) is frame
@@ -118,7 +118,7 @@ def test_simulated_split_has_the_public_layout(tmp_path: Path) -> None:
     assert (split.contact_mm_deg[:, 2] > 0.3).all()
 
 
-def test_table_leaves_out_what_there_is_nothing_of() -> None:
+def test_table_omits_missing_figures() -> None:
     figures = dict.fromkeys(("z_mm", "alpha_deg", "beta_deg", "x_mm", "y_mm", "gamma_deg"), 0.5)
     scored = {"n": 3, "mae": figures, "nll": 1.0, "coverage": {"68": figures, "95": figures}}
     quantiles = {clock: {"median": 1.0, "p99": 2.0} for clock in ("wall", "cpu")}

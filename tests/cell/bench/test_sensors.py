@@ -12,19 +12,19 @@ from touchcell.cell.cli.exit_codes import EXIT_OK
 from touchcell.cell.cli.main import main
 
 
-def test_every_sensor_is_heard(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_sensor_delivers_estimates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--", "--sensors", "2", "--rates", "30", "--seconds", "1.2"]
     assert main(["bench", "sensors", "--out", str(tmp_path), *words]) == EXIT_OK
     rows = json.loads((tmp_path / "sensors.json").read_text())["rows"]
     assert [(row["sensors"], row["workers"]) for row in rows] == [(2, False), (2, True)]
     for row in rows:
-        # Of the sensor that was heard least.
+        # Of the sensor with the fewest estimates.
         assert row["estimates_per_s"] > 0.0
         assert 0.0 < row["new_age_ms"]["median"] <= row["new_age_ms"]["p99"]
     assert "worker threads" in capsys.readouterr().out
 
 
-def test_a_worker_that_fails_is_no_silence(tmp_path: Path) -> None:
+def test_a_failed_worker_raises_in_the_loop(tmp_path: Path) -> None:
     (tmp_path / "frame_0.jpg").write_bytes(b"no image")
     for workers in (False, True):
         with pytest.raises(Exception, match="truncated"):

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from tests.helpers.pushing_cell import cell_file
-from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
+from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_DEVICE_LOST, EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
 from touchcell.cell.cli.main import main
 from touchcell.drivers.core.errors import ConnectError, DeviceGone
 from touchcell.simulation.devices.arm import SimArm
@@ -63,7 +63,7 @@ def test_a_device_that_is_not_there_is_4_and_has_a_result(tmp_path: Path, monkey
         raise ConnectError(arm.name, "nothing answers")
 
     monkeypatch.setattr(SimArm, "_open", nothing)
-    assert main(["run", str(cell(tmp_path)), "--quiet", "--out", str(tmp_path / "run")]) == EXIT_LOST
+    assert main(["run", str(cell(tmp_path)), "--quiet", "--out", str(tmp_path / "run")]) == EXIT_DEVICE_LOST
     assert result_of(tmp_path / "run")["outcome"] == "error"
     assert "nothing answers" in result_of(tmp_path / "run")["reason"]
 
@@ -75,7 +75,7 @@ def test_a_device_that_is_lost_when_it_is_given_back_is_4_and_the_result_stays(
         raise DeviceGone(arm.name, "unplugged")
 
     monkeypatch.setattr(SimArm, "_deactivate", gone)
-    assert main(["run", str(cell(tmp_path)), "--quiet", "--out", str(tmp_path / "run")]) == EXIT_LOST
+    assert main(["run", str(cell(tmp_path)), "--quiet", "--out", str(tmp_path / "run")]) == EXIT_DEVICE_LOST
     assert result_of(tmp_path / "run")["outcome"] == "done"
     assert "unplugged" in result_of(tmp_path / "run")["after_the_run"]
 

@@ -166,7 +166,7 @@ def test_messages_name_the_remedy(tmp_path: Path) -> None:
     assert message(tmp_path, "schema: 1\n", "") == f"{path}:1: schema: is missing (add `schema: 1`)"
     pose = "needs six numbers [x y z mm, rx ry rz deg], found 5"
     assert message(tmp_path, "25, 180, 0, 0]", "25, 180, 0]").endswith(f"arms.arm.start_pose_mm_deg: {pose}")
-    assert "unknown kind 'rampp' (did you mean 'ramp'?)" in message(tmp_path, "kind: ramp", "kind: rampp")
+    assert "unknown surface 'rampp' (did you mean 'ramp'?)" in message(tmp_path, "kind: ramp", "kind: rampp")
     assert "sim_tactip drives a camera, not an arm" in message(tmp_path, "driver: sim_arm", "driver: sim_tactip")
     assert "schema_" not in message(tmp_path, "seed: 1", "shema: 1")
     assert "rate_hz: must be a valid number, not 'yes'" in message(tmp_path, "rate_hz: 100", "rate_hz: yes")

@@ -1,4 +1,4 @@
-"""Runs as moving pictures: outlines of what there is, and a GIF that moves."""
+"""Animations of runs: outlines of solids, and a GIF that moves."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_tip_has_its_body_behind_it():
     assert body[:, 0].max() == pytest.approx(0, abs=0.1)
 
 
-def test_heights_are_those_of_the_surface():
+def test_heights_match_the_surface():
     x_m = np.array([-0.1, 0.0, 0.02])
     np.testing.assert_allclose(height_mm(Surface(Dome(0.05)), x_m, 0.0, 0.0), [0.0, 50.0, 45.83], atol=0.1)
     rising = height_mm(Surface(Ramp(0.1, np.radians(30))), np.array([0.2]), 0.0, 0.0)

@@ -28,7 +28,7 @@ def test_round_trip(tmp_path: Path) -> None:
     assert messages[-2].data["pose"][3][3] == 999.0
 
 
-def test_what_is_not_finite_becomes_null(tmp_path: Path) -> None:
+def test_non_finite_numbers_become_null(tmp_path: Path) -> None:
     with Recorder(tmp_path / "run.mcap") as recorder:
         recorder.write("/x", 0, {"a": float("nan"), "b": np.array([1.0, np.inf]), "c": np.float64("-inf")})
     (message,) = read(tmp_path / "run.mcap")
@@ -69,7 +69,7 @@ def test_a_file_cut_anywhere_is_readable_up_to_the_cut(tmp_path: Path) -> None:
 
 
 class _FullDisk(io.BytesIO):
-    """Refuses to grow beyond a size, as a full disk does."""
+    """Raises beyond a size, as a full disk does."""
 
     def write(self, data: object) -> int:
         if self.tell() > 40_000:
@@ -94,9 +94,9 @@ def test_full_disk_is_a_typed_error_and_keeps_what_was_written(tmp_path: Path) -
     assert len(list(read(path))) > 100
 
 
-def test_refuses_what_is_no_recording(tmp_path: Path) -> None:
+def test_refuses_files_that_are_not_recordings(tmp_path: Path) -> None:
     (tmp_path / "x").write_bytes(b"something else")
-    with pytest.raises(RecordingError, match="no MCAP"):
+    with pytest.raises(RecordingError, match="not an MCAP"):
         list(read(tmp_path / "x"))
     with pytest.raises(RecordingError, match="cannot be read"):
         list(read(tmp_path / "missing"))

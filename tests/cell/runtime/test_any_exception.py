@@ -13,7 +13,7 @@ import yaml
 
 from tests.helpers.pushing_cell import cell_file
 from touchcell.cell.cli import run as run_command
-from touchcell.cell.cli.exit_codes import EXIT_LOST, EXIT_TASK_FAILED, EXIT_TRIPPED
+from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_TASK_FAILED, EXIT_TRIPPED
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import Recorder
@@ -190,7 +190,7 @@ def test_the_command_leaves_a_result_a_black_box_and_the_right_exit_code(
     assert result["outcome"] == box["outcome"] == ("tripped" if trips else "error")
     assert result["reason"] == box["reason"] != ""
     lost = kind == "DeviceGone" and place != "an interlock" and place != "the recorder"
-    assert code == (EXIT_LOST if lost else EXIT_TRIPPED if trips else EXIT_TASK_FAILED)
+    assert code == (EXIT_DEVICE_LOST if lost else EXIT_TRIPPED if trips else EXIT_TASK_FAILED)
 
 
 def _raise(error: Exception) -> None:

@@ -143,7 +143,7 @@ def test_stop_without_a_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["stop"]) == EXIT_BAD_INPUT
-    assert "no run goes on" in capsys.readouterr().err
+    assert "no run is in progress" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("now", [False, True])

@@ -95,7 +95,7 @@ def test_an_arm_that_is_not_trusted_gets_the_strongest_stop_and_the_other_its_ow
 
 def test_an_arm_that_runs_on_is_stopped_by_stronger_means() -> None:
     pair = Pair()
-    pair.arms["right"].faults = ArmFaults(runs_on=True)
+    pair.arms["right"].faults = ArmFaults(ignores_expiry=True)
     _, reports = pair.stop()
     assert [role for role, _ in pair.escalations] == ["right"]
     assert pair.escalations[0][1] == pytest.approx(0.26, abs=0.0101)
@@ -121,7 +121,7 @@ def test_an_arm_that_sinks_loses_its_power_to_the_brakes() -> None:
 
 def test_an_arm_that_obeys_nothing_is_given_up_with_a_hint() -> None:
     pair = Pair()
-    pair.arms["left"].faults = ArmFaults(deaf=True, drift_m_s=0.004)
+    pair.arms["left"].faults = ArmFaults(ignores_stops=True, drift_m_s=0.004)
     _, reports = pair.stop()
     assert reports["left"].time_s is None
     assert "emergency stop" in reports["left"].problem
@@ -130,7 +130,7 @@ def test_an_arm_that_obeys_nothing_is_given_up_with_a_hint() -> None:
 
 def test_a_deaf_arm_ends_with_its_last_command() -> None:
     pair = Pair()
-    pair.arms["left"].faults = ArmFaults(deaf=True)
+    pair.arms["left"].faults = ArmFaults(ignores_stops=True)
     _, reports = pair.stop()
     assert pair.arms["left"].at_rest()
     left = reports["left"]

@@ -1,4 +1,4 @@
-"""Arms that come near each other, a table or themselves: when it slows, when it trips, and what a cell file may say."""
+"""Arms close to each other, a table or themselves: when motion is slowed, when it trips, and valid cell files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from touchcell.geometry import se3
 NOW = 1_000_000_000
 ENTRY = {"kind": "clearance", "limit_mm": 20, "slow_mm": 60}
 FINGER = Capsule("finger", (TOOL, TOOL), ((0.0, 0.0, 0.0), (0.0, 0.0, -0.1)), 0.02)
-# The right arm stands 1 m to the right and looks back.
+# The right arm stands 1 m to the right and faces back.
 BODIES = {
     "left": Body(np.eye(4), [FINGER]),
     "right": Body(se3.from_euler_mm_deg(np.array([1000.0, 0, 0, 0, 0, 180])), [FINGER]),
@@ -72,7 +72,7 @@ ASIDE = (0, 0, 0, 0, 0, 0)
         (59, None, FORTH, Severity.LIMIT),
         (59, BACK, None, None),
         (59, ASIDE, ASIDE, None),
-        # One goes on faster than the other makes way.
+        # One approaches faster than the other retreats.
         (59, FORTH, (-0.02, 0, 0, 0, 0, 0), Severity.LIMIT),
         (59, FORTH, (-0.08, 0, 0, 0, 0, 0), None),
         (21, FORTH, None, Severity.LIMIT),
@@ -85,7 +85,7 @@ ASIDE = (0, 0, 0, 0, 0, 0)
         (-5, BACK, BACK, None),
     ],
 )
-def test_two_arms_slow_down_then_stop_and_may_always_go_apart(gap_mm, left, right, severity):
+def test_two_arms_slow_down_then_stop_and_may_always_separate(gap_mm, left, right, severity):
     found = rule().check(apart(gap_mm, left, right))
     assert (found and found.severity) == severity
     if found is not None:
@@ -107,7 +107,7 @@ def test_the_sensor_turning_towards_the_other_counts_as_approach():
         assert (found and found.severity) == severity
 
 
-def test_a_table_counts_too_and_names_itself():
+def test_a_table_is_checked_and_named():
     view = CellView(NOW, {"left": arm(0.0, (0, 0, -0.05, 0, 0, 0), z_mm=155.0), "right": arm(0.0)})
     found = rule((TABLE,)).check(view)
     assert found.severity is Severity.LIMIT
@@ -115,7 +115,7 @@ def test_a_table_counts_too_and_names_itself():
     assert found.subject == "left"
 
 
-def test_slow_may_last_and_near_does_not():
+def test_slow_does_not_escalate_and_near_trips():
     supervisor = Supervisor(
         build_interlocks(parse_interlocks({"clear": ENTRY}), {}, PlanningScene({}, BODIES)), Latch()
     )
@@ -158,7 +158,7 @@ def test_links_are_where_kinematics_put_them_and_move_as_the_command_asks():
         body.frames(replace(jointed(q, dq), joints=None))
 
 
-def test_an_arm_that_folds_onto_itself_is_slowed():
+def test_an_arm_that_approaches_itself_is_slowed():
     parts = [
         *link_capsules(CHAIN.description),
         Capsule("gripper", (TOOL, TOOL), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.15)), 0.03),
@@ -196,7 +196,7 @@ def test_slow_below_the_limit_is_refused():
 
 
 def following(tmp_path: Path, **changes: Any) -> Path:
-    """Surface following with a finger along the sensor, and a post in the way that it slides."""
+    """Surface following with a finger along the sensor, and a post in its path."""
     data = cells()["surface_following"]
     data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
     data["task"]["distance_mm"] = 60
@@ -219,7 +219,7 @@ def test_a_running_cell_trips_before_the_post(tmp_path):
     assert result.outcome is Outcome.TRIPPED
     assert result.causes[0].interlock == "clear"
     assert "from post" in result.reason
-    # Slowed to 5 mm/s before, it stands right at the limit: the post's face is at 10 mm, the finger 15 mm thick.
+    # Slowed to 5 mm/s before, it stops right at the limit: the post's face is at 10 mm, the finger 15 mm thick.
     assert 0.010 - reached_m[0] - 0.015 == pytest.approx(0.020, abs=2e-4)
 
 

@@ -1,4 +1,4 @@
-"""Distances of capsules and boxes against MuJoCo's and against brute force; which pairs are looked at."""
+"""Distances of capsules and boxes against MuJoCo's and against brute force; which pairs are checked."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_mujoco_agrees():
     assert compared > 150
 
 
-def test_neighbouring_links_and_what_stands_still_are_left_out():
+def test_neighbouring_links_and_static_pairs_are_left_out():
     def link(k):
         return Capsule(f"link {k}", (k, k), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.1)), 0.05)
 
@@ -127,7 +127,7 @@ def test_neighbouring_links_and_what_stands_still_are_left_out():
     }
 
 
-def test_no_pairs_are_no_trouble():
+def test_no_pairs_give_no_distances():
     nothing = Clearances({"arm": []}, {"arm": 2}, [])
     assert nothing.pairs == ()
     assert nothing.distances(np.tile(np.eye(4), (2, 1, 1))).shape == (0,)

@@ -1,4 +1,4 @@
-"""Each rule at, just inside and just outside its limit; each way of getting its settings wrong."""
+"""Each interlock at, just inside and just outside its limit; invalid settings of each."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ GOOD = {
     "depth": {"kind": "depth", "limit_mm": 6.0},
     "frames": {"kind": "frame_age", "limit_ms": 100},
     "states": {"kind": "arm_state_age", "limit_ms": 50, "severity": "fault"},
+    "readings": {"kind": "reading_age", "limit_ms": 50},
     "tilt": {"kind": "tilt", "arm": "arm", "sensor": "sensor", "direction": [0, 0, 2], "limit_deg": 20},
     "frozen": {"kind": "frame_frozen", "limit_ms": 200},
     "exposure": {"kind": "exposure", "limit_percent": 20},
@@ -74,7 +75,7 @@ def rule(name):
 
 
 @pytest.mark.parametrize("name", GOOD)
-def test_a_quiet_cell_breaks_no_rule(name):
+def test_a_cell_at_rest_has_no_violation(name):
     quiet = rule(name)
     assert (quiet.evaluate(view(), {})[0] if isinstance(quiet, TimedInterlock) else quiet.check(view())) is None
 
@@ -84,7 +85,7 @@ def test_a_quiet_cell_breaks_no_rule(name):
     [
         ("box", {"pose_mm_deg": (0, 0, 199, 0, 0, 0)}, {"pose_mm_deg": (0, 0, 201, 0, 0, 0)}, 0.301, 0.3, "m"),
         ("box", {"pose_mm_deg": (-100, 0, 9, 0, 0, 0)}, {"pose_mm_deg": (-101, 0, 9, 0, 0, 0)}, -0.101, -0.1, "m"),
-        # Turned upside down, the sensor hangs 100 mm below the tool.
+        # Upside down, the sensor is 100 mm below the tool.
         ("box", {"pose_mm_deg": (0, 0, 101, 180, 0, 0)}, {"pose_mm_deg": (0, 0, 99, 180, 0, 0)}, -0.001, 0.0, "m"),
         ("speed", {"twist": (0.06, 0.08, 0, 0, 0, 0)}, {"twist": (0.06, 0.09, 0, 0, 0, 0)}, None, 0.1, "m/s"),
         ("speed", {"twist": (0, 0, 0, 0, 0, 1)}, {"twist": (0, 0, 0, 0, 0, -1.1)}, 1.1, 1.0, "rad/s"),
@@ -122,7 +123,7 @@ def test_limits(name, inside, outside, value, limit, unit):
         ((0, 0, 201, 0, 0, 0), (0.02, 0, -0.01, 0, 0, 0), (0, 0, 0.01, 0, 0, 0)),
         # Below and beside the box: it has to come back along both axes.
         ((105, 0, -110, 0, 0, 0), (-0.01, 0, 0.01, 0, 0, 0), (-0.01, 0, 0, 0, 0, 0)),
-        # The tool turns about itself, and the sensor at its end swings back or away.
+        # The tool rotates, and the sensor at its end swings back or away.
         ((105, 0, 100, 0, 0, 0), (0, 0, 0, 0, -0.1, 0), (0, 0, 0, 0, 0.1, 0)),
         # Along its own axis, and turned over: the command is along tool axes.
         ((0, 0, 99, 180, 0, 0), (0, 0, -0.01, 0, 0, 0), (0, 0, 0.01, 0, 0, 0)),

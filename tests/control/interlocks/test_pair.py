@@ -1,4 +1,4 @@
-"""Slip, markers, and what two sensors hold: each rule on hand-made contacts whose truth is known."""
+"""Slip, markers, and the object between two sensors: each interlock on synthetic contacts with known truth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOUNTS = {
     "leader_sensor": se3.from_euler_mm_deg(np.array([0, 0, 50.0, 0, 0, 0])),
     "follower_sensor": se3.from_euler_mm_deg(np.array([0, 0, 60.0, 0, 0, 30.0])),
 }
-# Bases turned against each other, so that nothing holds by accident.
+# Bases rotated relative to each other, so that nothing holds by accident.
 BASES = {
     "leader": se3.from_euler_mm_deg(np.array([-500.0, 0, 0, 0, 0, 20.0])),
     "follower": se3.from_euler_mm_deg(np.array([600.0, 100, 0, 0, 0, -150.0])),
@@ -33,12 +33,12 @@ ALONG_X = se3.from_euler_mm_deg(np.array([0, 0, 0, 0, 90.0, 0]))
 AGAINST_X = se3.from_euler_mm_deg(np.array([0, 0, 0, 0, -90.0, 0]))
 
 
-class Hands:
+class HeldBox:
     """A box of 80 mm between two sensors, which may move, lean and be squeezed. The sensors stick to it.
 
     Attributes:
         T_world_box: (4, 4) pose of the box.
-        offset_mm_deg: of each sensor from where it touched, in the surface's frame: [x y z alpha beta gamma].
+        offset_mm_deg: of each sensor from its first contact, in the surface's frame: [x y z alpha beta gamma].
     """
 
     def __init__(self) -> None:
@@ -86,12 +86,12 @@ def rule(kind: str, **changes: Any) -> TimedInterlock:
 
 
 def watch(
-    evaluate: TimedInterlock, hands: Hands, seconds: float, move: Callable[[float], None] = lambda t: None
+    evaluate: TimedInterlock, held: HeldBox, seconds: float, move: Callable[[float], None] = lambda t: None
 ) -> Iterator[Violation | None]:
     past: InterlockState = {}
     for k in range(round(seconds / DT_S)):
         move(k * DT_S)
-        found, past = evaluate.evaluate(hands.view(), past)
+        found, past = evaluate.evaluate(held.view(), past)
         yield found
 
 
@@ -102,42 +102,42 @@ def first(*args: Any) -> tuple[float, Violation]:
     raise AssertionError("nothing was found")
 
 
-def pushed_along(hands: Hands) -> Callable[[float], None]:
-    """The box is pushed and turned about the vertical, as rigid as it is."""
+def pushed_along(held: HeldBox) -> Callable[[float], None]:
+    """Push the box and turn it about the vertical, as a rigid body."""
 
     def move(t_s: float) -> None:
-        hands.T_world_box = se3.from_euler_mm_deg(np.array([30 * t_s, 10 * t_s, 150.0, 0, 0, 20 * t_s]))
+        held.T_world_box = se3.from_euler_mm_deg(np.array([30 * t_s, 10 * t_s, 150.0, 0, 0, 20 * t_s]))
 
     return move
 
 
 @pytest.mark.parametrize("kind", ["out_of_step", "object_lost", "toppling", "slip", "markers_lost"])
-def test_a_box_that_is_pushed_and_turned_breaks_no_rule(kind: str) -> None:
-    hands = Hands()
-    assert not any(watch(rule(kind), hands, 1.0, pushed_along(hands)))
+def test_a_box_that_is_pushed_and_turned_has_no_violation(kind: str) -> None:
+    held = HeldBox()
+    assert not any(watch(rule(kind), held, 1.0, pushed_along(held)))
 
 
 def test_a_follower_that_falls_behind_is_out_of_step_by_the_speed_of_the_gap() -> None:
-    hands = Hands()
+    held = HeldBox()
 
     def move(t_s: float) -> None:
-        pushed_along(hands)(t_s)
-        hands.offset_mm_deg["follower"][2] = 3.0 - 10.0 * min(t_s, 0.15)
+        pushed_along(held)(t_s)
+        held.offset_mm_deg["follower"][2] = 3.0 - 10.0 * min(t_s, 0.15)
 
-    at_s, found = first(rule("out_of_step"), hands, 0.15, move)
+    at_s, found = first(rule("out_of_step"), held, 0.15, move)
     assert (found.unit, found.subject, found.limit) == ("mm/s", "follower_sensor", 5)
-    # Along the line between tips that are offset a little, and with the turn's own chord.
+    # Along the line between slightly offset tips, and with the chord of the rotation.
     assert found.value == pytest.approx(10.0, abs=0.5)
     assert at_s == pytest.approx(0.06, abs=0.011)
 
 
 def test_a_load_that_only_one_carries_is_out_of_step_by_depth() -> None:
-    hands = Hands()
-    hands.offset_mm_deg["leader"][2] = 5.5
-    _, found = first(rule("out_of_step"), hands, 0.2)
+    held = HeldBox()
+    held.offset_mm_deg["leader"][2] = 5.5
+    _, found = first(rule("out_of_step"), held, 0.2)
     assert (found.unit, found.value) == ("mm", pytest.approx(2.5))
-    hands.state = "retract"
-    assert not any(watch(rule("out_of_step", states=["push"]), hands, 0.2))
+    held.state = "retract"
+    assert not any(watch(rule("out_of_step", states=["push"]), held, 0.2))
 
 
 @pytest.mark.parametrize(
@@ -149,85 +149,85 @@ def test_a_load_that_only_one_carries_is_out_of_step_by_depth() -> None:
     ],
 )
 def test_an_object_that_was_held_and_is_gone(gone: set[str], subject: str, words: str) -> None:
-    hands = Hands()
+    held = HeldBox()
 
     def move(t_s: float) -> None:
         if t_s >= 0.2:
-            hands.touching.update(dict.fromkeys(gone, False))
+            held.touching.update(dict.fromkeys(gone, False))
 
-    at_s, found = first(rule("object_lost"), hands, 1.0, move)
+    at_s, found = first(rule("object_lost"), held, 1.0, move)
     assert at_s == pytest.approx(0.30, abs=0.011)
     assert found.subject == subject
     assert words in found.reason
 
 
 def test_an_object_that_was_never_held_cannot_be_lost() -> None:
-    hands = Hands()
-    hands.touching["follower"] = False
-    assert not any(watch(rule("object_lost"), hands, 0.5))
+    held = HeldBox()
+    held.touching["follower"] = False
+    assert not any(watch(rule("object_lost"), held, 0.5))
 
 
-def test_a_flicker_of_one_contact_is_no_loss() -> None:
-    hands = Hands()
+def test_a_short_loss_of_one_contact_is_tolerated() -> None:
+    held = HeldBox()
 
     def move(t_s: float) -> None:
-        hands.touching["follower"] = not 0.2 <= t_s < 0.26
+        held.touching["follower"] = not 0.2 <= t_s < 0.26
 
-    assert not any(watch(rule("object_lost"), hands, 0.6, move))
+    assert not any(watch(rule("object_lost"), held, 0.6, move))
 
 
-def lean(hands: Hands, deg_s: float) -> Callable[[float], None]:
+def lean(held: HeldBox, deg_s: float) -> Callable[[float], None]:
     def move(t_s: float) -> None:
-        hands.T_world_box = se3.from_euler_mm_deg(np.array([0, 0, 150.0, 0, deg_s * max(t_s - 0.2, 0.0), 0]))
+        held.T_world_box = se3.from_euler_mm_deg(np.array([0, 0, 150.0, 0, deg_s * max(t_s - 0.2, 0.0), 0]))
 
     return move
 
 
 def test_leaning_slowly_trips_by_the_angle() -> None:
-    hands = Hands()
-    at_s, found = first(rule("toppling"), hands, 3.0, lean(hands, 4.0))
+    held = HeldBox()
+    at_s, found = first(rule("toppling"), held, 3.0, lean(held, 4.0))
     assert (found.unit, found.limit, found.subject) == ("deg", 5, "leader_sensor")
     assert found.value == pytest.approx(5.2, abs=0.1)
     assert at_s == pytest.approx(0.2 + 5.0 / 4.0 + 0.05, abs=0.03)
 
 
-def test_falling_over_trips_by_the_rate_long_before_the_angle() -> None:
-    hands = Hands()
-    at_s, found = first(rule("toppling", limit_deg=20), hands, 1.0, lean(hands, 30.0))
+def test_toppling_trips_by_the_rate_long_before_the_angle() -> None:
+    held = HeldBox()
+    at_s, found = first(rule("toppling", limit_deg=20), held, 1.0, lean(held, 30.0))
     assert found.unit == "deg/s"
     assert 8.0 < found.value < 30.0
     assert at_s < 0.2 + 0.15
 
 
 @pytest.mark.parametrize("sensors", [["leader_sensor"], ["follower_sensor", "leader_sensor"]])
-def test_it_is_seen_with_one_sensor_and_in_either_order(sensors: list[str]) -> None:
-    hands = Hands()
+def test_toppling_is_detected_with_one_sensor_and_in_either_order(sensors: list[str]) -> None:
+    held = HeldBox()
     evaluate = rule("toppling", sensors=sensors, arms=[sensor.removesuffix("_sensor") for sensor in sensors])
-    _, found = first(evaluate, hands, 3.0, lean(hands, 4.0))
+    _, found = first(evaluate, held, 3.0, lean(held, 4.0))
     assert (found.unit, found.value) == ("deg", pytest.approx(5.2, abs=0.1))
 
 
-def test_sensors_that_tilt_on_a_face_that_stands_see_no_leaning() -> None:
-    hands = Hands()
+def test_sensors_that_tilt_on_a_static_face_measure_no_leaning() -> None:
+    held = HeldBox()
 
     def move(t_s: float) -> None:
         for arm in ("leader", "follower"):
-            hands.offset_mm_deg[arm][3:5] = [20 * t_s, -15 * t_s]
+            held.offset_mm_deg[arm][3:5] = [20 * t_s, -15 * t_s]
 
-    assert not any(watch(rule("toppling"), hands, 0.8, move))
+    assert not any(watch(rule("toppling"), held, 0.8, move))
 
 
 def test_a_face_that_rises_along_the_sensor_trips_before_it_leans() -> None:
-    hands = Hands()
+    held = HeldBox()
 
     def move(t_s: float) -> None:
         # Of the leader's frame, x points down.
-        hands.offset_mm_deg["leader"][0] = 10 * t_s
+        held.offset_mm_deg["leader"][0] = 10 * t_s
 
-    at_s, found = first(rule("toppling"), hands, 1.0, move)
+    at_s, found = first(rule("toppling"), held, 1.0, move)
     assert (found.unit, found.subject) == ("mm", "leader_sensor")
     assert at_s == pytest.approx(0.25, abs=0.02)
-    sideways = Hands()
+    sideways = HeldBox()
 
     def aside(t_s: float) -> None:
         sideways.offset_mm_deg["leader"][1] = 10 * t_s
@@ -236,37 +236,37 @@ def test_a_face_that_rises_along_the_sensor_trips_before_it_leans() -> None:
 
 
 def test_a_contact_made_anew_is_a_new_reference() -> None:
-    hands = Hands()
+    held = HeldBox()
 
     def move(t_s: float) -> None:
-        lean(hands, 4.0)(t_s)
+        lean(held, 4.0)(t_s)
         away = 0.9 <= t_s < 1.0
-        hands.touching = {"leader": not away, "follower": not away}
+        held.touching = {"leader": not away, "follower": not away}
 
-    assert not any(watch(rule("toppling"), hands, 1.9, move))
+    assert not any(watch(rule("toppling"), held, 1.9, move))
 
 
-def test_shear_beyond_what_the_depth_holds_is_slip() -> None:
-    hands = Hands()
+def test_too_much_shear_per_depth_is_slip() -> None:
+    held = HeldBox()
 
     def move(t_s: float) -> None:
-        hands.offset_mm_deg["follower"][1] = 20.0 * t_s
+        held.offset_mm_deg["follower"][1] = 20.0 * t_s
 
-    at_s, found = first(rule("slip", severity="limit"), hands, 1.0, move)
+    at_s, found = first(rule("slip", severity="limit"), held, 1.0, move)
     assert (found.subject, found.severity) == ("follower_sensor", Severity.LIMIT)
     assert found.value == pytest.approx(1.0 + 0.05 * 20 / 3, abs=0.1)
     assert at_s == pytest.approx(3.0 / 20.0 + 0.05, abs=0.02)
 
 
-def test_a_contact_too_shallow_to_tell_is_not_judged_for_slip() -> None:
-    hands = Hands()
-    hands.offset_mm_deg["leader"][:3] = [0.0, 2.0, 0.9]
-    assert not any(watch(rule("slip"), hands, 0.3))
-    assert any(watch(rule("slip", min_depth_mm=0.5), hands, 0.3))
+def test_a_too_shallow_contact_is_not_checked_for_slip() -> None:
+    held = HeldBox()
+    held.offset_mm_deg["leader"][:3] = [0.0, 2.0, 0.9]
+    assert not any(watch(rule("slip"), held, 0.3))
+    assert any(watch(rule("slip", min_depth_mm=0.5), held, 0.3))
 
 
-def test_markers_that_are_missing_in_several_frames_on_end_trip() -> None:
-    view = Hands().view()
+def test_markers_missing_in_several_consecutive_frames_trip() -> None:
+    view = HeldBox().view()
     evaluate = rule("markers_lost")
     past: InterlockState = {}
     found = []
@@ -279,7 +279,7 @@ def test_markers_that_are_missing_in_several_frames_on_end_trip() -> None:
 
 
 @pytest.mark.parametrize("kind", ["out_of_step", "object_lost", "toppling"])
-def test_a_sensor_that_is_not_there_is_a_config_error(kind: str) -> None:
+def test_a_missing_sensor_is_a_config_error(kind: str) -> None:
     key = "sensors" if kind == "toppling" else "follower_sensor"
     changes = {"sensors": ["left"]} if kind == "toppling" else {"follower_sensor": "left"}
     with pytest.raises(ConfigError) as caught:

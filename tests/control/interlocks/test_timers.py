@@ -1,4 +1,4 @@
-"""Rules with a past: what starts them, what keeps them, what they forget, and what lasts too long."""
+"""Interlocks with state: what starts, keeps and clears it, and what lasts too long."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def first(found: list[Violation | None]) -> int:
     return next(k for k, violation in enumerate(found) if violation is not None)
 
 
-def test_a_frozen_picture_is_found_although_frames_keep_coming() -> None:
+def test_a_frozen_image_is_detected_although_frames_keep_arriving() -> None:
     interlock = rule(kind="frame_frozen", limit_ms=50)
     live = [sensor_cycle(k, content=k) for k in range(5)]
     found = evaluate(interlock, live + [sensor_cycle(k, content=4) for k in range(5, 12)])
@@ -74,14 +74,14 @@ def test_a_frozen_picture_is_found_although_frames_keep_coming() -> None:
     assert violation.value == pytest.approx(0.06)
 
 
-def test_without_a_picture_the_number_has_to_move() -> None:
+def test_without_content_the_frame_number_has_to_change() -> None:
     interlock = rule(kind="frame_frozen", limit_ms=50)
     stuck = [replace(sensor_cycle(k), sensors={"sensor": replace(SENSOR, seq=7)}) for k in range(8)]
     assert first(evaluate(interlock, stuck)) == 6
     assert evaluate(interlock, [sensor_cycle(k) for k in range(20)]) == [None] * 20
 
 
-def test_exposure_is_held_against_the_first_ten_frames() -> None:
+def test_exposure_is_compared_with_the_first_ten_frames() -> None:
     interlock = rule(kind="exposure", limit_percent=20)
     cycles = [sensor_cycle(k, brightness=50.0 + (k % 2)) for k in range(10)]
     cycles += [sensor_cycle(10, brightness=60.5), sensor_cycle(11, brightness=60.7), sensor_cycle(12, brightness=40.3)]
@@ -140,13 +140,13 @@ def test_innovations_are_counted_by_frame_not_by_cycle() -> None:
     assert evaluate(interlock, [sensor_cycle(k, nis=25.0 if k % 3 else 1.0) for k in range(30)]) == [None] * 30
 
 
-def test_out_of_range_is_forgiven_for_a_while() -> None:
+def test_out_of_range_is_tolerated_for_a_while() -> None:
     interlock = rule(kind="out_of_range", limit_ms=50)
     assert first(evaluate(interlock, [sensor_cycle(k, in_range=False) for k in range(10)])) == 6
     assert evaluate(interlock, [sensor_cycle(k, in_range=k % 5 == 0) for k in range(40)]) == [None] * 40
 
 
-def test_tracking_error_is_measured_against_what_was_sent() -> None:
+def test_tracking_error_is_measured_against_the_sent_command() -> None:
     interlock = rule(kind="tracking", limit_mm_s=5, hold_ms=30)
     good = evaluate(interlock, [arm_cycle(k, vx_mm_s=20, sent_mm_s=24) for k in range(20)])
     assert good == [None] * 20
@@ -156,7 +156,7 @@ def test_tracking_error_is_measured_against_what_was_sent() -> None:
     assert bad[3].value == pytest.approx(20.0)
 
 
-def test_an_arm_told_to_stand_may_settle_and_then_must_not_drift() -> None:
+def test_a_stopped_arm_may_settle_and_then_must_not_drift() -> None:
     interlock = rule(kind="standstill", limit_mm=1, settle_ms=50)
     settling = [arm_cycle(k, x_mm=5.0 * min(k, 5)) for k in range(30)]
     assert evaluate(interlock, settling) == [None] * 30
@@ -167,7 +167,7 @@ def test_an_arm_told_to_stand_may_settle_and_then_must_not_drift() -> None:
     assert evaluate(interlock, [arm_cycle(k, x_mm=k, sent_mm_s=100) for k in range(30)]) == [None] * 30
 
 
-def test_a_gate_that_holds_back_for_long_trips() -> None:
+def test_a_gate_that_limits_for_long_trips() -> None:
     interlock = rule(kind="limited", limit_ms=300)
     found = evaluate(interlock, [arm_cycle(k, sent_mm_s=100, held=True) for k in range(40)])
     assert first(found) == 31

@@ -26,7 +26,7 @@ CHAIN = SerialChain(ChainDescription.shipped("generic_6r"))
 WORKING = np.deg2rad([10.0, 40.0, 90.0, 5.0, 50.0, 20.0])
 
 
-class Bench:
+class GateHarness:
     """A gate called once per ``DT_S``; ``q`` is the joint configuration, if it is to be used."""
 
     def __init__(self, limits: TwistLimits = LIMITS, ik: DifferentialIk | None = None) -> None:
@@ -51,15 +51,15 @@ def norms(vector: Array) -> tuple[float, float]:
     return float(np.linalg.norm(vector[:3])), float(np.linalg.norm(vector[3:]))
 
 
-@given(asked=st.lists(st.tuples(wanted, st.integers(1, 12)), min_size=1, max_size=6))
+@given(requested=st.lists(st.tuples(wanted, st.integers(1, 12)), min_size=1, max_size=6))
 @settings(max_examples=60)
-def test_speed_acceleration_and_jerk_limits_hold_for_any_command(asked: list[tuple[Array, int]]) -> None:
-    bench = Bench()
-    bench.send(np.zeros(6))
+def test_speed_acceleration_and_jerk_limits_hold_for_any_command(requested: list[tuple[Array, int]]) -> None:
+    harness = GateHarness()
+    harness.send(np.zeros(6))
     last, accel = np.zeros(6), np.zeros(6)
-    for twist, cycles in asked:
+    for twist, cycles in requested:
         for _ in range(cycles):
-            sent = bench.send(twist).command.twist
+            sent = harness.send(twist).command.twist
             now = (sent - last) / DT_S
             jerk = (now - accel) / DT_S
             # Where the jerk limit carries the twist over the speed limit, the speed limit has priority.
@@ -74,23 +74,23 @@ def test_speed_acceleration_and_jerk_limits_hold_for_any_command(asked: list[tup
 @given(first=wanted, second=wanted)
 @settings(max_examples=60)
 def test_a_twist_that_stays_is_reached_exactly_and_stays(first: Array, second: Array) -> None:
-    bench = Bench()
+    harness = GateHarness()
     for _ in range(20):
-        bench.send(0.08 * first)
+        harness.send(0.08 * first)
     target = np.concatenate([0.05 * second[:3], 0.25 * second[3:]])
     for _ in range(200):
-        sent = bench.send(target)
+        sent = harness.send(target)
     np.testing.assert_array_equal(sent.command.twist, target)
     assert not sent.limited
 
 
 def test_from_rest_the_twist_keeps_its_direction_and_never_overshoots() -> None:
-    bench = Bench()
-    bench.send(np.zeros(6))
+    harness = GateHarness()
+    harness.send(np.zeros(6))
     target = np.array([0.06, -0.02, 0.0, 0.3, 0.0, -0.1])
     share = 0.0
     for _ in range(150):
-        sent = bench.send(target).command.twist
+        sent = harness.send(target).command.twist
         now = float(sent @ target / (target @ target))
         np.testing.assert_allclose(sent, now * target, atol=1e-12)
         assert share - 1e-12 <= now <= 1.0 + 1e-12
@@ -99,23 +99,23 @@ def test_from_rest_the_twist_keeps_its_direction_and_never_overshoots() -> None:
 
 
 def test_the_first_step_from_rest_is_the_jerks_and_is_named_with_value_and_limit() -> None:
-    bench = Bench()
-    bench.send(np.zeros(6))
-    sent = bench.send(np.array([0.05, 0, 0, 0, 0, 0]))
+    harness = GateHarness()
+    harness.send(np.zeros(6))
+    sent = harness.send(np.array([0.05, 0, 0, 0, 0, 0]))
     assert sent.command.twist[0] == pytest.approx(20.0 * DT_S**2)
-    told = {a.limit: (a.asked, a.allowed) for a in sent.adjustments}
-    assert told["tcp linear acceleration"] == (pytest.approx(0.05 / DT_S), 0.5)
-    assert told["tcp linear jerk"] == (pytest.approx(0.5 / DT_S), 20.0)
-    assert set(told) == {"tcp linear acceleration", "tcp linear jerk"}
+    limits = {a.limit: (a.requested, a.allowed) for a in sent.adjustments}
+    assert limits["tcp linear acceleration"] == (pytest.approx(0.05 / DT_S), 0.5)
+    assert limits["tcp linear jerk"] == (pytest.approx(0.5 / DT_S), 20.0)
+    assert set(limits) == {"tcp linear acceleration", "tcp linear jerk"}
 
 
 def test_the_last_difference_before_the_target_is_removed_smoothly() -> None:
-    bench = Bench()
-    bench.send(np.zeros(6))
+    harness = GateHarness()
+    harness.send(np.zeros(6))
     accel = []
     last = 0.0
     while last < 0.05:
-        now = bench.send(np.array([0.05, 0, 0, 0, 0, 0])).command.twist[0]
+        now = harness.send(np.array([0.05, 0, 0, 0, 0, 0])).command.twist[0]
         accel.append((now - last) / DT_S)
         last = now
     assert max(accel) == pytest.approx(0.5)
@@ -123,56 +123,56 @@ def test_the_last_difference_before_the_target_is_removed_smoothly() -> None:
 
 
 def test_after_a_silence_it_starts_from_rest() -> None:
-    bench = Bench()
+    harness = GateHarness()
     for _ in range(100):
-        bench.send(np.array([0.1, 0, 0, 0, 0, 0]))
-    first = bench.send(np.array([0.1, 0, 0, 0, 0, 0]), dt_s=0.2).command.twist[0]
+        harness.send(np.array([0.1, 0, 0, 0, 0, 0]))
+    first = harness.send(np.array([0.1, 0, 0, 0, 0, 0]), dt_s=0.2).command.twist[0]
     assert first == pytest.approx(20.0 * FIRST_STEP_S**2)
 
 
-def free_bench(**changes: float) -> Bench:
-    return Bench(FREE, DifferentialIk(CHAIN, replace(IkSettings(), **changes)))
+def free_harness(**changes: float) -> GateHarness:
+    return GateHarness(FREE, DifferentialIk(CHAIN, replace(IkSettings(), **changes)))
 
 
 def test_a_joint_near_its_limit_slows_the_whole_twist_outwards_and_nothing_inwards() -> None:
-    bench = free_bench()
-    bench.q[5] = CHAIN.upper[5] - np.deg2rad(1.0)
-    mixed = CHAIN.jacobian(bench.q) @ np.array([0.1, 0, 0, 0, 0, 1.0])
+    harness = free_harness()
+    harness.q[5] = CHAIN.upper[5] - np.deg2rad(1.0)
+    mixed = CHAIN.jacobian(harness.q) @ np.array([0.1, 0, 0, 0, 0, 1.0])
     for _ in range(100):
-        sent = bench.send(mixed)
+        sent = harness.send(mixed)
     share = (CHAIN.speed[5] / 5.0) / 1.0
     np.testing.assert_allclose(sent.command.twist, share * mixed, rtol=1e-9)
     (found,) = sent.adjustments
-    assert (found.limit, found.asked, found.allowed) == ("joint tool", pytest.approx(1.0), pytest.approx(share))
+    assert (found.limit, found.requested, found.allowed) == ("joint tool", pytest.approx(1.0), pytest.approx(share))
     for _ in range(100):
-        back = bench.send(-mixed)
+        back = harness.send(-mixed)
     np.testing.assert_array_equal(back.command.twist, -mixed)
 
 
 def test_beyond_a_joints_limit_only_the_way_back_is_open() -> None:
-    bench = free_bench()
-    bench.q[5] = CHAIN.upper[5] + 0.01
-    outwards = CHAIN.jacobian(bench.q)[:, 5]
-    assert not bench.send(outwards).command.twist.any()
+    harness = free_harness()
+    harness.q[5] = CHAIN.upper[5] + 0.01
+    outwards = CHAIN.jacobian(harness.q)[:, 5]
+    assert not harness.send(outwards).command.twist.any()
     for _ in range(100):
-        back = bench.send(-0.5 * outwards)
+        back = harness.send(-0.5 * outwards)
     np.testing.assert_array_equal(back.command.twist, -0.5 * outwards)
 
 
 def test_joint_speed_and_acceleration_hold_for_the_whole_twist() -> None:
-    bench = free_bench()
-    fast = CHAIN.jacobian(bench.q) @ np.array([0.0, 4.0, 0, 0, 0, 0.5])
-    bench.send(np.zeros(6))
+    harness = free_harness()
+    fast = CHAIN.jacobian(harness.q) @ np.array([0.0, 4.0, 0, 0, 0, 0.5])
+    harness.send(np.zeros(6))
     before = np.zeros(6)
-    inverse = np.linalg.inv(CHAIN.jacobian(bench.q))
+    inverse = np.linalg.inv(CHAIN.jacobian(harness.q))
     for k in range(200):
-        sent = bench.send(fast)
+        sent = harness.send(fast)
         dq = inverse @ sent.command.twist
         assert (np.abs(dq - before) <= CHAIN.accel * DT_S * (1 + 1e-9)).all()
         assert (np.abs(dq) <= CHAIN.speed * (1 + 1e-9)).all()
         if k == 0:
-            told = {a.limit: (a.asked, a.allowed) for a in sent.adjustments}
-            assert told == {
+            limits = {a.limit: (a.requested, a.allowed) for a in sent.adjustments}
+            assert limits == {
                 "joint shoulder": (pytest.approx(4.0), pytest.approx(CHAIN.speed[1])),
                 "joint shoulder acceleration": (pytest.approx(CHAIN.speed[1] / DT_S), pytest.approx(CHAIN.accel[1])),
             }
@@ -181,17 +181,17 @@ def test_joint_speed_and_acceleration_hold_for_the_whole_twist() -> None:
 
 
 def test_a_singularity_is_approached_ever_slower_and_left() -> None:
-    bench = free_bench()
+    harness = free_harness()
     outwards = np.array([0.1, 0, 0, 0, 0, 0.0])
     for _ in range(3000):
-        sent = bench.send(outwards)
-        bench.q = bench.q + bench.ik.solve(bench.q, sent.command.twist).dq * DT_S
-    at = bench.ik.solve(bench.q, np.zeros(6)).smallest_singular_value
+        sent = harness.send(outwards)
+        harness.q = harness.q + harness.ik.solve(harness.q, sent.command.twist).dq * DT_S
+    at = harness.ik.solve(harness.q, np.zeros(6)).smallest_singular_value
     assert at == pytest.approx(0.02, abs=1e-3)
     assert np.linalg.norm(sent.command.twist) < 0.002
     assert any(a.limit == "singularity" for a in sent.adjustments)
     for _ in range(100):
-        back = bench.send(-outwards)
+        back = harness.send(-outwards)
     assert np.linalg.norm(back.command.twist) > 0.05
 
 

@@ -29,7 +29,7 @@ NO_JERK = replace(LIMITS, jerk_m_s3=1e12, rot_jerk_rad_s3=1e12)
 FORWARD = np.array([0.1, 0, 0, 0, 0, 0])
 
 
-class Bench:
+class GateHarness:
     """A gate with its lease, and the command that would pass."""
 
     def __init__(self, limits: TwistLimits = LIMITS, max_ttl_s: float = 0.5) -> None:
@@ -57,104 +57,106 @@ class Bench:
 
 
 @pytest.fixture
-def bench() -> Bench:
-    return Bench()
+def harness() -> GateHarness:
+    return GateHarness()
 
 
 # --- each reason, and their order
 
 
 @pytest.mark.parametrize("shape", [(), (0,), (1,), (5,), (7,), (1, 6), (6, 1), (2, 3), (6, 6)])
-def test_a_twist_of_another_shape_is_refused_with_the_shape_that_it_has(bench: Bench, shape: tuple[int, ...]) -> None:
-    refused = bench.refusal(np.zeros(shape))
+def test_a_twist_of_another_shape_is_refused_with_the_shape_that_it_has(
+    harness: GateHarness, shape: tuple[int, ...]
+) -> None:
+    refused = harness.refusal(np.zeros(shape))
     assert refused.reason is Rejection.SHAPE
     assert (refused.value, refused.limit) == (shape, (6,))
 
 
 @pytest.mark.parametrize("frame", ["base", "tcp", None, 0, TwistFrame])
-def test_a_frame_that_is_none_is_refused(bench: Bench, frame: Any) -> None:
-    refused = bench.refusal(frame=frame)
+def test_a_frame_that_is_none_is_refused(harness: GateHarness, frame: Any) -> None:
+    refused = harness.refusal(frame=frame)
     assert refused.reason is Rejection.FRAME
     assert refused.value is frame
 
 
 @pytest.mark.parametrize("ttl_s", [0.0, -0.1, 0.5000001, 3.0, 1e6])
-def test_a_time_to_live_outside_its_range_is_refused_with_the_longest(bench: Bench, ttl_s: float) -> None:
-    refused = bench.refusal(ttl_s=ttl_s)
+def test_a_time_to_live_outside_its_range_is_refused_with_the_longest(harness: GateHarness, ttl_s: float) -> None:
+    refused = harness.refusal(ttl_s=ttl_s)
     assert refused.reason is Rejection.LIMIT
     assert (refused.value, refused.limit) == (ttl_s, 0.5)
 
 
-def test_the_longest_time_to_live_is_accepted(bench: Bench) -> None:
-    assert bench.send(ttl_s=0.5).command.ttl_s == 0.5
+def test_the_longest_time_to_live_is_accepted(harness: GateHarness) -> None:
+    assert harness.send(ttl_s=0.5).command.ttl_s == 0.5
 
 
 @pytest.mark.parametrize("ttl_s", [math.nan, math.inf, -math.inf, None, "0.1", [0.1, 0.2], 10**400])
-def test_a_time_to_live_that_is_no_finite_number_is_refused(bench: Bench, ttl_s: Any) -> None:
-    assert bench.refusal(ttl_s=ttl_s).reason is Rejection.NON_FINITE
+def test_a_time_to_live_that_is_no_finite_number_is_refused(harness: GateHarness, ttl_s: Any) -> None:
+    assert harness.refusal(ttl_s=ttl_s).reason is Rejection.NON_FINITE
 
 
 @pytest.mark.parametrize("t_ns", [None, "now", math.nan, 1e9])
-def test_a_time_stamp_that_is_no_whole_number_is_refused(bench: Bench, t_ns: Any) -> None:
-    assert bench.refusal(t_ns=t_ns).reason is Rejection.EXPIRED
+def test_a_time_stamp_that_is_no_whole_number_is_refused(harness: GateHarness, t_ns: Any) -> None:
+    assert harness.refusal(t_ns=t_ns).reason is Rejection.EXPIRED
 
 
 @pytest.mark.parametrize("t_ns", [10**400, -(10**400), 0])
-def test_a_time_stamp_far_from_now_is_refused(bench: Bench, t_ns: int) -> None:
-    assert bench.refusal(t_ns=t_ns).reason is Rejection.EXPIRED
+def test_a_time_stamp_far_from_now_is_refused(harness: GateHarness, t_ns: int) -> None:
+    assert harness.refusal(t_ns=t_ns).reason is Rejection.EXPIRED
 
 
-def test_a_command_lives_to_the_end_of_its_time_and_not_a_nanosecond_longer(bench: Bench) -> None:
-    now_ns = bench.clock.now_ns() + 10_000_000
-    bench.send(t_ns=now_ns - 100_000_000)
+def test_a_command_lives_to_the_end_of_its_time_and_not_a_nanosecond_longer(harness: GateHarness) -> None:
+    now_ns = harness.clock.now_ns() + 10_000_000
+    harness.send(t_ns=now_ns - 100_000_000)
     now_ns += 10_000_000
-    assert bench.refusal(t_ns=now_ns - 100_000_001).reason is Rejection.EXPIRED
+    assert harness.refusal(t_ns=now_ns - 100_000_001).reason is Rejection.EXPIRED
     now_ns += 10_000_000
-    assert bench.refusal(t_ns=now_ns + 1).reason is Rejection.EXPIRED
+    assert harness.refusal(t_ns=now_ns + 1).reason is Rejection.EXPIRED
 
 
-def test_the_first_reason_in_the_documented_order_is_the_one_that_is_given(bench: Bench) -> None:
+def test_the_first_reason_in_the_documented_order_is_the_one_that_is_given(harness: GateHarness) -> None:
     wrong: dict[str, Any] = {"frame": "base", "ttl_s": 9.0, "t_ns": 0, "state": Lifecycle.READY}
-    bench.lease = None
-    assert bench.refusal(np.full(5, math.nan), **wrong).reason is Rejection.NON_FINITE
-    assert bench.refusal(np.zeros(5), **wrong).reason is Rejection.SHAPE
-    assert bench.refusal(**wrong).reason is Rejection.FRAME
+    harness.lease = None
+    assert harness.refusal(np.full(5, math.nan), **wrong).reason is Rejection.NON_FINITE
+    assert harness.refusal(np.zeros(5), **wrong).reason is Rejection.SHAPE
+    assert harness.refusal(**wrong).reason is Rejection.FRAME
     del wrong["frame"]
-    assert bench.refusal(**wrong).reason is Rejection.LEASE
-    bench.desk.revoke()
-    bench.lease = bench.desk.acquire("test")
-    assert bench.refusal(**wrong).reason is Rejection.MODE
+    assert harness.refusal(**wrong).reason is Rejection.LEASE
+    harness.desk.revoke()
+    harness.lease = harness.desk.acquire("test")
+    assert harness.refusal(**wrong).reason is Rejection.MODE
     del wrong["state"]
-    assert bench.refusal(**wrong).reason is Rejection.LIMIT
+    assert harness.refusal(**wrong).reason is Rejection.LIMIT
     del wrong["ttl_s"]
-    assert bench.refusal(**wrong).reason is Rejection.EXPIRED
+    assert harness.refusal(**wrong).reason is Rejection.EXPIRED
 
 
 @pytest.mark.parametrize("state", [s for s in Lifecycle if s is not Lifecycle.ACTIVE])
-def test_only_an_active_arm_takes_a_twist(bench: Bench, state: Lifecycle) -> None:
-    assert bench.refusal(state=state).reason is Rejection.MODE
+def test_only_an_active_arm_takes_a_twist(harness: GateHarness, state: Lifecycle) -> None:
+    assert harness.refusal(state=state).reason is Rejection.MODE
 
 
 # --- the lease
 
 
 @pytest.mark.parametrize("lease", [None, "test", 0, object()])
-def test_a_wrong_lease_object_is_refused_whether_one_is_held_or_not(bench: Bench, lease: Any) -> None:
-    held, bench.lease = bench.lease, lease
-    assert bench.refusal().reason is Rejection.LEASE
-    bench.desk.release(held)
-    assert bench.refusal().reason is Rejection.LEASE
-    bench.desk.revoke()
-    assert bench.refusal().reason is Rejection.LEASE
+def test_a_wrong_lease_object_is_refused_whether_one_is_held_or_not(harness: GateHarness, lease: Any) -> None:
+    held, harness.lease = harness.lease, lease
+    assert harness.refusal().reason is Rejection.LEASE
+    harness.desk.release(held)
+    assert harness.refusal().reason is Rejection.LEASE
+    harness.desk.revoke()
+    assert harness.refusal().reason is Rejection.LEASE
 
 
-def test_a_lease_equal_to_the_one_that_is_held_is_another_lease(bench: Bench) -> None:
-    held = bench.lease
-    bench.lease = Lease(held.device, held.owner, held.epoch)
-    assert bench.lease == held
-    assert bench.refusal().reason is Rejection.LEASE
-    bench.desk.release(bench.lease)
-    assert bench.desk.owner == "test", "a copy releases nothing either"
+def test_a_lease_equal_to_the_one_that_is_held_is_another_lease(harness: GateHarness) -> None:
+    held = harness.lease
+    harness.lease = Lease(held.device, held.owner, held.epoch)
+    assert harness.lease == held
+    assert harness.refusal().reason is Rejection.LEASE
+    harness.desk.release(harness.lease)
+    assert harness.desk.owner == "test", "a copy releases nothing either"
 
 
 def test_of_concurrent_threads_exactly_one_acquires_the_lease() -> None:
@@ -206,24 +208,24 @@ NOT_NUMBERS = {
 
 
 @pytest.mark.parametrize("kind", AS_NUMBERS)
-def test_every_kind_of_array_of_six_numbers_is_accepted(bench: Bench, kind: str) -> None:
+def test_every_kind_of_array_of_six_numbers_is_accepted(harness: GateHarness, kind: str) -> None:
     twist = np.array([0.0625, -0.03125, 0.015625, 0.125, 0.25, -0.0625])
     for _ in range(60):
-        sent = bench.send(AS_NUMBERS[kind](twist))
+        sent = harness.send(AS_NUMBERS[kind](twist))
     np.testing.assert_array_equal(sent.command.twist, twist)
     assert sent.command.twist.dtype == np.float64
     assert type(sent.command.twist) is np.ndarray
 
 
-def test_integers_are_taken_for_numbers(bench: Bench) -> None:
+def test_integers_are_taken_for_numbers(harness: GateHarness) -> None:
     for _ in range(60):
-        sent = bench.send(np.array([1, 0, 0, 0, 0, 0], np.int8))
+        sent = harness.send(np.array([1, 0, 0, 0, 0, 0], np.int8))
     np.testing.assert_array_equal(sent.command.twist, FORWARD)
 
 
 @pytest.mark.parametrize("kind", NOT_NUMBERS)
-def test_anything_but_an_array_of_numbers_is_refused(bench: Bench, kind: str) -> None:
-    assert bench.refusal(NOT_NUMBERS[kind]).reason is Rejection.SHAPE
+def test_anything_but_an_array_of_numbers_is_refused(harness: GateHarness, kind: str) -> None:
+    assert harness.refusal(NOT_NUMBERS[kind]).reason is Rejection.SHAPE
 
 
 class Hostile:
@@ -233,13 +235,13 @@ class Hostile:
         raise RuntimeError("no")
 
 
-def test_an_object_that_raises_when_it_is_read_is_refused(bench: Bench) -> None:
-    assert bench.refusal(Hostile()).reason is Rejection.SHAPE
+def test_an_object_that_raises_when_it_is_read_is_refused(harness: GateHarness) -> None:
+    assert harness.refusal(Hostile()).reason is Rejection.SHAPE
 
 
-def test_masked_elements_are_refused_although_numbers_lie_beneath(bench: Bench) -> None:
+def test_masked_elements_are_refused_although_numbers_lie_beneath(harness: GateHarness) -> None:
     masked = np.ma.masked_array(FORWARD, mask=[0, 0, 1, 0, 0, 0])
-    assert bench.refusal(masked).reason is Rejection.NON_FINITE
+    assert harness.refusal(masked).reason is Rejection.NON_FINITE
 
 
 @given(
@@ -258,10 +260,10 @@ def test_masked_elements_are_refused_although_numbers_lie_beneath(bench: Bench) 
 )
 @settings(max_examples=300)
 def test_any_command_is_refused_or_sent_finite_and_within_the_limits(twist: Any, ttl_s: Any, frame: Any) -> None:
-    bench = Bench()
+    harness = GateHarness()
     for _ in range(3):
         try:
-            sent = bench.send(twist, ttl_s=ttl_s, frame=frame)
+            sent = harness.send(twist, ttl_s=ttl_s, frame=frame)
         except CommandRejected:
             continue
         assert np.isfinite(sent.command.twist).all()
@@ -272,8 +274,8 @@ def test_any_command_is_refused_or_sent_finite_and_within_the_limits(twist: Any,
 # --- what it returns is its own
 
 
-def test_neither_the_command_nor_what_was_sent_can_be_written_to(bench: Bench) -> None:
-    sent = bench.cruise()
+def test_neither_the_command_nor_what_was_sent_can_be_written_to(harness: GateHarness) -> None:
+    sent = harness.cruise()
     for twist in (sent.command.twist, TwistCommand(FORWARD, TwistFrame.BASE, 0, 0.1).twist):
         with pytest.raises(ValueError, match="read-only"):
             twist *= 1e3
@@ -281,25 +283,25 @@ def test_neither_the_command_nor_what_was_sent_can_be_written_to(bench: Bench) -
             twist.setflags(write=True)
 
 
-def test_the_array_that_a_command_was_made_of_may_change_without_changing_the_command(bench: Bench) -> None:
+def test_the_array_that_a_command_was_made_of_may_change_without_changing_the_command(harness: GateHarness) -> None:
     mine = np.array([0.01, 0, 0, 0, 0, 0])
-    command = TwistCommand(mine, TwistFrame.BASE, bench.clock.now_ns(), 0.1)
+    command = TwistCommand(mine, TwistFrame.BASE, harness.clock.now_ns(), 0.1)
     mine[:] = math.nan
-    sent = bench.gate.admit(command, bench.lease, Lifecycle.ACTIVE, np.eye(4))
+    sent = harness.gate.admit(command, harness.lease, Lifecycle.ACTIVE, np.eye(4))
     mine[:] = 7.0
     assert np.isfinite(sent.command.twist).all()
     np.testing.assert_array_equal(command.twist, [0.01, 0, 0, 0, 0, 0])
 
 
-def test_a_read_only_view_of_an_array_that_changes_does_not_change_what_was_sent(bench: Bench) -> None:
+def test_a_read_only_view_of_an_array_that_changes_does_not_change_what_was_sent(harness: GateHarness) -> None:
     mine = np.array([0.01, 0, 0, 0, 0, 0])
     view = mine.view()
     view.setflags(write=False)
     for _ in range(60):
-        sent = bench.send(view)
+        sent = harness.send(view)
     mine[:] = math.nan
     np.testing.assert_array_equal(sent.command.twist, [0.01, 0, 0, 0, 0, 0])
-    after = bench.send(np.array([0.01, 0, 0, 0, 0, 0]))
+    after = harness.send(np.array([0.01, 0, 0, 0, 0, 0]))
     np.testing.assert_array_equal(after.command.twist, [0.01, 0, 0, 0, 0, 0])
 
 
@@ -312,18 +314,18 @@ def test_a_read_only_view_of_an_array_that_changes_does_not_change_what_was_sent
     ],
 )
 def test_a_twist_changed_by_a_driver_is_checked_again(made: Array, reason: Rejection) -> None:
-    bench = Bench()
-    bench.cruise()
+    harness = GateHarness()
+    harness.cruise()
 
     def follow(twist: Array) -> tuple[Array, tuple[Adjustment, ...]]:
         return made, ()
 
-    bench.clock.advance_s(0.01)
-    command = TwistCommand(FORWARD, TwistFrame.BASE, bench.clock.now_ns(), 0.1)
+    harness.clock.advance_s(0.01)
+    command = TwistCommand(FORWARD, TwistFrame.BASE, harness.clock.now_ns(), 0.1)
     with pytest.raises(CommandRejected) as caught:
-        bench.gate.admit(command, bench.lease, Lifecycle.ACTIVE, np.eye(4), follow)
+        harness.gate.admit(command, harness.lease, Lifecycle.ACTIVE, np.eye(4), follow)
     assert caught.value.reason is reason
-    np.testing.assert_array_equal(bench.send().command.twist, FORWARD, "the last good command is what counts")
+    np.testing.assert_array_equal(harness.send().command.twist, FORWARD, "the last good command is what counts")
 
 
 class Overshooting(DifferentialIk):
@@ -343,20 +345,20 @@ class Overshooting(DifferentialIk):
 
 
 def test_kinematics_that_return_too_much_are_caught_before_it_is_sent() -> None:
-    bench = Bench(NO_JERK)
+    harness = GateHarness(NO_JERK)
     ik = Overshooting(SerialChain(ChainDescription.shipped("generic_6r")))
-    bench.cruise()
-    command = TwistCommand(FORWARD, TwistFrame.BASE, bench.clock.now_ns(), 0.1)
+    harness.cruise()
+    command = TwistCommand(FORWARD, TwistFrame.BASE, harness.clock.now_ns(), 0.1)
     with pytest.raises(CommandRejected) as caught:
-        bench.gate.admit(command, bench.lease, Lifecycle.ACTIVE, np.eye(4), joints=lambda: ik.at(np.full(6, 0.5)))
+        harness.gate.admit(command, harness.lease, Lifecycle.ACTIVE, np.eye(4), joints=lambda: ik.at(np.full(6, 0.5)))
     assert caught.value.reason is Rejection.LIMIT
     assert caught.value.limit == (0.1, 0.5)
 
 
 @pytest.mark.parametrize("field", ["speed_m_s", "rot_speed_rad_s"])
 def test_a_limit_that_is_no_number_lets_nothing_through(field: str) -> None:
-    bench = Bench(replace(LIMITS, **{field: math.nan}))
-    assert bench.refusal().reason is Rejection.LIMIT
+    harness = GateHarness(replace(LIMITS, **{field: math.nan}))
+    assert harness.refusal().reason is Rejection.LIMIT
 
 
 # --- from rest
@@ -368,10 +370,10 @@ def test_a_limit_that_is_no_number_lets_nothing_through(field: str) -> None:
 def test_from_rest_every_command_obeys_acceleration_whatever_its_time_to_live(
     ttl_s: float, rate_hz: float, limits: TwistLimits
 ) -> None:
-    bench = Bench(limits)
+    harness = GateHarness(limits)
     before = np.zeros(6)
     for k in range(5):
-        sent = bench.send(ttl_s=ttl_s, after_s=1.0 / rate_hz)
+        sent = harness.send(ttl_s=ttl_s, after_s=1.0 / rate_hz)
         # After the end of its time the arm stands, and what counts is the step from rest.
         before = before if ttl_s >= 1.0 / rate_hz else np.zeros(6)
         step_s = FIRST_STEP_S if k == 0 or ttl_s < 1.0 / rate_hz else 1.0 / rate_hz
@@ -380,31 +382,31 @@ def test_from_rest_every_command_obeys_acceleration_whatever_its_time_to_live(
         before = sent.command.twist
 
 
-def test_a_reset_makes_the_next_command_the_first(bench: Bench) -> None:
-    bench.cruise()
-    bench.gate.reset()
-    assert np.linalg.norm(bench.send(after_s=0.0).command.twist) <= 0.5 * FIRST_STEP_S
+def test_a_reset_makes_the_next_command_the_first(harness: GateHarness) -> None:
+    harness.cruise()
+    harness.gate.reset()
+    assert np.linalg.norm(harness.send(after_s=0.0).command.twist) <= 0.5 * FIRST_STEP_S
 
 
 def test_the_scale_is_the_smaller_of_both_parts() -> None:
     """Also where the linear part asks for less and comes first."""
-    bench = Bench(NO_JERK)
-    asked = np.array([0.4, 0, 0, 1.0, 0, 0])
-    sent = bench.cruise(asked)
-    np.testing.assert_allclose(sent.command.twist, 0.25 * asked, rtol=1e-9)
+    harness = GateHarness(NO_JERK)
+    requested = np.array([0.4, 0, 0, 1.0, 0, 0])
+    sent = harness.cruise(requested)
+    np.testing.assert_allclose(sent.command.twist, 0.25 * requested, rtol=1e-9)
     assert {a.limit for a in sent.adjustments} == {"tcp linear speed", "tcp angular speed"}
     other = np.array([0.2, 0, 0, 2.0, 0, 0])
-    np.testing.assert_allclose(bench.cruise(other).command.twist, 0.25 * other, rtol=1e-9)
+    np.testing.assert_allclose(harness.cruise(other).command.twist, 0.25 * other, rtol=1e-9)
 
 
-def test_a_twist_along_tool_axes_is_turned_whole_and_a_twist_along_base_axes_not_at_all(bench: Bench) -> None:
+def test_a_twist_along_tool_axes_is_turned_whole_and_a_twist_along_base_axes_not_at_all(harness: GateHarness) -> None:
     T = np.array([[0, -1, 0, 0.4], [1, 0, 0, 0], [0, 0, 1, 0.3], [0, 0, 0, 1.0]])
-    asked = np.array([0.05, 0, 0.01, 0.2, 0, 0.1])
-    for frame, expected in ((TwistFrame.TCP, [0, 0.05, 0.01, 0, 0.2, 0.1]), (TwistFrame.BASE, asked)):
+    requested = np.array([0.05, 0, 0.01, 0.2, 0, 0.1])
+    for frame, expected in ((TwistFrame.TCP, [0, 0.05, 0.01, 0, 0.2, 0.1]), (TwistFrame.BASE, requested)):
         for _ in range(60):
-            bench.clock.advance_s(0.01)
-            command = TwistCommand(asked, frame, bench.clock.now_ns(), 0.1, t_cause_ns=5)
-            sent = bench.gate.admit(command, bench.lease, Lifecycle.ACTIVE, T)
+            harness.clock.advance_s(0.01)
+            command = TwistCommand(requested, frame, harness.clock.now_ns(), 0.1, t_cause_ns=5)
+            sent = harness.gate.admit(command, harness.lease, Lifecycle.ACTIVE, T)
         np.testing.assert_allclose(sent.command.twist, expected, atol=1e-15)
         assert sent.command.frame is TwistFrame.BASE
-        assert (sent.command.t_ns, sent.command.t_cause_ns, sent.t_ns) == (command.t_ns, 5, bench.clock.now_ns())
+        assert (sent.command.t_ns, sent.command.t_cause_ns, sent.t_ns) == (command.t_ns, 5, harness.clock.now_ns())

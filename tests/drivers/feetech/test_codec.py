@@ -172,13 +172,13 @@ def test_identity_golden() -> None:
     table[5], table[7], table[8], table[18], table[33] = 4, 250, 1, 0x0C, 0
     table[9:11], table[11:13] = (100).to_bytes(2, "little"), (4000).to_bytes(2, "little")
     table[31:33] = (0x800 | 85).to_bytes(2, "little")
-    told = codec.decode_identity(bytes(table))
-    assert (told.model, told.servo, told.return_delay_s) == (777, 4, pytest.approx(500e-6))
-    assert (told.min_ticks, told.max_ticks, told.homing_offset_ticks) == (100, 4000, -85)
-    assert (told.acknowledges, told.multi_turn, told.speed_unit_ticks_s) == (True, False, 1)
+    identity = codec.decode_identity(bytes(table))
+    assert (identity.model, identity.servo, identity.return_delay_s) == (777, 4, pytest.approx(500e-6))
+    assert (identity.min_ticks, identity.max_ticks, identity.homing_offset_ticks) == (100, 4000, -85)
+    assert (identity.acknowledges, identity.multi_turn, identity.speed_unit_ticks_s) == (True, False, 1)
     table[18] = 0x18
-    told = codec.decode_identity(bytes(table))
-    assert (told.multi_turn, told.speed_unit_ticks_s) == (True, 50)
+    identity = codec.decode_identity(bytes(table))
+    assert (identity.multi_turn, identity.speed_unit_ticks_s) == (True, 50)
     with pytest.raises(CodecError):
         codec.decode_identity(bytes(40))
 

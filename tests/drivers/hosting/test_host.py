@@ -28,10 +28,10 @@ from touchcell.drivers.hosting.layouts import (
     Reason,
     RecordReader,
     RecordWriter,
-    cause_of,
     close_fd,
-    new_block,
-    put_cause,
+    create_block,
+    read_cause,
+    write_cause,
 )
 from touchcell.drivers.hosting.wire import decode_note
 from touchcell.simulation.devices.arm import SimArm
@@ -40,7 +40,7 @@ PERIOD_S = 0.02
 STEP_NS = 2_000_000
 
 
-class Bench:
+class HostHarness:
     """A host with two simulated arms, and all blocks in the hands of the test."""
 
     def __init__(self, categories: tuple[int, int] = (2, 2)) -> None:
@@ -85,7 +85,7 @@ class Bench:
             self.leases[name] = self.call("acquire", name, owner="test")["epoch"]
 
     def block(self, dtype: Any) -> int:
-        self.fds.append(new_block("test", dtype))
+        self.fds.append(create_block("test", dtype))
         return self.fds[-1]
 
     def call(self, call: str, device: str = "", **arguments: Any) -> dict[str, Any]:
@@ -100,16 +100,16 @@ class Bench:
         for _ in range(cycles):
             self.clock.advance_s(STEP_NS * 1e-9)
             if self.beating:
-                self.tell_watch()
+                self.write_watchdog_record()
             self.host.cycle()
 
-    def tell_watch(self, cause: Cause | None = None) -> None:
+    def write_watchdog_record(self, cause: Cause | None = None) -> None:
         value = self.watch.value
         value["count"] += 1
         value["t_ns"], value["guarding"] = self.clock.now_ns(), self.guarding
         if cause is not None:
             value["stop"] = True
-            put_cause(value, cause)
+            write_cause(value, cause)
         self.watch.publish()
 
     def send(self, name: str, speed_m_s: float = 0.02, ttl_s: float = 0.06) -> TouchcellError | None:
@@ -142,66 +142,66 @@ class Bench:
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
-    bench = Bench()
-    yield bench
-    bench.close()
+def harness() -> Iterator[HostHarness]:
+    harness = HostHarness()
+    yield harness
+    harness.close()
 
 
-def test_nothing_moves_without_guarding(bench: Bench) -> None:
-    bench.step()
-    refused = bench.send("left")
+def test_nothing_moves_without_guarding(harness: HostHarness) -> None:
+    harness.step()
+    refused = harness.send("left")
     assert isinstance(refused, CommandRejected)
     assert refused.reason is Rejection.MODE
-    bench.step(20)
-    assert bench.states["left"].read()["at_rest"]
-    assert bench.states["left"].read()["obeyed"] == 0
+    harness.step(20)
+    assert harness.states["left"].read()["at_rest"]
+    assert harness.states["left"].read()["obeyed"] == 0
 
 
-def test_lease_freshness_and_limits_are_checked_in_the_host(bench: Bench) -> None:
-    bench.guarding = True
-    bench.step()
-    bench.leases["left"] += 1
-    refused = bench.send("left")
+def test_lease_freshness_and_limits_are_checked_in_the_host(harness: HostHarness) -> None:
+    harness.guarding = True
+    harness.step()
+    harness.leases["left"] += 1
+    refused = harness.send("left")
     assert isinstance(refused, CommandRejected)
     assert refused.reason is Rejection.LEASE
-    bench.leases["left"] -= 1
-    refused = bench.send("left", ttl_s=5.0)
+    harness.leases["left"] -= 1
+    refused = harness.send("left", ttl_s=5.0)
     assert isinstance(refused, CommandRejected)
     assert refused.reason is Rejection.LIMIT
-    refused = bench.send("left", speed_m_s=float("nan"))
+    refused = harness.send("left", speed_m_s=float("nan"))
     assert isinstance(refused, CommandRejected)
     assert refused.reason is Rejection.NON_FINITE
-    bench.step()
-    assert bench.send("left", speed_m_s=9.0) is None
-    sent = bench.answers["left"].read()["twist"]
+    harness.step()
+    assert harness.send("left", speed_m_s=9.0) is None
+    sent = harness.answers["left"].read()["twist"]
     assert 0.0 < sent[0] <= 0.5 * FIRST_STEP_S, "the gate limits acceleration"
 
 
-def test_a_command_expires_in_the_host_without_a_newer_one(bench: Bench) -> None:
-    bench.move()
-    bench.step(60)
-    record = bench.states["left"].read()
+def test_a_command_expires_in_the_host_without_a_newer_one(harness: HostHarness) -> None:
+    harness.move()
+    harness.step(60)
+    record = harness.states["left"].read()
     assert record["at_rest"]
-    assert not bench.beat.read()["latched"]
+    assert not harness.beat.read()["latched"]
 
 
-def test_the_stop_flag_stops_both_arms_in_that_cycle_and_latches(bench: Bench) -> None:
-    bench.move()
-    bench.tell_watch(Cause(Reason.TASK_SILENT, bench.clock.now_ns(), 0.06, 0.05))
-    bench.host.cycle()
-    stopped_ns = bench.clock.now_ns()
+def test_the_stop_flag_stops_both_arms_in_that_cycle_and_latches(harness: HostHarness) -> None:
+    harness.move()
+    harness.write_watchdog_record(Cause(Reason.TASK_SILENT, harness.clock.now_ns(), 0.06, 0.05))
+    harness.host.cycle()
+    stopped_ns = harness.clock.now_ns()
     for _ in range(60):
-        refused = bench.send("left")
+        refused = harness.send("left")
         assert isinstance(refused, CommandRejected)
         assert refused.reason is Rejection.MODE
-        bench.step()
-    assert cause_of(bench.beat.read()).reason is Reason.TASK_SILENT
-    for state in bench.states.values():
+        harness.step()
+    assert read_cause(harness.beat.read()).reason is Reason.TASK_SILENT
+    for state in harness.states.values():
         record = state.read()
         assert record["at_rest"]
         assert record["stop_ns"] == stopped_ns
-        assert record["obeyed_ns"] <= stopped_ns
+        assert record["executed_ns"] <= stopped_ns
         assert 0.038 <= (record["rest_ns"] - stopped_ns) * 1e-9 <= 0.046, "20 mm/s at 0.5 m/s2"
         assert np.isclose(record["stop_speed_m_s"], 0.02)
         assert np.isclose(record["stop_way_m"], 0.0004, atol=1e-4)
@@ -210,108 +210,108 @@ def test_the_stop_flag_stops_both_arms_in_that_cycle_and_latches(bench: Bench) -
 @given(silent_after=st.integers(1, 20))
 @settings(max_examples=20)
 def test_a_silent_watchdog_is_found_within_its_time(silent_after: int) -> None:
-    bench = Bench()
+    harness = HostHarness()
     try:
-        bench.move(30 + silent_after)
-        last_ns = int(bench.watch.value["t_ns"])
-        bench.beating = False
+        harness.move(30 + silent_after)
+        last_ns = int(harness.watch.value["t_ns"])
+        harness.beating = False
         refused = None
         while refused is None:
-            bench.step()
-            refused = bench.send("right")
-        cause = cause_of(bench.beat.read())
+            harness.step()
+            refused = harness.send("right")
+        cause = read_cause(harness.beat.read())
         assert cause.reason is Reason.WATCHDOG_SILENT
         assert 0.05 < (cause.t_ns - last_ns) * 1e-9 <= 0.05 + STEP_NS * 1e-9
         # Its beats come back, and nothing changes.
-        bench.beating = True
-        bench.step(60)
-        assert bench.send("right") is not None
-        assert all(state.read()["at_rest"] for state in bench.states.values())
+        harness.beating = True
+        harness.step(60)
+        assert harness.send("right") is not None
+        assert all(state.read()["at_rest"] for state in harness.states.values())
     finally:
-        bench.close()
+        harness.close()
 
 
-def test_end_of_guarding_stops_moving_arms(bench: Bench) -> None:
-    bench.move()
-    bench.guarding = False
-    bench.step(30)
-    assert all(state.read()["at_rest"] for state in bench.states.values())
-    assert not bench.beat.read()["latched"]
+def test_end_of_guarding_stops_moving_arms(harness: HostHarness) -> None:
+    harness.move()
+    harness.guarding = False
+    harness.step(30)
+    assert all(state.read()["at_rest"] for state in harness.states.values())
+    assert not harness.beat.read()["latched"]
 
 
-def test_an_arm_that_runs_on_is_stopped_by_stronger_means(bench: Bench) -> None:
-    bench.move()
-    arm = bench.arm("left")
-    arm.faults = replace(arm.faults, runs_on=True)
-    bench.tell_watch(Cause(Reason.TASK_SILENT, bench.clock.now_ns()))
-    bench.step(400)
-    record = bench.states["left"].read()
+def test_an_arm_that_runs_on_is_stopped_by_stronger_means(harness: HostHarness) -> None:
+    harness.move()
+    arm = harness.arm("left")
+    arm.faults = replace(arm.faults, ignores_expiry=True)
+    harness.write_watchdog_record(Cause(Reason.TASK_SILENT, harness.clock.now_ns()))
+    harness.step(400)
+    record = harness.states["left"].read()
     assert record["escalated"]
     assert record["at_rest"]
     assert arm.state is Lifecycle.READY
-    assert not bench.states["right"].read()["escalated"]
+    assert not harness.states["right"].read()["escalated"]
 
 
 def test_each_arm_stops_by_its_own_category() -> None:
-    bench = Bench((1, 2))
-    bench.move()
-    bench.tell_watch(Cause(Reason.HOST_SILENT, bench.clock.now_ns(), host=1))
-    bench.step(60)
-    assert bench.arm("left").state is Lifecycle.READY
-    assert bench.arm("right").state is Lifecycle.ACTIVE
-    bench.close()
+    harness = HostHarness((1, 2))
+    harness.move()
+    harness.write_watchdog_record(Cause(Reason.HOST_SILENT, harness.clock.now_ns(), host=1))
+    harness.step(60)
+    assert harness.arm("left").state is Lifecycle.READY
+    assert harness.arm("right").state is Lifecycle.ACTIVE
+    harness.close()
 
 
-def test_the_latch_is_cleared_only_at_rest_without_lease_and_stop_flag(bench: Bench) -> None:
-    bench.move()
-    bench.tell_watch(Cause(Reason.TASK_SILENT, bench.clock.now_ns()))
-    bench.host.cycle()
-    bench.guarding = False
+def test_the_latch_is_cleared_only_at_rest_without_lease_and_stop_flag(harness: HostHarness) -> None:
+    harness.move()
+    harness.write_watchdog_record(Cause(Reason.TASK_SILENT, harness.clock.now_ns()))
+    harness.host.cycle()
+    harness.guarding = False
 
     def refused() -> bool:
         try:
-            bench.call("clear")
+            harness.call("clear")
         except LifecycleError:
             return True
         return False
 
     assert refused(), "still moving"
-    bench.step(60)
+    harness.step(60)
     assert refused(), "the stop flag is set"
-    bench.watch.value["stop"] = False
-    bench.step()
+    harness.watch.value["stop"] = False
+    harness.step()
     assert refused(), "the lease is held"
-    for name, epoch in bench.leases.items():
-        bench.call("release", name, epoch=epoch)
-    bench.guarding = True
-    bench.step()
+    for name, epoch in harness.leases.items():
+        harness.call("release", name, epoch=epoch)
+    harness.guarding = True
+    harness.step()
     assert refused(), "guarded"
-    bench.guarding = False
-    bench.step()
+    harness.guarding = False
+    harness.step()
     assert not refused()
-    bench.step(60)
-    assert not bench.beat.read()["latched"]
-    assert all(state.read()["at_rest"] for state in bench.states.values()), "clearing moves nothing"
+    harness.step(60)
+    assert not harness.beat.read()["latched"]
+    assert all(state.read()["at_rest"] for state in harness.states.values()), "clearing moves nothing"
 
 
-def test_a_stop_drops_the_twist_that_was_written_before_it(bench: Bench) -> None:
-    bench.move()
-    bench.step()
-    obeyed = int(bench.states["left"].read()["obeyed"])
-    value = bench.commands["left"].value
+def test_a_stop_drops_the_twist_that_was_written_before_it(harness: HostHarness) -> None:
+    harness.move()
+    harness.step()
+    obeyed = int(harness.states["left"].read()["obeyed"])
+    value = harness.commands["left"].value
     value["number"] += 1
     value["stop"], value["category"] = value["number"] + 1, 2
-    bench.commands["left"].publish()
-    bench.step(60)
-    record = bench.states["left"].read()
+    harness.commands["left"].publish()
+    harness.step(60)
+    record = harness.states["left"].read()
     assert record["obeyed"] == obeyed
     assert record["at_rest"]
 
 
-def test_an_error_raised_by_a_driver_is_published_with_the_state(bench: Bench) -> None:
-    bench.move()
-    bench.arm("left").disconnect()
-    bench.step()
-    record = bench.states["left"].read()
+def test_an_error_raised_by_a_driver_is_published_with_the_state(harness: HostHarness) -> None:
+    harness.move()
+    harness.arm("left").disconnect()
+    harness.step()
+    record = harness.states["left"].read()
     assert record["lifecycle"] == 0
-    assert not bench.states["right"].read()["failed"]
+    assert not harness.states["right"].read()["failed"]

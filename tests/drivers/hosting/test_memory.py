@@ -79,7 +79,7 @@ def _images(records: list[bytes]) -> list[bytes]:
     images: list[bytes] = []
     with mmap.mmap(fd, size) as memory_map, BlockWriter(fd, LAYOUT) as writer:
 
-        def look() -> None:
+        def copy_image() -> None:
             image = bytes(memory_map)
             if images and images[-1] != image:
                 changed = [k for k in range(size) if image[k] != images[-1][k]]
@@ -90,12 +90,12 @@ def _images(records: list[bytes]) -> list[bytes]:
             images.append(image)
 
         for record in records:
-            sys.settrace(_Traced(look))
+            sys.settrace(_Traced(copy_image))
             try:
                 writer.write(record)
             finally:
                 sys.settrace(None)
-            look()
+            copy_image()
     os.close(fd)
     return images
 

@@ -10,8 +10,8 @@ import pytest
 
 SPIN = """
 import os, time
-from touchcell.drivers.hosting.realtime import ask_for_realtime
-print(ask_for_realtime().split(" ")[0], os.sched_getscheduler(0) == os.SCHED_FIFO)
+from touchcell.drivers.hosting.realtime import request_realtime
+print(request_realtime().split(" ")[0], os.sched_getscheduler(0) == os.SCHED_FIFO)
 deadline = time.monotonic() + 20.0
 while os.sched_getscheduler(0) == os.SCHED_FIFO and time.monotonic() < deadline:
     pass
@@ -25,7 +25,7 @@ os.sched_setscheduler = refuse
 """
 
 
-def told(script: str) -> list[str]:
+def run_script(script: str) -> list[str]:
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     return run.stdout.split()
 
@@ -33,11 +33,11 @@ def told(script: str) -> list[str]:
 def test_a_process_that_never_pauses_falls_back_to_ordinary_scheduling() -> None:
     if os.geteuid() != 0:
         pytest.skip("needs the privilege for real-time scheduling")
-    words = told(SPIN)
-    if words[0] != "SCHED_FIFO":
+    lines = run_script(SPIN)
+    if lines[0] != "SCHED_FIFO":
         pytest.skip("no real-time scheduling in this container")
-    assert words == ["SCHED_FIFO", "True", "True"]
+    assert lines == ["SCHED_FIFO", "True", "True"]
 
 
 def test_without_the_privilege_it_continues_and_reports_it() -> None:
-    assert told(REFUSED + SPIN) == ["ordinary", "False", "True"]
+    assert run_script(REFUSED + SPIN) == ["ordinary", "False", "True"]

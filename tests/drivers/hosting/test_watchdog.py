@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from touchcell.drivers.hosting.layouts import Cause, Reason
-from touchcell.drivers.hosting.watchdog import Beat, Judge, silence_s
+from touchcell.drivers.hosting.watchdog import Beat, HeartbeatMonitor, silence_s
 
 PERIOD_S = 0.01
 MS = 1_000_000
@@ -18,7 +18,7 @@ class Scene:
     """A task and two hosts, polled four times per period as by the watchdog."""
 
     def __init__(self) -> None:
-        self.judge = Judge(PERIOD_S)
+        self.judge = HeartbeatMonitor(PERIOD_S)
         self.now_ns = 1_000 * MS
         self.judge.begin(self.now_ns)
         self.task = Beat(1, self.now_ns)
@@ -28,7 +28,7 @@ class Scene:
         """Let the task beat at these times; hosts beat at every look unless one is silent."""
         for beat_ns in beats_ns:
             while self.now_ns + STEP_NS < beat_ns:
-                if (cause := self.look(silent_host)) is not None:
+                if (cause := self.poll(silent_host)) is not None:
                     return cause
             period_ns = beat_ns - self.task.t_ns
             late = period_ns > 15 * MS
@@ -38,9 +38,9 @@ class Scene:
                 late=self.task.late + late,
                 late_ns=period_ns if late else self.task.late_ns,
             )
-        return self.look(silent_host)
+        return self.poll(silent_host)
 
-    def look(self, silent_host: int | None = None) -> Cause | None:
+    def poll(self, silent_host: int | None = None) -> Cause | None:
         self.now_ns += STEP_NS
         self.hosts = [
             host if k == silent_host else Beat(host.count + 1, self.now_ns) for k, host in enumerate(self.hosts)
@@ -67,7 +67,7 @@ def test_a_silent_task_is_found_within_two_missed_beats(good: int) -> None:
     last_ns = scene.task.t_ns
     cause = None
     while cause is None:
-        cause = scene.look()
+        cause = scene.poll()
     assert cause.reason is Reason.TASK_SILENT
     assert cause.limit_s == silence_s(PERIOD_S) == 0.025
     assert 25 * MS < cause.t_ns - last_ns <= 25 * MS + STEP_NS
@@ -78,7 +78,7 @@ def test_silence_from_before_the_guard_does_not_count() -> None:
     scene = Scene()
     scene.now_ns += 3_000 * MS
     scene.judge.begin(scene.now_ns)
-    assert scene.look() is None
+    assert scene.poll() is None
 
 
 def test_a_silent_host_is_named() -> None:

@@ -25,7 +25,7 @@ from touchcell.drivers.core.errors import (
     TransportTimeout,
 )
 from touchcell.drivers.hosting import wire
-from touchcell.drivers.hosting.layouts import ANSWER, ARM, RecordReader, RecordWriter, close_fd, new_block
+from touchcell.drivers.hosting.layouts import ANSWER, ARM, RecordReader, RecordWriter, close_fd, create_block
 from touchcell.drivers.hosting.memory import BlockMismatch
 from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.errors import ConfigError, TouchcellError
@@ -99,7 +99,7 @@ def test_a_closed_socket_gives_no_message() -> None:
 
 
 def test_a_record_arrives_with_its_tail_and_only_for_its_own_layout() -> None:
-    fd = new_block("arm", ARM)
+    fd = create_block("arm", ARM)
     with RecordWriter(fd, ARM) as writer, RecordReader(fd, ARM) as reader:
         assert reader.read()["seq"] == 0
         writer.value["seq"], writer.value["twist"] = 7, np.arange(6.0)
@@ -115,7 +115,7 @@ def test_a_record_arrives_with_its_tail_and_only_for_its_own_layout() -> None:
 
 
 def plain(value: Any) -> Any:
-    return wire._living(json.loads(json.dumps(wire._plain(value))))
+    return wire._decoded_value(json.loads(json.dumps(wire._plain(value))))
 
 
 @given(

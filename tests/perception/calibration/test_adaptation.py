@@ -18,7 +18,6 @@ from touchcell.drivers.replay.dataset import PUBLIC_CROP
 from touchcell.geometry import se3
 from touchcell.perception.calibration.adaptation import (
     AdaptSettings,
-    FewShotDataset,
     about_z,
     adapt,
     adapt_to,
@@ -36,6 +35,7 @@ from touchcell.perception.models.model_file import Header, Labels, Model, save_m
 from touchcell.perception.models.prediction import Prediction
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.marker_learning import train_guess
+from touchcell.perception.networks.marker_training import LabelledDiscs
 from touchcell.perception.runtime.calibrated_estimator import turned
 from touchcell.perception.runtime.estimators import load_estimator
 from touchcell.simulation.mount import MountModel
@@ -49,7 +49,7 @@ SIZE_OF_MARKERS = MarkerSize.of_disc(np.pi * TIP.disc_radius_px**2)
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    """A small marker model of the default sensor, whose matcher was given the markers rather than having to learn."""
+    """A small marker model of the default sensor, whose matcher was given the markers instead of learning them."""
     tip = Tip(TIP)
     corner = np.array(PUBLIC_CROP[:2], dtype=np.float64)
     reference = tip.project(tip.rest_positions) - corner
@@ -110,27 +110,27 @@ def model() -> Model:
     return made
 
 
-def test_another_camera_and_other_axes_cost_next_to_nothing(model: Model) -> None:
+def test_another_camera_and_other_axes_cost_almost_no_accuracy(model: Model) -> None:
     own = _drawn(TIP, RIG, 60, 5, model)
     turn = np.radians(-130.0)
     spin = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     middle = np.array([222.0, 219.0])
     frames = [Discs((each.centres - middle) @ spin.T * 1.05 + middle + 4.0, each.areas) for each in own.frames]
-    other = FewShotDataset(frames, about_z(np.radians(35.0), own.xi))
+    other = LabelledDiscs(frames, about_z(np.radians(35.0), own.xi))
     brought = align_to_sensor(model, other)
     assert brought.camera.zoom == pytest.approx(1 / 1.05, abs=0.03)
     assert brought.matched.mean() > 0.9
-    # The lattice leaves a sixth of a turn open, which camera and labels have to share.
+    # The lattice is ambiguous by 60 degrees; camera and labels have to agree on one.
     off = (brought.camera.turn_deg - 130.0 + 180) % 360 - 180
     assert off % 60 == pytest.approx(0.0, abs=2.0) or off % 60 == pytest.approx(60.0, abs=2.0)
     before, _ = _errors(model, own)
     adapted = adapt_to(model, other, preprocessing=model.header.preprocessing, size=SIZE_OF_MARKERS, settings=SETTINGS)
-    after, matched = _errors(adapted, FewShotDataset(frames, other.xi))
+    after, matched = _errors(adapted, LabelledDiscs(frames, other.xi))
     assert matched > 0.9
     assert (after < 1.5 * before + 0.1).all()
 
 
-def test_thirty_images_bring_it_to_another_sensor(model: Model, tmp_path: Path) -> None:
+def test_thirty_images_adapt_it_to_another_sensor(model: Model, tmp_path: Path) -> None:
     tip, rig = second_sensor(TIP, RIG)
     few, held_out = (_drawn(tip, rig, n, seed, model) for n, seed in ((30, 7), (60, 8)))
     before, seen_before = _errors(model, held_out)
@@ -155,7 +155,7 @@ def test_turned_predictions_are_about_turned_axes() -> None:
     np.testing.assert_allclose(turned(found, -40.0).covariance, root @ root.T)
 
 
-def test_folded_layers_do_what_the_model_file_does(model: Model) -> None:
+def test_folded_layers_compute_the_same_as_the_model_file(model: Model) -> None:
     architecture = model.header.architecture
     assert isinstance(architecture, MarkerArchitecture)
     frames = _drawn(TIP, RIG, 5, 9, model).frames
@@ -183,14 +183,14 @@ def test_what_cannot_be_adapted_is_refused(model: Model, tmp_path: Path) -> None
     with pytest.raises(TrainingError):
         align_to_sensor(model, dataclasses.replace(few, frames=shuffled))
     with pytest.raises(TrainingError, match="are needed"):
-        align_to_sensor(model, FewShotDataset(few.frames[:6], few.xi[:6]))
+        align_to_sensor(model, LabelledDiscs(few.frames[:6], few.xi[:6]))
 
 
 def test_samples_of_a_real_sensor_are_labelled_with_the_command() -> None:
     imagined = Imagined(load_tip("franka_tactip_1"), processed=True)
     made = _discs(imagined, 40, 3)
     contacts = se3.to_euler_mm_deg(se3.inverse(se3.exp(made.xi)))
-    # What slips does so in the image alone: shallow contacts keep labels of large shear.
+    # Slip is visible in the image only: shallow contacts keep labels of large shear.
     assert np.hypot(*contacts[contacts[:, 2] < 2.0][:, :2].T).max() > 3.0
     assert all(300 < len(each) <= 331 for each in made.frames)
     assert imagined.preprocessing("markers").output_size == SIZE
@@ -199,7 +199,7 @@ def test_samples_of_a_real_sensor_are_labelled_with_the_command() -> None:
 
 
 @pytest.mark.timeout(400)
-def test_calibrate_sim_fits_simulated_images_and_says_how_well(
+def test_calibrate_sim_fits_simulated_images_and_reports_the_residual(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_split(tmp_path / "data", "train", 100, seed=1)

@@ -29,7 +29,7 @@ def image(points: Array, seed: int = 0) -> ImageArray:
 
 
 def seen_through(change: CameraChange, points: Array) -> Array:
-    """Where the changed camera sees what the taught camera sees at ``points``."""
+    """Return the points of the changed camera for ``points`` of the training camera."""
     return (points - change.matrix[:, 2]) @ np.linalg.inv(change.matrix[:, :2]).T
 
 
@@ -53,7 +53,7 @@ def test_a_changed_camera_is_found_in_a_few_images_and_undone() -> None:
     assert (straightened != image(REST, 0)).mean() < 0.03 < 0.1 < (frames[0] != image(REST, 0)).mean()
 
 
-def test_what_a_model_holds_is_enough() -> None:
+def test_the_models_own_image_is_enough() -> None:
     preprocessing = Preprocessing(input_size=SIZE, output_size=(128, 128))
     held = model_of(None)
     held = Model(held.header.model_copy(update={"preprocessing": preprocessing}), held.tensors, None)
@@ -63,7 +63,7 @@ def test_what_a_model_holds_is_enough() -> None:
     np.testing.assert_allclose(found.points(seen_through(CHANGE, REST)), REST, atol=0.5)
 
 
-def test_an_image_out_of_contact_is_believed_before_a_lattice_that_was_pressed() -> None:
+def test_an_image_out_of_contact_takes_precedence_over_a_deformed_lattice() -> None:
     preprocessing = Preprocessing(input_size=SIZE, output_size=SIZE)
     header = model_of(None).header.model_copy(update={"preprocessing": preprocessing})
     pressed = {"lattice": (1.01 * REST).astype(np.float32)}
@@ -73,7 +73,7 @@ def test_an_image_out_of_contact_is_believed_before_a_lattice_that_was_pressed()
     np.testing.assert_allclose(held.shift_px, 0.0, atol=0.01)
 
 
-def test_without_anything_to_compare_with_it_says_what_to_give() -> None:
+def test_without_a_reference_the_error_names_the_option() -> None:
     with pytest.raises(TrainingError, match="--reference"):
         find_change(model_of(None), [image(REST)])
     with pytest.raises(TrainingError, match="no image"):
@@ -95,7 +95,7 @@ def test_two_changes_after_each_other_are_one() -> None:
     np.testing.assert_allclose(CHANGE.after(first).points(points), CHANGE.points(first.points(points)), atol=1e-9)
 
 
-def test_an_estimator_sees_through_the_change() -> None:
+def test_an_estimator_undoes_the_change() -> None:
     plain = ContactModel(model_of(None))
     through = CalibratedEstimator(ContactModel(model_of(None)), CHANGE)
     there, here = image(REST), image(seen_through(CHANGE, REST))
@@ -105,7 +105,7 @@ def test_an_estimator_sees_through_the_change() -> None:
     np.testing.assert_allclose(through.predict(here).xi, through.predict_reduced(through.reduce(here)).xi)
 
 
-def test_a_sixth_of_a_turn_brings_a_lattice_onto_itself() -> None:
+def test_a_lattice_is_symmetric_under_rotation_by_60_degrees() -> None:
     for sixth, order in enumerate(lattice_turns(10)):
         assert sorted(order) == list(range(331))
         linear, off = similarity(REST[order], REST)

@@ -17,7 +17,7 @@ MARKERS = MarkerSize.of_disc(np.pi * 6.2**2)
 
 
 def errors(discs: Discs, truth: np.ndarray) -> np.ndarray:
-    """Distance of each disc from the marker nearest to it."""
+    """Return the distance of each disc from its nearest marker."""
     return np.linalg.norm(discs.centres[:, None] - truth[None], axis=2).min(axis=1)
 
 
@@ -120,10 +120,10 @@ def test_lattice_is_fitted_to_an_undeformed_tip(turn_deg: float, zoom: float, sh
     assert len(set(distances.argmin(axis=1))) == 331
 
 
-def test_density_tells_where_markers_crowd() -> None:
+def test_density_rises_where_markers_crowd() -> None:
     middle = REST.mean(axis=0)
     assert np.abs(density_change(REST, REST, SIZE, 18.0)).max() == 0.0
-    # Those right of the middle move away from it: fewer there, and more at the rim.
+    # Markers right of the centre move away from it: fewer there, and more at the rim.
     from_middle = REST - middle
     near = np.exp(-((np.linalg.norm(from_middle - [60.0, 0.0], axis=1) / 50.0) ** 2))
     change = density_change(REST + 0.5 * near[:, None] * (from_middle - [60.0, 0.0]), REST, SIZE, 18.0)

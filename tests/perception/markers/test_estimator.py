@@ -34,16 +34,16 @@ QUICK = MarkerSettings(epochs=8, networks=2, hidden=(96, 48), modes=16, guess_st
 
 
 class Recorder:
-    """Keeps what a training tells, and interrupts it after an epoch."""
+    """Records the progress of a training, and interrupts it after an epoch."""
 
     def __init__(self, interrupt_after: int = 0) -> None:
         self.records: list[EpochRecord] = []
-        self.told: dict[str, tuple[int, int]] = {}
+        self.calls: dict[str, tuple[int, int]] = {}
         self.batches = 0
         self._interrupt_after = interrupt_after
 
     def images(self, split: str, done: int, total: int) -> None:
-        self.told[split] = (done, total)
+        self.calls[split] = (done, total)
 
     def batch(self, epoch: int, epochs: int, done: int, total: int, loss: float) -> None:
         if self._interrupt_after and epoch > self._interrupt_after:
@@ -67,20 +67,20 @@ def trained(data: Path) -> Path:
     out = data / "markers.safetensors"
     recorder = Recorder()
     train_markers(data, out, settings=QUICK, cache=data / "cache", observer=recorder)
-    assert recorder.told["train"] == (160, 160)
-    assert recorder.told["matched"][0] == recorder.told["matched"][1]
+    assert recorder.calls["train"] == (160, 160)
+    assert recorder.calls["matched"][0] == recorder.told["matched"][1]
     assert len(recorder.records) == 8
     # Ten batches hold all images once.
     assert recorder.batches >= 16
     return out
 
 
-def test_few_images_teach_contacts(data: Path, trained: Path) -> None:
+def test_few_images_suffice_to_learn_contacts(data: Path, trained: Path) -> None:
     for name in ("markers_predictions.png", "markers_curves.png", "markers_markers.png"):
         assert (data / name).stat().st_size > 10_000
     result = evaluate(data, "val", trained)
     assert result.n == 40
-    # Well below what the middle of the range errs by: 1.4 mm, 2 mm, 10 deg.
+    # Well below the error of the constant centre of the range: 1.4 mm, 2 mm, 10 deg.
     assert result.mae["z_mm"] < 0.5 * 1.4
     assert result.mae["x_mm"] < 0.5 * 2.0
     assert result.mae["alpha_deg"] < 0.8 * 10.0
@@ -124,7 +124,7 @@ def test_order_of_images_does_not_matter(trained: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["black", "white", "noise", "few", "half"])
-def test_images_that_show_no_lattice_are_told(trained: Path, name: str) -> None:
+def test_images_without_a_lattice_are_reported(trained: Path, name: str) -> None:
     rng = np.random.default_rng(0)
     lit = simulated(1, seed=6).images[0]
     images = {
@@ -174,7 +174,7 @@ def test_interrupted_training_ends_in_the_same_model(data: Path, trained: Path) 
     rest = Recorder()
     train_markers(data, out, settings=QUICK, cache=data / "cache", observer=rest)
     assert [record.epoch for record in rest.records] == [4, 5, 6, 7, 8]
-    assert "matched" not in rest.told
+    assert "matched" not in rest.calls
     assert taught(out) == taught(trained)
     assert 0.0 < load_model(out).header.training["epochs_cpu_s"] < 600.0
 
@@ -196,7 +196,7 @@ def test_impossible_settings(changes: dict[str, float]) -> None:
         dataclasses.replace(QUICK, **changes)  # type: ignore[arg-type]
 
 
-def test_numpy_and_torch_say_the_same(trained: Path) -> None:
+def test_numpy_and_torch_agree(trained: Path) -> None:
     model = load_model(trained)
     tensors = {name: tensor.astype(np.float64) for name, tensor in model.tensors.items()}
     displacement_model = DisplacementModel(

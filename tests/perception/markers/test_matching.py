@@ -18,7 +18,7 @@ from touchcell.perception.networks.marker_learning import Learned, fit_lattice, 
 
 @pytest.fixture(scope="module")
 def learned() -> Learned:
-    """A matcher that has seen images alone, of simulated contacts."""
+    """A matcher learned from images only, of simulated contacts."""
     frames = [detect_markers(image, MARKERS) for image in simulated(200, seed=11).images]
     reference, _ = fit_lattice(Discs(REST, np.full(331, 120.0)), 10)
     return learn_markers(frames, SIZE, modes=20, reference=reference, rounds=1, guess_steps=60)
@@ -30,15 +30,15 @@ def sample() -> Simulated:
 
 
 def identity_of(learned: Learned) -> np.ndarray:
-    """Which simulated marker each marker of the learned lattice is: one of six equal turns."""
+    """Return the simulated marker of each marker of the learned lattice, up to the six equal rotations."""
     distances = np.linalg.norm(learned.matcher.model.reference[:, None] - REST[None], axis=2)
     identity = distances.argmin(axis=1)
     assert len(set(identity)) == 331
     return identity
 
 
-def share_right(field: MarkerField, truth: np.ndarray) -> float:
-    """Share of the seen markers whose disc is their own."""
+def correct_fraction(field: MarkerField, truth: np.ndarray) -> float:
+    """Return the fraction of the seen markers whose disc is their own."""
     off = np.linalg.norm(field.positions - truth, axis=1)[field.seen]
     return float((off < 2.0).mean()) if len(off) else 0.0
 
@@ -48,14 +48,14 @@ def test_cold_start_is_right_over_the_whole_range(learned: Learned, sample: Simu
     right, trusted = [], []
     for image, pixels in zip(sample.images, sample.pixels, strict=True):
         field = learned.matcher.match(detect_markers(image, MARKERS))
-        right.append(share_right(field, pixels[identity]))
+        right.append(correct_fraction(field, pixels[identity]))
         trusted.append(field.valid)
         if field.valid:
             assert field.seen.sum() >= 0.9 * len(inside(pixels))
     well = np.array(right) > 0.97
     assert well.mean() >= 0.99
     assert np.mean(well[trusted]) >= 0.99
-    # What is not right is known not to be.
+    # Wrong matches are marked as invalid.
     assert np.mean(trusted) >= 0.97
 
 
@@ -79,7 +79,7 @@ def test_seen_markers_are_sub_pixel_and_hidden_ones_near(learned: Learned, sampl
     assert np.median(errors) < 1.5
 
 
-def test_tracking_gives_what_a_cold_start_gives(learned: Learned) -> None:
+def test_tracking_and_a_cold_start_give_the_same(learned: Learned) -> None:
     start, end = (REST, simulated(1, seed=17, depth_mm=(3.0, 3.1)).pixels[0])
     previous = None
     identity = identity_of(learned)
@@ -95,8 +95,8 @@ def test_tracking_gives_what_a_cold_start_gives(learned: Learned) -> None:
         previous = tracked
 
 
-def test_a_guess_that_leads_nowhere_is_not_followed(learned: Learned, sample: Simulated) -> None:
-    """With a blind first guess, the learned contact whose discs lie alike is where the match starts."""
+def test_a_failed_guess_is_not_used(learned: Learned, sample: Simulated) -> None:
+    """With a blind first guess, the match starts from the learned contact with the most similar discs."""
     model = learned.matcher.model
     nothing = np.zeros_like(learned.guess.bias)
     nothing[:2] = 3.0
@@ -112,7 +112,7 @@ def test_a_guess_that_leads_nowhere_is_not_followed(learned: Learned, sample: Si
         assert field.valid
         np.testing.assert_allclose(field.positions[field.seen], places[field.seen], atol=1e-9)
         lost = alone.match(discs)
-        assert share_right(lost, places) > 0.97 or not lost.valid
+        assert correct_fraction(lost, places) > 0.97 or not lost.valid
 
 
 def test_a_jump_between_frames_is_survived(learned: Learned, sample: Simulated) -> None:
@@ -120,12 +120,12 @@ def test_a_jump_between_frames_is_survived(learned: Learned, sample: Simulated) 
     previous, right = None, []
     for image, pixels in zip(sample.images[:80], sample.pixels[:80], strict=True):
         previous = learned.matcher.match(detect_markers(image, MARKERS), previous)
-        right.append(share_right(previous, pixels[identity]) > 0.97 or not previous.valid)
+        right.append(correct_fraction(previous, pixels[identity]) > 0.97 or not previous.valid)
     assert np.mean(right) >= 0.98
 
 
 @pytest.mark.parametrize("n", [0, 5, 331, 2000])
-def test_discs_that_are_no_lattice_are_not_believed(learned: Learned, n: int) -> None:
+def test_discs_that_are_not_a_lattice_are_invalid(learned: Learned, n: int) -> None:
     places = np.random.default_rng(n).uniform(0.0, 440.0, (n, 2))
     field = learned.matcher.match(Discs(places, np.full(n, 120.0)))
     assert not field.valid
@@ -133,7 +133,7 @@ def test_discs_that_are_no_lattice_are_not_believed(learned: Learned, n: int) ->
     assert np.isfinite(field.positions).all()
 
 
-def test_images_without_a_lattice_teach_nothing() -> None:
+def test_images_without_a_lattice_raise() -> None:
     rng = np.random.default_rng(0)
     frames = [Discs(rng.uniform(0.0, 440.0, (331, 2)), np.full(331, 120.0)) for _ in range(10)]
     with pytest.raises(TrainingError, match="lattice"):
@@ -142,7 +142,7 @@ def test_images_without_a_lattice_teach_nothing() -> None:
         learn_markers([Discs(np.empty((0, 2)), np.empty(0))] * 10, SIZE)
 
 
-def test_principal_components_fill_what_was_not_seen() -> None:
+def test_principal_components_fill_unseen_markers() -> None:
     rng = np.random.default_rng(3)
     reference = rng.uniform(0.0, 100.0, (20, 2))
     basis = np.linalg.qr(rng.normal(size=(40, 3)))[0].T

@@ -34,7 +34,7 @@ def test_small_changes_of_a_contact_are_small_changes_of_xi(mean: np.ndarray) ->
 
 @given(means, sigmas)
 def test_sigmas_are_those_along_and_across_the_shear(mean: np.ndarray, sigma: np.ndarray) -> None:
-    """What ``aligned`` makes of residuals drawn from the served covariance has the sigmas that were put in."""
+    """Residuals drawn from the predicted covariance have, ``aligned``, the sigmas that were put in."""
     contact = LABELS.contacts(mean)
     along = shear_direction(contact)
     axes = np.eye(6)
@@ -48,7 +48,7 @@ def test_sigmas_are_those_along_and_across_the_shear(mean: np.ndarray, sigma: np
     np.testing.assert_allclose(aligned, np.diag(1.0 / LABELS.sigma_unit), atol=1e-12)
 
 
-def test_labels_of_either_kind_come_back() -> None:
+def test_labels_of_either_kind_round_trip() -> None:
     xi = xi_from_contact(np.random.default_rng(0).uniform(LABELS.low, LABELS.high, (20, 6)))
     for labels in (LABELS, OTHER):
         np.testing.assert_allclose(labels.contacts(labels.targets(xi)), contact_from_xi(xi), atol=1e-9)
@@ -63,7 +63,7 @@ def test_labels_of_either_kind_come_back() -> None:
     )
 
 
-def test_a_contact_without_shear_has_a_direction_all_the_same() -> None:
+def test_a_contact_without_shear_has_a_direction() -> None:
     np.testing.assert_array_equal(shear_direction(np.zeros((2, 6))), [[1.0, 0.0], [1.0, 0.0]])
     np.testing.assert_allclose(shear_direction(np.array([3.0, -4.0, 1, 0, 0, 0])), [0.6, -0.8])
 

@@ -38,7 +38,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def rewrite(path: Path, *, header: object = None, drop: str = "", **tensors: np.ndarray) -> None:
-    """Write a model as another program might have, past the checks."""
+    """Write a model without the checks, as another program might."""
     model = make_model(reference=False)
     kept = {name: tensor for name, tensor in {**model.tensors, **tensors}.items() if name != drop}
     text = model.header.model_dump_json() if header is None else json.dumps(header)
@@ -47,7 +47,7 @@ def rewrite(path: Path, *, header: object = None, drop: str = "", **tensors: np.
 
 
 @pytest.mark.parametrize("reference", [True, False])
-def test_a_saved_tip_loads_unchanged(path: Path, reference: bool) -> None:
+def test_a_saved_model_loads_unchanged(path: Path, reference: bool) -> None:
     model = make_model(reference=reference)
     save_model(model, path)
     loaded = load_model(path)
@@ -87,7 +87,7 @@ def test_foreign_files(path: Path) -> None:
     with pytest.raises(ModelError, match="damaged"):
         load_model(path)
     save_file({"weight": np.zeros(3, np.float32)}, path)
-    with pytest.raises(ModelError, match="no touchcell model"):
+    with pytest.raises(ModelError, match="not a touchcell model"):
         load_model(path)
 
 
@@ -120,14 +120,14 @@ def test_newer_format_asks_for_a_newer_touchcell(path: Path) -> None:
     assert "newer touchcell" in caught.value.hint
 
 
-def test_preprocessing_that_does_not_feed_the_network(path: Path) -> None:
+def test_preprocessing_that_does_not_match_the_network(path: Path) -> None:
     other = {**json.loads(preprocessing(16).model_dump_json())}
     rewrite(path, header=header_with(preprocessing=other))
     with pytest.raises(ModelError, match="input_size"):
         load_model(path)
 
 
-def test_tensors_that_the_header_does_not_announce(path: Path) -> None:
+def test_tensors_that_do_not_match_the_header(path: Path) -> None:
     for key, change in {
         "hidden.bias": {"drop": "hidden.bias"},
         "conv0.weight": {"conv0.weight": np.zeros((3, 1, 5, 5), np.float32)},

@@ -1,4 +1,4 @@
-"""The ONNX bytes that touchcell writes are what the ``onnx`` package reads, checks and would have written."""
+"""The ONNX bytes that touchcell writes are read, validated and reproduced by the ``onnx`` package."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ def speckled(height: int, width: int) -> np.ndarray:
 
 
 def area_means(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Exact means over output pixels, through the integral image, in float64."""
+    """Return exact means over output pixels, through the integral image, in float64."""
 
     def integrate(values: np.ndarray, n: int) -> np.ndarray:
         total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
@@ -99,7 +99,7 @@ def test_other_images_are_refused(image: object, attribute: str) -> None:
     assert caught.value.attribute == attribute
 
 
-def test_survives_json_and_cannot_be_changed() -> None:
+def test_round_trips_through_json_and_is_immutable() -> None:
     steps = Preprocessing(
         input_size=(480, 640),
         crop=Crop(1, 2, 300, 400),

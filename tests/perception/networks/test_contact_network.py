@@ -25,7 +25,7 @@ SMALL = Architecture(input_size=(32, 32), channels=(4, 8), hidden=16)
 
 
 def float32_sweep() -> torch.Tensor:
-    """Values of every float32 exponent and both signs, the ends of the range and infinities, rising."""
+    """Values of every float32 exponent and both signs, the ends of the range and infinities, in rising order."""
     bits = np.arange(0, 0x7F80_0000, 0x0001_3579, dtype=np.uint32)
     positive = np.append(bits.view(np.float32), [np.finfo(np.float32).max, np.inf]).astype(np.float32)
     near = np.linspace(-60, 60, 20001, dtype=np.float32)
@@ -43,7 +43,7 @@ def test_softbound_never_leaves_its_bounds_and_rises(low: float, high: float) ->
     assert values[0] == pytest.approx(lowest, abs=1e-6)
     assert values[-1] == pytest.approx(highest, rel=1e-6)
     steps = np.diff(values)
-    # Exponential and logarithm are each good to an ulp, so a fall within one is a tie.
+    # Exponential and logarithm are each accurate to an ulp, so a decrease within one is a tie.
     assert steps.min() >= -np.spacing(np.float32(max(abs(low), abs(high), high - low)))
     bounded.sum().backward()
     assert torch.isfinite(x.grad).all()
@@ -66,7 +66,7 @@ def test_the_naive_form_does_leave_its_bounds() -> None:
     torch.testing.assert_close(softbound(x, 1e-6, 10.0), torch.tensor([10.0, 10.0]))
 
 
-def test_softbound_keeps_a_nan_for_the_loss_to_find() -> None:
+def test_softbound_propagates_nan_to_the_loss() -> None:
     assert torch.isnan(softbound(torch.tensor([math.nan]), -1.0, 1.0)).all()
 
 

@@ -213,7 +213,7 @@ def test_default_cache_follows_xdg(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     assert dataset.default_cache() == tmp_path / "touchcell" / "images"
 
 
-def test_digest_tells_content_apart() -> None:
+def test_digest_depends_on_the_content() -> None:
     data = labelled(4, seed=1)
     same = LabelledImages(data.images.copy(), data.xi + 1e-15)
     other_image = LabelledImages(data.images.copy(), data.xi)

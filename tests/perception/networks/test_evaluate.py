@@ -25,7 +25,7 @@ SIGMA = np.array([3.0, 3.0, 1.5, 12.0, 12.0, 3.0])
 
 
 class TickingClock(VirtualClock):
-    """Passes 1 ms at every look but the 20th, which takes 50."""
+    """A clock that advances by 1 ms per reading, by 50 ms at the 20th."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ def data(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def model(tmp_path: Path) -> Path:
-    """A model that answers the middle of the range with known uncertainty, whatever it sees."""
+    """A model that predicts the centre of the range with known uncertainty for every image."""
     base = constant_model("cnn", [0.0] * 6)
     centre = xi_from_contact(CENTRE)
     header = base.header.model_copy(
@@ -82,7 +82,7 @@ def test_figures_are_their_definitions(data: Path, model: Path) -> None:
     assert calls == [(i + 1, N) for i in range(N)]
 
 
-def test_json_has_the_promised_keys(data: Path, model: Path, tmp_path: Path) -> None:
+def test_json_has_the_documented_keys(data: Path, model: Path, tmp_path: Path) -> None:
     evaluation = evaluate(data, "val", model)
     evaluation.write(tmp_path / "out" / "evaluation.json")
     fields = json.loads((tmp_path / "out" / "evaluation.json").read_text())
@@ -104,7 +104,7 @@ def test_table_shows_every_figure(data: Path, model: Path) -> None:
     assert "1.00 ms" in shown
 
 
-def test_opencv_threads_are_given_back(data: Path, model: Path) -> None:
+def test_opencv_threads_are_restored(data: Path, model: Path) -> None:
     before = cv2.getNumThreads()
     evaluate(data, "val", model)
     assert cv2.getNumThreads() == before

@@ -15,7 +15,7 @@ COVARIANCE = np.outer(XI_UNITS, XI_UNITS) * (L @ L.T)
 
 
 def calibrated(n: int) -> Scores:
-    """Predictions that err exactly as they say."""
+    """Predictions whose errors have exactly the predicted distribution."""
     rng = np.random.default_rng(0)
     xi = xi_from_contact(CONTACT) - rng.normal(size=(n, 6)) @ L.T * XI_UNITS
     return Scores(np.tile(CONTACT, (n, 1)), xi, np.tile(COVARIANCE, (n, 1, 1)), np.ones(n, bool))
@@ -41,7 +41,7 @@ def test_likelihood_is_that_of_the_full_covariance() -> None:
     np.testing.assert_allclose(scores.sigma, np.tile(np.sqrt(np.diag(C)), (50, 1)))
 
 
-def test_calibrated_predictions_cover_what_they_promise() -> None:
+def test_calibrated_predictions_have_the_nominal_coverage() -> None:
     scores = calibrated(4000)
     shares = [0.1, 0.5, 0.68, 0.95]
     for found in scores.reliability(shares).values():
@@ -54,7 +54,7 @@ def test_calibrated_predictions_cover_what_they_promise() -> None:
     assert overconfident.joint_coverage(0.95) < 0.5
 
 
-def test_slip_free_is_told_by_the_labels() -> None:
+def test_slip_free_is_decided_by_the_labels() -> None:
     scores = calibrated(4)
     contact = scores.contact_mm_deg.copy()
     contact[:, :3] = [[1.0, 1.0, 3.0], [3.0, 0.0, 3.0], [0.0, -0.5, 1.0], [0.0, -0.7, 1.0]]

@@ -29,7 +29,7 @@ QUICK = Settings(epochs=4, batch_size=16, learning_rate=3e-3)
 
 
 class Recorder:
-    """Keeps what a training tells, and interrupts it after an epoch."""
+    """Records the progress of a training, and interrupts it after an epoch."""
 
     def __init__(self, interrupt_after: int = 0) -> None:
         self.records: list[EpochRecord] = []
@@ -76,7 +76,7 @@ def test_learns_and_writes_model_and_figures(
         reference=reference,
     )
     first, last = recorder.records[0].mae, recorder.records[-1].mae
-    assert last["x_mm"] < 0.5 * 2.5  # 2.5 is what the mean label gives.
+    assert last["x_mm"] < 0.5 * 2.5  # 2.5 is the error of the mean label.
     assert last["z_mm"] < first["z_mm"]
     assert len(recorder.batches) == 12 * 15
     header = load_model(out).header

@@ -13,7 +13,7 @@ REST = CENTRE - [0.0, 0.0, 2.75, 0.0, 0.0, 0.0]
 
 
 def seen(contact: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A preprocessed image with the noise of a camera."""
+    """Return a preprocessed image with the noise of a camera."""
     image = draw(contact).astype(float) + rng.normal(0.0, 6.0, (44, 48))
     return preprocessing().reduce(np.clip(image, 0, 255).astype(np.uint8))
 
@@ -54,7 +54,7 @@ def test_a_change_in_an_eighth_of_the_image_counts_whole() -> None:
     touched[8:16, :] = 51
     assert gate.compare(touched) == pytest.approx(0.2)
     assert gate.compare(np.zeros((64, 64), np.uint8)) == 0.0
-    # Sides that the blocks do not divide are compared whole too.
+    # Sides that are not a multiple of the blocks are compared whole too.
     gate = ContactGate(np.zeros((13, 11), np.uint8))
     assert gate.compare(np.full((13, 11), 51, np.uint8)) == pytest.approx(0.2)
 

@@ -1,4 +1,4 @@
-"""The SE(3) filter follows the equations, gains from every frame, and says honestly how sure it is."""
+"""The SE(3) filter follows the equations, improves with every frame, and is consistent."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OBSERVED = np.diag([0.3e-3, 0.3e-3, 0.1e-3, 0.01, 0.012, 0.02]) ** 2
 
 
 def walk(n: int, seed: int) -> list[Array]:
-    """Sensor poses of a gentle random walk in the world."""
+    """Return sensor poses of a gentle random walk in the world."""
     rng = np.random.default_rng(seed)
     poses = [se3.from_euler_mm_deg([400.0, 10.0, 100.0, 180.0, 0.0, 30.0])]
     for _ in range(n - 1):
@@ -27,7 +27,7 @@ def walk(n: int, seed: int) -> list[Array]:
 
 
 def observations(poses: list[Array], seed: int) -> tuple[list[Array], list[PoseGaussian]]:
-    """True contacts of a surface that stands still, and noisy observations of them."""
+    """Return true contacts of a static surface, and noisy observations of them."""
     rng = np.random.default_rng(seed)
     T_world_f = se3.compose(poses[0], CONTACT)
     truth = [se3.compose(se3.inverse(T), T_world_f) for T in poses]
@@ -50,7 +50,7 @@ def test_prediction_moves_the_belief_by_the_sensors_own_motion() -> None:
     )
 
 
-def test_a_still_contact_is_known_better_with_every_frame() -> None:
+def test_the_covariance_of_a_static_contact_shrinks_with_every_frame() -> None:
     pose_filter = PoseFilter(np.zeros((6, 6)))
     T_base_sensor = np.eye(4)
     for i in range(9):
@@ -78,7 +78,7 @@ def test_filtering_beats_single_frames_and_is_consistent() -> None:
     assert 4.0 < last.mean() < 8.0
 
 
-def test_innovation_tells_a_wrong_frame() -> None:
+def test_innovation_reveals_a_wrong_frame() -> None:
     pose_filter = PoseFilter(np.zeros((6, 6)))
     pose_filter.update(PoseGaussian(CONTACT, OBSERVED), np.eye(4), 0)
     far = se3.compose(se3.exp(np.array([5e-3, 0, 0, 0, 0, 0])), CONTACT)

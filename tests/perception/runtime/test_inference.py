@@ -54,7 +54,7 @@ def test_outputs_stay_bounded_for_any_weights() -> None:
 
 
 def constant_model(kind: str, output: list[float]) -> Model:
-    """A model that says the same of every image."""
+    """Return a model with the same output for every image."""
     base = make_model()
     architecture = base.header.architecture.model_copy(update={"kind": kind})
     tensors = {name: np.zeros(shape, np.float32) for name, shape in architecture.tensor_shapes().items()}
@@ -73,13 +73,13 @@ def test_mean_and_sigma_are_in_si_units_and_calibrated() -> None:
     np.testing.assert_allclose(prediction.sigma, [1.0, 4.0, 1.5, 2.0, 2.5, 3.0])
     assert prediction.xi.dtype == prediction.sigma.dtype == np.float64
 
-    # A density network's sigma is the scale over its inverse standard deviation; 2 is the middle of those bounds.
+    # A density network's sigma is the scale over its inverse standard deviation; 2 is the centre of those bounds.
     prediction = ContactModel(constant_model("gdn", [0.0] * 6 + [2.0] * 6)).predict(IMAGES[0])
     np.testing.assert_allclose(prediction.xi, [0.0, 2.0, 0.5, 0.5, 0.5, 0.5], atol=1e-6)
     np.testing.assert_allclose(prediction.sigma, np.exp(-2.0) * np.array([1.0, 4.0, 1.5, 2.0, 2.5, 3.0]), rtol=1e-5)
 
 
-def test_tells_when_it_was_not_taught_this() -> None:
+def test_predictions_outside_the_training_range_are_marked() -> None:
     assert ContactModel(constant_model("cnn", [1.0, -1.0, 1.04, 0.0, 0.0, 0.0])).predict(IMAGES[0]).in_range
     assert not ContactModel(constant_model("cnn", [0.0, 0.0, 1.2, 0.0, 0.0, 0.0])).predict(IMAGES[0]).in_range
     assert not ContactModel(constant_model("cnn", [0.0, 0.0, 0.0, 0.0, 0.0, -1.2])).predict(IMAGES[0]).in_range
@@ -123,7 +123,7 @@ def test_model_made_for_another_preprocessing(image: np.ndarray, attribute: str)
     assert caught.value.attribute == attribute
 
 
-def test_a_running_cell_carries_no_torch(tmp_path: Path) -> None:
+def test_inference_does_not_import_torch(tmp_path: Path) -> None:
     save_model(make_model(), tmp_path / "m.safetensors")
     program = (
         "import sys, numpy; from pathlib import Path; from touchcell.perception.runtime.inference import ContactModel\n"

@@ -1,4 +1,4 @@
-"""The moving-surface filter follows a moving surface without lag, costs nothing on a still one, and is consistent."""
+"""The moving-surface filter follows a moving surface without lag, is as good on a static one, and is consistent."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from touchcell.cell.config.schema import NetworkEstimator
-from touchcell.cell.runtime.sensor import build_filter
 from touchcell.geometry import se3
 from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.gaussian import NotPositiveDefinite, PoseGaussian
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.filter import PoseFilter, isotropic_noise
 from touchcell.perception.runtime.moving_surface import MovingSurfaceFilter
+from touchcell.perception.runtime.network_estimator import NetworkEstimator
 
 STEP_NS = 33_000_000
 CONTACT = se3.inverse(se3.from_euler_mm_deg([1.0, -0.5, 3.0, 5.0, -8.0, 2.0]))
@@ -26,7 +25,7 @@ SPEED = isotropic_noise(0.03, 0.15)
 
 
 def sensor_poses(n: int, seed: int) -> list[Array]:
-    """A sensor that wanders through the base frame, 0.4 m from its origin."""
+    """Return poses of a sensor that wanders through the base frame, 0.4 m from its origin."""
     rng = np.random.default_rng(seed)
     poses = [se3.from_euler_mm_deg([400.0, 10.0, 100.0, 180.0, 0.0, 30.0])]
     for _ in range(n - 1):
@@ -35,7 +34,7 @@ def sensor_poses(n: int, seed: int) -> list[Array]:
 
 
 def contacts(poses: list[Array], twist_base: Array) -> list[Array]:
-    """True T_s_f of a surface that moves at a constant twist of the base frame."""
+    """Return the true T_s_f of a surface that moves at a constant twist of the base frame."""
     T_base_f = se3.compose(poses[0], CONTACT)
     steps = [se3.exp(twist_base * (k * STEP_NS * 1e-9)) for k in range(len(poses))]
     return [se3.compose(se3.inverse(T), se3.compose(step, T_base_f)) for T, step in zip(poses, steps, strict=True)]
@@ -50,7 +49,7 @@ def error(true: Array, mean: Array) -> Array:
 
 
 def follow(pose_filter: PoseFilter | MovingSurfaceFilter, poses: list[Array], truth: list[Array]) -> Array:
-    """(n, 6) errors of the filter on observations without error."""
+    """Return (n, 6) errors of the filter on observations without error."""
     errors = []
     for k, (pose, true) in enumerate(zip(poses, truth, strict=True)):
         state = pose_filter.update(PoseGaussian(true, OBSERVED), pose, k * STEP_NS)
@@ -112,7 +111,7 @@ def observe(true: Array, root: Array, rng: np.random.Generator) -> PoseGaussian:
     return PoseGaussian(se3.compose(se3.exp(root @ rng.normal(size=6)), true), OBSERVED)
 
 
-def test_without_twist_noise_it_is_the_still_filter() -> None:
+def test_without_twist_noise_it_equals_the_static_filter() -> None:
     root, quiet = np.linalg.cholesky(OBSERVED), isotropic_noise(1e-9, 1e-9)
     rng = np.random.default_rng(5)
     poses = sensor_poses(60, 5)
@@ -144,8 +143,8 @@ def test_a_still_surface_costs_little_once_the_twist_is_known_to_be_small() -> N
     assert (rms["moving"] < 1.03 * rms["still"]).all()
 
 
-def test_it_says_how_sure_it_is() -> None:
-    """Truth drawn from the model itself: NEES of pose and twist, and NIS, are those of their degrees of freedom."""
+def test_it_is_consistent() -> None:
+    """Truth drawn from the model itself: NEES of pose and twist, and NIS, match their degrees of freedom."""
     runs, n, dt = 40, 60, STEP_NS * 1e-9
     root = np.linalg.cholesky(OBSERVED)
     nees, nis = [], []
@@ -216,7 +215,7 @@ def test_reset_forgets_the_motion_too() -> None:
         moving.predict(poses[0], 0)
 
 
-def test_what_is_no_pose_or_covariance_is_refused_at_once() -> None:
+def test_invalid_poses_and_covariances_are_refused_at_once() -> None:
     for i in range(3):
         arguments = [DRIFT, ACCELERATION, SPEED]
         arguments[i] = np.full((6, 6), np.nan)
@@ -242,4 +241,4 @@ def test_a_cell_file_chooses_the_model() -> None:
     ):
         estimator = NetworkEstimator.model_validate({"kind": "network", "model": "m", "filter": section})
         assert estimator.filter is not None
-        assert type(build_filter(estimator.filter)) is kind
+        assert type(estimator.filter.build()) is kind

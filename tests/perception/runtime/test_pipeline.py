@@ -1,4 +1,4 @@
-"""The pipeline does no more than a scene needs, stamps what it says, and replays the sensor's motion."""
+"""The pipeline does no more than a cell needs, stamps its estimates, and propagates them by the sensor's motion."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PRESSED: ImageArray = np.full((16, 16), 200, np.uint8)
 
 
 class StubModel:
-    """A network that always says the same, and counts how often it is asked."""
+    """A network with constant output that counts its calls."""
 
     def __init__(self) -> None:
         self.reductions = 0
@@ -70,7 +70,7 @@ def pipeline(images: list[ImageArray], **parts: object) -> tuple[ContactPipeline
     return made, model, clock
 
 
-def test_what_the_estimator_tells_of_its_markers_comes_with_the_estimate() -> None:
+def test_the_estimators_marker_fraction_is_part_of_the_estimate() -> None:
     made, _, clock = pipeline([np.zeros((8, 8), np.uint8)] * 2)
     for now_ns in ticks(clock, 5):
         estimate = made.update(now_ns)
@@ -109,7 +109,7 @@ def test_estimate_carries_the_networks_gaussian() -> None:
     np.testing.assert_allclose(estimate.belief.covariance, J @ np.diag(SIGMA**2) @ J.T, rtol=1e-9, atol=1e-18)
 
 
-def test_motion_since_the_frame_is_replayed() -> None:
+def test_the_estimate_is_propagated_by_the_motion_since_its_frame() -> None:
     source, _, clock = pipeline([PRESSED] * 2, pose_filter=PoseFilter(isotropic_noise(1e-3, 0.01)))
     for i, now_ns in enumerate(ticks(clock, 3)):
         source.record_pose(now_ns, pose(0.2 * i))
@@ -136,7 +136,7 @@ def test_a_new_contact_starts_afresh() -> None:
     np.testing.assert_allclose(estimate.belief.covariance, J @ np.diag(SIGMA**2) @ J.T, rtol=1e-9, atol=1e-18)
 
 
-def test_what_lies_outside_the_range_is_told_and_not_fused() -> None:
+def test_a_prediction_outside_the_range_is_marked_and_not_fused() -> None:
     strange = np.full_like(PRESSED, 7)
 
     class Doubtful(StubModel):
@@ -156,7 +156,7 @@ def test_what_lies_outside_the_range_is_told_and_not_fused() -> None:
 
     with_strange = estimates([PRESSED, strange, PRESSED])
     assert [estimate.in_range for estimate in with_strange] == [True] * 3 + [False] * 3 + [True] * 3
-    # The contact of the frame before, moved by the arm and less certain, in place of the doubtful one.
+    # The previous contact, moved by the arm and less certain, in place of the unreliable one.
     for i, estimate in enumerate(with_strange[:6]):
         assert estimate.belief is not None
         np.testing.assert_allclose(estimate.belief.mean, pose(-0.1 * i) @ se3.exp(XI), atol=1e-9)
@@ -164,7 +164,7 @@ def test_what_lies_outside_the_range_is_told_and_not_fused() -> None:
     assert spreads[5] > spreads[3] > spreads[2]
     assert with_strange[3].nis is None
     assert with_strange[6].nis is not None
-    # With nothing to carry on, the doubtful contact itself is told.
+    # Without a previous contact, the unreliable one itself is returned.
     first = estimates([strange, PRESSED])
     assert not first[2].in_range
     assert first[2].belief is not None
@@ -173,7 +173,7 @@ def test_what_lies_outside_the_range_is_told_and_not_fused() -> None:
     np.testing.assert_allclose(first[3].belief.mean, se3.exp(XI), atol=1e-12)
 
 
-def test_end_of_the_recording_is_told() -> None:
+def test_the_end_of_the_recording_is_reported() -> None:
     source, _, clock = pipeline([PRESSED] * 2)
     for now_ns in ticks(clock, 8):
         last = source.update(now_ns)
@@ -207,7 +207,7 @@ def test_a_foreign_image_is_refused(tmp_path: object) -> None:
         source.update(0)
 
 
-def test_a_frame_older_than_the_newest_is_left_alone() -> None:
+def test_a_frame_older_than_the_newest_is_ignored() -> None:
     made, model, clock = pipeline([PRESSED] * 10, pose_filter=PoseFilter(isotropic_noise(1e-3, 0.01)))
     made.record_pose(0, pose(0))
     clock.advance_s(0.1)

@@ -213,7 +213,7 @@ def test_an_arm_deaf_to_stops_still_stops_when_its_command_expires() -> None:
     get_going(arm, lease, clock, [0.1, 0, 0, 0, 0, 0])
     send(arm, lease, clock, [0.1, 0, 0, 0, 0, 0], 0.3)
     clock.advance_s(0.2)
-    arm.faults = ArmFaults(deaf=True)
+    arm.faults = ArmFaults(ignores_stops=True)
     arm.stop()
     clock.advance_s(0.09)
     assert arm.tcp().value.twist[0] == pytest.approx(0.1)

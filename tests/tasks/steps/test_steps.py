@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -267,3 +268,13 @@ def _cycles(task: StepsTask, limit: int) -> Iterator[int]:
         if task.finished:
             return
         yield i
+
+
+def test_steps_are_read_from_a_cell_file_whose_numbers_are_lists() -> None:
+    # Cell files are held to the strict rules for JSON, where a list stands for a tuple.
+    text = json.dumps({"steps": [{"repeat": {"times": 2, "steps": [TOUCH, PRESS]}}], "withdraw_mm": 10})
+    config = StepsConfig.model_validate_json(text, strict=True)
+    (repeat,) = config.steps
+    assert isinstance(repeat, Repeat)
+    assert isinstance(repeat.steps[0], Move)
+    assert repeat.steps[0].by_mm_deg == (0.0, 0.0, 30.0)

@@ -1,1 +1,1 @@
-"""What is made from a recording after a run."""
+"""Analysis of a run's recording: reports, plots and viewers."""

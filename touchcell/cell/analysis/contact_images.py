@@ -1,4 +1,4 @@
-"""What a sensor felt, as pictures of its markers, from the images of a recording alone."""
+"""Images of a sensor's contacts with marker displacements, from the images of a recording alone."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class ContactPicture:
 
     Attributes:
         role: of the sensor.
-        t_ns: when it was exposed.
-        image: uint8 (height, width), black and white, as markers are looked for in it.
-        markers: of it, followed since the recording's first image.
+        t_ns: time of exposure.
+        image: uint8 (height, width), black and white, the image in which markers were detected.
+        markers: its markers, tracked since the recording's first image.
         spacing_px: of neighbouring markers in the first image.
     """
 
@@ -44,13 +44,13 @@ class ContactPicture:
     spacing_px: float
 
     def drawn(self) -> ImageArray:
-        """uint8 (height, 2 width, 3) BGR: displacement arrows and change of density."""
+        """Return uint8 (height, 2 width, 3) BGR: displacement arrows and change of density."""
         markers = self.markers
         return draw_contact(self.image, markers.reference, markers.positions, self.spacing_px, arrows=markers.followed)
 
 
 def contact_pictures(messages: Iterable[Message]) -> Iterator[ContactPicture]:
-    """Each recorded image with its markers; images in which none can be found are passed over.
+    """Yield each recorded image with its markers; images without detectable markers are skipped.
 
     The first image of a sensor counts as undeformed, as a run begins out of contact.
     """
@@ -79,7 +79,7 @@ def contact_pictures(messages: Iterable[Message]) -> Iterator[ContactPicture]:
 
 
 def write_strip(recording: Path, run: Run, role: str, path: Path) -> Path | None:
-    """A few contacts of a run side by side, arrows above and density below; None where there is nothing to show.
+    """Write a figure of a few contacts of a run, arrows above and density below; None where there are none.
 
     Args:
         recording: of the run.
@@ -88,7 +88,7 @@ def write_strip(recording: Path, run: Run, role: str, path: Path) -> Path | None
         path: PNG to write.
 
     Raises:
-        RecordingError: the recording is gone.
+        RecordingError: the recording is missing.
     """
     contact = run.series(f"/sensors/{role}/contact")
     if contact is None:

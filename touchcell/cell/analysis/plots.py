@@ -1,4 +1,4 @@
-"""The pictures that end a run. Imported only then, because matplotlib is heavy."""
+"""Plots of a run. Imported only when needed, because matplotlib is heavy."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _TITLES = dict(
         strict=True,
     )
 )
-# Order of the panels: what the sensor is servoed on first.
+# Order of the panels: the servoed components first.
 _PANELS = ("z_mm", "alpha_deg", "beta_deg", "x_mm", "y_mm", "gamma_deg")
-# A TacTip's (SPEC part 2): ticks of this length from the tip's centre trace the surface that it is pressed on.
+# Radius of a TacTip: ticks of this length from the tip's centre trace the surface that it is pressed on.
 _TIP_RADIUS_MM = 20.0
 _LEAST_EXTENT_MM = 1.0
 _STATE_COLOURS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52", "#8172b3", "#937860", "#da8bc3", "#8c8c8c")
 
 
 def plot_contact(run: Run, sensor: str, path: Path, *, last_s: float | None = None) -> Path:
-    """Contact pose and shear over time: the estimate with two standard deviations, the truth, and the reference.
+    """Plot contact pose and shear over time: the estimate with two standard deviations, the truth, and the reference.
 
-    ``last_s`` shows only the end of the run, for replayed images, of which each is another contact.
+    ``last_s`` shows only the end of the run, for replayed images, each of which is another contact.
     """
     contact = run.series(f"/sensors/{sensor}/contact")
     truth = run.series(f"/sensors/{sensor}/truth")
@@ -63,7 +63,7 @@ def plot_contact(run: Run, sensor: str, path: Path, *, last_s: float | None = No
 
 
 def plot_agreement(run: Run, sensor: str, path: Path) -> Path:
-    """Estimates against what is true, of single frames and of the filter, with the mean absolute error of each."""
+    """Plot estimates over the truth, of single frames and of the filter, with the mean absolute error of each."""
     truth = run.series(f"/sensors/{sensor}/truth")
     assert truth is not None
     figure = Figure(figsize=(14, 9), layout="constrained")
@@ -95,13 +95,13 @@ def plot_agreement(run: Run, sensor: str, path: Path) -> Path:
 
 
 def plot_trajectory(run: Run, path: Path, mounts: Mapping[str, tuple[Array, Array]]) -> Path:
-    """The arms' paths from the side and from above with the sensor's axis, coloured by the task's state.
+    """Plot the arms' paths in side and top view with the sensor's axis, coloured by the task's state.
 
     Args:
         run: its recording.
         path: PNG to write.
-        mounts: by arm, the poses (4, 4) of its base in the world and of its sensor in its tool; none means that both
-            are the same.
+        mounts: by arm, the poses (4, 4) of its base in the world and of its sensor in its tool; None means that both
+            are the identity.
     """
     figure = Figure(figsize=(15, 6), layout="constrained")
     axes = figure.subplots(1, 2)
@@ -113,7 +113,7 @@ def plot_trajectory(run: Run, path: Path, mounts: Mapping[str, tuple[Array, Arra
         T_world_base, T_tcp_sensor = mounts.get(arm, (np.eye(4), np.eye(4)))
         T = T_world_base @ tip_points(series) @ T_tcp_sensor
         points = 1e3 * T[:, :3, 3]
-        # The view from the side looks along the horizontal axis in which the path is narrowest.
+        # The side view is along the horizontal axis in which the path is narrowest.
         along = int(np.argmax(np.ptp(points[:, :2], axis=0)))
         for axis, (i, j) in zip(axes, ((along, 2), (0, 1)), strict=True):
             _draw_path(axis, run, series.t_s, points[:, [i, j]], colours)
@@ -133,7 +133,7 @@ def plot_trajectory(run: Run, path: Path, mounts: Mapping[str, tuple[Array, Arra
 
 
 def plot_budget(stages_ms: Mapping[str, Array], path: Path, title: str) -> Path:
-    """Median and 99th percentile of the time that each stage takes, as bars in the order given."""
+    """Plot median and 99th percentile of the duration of each stage, as bars in the given order."""
     figure = Figure(figsize=(9, 0.5 * len(stages_ms) + 1.5), layout="constrained")
     axis = figure.subplots()
     position = np.arange(len(stages_ms))
@@ -170,7 +170,7 @@ def _draw_axes(axis: Axes, T: Array, points: Array, view: tuple[int, int]) -> No
 
 
 def _shade_states(axis: Axes, run: Run) -> None:
-    """Light bands where the task was running, so that approach and retreat do not look like errors."""
+    """Shade the times at which the task was running, so that approach and retreat do not look like errors."""
     task = run.series("/task")
     if task is None:
         return
@@ -181,7 +181,7 @@ def _shade_states(axis: Axes, run: Run) -> None:
 
 
 def _limit(axis: Axes, value: Array, truth: Array) -> None:
-    """Axis limits from the values, not from wide uncertainty at first contact."""
+    """Set axis limits from the values, not from the wide uncertainty at first contact."""
     finite = np.concatenate([value[np.isfinite(value)], truth[np.isfinite(truth)]])
     if len(finite):
         margin = 0.15 * max(float(np.ptp(finite)), 0.2)

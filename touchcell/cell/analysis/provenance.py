@@ -1,4 +1,4 @@
-"""Where, when and from which sources a figure was measured."""
+"""Provenance of measured figures: machine, date and source revision."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 
 def provenance() -> dict[str, str]:
-    """Machine, interpreter, date and git commit, to be written beside every measured figure."""
+    """Return machine, interpreter, date and git commit, to be stored with every measured figure."""
     return {
         "cpu": _cpu_model(),
         "cores": str(os.cpu_count()),
@@ -34,7 +34,7 @@ def _cpu_model() -> str:
 
 
 def _commit() -> str:
-    """Short hash, with "+" if the tree has uncommitted changes; "unknown" outside a checkout."""
+    """Return the short hash, with "+" if the tree has uncommitted changes; "unknown" outside a checkout."""
     try:
         return _git("rev-parse", "--short", "HEAD") + ("+" if _git("status", "--porcelain") else "")
     except (OSError, subprocess.CalledProcessError):

@@ -1,4 +1,4 @@
-"""A run's summary and plots, made from its recording alone, so that they can be made again at any time."""
+"""A run's summary and plots, made from its recording alone, so that they can be regenerated at any time."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from touchcell import compiled
 from touchcell.cell.analysis.run_data import STAGES, Run, Series, load_run
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.recording.messages import COMPONENTS
@@ -18,7 +19,7 @@ from touchcell.geometry.types import Array
 
 
 def write_report(folder: Path) -> str:
-    """Write ``summary.json``, ``summary.txt`` and the plots into a run folder; returns the text.
+    """Write ``summary.json``, ``summary.txt`` and the plots into a run folder; return the text.
 
     Raises:
         RecordingError: the folder holds no recording.
@@ -49,13 +50,13 @@ def _pictures(run: Run, folder: Path) -> list[Path]:
         strip = write_strip(folder / RECORDING, run, sensor, folder / f"markers_{sensor}.png")
         pictures += [strip] if strip is not None else []
     if stages_ms := _stages_ms(run):
-        title = "time that each stage of a control cycle took, in the cycles in which it ran"
+        title = "duration of each stage of a control cycle, in the cycles in which it ran"
         pictures.append(plot_budget(stages_ms, folder / "budget.png", title))
     return pictures
 
 
 def _mounts(folder: Path) -> dict[str, tuple[Array, Array]]:
-    """Where each arm stands in the world, and where its sensor sits on its tool, as far as the cell file is there."""
+    """Return the poses of each arm's base in the world and of its sensor in its tool, where the cell file has them."""
     from touchcell.cell.analysis.run_folder import RunFolder
 
     try:
@@ -69,7 +70,7 @@ def _mounts(folder: Path) -> dict[str, tuple[Array, Array]]:
 
 
 def _stages_ms(run: Run) -> dict[str, Array]:
-    """Durations of each stage in the cycles in which it ran, in the order in which they run."""
+    """Return durations of each stage in the cycles in which it ran, in the order of execution."""
     timing = run.series("/timing")
     if timing is None:
         return {}
@@ -79,9 +80,9 @@ def _stages_ms(run: Run) -> dict[str, Array]:
 
 
 def summarise(run: Run) -> dict[str, Any]:
-    """Errors of a run in millimetres and degrees.
+    """Return the errors of a run in millimetres and degrees.
 
-    ``control`` is the true contact against the reference (what the arm achieved), ``estimation`` the estimate against
+    ``control`` is the true contact against the reference (the arm's performance), ``estimation`` the estimate against
     the truth, ``single_frame`` each frame's own measurement against the truth; all during the task's ``run`` state, or
     the whole recording where the task has none.
     """
@@ -114,7 +115,7 @@ def _sensor_errors(run: Run, sensor: str) -> dict[str, dict[str, dict[str, float
 
 
 def _difference(series: Series, selected: NDArray[np.bool_], truth: Series) -> dict[str, dict[str, float]] | None:
-    """Error of ``series`` against the truth of its time, RMS and mean absolute, per component."""
+    """Return the error of ``series`` against the truth of its time, RMS and mean absolute, per component."""
     poses, true = series.poses(), truth.poses()
     index = np.clip(np.searchsorted(truth.t_s, series.t_s + 1e-6, side="right") - 1, 0, len(truth.t_s) - 1)
     error = (poses - true[index])[selected]
@@ -123,7 +124,7 @@ def _difference(series: Series, selected: NDArray[np.bool_], truth: Series) -> d
 
 
 def _reference_error(run: Run, sensor: str, achieved: Series) -> dict[str, dict[str, float]] | None:
-    """Achieved contact against the reference that the task recorded, for the components that it controls."""
+    """Return the achieved contact against the reference that the task recorded, for the components that it controls."""
     task = run.series("/task")
     if task is None:
         return None
@@ -132,9 +133,9 @@ def _reference_error(run: Run, sensor: str, achieved: Series) -> dict[str, dict[
     poses = achieved.poses()
     errors = {}
     for i, name in enumerate(COMPONENTS):
-        # A task with several sensors says whose reference it is.
-        told = task.column(f"{sensor}_reference_{name}")
-        reference = (told if np.isfinite(told).any() else task.column(f"reference_{name}"))[index]
+        # A task with several sensors prefixes the sensor's role.
+        own = task.column(f"{sensor}_reference_{name}")
+        reference = (own if np.isfinite(own).any() else task.column(f"reference_{name}"))[index]
         error = (poses[:, i] - reference)[running]
         error = error[np.isfinite(error)]
         if len(error):
@@ -172,6 +173,7 @@ def _text(folder: Path, result: dict[str, Any], summary: dict[str, Any], picture
         lines += [
             f"  {stage:<18}{row['median']:11.1f}{row['p99']:11.1f}{row['count']:9d}" for stage, row in stages.items()
         ]
+    lines += compiled.missing()
     lines.append(f"run folder: {folder}")
     lines += [f"  {picture.name}" for picture in pictures]
     return "\n".join(lines)

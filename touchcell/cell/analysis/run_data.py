@@ -1,4 +1,4 @@
-"""A run's recording as arrays: one series a topic."""
+"""A run's recording as arrays: one series per topic."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ STAGES = (
     "gate_and_send",
     "cycle",
 )
-"""Stages of a control cycle as recorded under /timing, in the order in which they run, and the whole."""
+"""Stages of a control cycle as recorded under /timing, in the order of execution, and the whole."""
 
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """One topic over time: ``t_s`` (n,) and columns of the same length; what was not recorded is NaN."""
+    """One topic over time: ``t_s`` (n,) and columns of the same length; missing values are NaN."""
 
     t_s: Array
     rows: tuple[dict[str, Any], ...]
 
     def column(self, name: str) -> Array:
-        """(n,) values of one key."""
+        """Return the (n,) values of one key."""
         return np.array([_number(row.get(name)) for row in self.rows])
 
     def poses(self) -> Array:
-        """(n, 6) Euler components in mm and degrees."""
+        """Return (n, 6) Euler components in mm and degrees."""
         return np.stack([self.column(name) for name in COMPONENTS], axis=1)
 
 
@@ -56,16 +56,16 @@ class Run:
     start_ns: int
 
     def series(self, topic: str) -> Series | None:
-        """The topic's series, or None where nothing was recorded."""
+        """Return the topic's series, or None where nothing was recorded."""
         return self.topics.get(topic)
 
     def roles(self, kind: str, leaf: str) -> list[str]:
-        """Roles with a topic ``/kind/ROLE/leaf``."""
+        """Return the roles with a topic ``/kind/ROLE/leaf``."""
         parts = [topic.split("/") for topic in self.topics]
         return sorted(p[2] for p in parts if len(p) == 4 and p[1] == kind and p[3] == leaf)
 
     def during(self, t_s: Array, state: str) -> NDArray[np.bool_]:
-        """Which of ``t_s`` lie in cycles in which the task was in ``state``."""
+        """Return a mask of the times ``t_s`` at which the task was in ``state``."""
         task = self.topics.get("/task")
         if task is None or not len(task.t_s):
             return np.zeros(len(t_s), dtype=bool)
@@ -76,7 +76,7 @@ class Run:
 
 
 def load_run(path: Path) -> Run:
-    """Read a recording; images are left out. Raises RecordingError."""
+    """Read a recording without its images. Raises RecordingError."""
     grouped: dict[str, list[Message]] = {}
     for message in read(path):
         if not message.topic.endswith("/image"):
@@ -94,7 +94,7 @@ def load_run(path: Path) -> Run:
 
 
 def tip_points(series: Series) -> Array:
-    """(n, 4, 4) poses of a pose series."""
+    """Return the (n, 4, 4) poses of a pose series."""
     return se3.from_euler_mm_deg(series.poses())
 
 

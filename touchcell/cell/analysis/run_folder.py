@@ -1,4 +1,4 @@
-"""What a run has left behind, and what was true in it: where sensors and surfaces were, what was touched."""
+"""A run's folder and its ground truth: poses of sensors, surfaces and objects, true contacts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from touchcell.geometry.types import Array
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A run's folder: ``cell.yaml`` and ``run.mcap``, read when they are asked for."""
+    """A run's folder: ``cell.yaml`` and ``run.mcap``, read on demand."""
 
     path: Path
 
@@ -28,7 +28,7 @@ class RunFolder:
 
     @cached_property
     def recording(self) -> Run:
-        """What was recorded, without images. Raises RecordingError."""
+        """The recording without images. Raises RecordingError."""
         return load_run(self.path / "run.mcap")
 
 
@@ -40,19 +40,19 @@ class Poses:
     T_world: Array
 
     def at(self, t_s: Array) -> Array:
-        """(m, 4, 4) the newest pose at each of ``t_s``, or the first."""
+        """Return (m, 4, 4) the newest pose at each of ``t_s``, or the first."""
         index = np.searchsorted(self.t_s, t_s + 1e-6, side="right") - 1
         poses: Array = self.T_world[np.clip(index, 0, len(self.t_s) - 1)]
         return poses
 
 
 def scene_time(run: RunFolder, series: Series) -> Array:
-    """(n,) times of a series since the start of the scene, which is when simulated time was zero."""
+    """Return the (n,) times of a series since the start of the scene, the origin of simulated time."""
     return series.t_s + 1e-9 * run.recording.start_ns
 
 
 def sensor_poses(run: RunFolder, role: str) -> Poses:
-    """Where the sensor of a role was."""
+    """Return the poses of the sensor of a role."""
     plan = run.plan
     section = plan.cell.sensors[plan.sensor_roles[role]]
     assert section.mounted_on is not None
@@ -65,32 +65,35 @@ def sensor_poses(run: RunFolder, role: str) -> Poses:
 
 
 def during(run: RunFolder, series: Series, state: str = "run") -> NDArray[np.bool_]:
-    """(n,) which samples lie in cycles in which the task was in ``state``."""
+    """Return a mask (n,) of the samples taken while the task was in ``state``."""
     return run.recording.during(series.t_s, state)
 
 
 def true_contacts(run: RunFolder, role: str) -> tuple[Series, Array]:
-    """The series of true contacts of a sensor, and them as (n, 6) in mm and degrees; NaN out of contact."""
+    """Return the series of true contacts of a sensor, and the contacts as (n, 6) in mm and degrees.
+
+    NaN out of contact.
+    """
     series = run.recording.series(f"/sensors/{role}/truth")
     assert series is not None
     return series, series.poses()
 
 
 def tilt_deg(contacts_mm_deg: Array) -> Array:
-    """(n,) angle between the sensor's axis and the surface's normal, of contacts (n, 6)."""
+    """Return the (n,) angle between the sensor's axis and the surface normal, of contacts (n, 6)."""
     alpha, beta = np.radians(contacts_mm_deg[:, 3]), np.radians(contacts_mm_deg[:, 4])
     angle: Array = np.degrees(np.arccos(np.clip(np.cos(alpha) * np.cos(beta), -1.0, 1.0)))
     return angle
 
 
 def rms(values: Array) -> float:
-    """Root mean square of what is finite; NaN of nothing."""
+    """Return the root mean square of the finite values; NaN if there are none."""
     finite = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(finite**2))) if len(finite) else float("nan")
 
 
 def object_poses(run: RunFolder) -> Mapping[str, Poses]:
-    """Where every free object was, by its name."""
+    """Return the poses of every free object, by its name."""
     return {
         topic.rpartition("/")[2]: Poses(scene_time(run, series), tip_points(series))
         for topic, series in run.recording.topics.items()

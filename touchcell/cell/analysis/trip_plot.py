@@ -1,4 +1,4 @@
-"""The plot around a trip. Imported only then, because matplotlib is heavy."""
+"""The plot around a trip. Imported only when needed, because matplotlib is heavy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _BEFORE_S, _AFTER_S = 1.0, 0.5
 
 
 def plot_trip(run: Run, trip_s: float, cause: dict[str, Any] | None, path: Path) -> Path:
-    """Speed sent and measured, depth, and the age of the frames, from a second before the trip until after the stop."""
+    """Plot commanded and measured speed, depth, and frame age, from a second before the trip until after the stop."""
     figure = Figure(figsize=(11, 8), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True)
     speed, depth, age = axes

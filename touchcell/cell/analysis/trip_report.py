@@ -1,4 +1,4 @@
-"""``touchcell why``: explains in words why a run tripped, from its black box, with a plot around the moment."""
+"""``touchcell why``: explains why a run tripped, from its black box, with a plot around the moment."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from touchcell.cell.runtime.watchdog import NOTES
 from touchcell.geometry.types import Array
 
 BEFORE_S: Final = 1.0
-"""How much of the time before the trip is told."""
+"""Time before the trip that is reported, s."""
 
 
 def explain(folder: Path) -> str:
-    """What tripped the run in ``folder``, what happened in the second before, and how the arms came to rest.
+    """Return what tripped the run in ``folder``, what happened in the second before, and how the arms came to rest.
 
     Also draws ``why.png`` beside it. A run whose process died has the watchdog's note only.
 
@@ -71,34 +71,34 @@ def _from_watchdog(file: Path) -> str:
     for name, arm in note["arms"].items():
         rest = "never seen at rest" if arm["time_s"] is None else f"at rest after {arm['time_s']:.3f} s"
         lines.append(
-            f"  {name}: told to stop at {1e3 * arm['speed_m_s']:.1f} mm/s; {rest} and {1e3 * arm['distance_m']:.2f} mm"
-            + (", by the strongest category it offers" if arm["escalated"] else "")
+            f"  {name}: commanded to stop at {1e3 * arm['speed_m_s']:.1f} mm/s; {rest} and "
+            f"{1e3 * arm['distance_m']:.2f} mm" + (", by the strongest category it offers" if arm["escalated"] else "")
         )
     return "\n".join(lines)
 
 
 def _cause(cause: dict[str, Any]) -> str:
-    words = f"{cause['interlock']} ({cause['severity']}): {cause['subject']}: {cause['reason']}"
+    text = f"{cause['interlock']} ({cause['severity']}): {cause['subject']}: {cause['reason']}"
     if cause["value"] is not None and cause["limit"] is not None:
-        words += f"  [value {cause['value']:.4g}, limit {cause['limit']:.4g} {cause['unit']}]"
-    return words + (f", tactile frame {cause['frame_seq']}" if cause["frame_seq"] is not None else "")
+        text += f"  [value {cause['value']:.4g}, limit {cause['limit']:.4g} {cause['unit']}]"
+    return text + (f", tactile frame {cause['frame_seq']}" if cause["frame_seq"] is not None else "")
 
 
 def _stop(stop: dict[str, Any]) -> str:
     speed = "an unknown speed" if stop["speed_m_s"] is None else f"{1e3 * stop['speed_m_s']:.1f} mm/s"
-    words = f"stopped by category {stop['category']} from {speed}"
+    text = f"stopped by category {stop['category']} from {speed}"
     if stop["escalated"]:
-        words += ", was still moving when it should have stood, and was stopped by the strongest category it offers"
+        text += ", was still moving after its stopping time, and was stopped by the strongest category it offers"
     if stop["time_s"] is None:
-        return f"{words}; never seen at rest: {stop['problem']}"
-    words += f"; at rest after {stop['time_s']:.3f} s (declared {stop['declared_s']:.3f} s)"
+        return f"{text}; never seen at rest: {stop['problem']}"
+    text += f"; at rest after {stop['time_s']:.3f} s (declared {stop['declared_s']:.3f} s)"
     if stop["distance_m"] is not None:
-        words += f" and {1e3 * stop['distance_m']:.2f} mm (declared {1e3 * stop['declared_m']:.2f} mm)"
-    return words
+        text += f" and {1e3 * stop['distance_m']:.2f} mm (declared {1e3 * stop['declared_m']:.2f} mm)"
+    return text
 
 
 def _before(run: Run, trip_s: float) -> list[str]:
-    """What the second before the trip looked like, one line for each thing that tells something."""
+    """Return the events of the second before the trip, one line per arm, sensor and task."""
     lines = []
     task = _window(run.series("/task"), trip_s)
     if task is not None:
@@ -107,20 +107,21 @@ def _before(run: Run, trip_s: float) -> list[str]:
     for role in run.roles("arms", "tcp"):
         tcp = _window(run.series(f"/arms/{role}/tcp"), trip_s)
         if tcp is not None:
-            way_mm = _way(tcp.poses()[:, :3])
-            lines.append(f"{role}: moved {way_mm:.1f} mm, at most at {np.nanmax(_finite(tcp, 'speed_mm_s')):.1f} mm/s")
+            path_mm = _path_length(tcp.poses()[:, :3])
+            lines.append(f"{role}: moved {path_mm:.1f} mm, at most at {np.nanmax(_finite(tcp, 'speed_mm_s')):.1f} mm/s")
         commands = _window(run.series(f"/arms/{role}/command"), trip_s)
         if commands is not None:
             held = [row for row in commands.rows if row["limited_by"]]
             why = ", ".join(dict.fromkeys(limit for row in held for limit in row["limited_by"]))
-            lines.append(f"{role}: {len(held)} of {len(commands.rows)} commands held back{f' by {why}' if why else ''}")
+            lines.append(f"{role}: {len(held)} of {len(commands.rows)} commands limited{f' by {why}' if why else ''}")
     for role in run.roles("sensors", "contact"):
         contact = _window(run.series(f"/sensors/{role}/contact"), trip_s)
         if contact is not None:
             depth = _finite(contact, "z_mm")
             ages_ms = [1e3 * (t - (row["t_frame_ns"] - run.start_ns) * 1e-9) for t, row in _rows(contact)]
-            told = f"{depth[0]:.2f} -> {depth[-1]:.2f} mm deep" if np.isfinite(depth[[0, -1]]).all() else "no contact"
-            lines.append(f"{role}: {told}, frames up to {max(ages_ms):.0f} ms old")
+            finite = np.isfinite(depth[[0, -1]]).all()
+            change = f"{depth[0]:.2f} -> {depth[-1]:.2f} mm deep" if finite else "no contact"
+            lines.append(f"{role}: {change}, frames up to {max(ages_ms):.0f} ms old")
     return lines
 
 
@@ -134,13 +135,13 @@ def _finite(series: Series, name: str) -> Array:
     return finite if len(finite) else np.array([np.nan])
 
 
-def _way(points: Array) -> float:
+def _path_length(points: Array) -> float:
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     return float(np.nansum(steps))
 
 
 def _window(series: Series | None, trip_s: float) -> Series | None:
-    """The part of ``series`` in the time before the trip; None where there is nothing in it."""
+    """Return the part of ``series`` in the time before the trip; None where it is empty."""
     if series is None:
         return None
     inside = np.flatnonzero((series.t_s >= trip_s - BEFORE_S) & (series.t_s <= trip_s))

@@ -1,6 +1,6 @@
-"""``touchcell view``: a run's contacts in a browser while it goes on, or played again from its recording.
+"""``touchcell view``: a run's contacts in a browser, live or replayed from its recording.
 
-It follows the recording from a process of its own and touches nothing of the run.
+It follows the recording from its own process and does not affect the run.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ _PAGE: Final = b"""<!doctype html><title>touchcell view</title>
 
 
 class Page:
-    """A page on this machine that shows the newest picture; a context manager.
+    """A local web page that shows the newest image; a context manager.
 
     Args:
         port: 0 for any that is free.
 
     Raises:
-        OSError: the port is taken.
+        OSError: the port is in use.
     """
 
     def __init__(self, port: int) -> None:
@@ -56,14 +56,14 @@ class Page:
                 self.wfile.write(content)
 
             def log_message(self, format: str, *arguments: object) -> None:
-                """A line for every picture would tell nobody anything."""
+                """Suppress the log line per image."""
 
         self._server = ThreadingHTTPServer((_ADDRESS, port), Handler)
         self._thread = threading.Thread(target=self._server.serve_forever, name="page", daemon=True)
 
     @property
     def url(self) -> str:
-        """Where it is."""
+        """Address of the page."""
         return f"http://{_ADDRESS}:{self._server.server_address[1]}/"
 
     def show(self, picture: ImageArray) -> None:
@@ -84,7 +84,7 @@ def view_run(folder: Path, port: int) -> None:
     """Show the run until it has ended and its recording has been played, or until Ctrl-C.
 
     Raises:
-        RecordingError: the folder holds no recording, or one without images; or the port is taken.
+        RecordingError: the folder holds no recording, or one without images; or the port is in use.
     """
     try:
         page = Page(port)
@@ -101,9 +101,9 @@ def view_run(folder: Path, port: int) -> None:
 
 
 def play(folder: Path, show: Callable[[ImageArray], None], clock: Clock) -> int:
-    """Show what the sensors of a run see, no faster than it was recorded; returns the number of images.
+    """Show the images of a run's sensors, no faster than they were recorded; return the number of images.
 
-    A run that still goes on is caught up with as fast as its images can be read, and then followed to its end.
+    For a live run its past images are shown as fast as they can be read, then the run is followed to its end.
 
     Raises:
         RecordingError: there is no recording.
@@ -120,7 +120,7 @@ def play(folder: Path, show: Callable[[ImageArray], None], clock: Clock) -> int:
         nonlocal over
         if over:
             return False
-        # What the run wrote before it ended is still to be read.
+        # The remaining messages are still to be read after the run has ended.
         over = await_end(folder, 0.0)
         clock.sleep_until_ns(clock.now_ns() + _LOOK_AGAIN_NS)
         return True
@@ -130,7 +130,7 @@ def play(folder: Path, show: Callable[[ImageArray], None], clock: Clock) -> int:
         first_ns = picture.t_ns if first_ns is None else first_ns
         clock.sleep_until_ns(started_ns + picture.t_ns - first_ns)
         last = picture
-        # More pictures than anybody sees would only take time from the run.
+        # A higher image rate than is visible would only take time from the run.
         if clock.now_ns() - drawn_ns >= _DRAWN_EVERY_NS:
             drawn_ns = clock.now_ns()
             rows[picture.role] = picture.drawn()
@@ -142,6 +142,6 @@ def play(folder: Path, show: Callable[[ImageArray], None], clock: Clock) -> int:
 
 
 def _stacked(rows: dict[str, ImageArray]) -> ImageArray:
-    """One row for each sensor, as wide as the widest."""
+    """Stack one row per sensor, as wide as the widest."""
     width = max(row.shape[1] for row in rows.values())
     return np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for _, row in sorted(rows.items())])

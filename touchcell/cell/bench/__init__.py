@@ -1,1 +1,1 @@
-"""Benchmarks that tell a user about his own machine and cell: ``touchcell bench NAME``."""
+"""Benchmarks of the user's own machine and cell: ``touchcell bench NAME``."""

@@ -1,4 +1,4 @@
-"""Which benchmarks there are: those that are installed, and in a checkout also those for developers."""
+"""Catalogue of benchmarks: those that are installed, and in a checkout also those for developers."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ BENCHMARKS: Final = Registry("touchcell.benchmarks", "benchmark", Benchmark)
 
 
 def benchmark_names() -> list[str]:
-    """Names of all benchmarks; nothing is imported but the list of the checkout's own."""
+    """Return the names of all benchmarks; nothing is imported but the list of the checkout's own."""
     return sorted({*BENCHMARKS.names(), *_of_checkout()})
 
 
 def benchmark(name: str) -> Benchmark:
-    """The benchmark ``name``. Raises ConfigError for an unknown one."""
+    """Return the benchmark ``name``. Raises ConfigError for an unknown one."""
     of_checkout = _of_checkout()
     if name in of_checkout:
         run: Benchmark = importlib.import_module(of_checkout[name]).run

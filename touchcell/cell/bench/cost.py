@@ -1,6 +1,6 @@
-"""``touchcell bench cost``: what a scene pays for: start-up time, memory and cycle time, with and without each part.
+"""``touchcell bench cost``: start-up time, memory and cycle time of a cell, with and without each part.
 
-Each scene runs in a fresh process that does what ``touchcell run`` does, with its recording and its black box.
+Each cell runs in a fresh process that does the same as ``touchcell run``, with its recording and its black box.
 ``ready`` counts from the start of the process until the first control cycle; memory is that of the process after the
 last one, before the plots are made, and its peak.
 """
@@ -28,7 +28,7 @@ _HEAVY = ("torch", "matplotlib", "onnxruntime", "onnx", "cv2", "mujoco", "rich")
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Print the table of scenes; writes ``cost.json`` into ``out``."""
+    """Print the table of cells; write ``cost.json`` into ``out``."""
     base = yaml.safe_load(find_cell(Path("configs/surface_follow_sim.yaml")).read_text())
     base["task"]["distance_mm"] = 60
     far = json.loads(json.dumps(base))
@@ -60,7 +60,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
 
 
 def replaying(images: Path) -> dict[str, Any]:
-    """A cell that only looks at camera frames on file: what a process serves that neither simulates nor moves."""
+    """Return a cell that only replays camera frames from files: a process without simulation and motion."""
     estimator = {"kind": "network", "model": "builtin:sim_gdn"}
     return {
         "schema": 1,
@@ -73,7 +73,7 @@ def replaying(images: Path) -> dict[str, Any]:
 
 
 def measure(cell: dict[str, Any], what: str, starts: int = 3) -> dict[str, Any]:
-    """The quickest of some starts of ``touchcell run`` or ``check``: the others waited for a busy machine."""
+    """Return the quickest of some starts of ``touchcell run`` or ``check``: the others waited for a busy machine."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cell.yaml"
         path.write_text(yaml.safe_dump(cell))

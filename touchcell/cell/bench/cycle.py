@@ -1,8 +1,8 @@
-"""``touchcell bench cycle``: one control cycle from frame to twist, by stage, in a running cell.
+"""``touchcell bench cycle``: duration of one control cycle from frame to twist, by stage, in a running cell.
 
 The shipped surface-following cell runs once with the learned estimator and once on the true contact, in simulated time;
-durations are measured inside the run loop around each stage. Drawing the simulated frame is not part of a real cell's
-cycle and is listed apart, as ``read frame``.
+durations are measured inside the run loop around each stage. Rendering the simulated frame is not part of a real cell's
+cycle and is listed separately, as ``read frame``.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 
-# Stages of a cycle with a new frame that also a real cell has.
+# Stages of a cycle with a new frame that a real cell has as well.
 _STAGES = ("preprocess", "infer", "filter", "task and control", "supervisor", "gate and send")
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Print and plot the latency budget; writes ``cycle.json`` and ``cycle.png`` into ``out``."""
+    """Print and plot the latency budget; write ``cycle.json`` and ``cycle.png`` into ``out``."""
     path = find_cell(Path(arguments[0]) if arguments else Path("configs/surface_follow_sim.yaml"))
     plan = plan_cell(path)
     cell = compose(plan)

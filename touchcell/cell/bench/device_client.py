@@ -1,4 +1,4 @@
-"""One client of one device in a process of its own, so that its time and memory are its own: ours, or the vendor's.
+"""Measure one client of one device, ours or the vendor's, in its own process.
 
     python -m touchcell.cell.bench.device_client ours|vendor NAME FOLDER ADDRESS
 
@@ -28,7 +28,7 @@ _SPEED_M_S = 0.005
 
 
 def ours(name: str, folder: Path, address: int) -> dict[str, Any]:
-    """Figures of touchcell's driver on the rig ``name``."""
+    """Measure touchcell's driver on the device fixture ``name``."""
     from touchcell.drivers.core.clock import MonotonicClock
     from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 
@@ -48,7 +48,7 @@ def ours(name: str, folder: Path, address: int) -> dict[str, Any]:
     ages_ms = []
     for _ in range(200):
         ages_ms.append((clock.now_ns() - read().t_ns) * 1e-6)
-        # No multiple of any device's period.
+        # Not a multiple of any device's period.
         time.sleep(0.0037)
     row["age_ms"] = float(np.median(ages_ms))
     lease = None if is_camera else device.acquire("bench")
@@ -71,7 +71,7 @@ def ours(name: str, folder: Path, address: int) -> dict[str, Any]:
 
 
 def vendor(name: str, folder: Path, address: int) -> dict[str, Any]:
-    """Figures of the vendor's own client on the same emulator. Raises ImportError where it is not installed."""
+    """Measure the vendor's own client on the same emulator. Raises ImportError where it is not installed."""
     start_s = time.perf_counter()
     read = _VENDORS[name](folder, address)
     read()
@@ -106,7 +106,7 @@ def _damiao(folder: Path, address: int) -> Callable[[], Any]:
     motors = [controller.add_motor(number, 0x10 + number, "4340") for number in range(1, 7)]
 
     def read() -> None:
-        # The client hands out whatever arrived last, without a number or a stamp: there is no rate to be measured.
+        # The client returns the latest data without a number or a stamp: its rate cannot be measured.
         for motor in motors:
             motor.request_motor_feedback()
         deadline_s = time.perf_counter() + 2.0
@@ -159,7 +159,7 @@ _VENDORS: dict[str, Callable[[Path, int], Callable[[], Any]]] = {
 
 
 def _rate(read: Callable[[], Any]) -> float:
-    """Distinct samples per second."""
+    """Return distinct samples per second."""
     seen = {read()}
     start_s = time.perf_counter()
     while (passed_s := time.perf_counter() - start_s) < _RATE_S:
@@ -173,12 +173,12 @@ def _memory_mb() -> float:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Measure, and print."""
+    """Measure and print."""
     who, name, folder, address = arguments
     print(json.dumps((ours if who == "ours" else vendor)(name, Path(folder), int(address))), flush=True)
 
 
 if __name__ == "__main__":
     main(sys.argv[1:])
-    # Vendors' threads may not end by themselves.
+    # Vendor threads may not end by themselves.
     os._exit(0)

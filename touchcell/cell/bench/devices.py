@@ -25,7 +25,7 @@ from touchcell.cell.bench.provenance import provenance
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import TwistSink
 from touchcell.testing.conformance.client import MovingClient
-from touchcell.testing.conformance.context import Bench, DeviceUnderTest
+from touchcell.testing.conformance.context import ConformanceContext, DeviceUnderTest
 from touchcell.testing.emulation.rig import RIGS
 
 _RIGS = ("ur", "franka", "damiao_can", "feetech_serial", "v4l2")
@@ -59,12 +59,12 @@ def run(arguments: Sequence[str], out: Path) -> None:
         print(f"{name} ...", flush=True)
         with tempfile.TemporaryDirectory(prefix="touchcell-bench-") as folder:
             address = 1000 + (os.getpid() % 30_000) * 16 + number
-            seat = DeviceUnderTest(RIGS.load(name), Path(folder), address)
+            device = DeviceUnderTest(RIGS.load(name), Path(folder), address)
             try:
-                rows[name] = _measure(seat)
-                rows[f"{name}, vendor"] = _vendor(seat)
+                rows[name] = _measure(device)
+                rows[f"{name}, vendor"] = _vendor(device)
             finally:
-                seat.clear()
+                device.clear()
     print(f"\n{'':<24}" + "".join(f"{title:>11}" for _, title, _ in _COLUMNS))
     for name, row in rows.items():
         cells = (f"{format(row[key], form) if row.get(key) is not None else '-':>11}" for key, _, form in _COLUMNS)
@@ -77,35 +77,35 @@ def run(arguments: Sequence[str], out: Path) -> None:
     (out / "devices.json").write_text(json.dumps({"provenance": provenance(), "rows": rows}, indent=1) + "\n")
 
 
-def _measure(seat: DeviceUnderTest) -> dict[str, Any]:
-    name = seat.function.__module__.rpartition(".")[2]
-    seat.emulator()
-    row = _client("ours", seat, name)
+def _measure(device: DeviceUnderTest) -> dict[str, Any]:
+    name = device.function.__module__.rpartition(".")[2]
+    device.emulator()
+    row = _client("ours", device, name)
     for part in (_wire, _ttl, _kill, _frozen):
-        seat.clear()
-        if TwistSink in seat.rig.spec.capabilities.provides or part is _frozen:
+        device.clear()
+        if TwistSink in device.rig.spec.capabilities.provides or part is _frozen:
             try:
-                row |= part(seat)
+                row |= part(device)
             except BaseException as error:
                 if isinstance(error, KeyboardInterrupt):
                     raise
                 row["error"] = f"{part.__name__.strip('_')}: {error}"
-    seat.clear()
+    device.clear()
     return row
 
 
-def _vendor(seat: DeviceUnderTest) -> dict[str, Any]:
-    name = seat.function.__module__.rpartition(".")[2]
-    seat.emulator()
-    return _client("vendor", seat, name)
+def _vendor(device: DeviceUnderTest) -> dict[str, Any]:
+    name = device.function.__module__.rpartition(".")[2]
+    device.emulator()
+    return _client("vendor", device, name)
 
 
-def _client(who: str, seat: DeviceUnderTest, name: str) -> dict[str, Any]:
+def _client(who: str, device: DeviceUnderTest, name: str) -> dict[str, Any]:
     environment = dict(os.environ)
     if name == "v4l2":
         from touchcell.drivers.v4l2.shim import environment as shim
 
-        environment |= shim(seat.folder)
+        environment |= shim(device.folder)
     try:
         result = subprocess.run(
             [
@@ -116,8 +116,8 @@ def _client(who: str, seat: DeviceUnderTest, name: str) -> dict[str, Any]:
                 "touchcell.cell.bench.device_client",
                 who,
                 name,
-                seat.folder,
-                str(seat.address),
+                device.folder,
+                str(device.address),
             ],
             capture_output=True,
             text=True,
@@ -133,76 +133,76 @@ def _client(who: str, seat: DeviceUnderTest, name: str) -> dict[str, Any]:
     return row
 
 
-def _wire(seat: DeviceUnderTest) -> dict[str, Any]:
+def _wire(device: DeviceUnderTest) -> dict[str, Any]:
     """From the call of ``send_twist`` to the emulator's own receive stamp, each time from rest."""
-    bench = Bench(seat)
+    context = ConformanceContext(device)
     try:
-        lease = bench.leased()
-        bench.settle()
+        lease = context.leased()
+        context.settle()
         latencies_ms = []
         for trial in range(_TRIALS):
-            bench.sleep(_CALM_S)
+            context.sleep(_CALM_S)
             sign = 1.0 if trial % 2 else -1.0
-            command = bench.command(sign * bench.twist(bench.axis()), ttl_s=0.04)
+            command = context.command(sign * context.twist(context.axis()), ttl_s=0.04)
             before_ns = time.monotonic_ns()
-            bench.arm.send_twist(command, lease)
-            bench.sleep(0.035)
-            onset_ns = bench.truth()["command_onset_ns"]
+            context.arm.send_twist(command, lease)
+            context.sleep(0.035)
+            onset_ns = context.truth()["command_onset_ns"]
             if onset_ns > before_ns:
                 latencies_ms.append((onset_ns - before_ns) * 1e-6)
-            bench.arm.stop()
-            bench.settle()
+            context.arm.stop()
+            context.settle()
         return {
             "wire_ms": statistics.median(latencies_ms),
             "wire_p99_ms": float(np.percentile(latencies_ms, 99)),
             "wire_trials": len(latencies_ms),
         }
     finally:
-        bench.close()
+        context.close()
 
 
-def _ttl(seat: DeviceUnderTest) -> dict[str, Any]:
+def _ttl(device: DeviceUnderTest) -> dict[str, Any]:
     """From the expiry of the last command until the tool truly rests."""
-    bench = Bench(seat)
+    context = ConformanceContext(device)
     try:
-        lease = bench.leased()
-        bench.settle()
-        track, _ = bench.stream(lease, bench.twist(bench.axis()), 0.6, ttl_s=_TTL_S)
+        lease = context.leased()
+        context.settle()
+        track, _ = context.stream(lease, context.twist(context.axis()), 0.6, ttl_s=_TTL_S)
         expiry_ns = track.t_ns[-1] + _TTL_S * 1e9
-        rest = bench.track_to_rest(3.0)
+        rest = context.track_to_rest(3.0)
         return {"stop_ttl_ms": (rest.t_ns[-1] - expiry_ns) * 1e-6}
     finally:
-        bench.close()
+        context.close()
 
 
-def _kill(seat: DeviceUnderTest) -> dict[str, Any]:
+def _kill(device: DeviceUnderTest) -> dict[str, Any]:
     """From kill -9 of the client until the tool rests, or motors that carry an arm without brakes let go."""
-    bench = Bench(seat)
-    falls = seat.rig.spec.capabilities.falls_on_power_loss
+    context = ConformanceContext(device)
+    falls = device.rig.spec.capabilities.falls_on_power_loss
     try:
-        with MovingClient(seat.function, seat.folder, seat.address, bench.speed()) as client:
-            bench.sleep(0.3)
+        with MovingClient(device.function, device.folder, device.address, context.speed()) as client:
+            context.sleep(0.3)
             client.kill()
-            start_ns, start = bench.clock.now_ns(), bench.position()
+            start_ns, start = context.clock.now_ns(), context.position()
             ended = (lambda truth: not truth["energised"]) if falls else None
-            rest = bench.track_to_rest(client.silence_s + 3.0, ended)
+            rest = context.track_to_rest(client.silence_s + 3.0, ended)
         travel_mm = 1e3 * float(np.linalg.norm(rest.poses[-1][:3, 3] - start))
         return {"stop_kill_ms": (rest.t_ns[-1] - start_ns) * 1e-6, "stop_kill_mm": travel_mm}
     finally:
-        bench.close()
+        context.close()
 
 
-def _frozen(seat: DeviceUnderTest) -> dict[str, Any]:
+def _frozen(device: DeviceUnderTest) -> dict[str, Any]:
     """From SIGSTOP of the device until the driver is FAULTED."""
-    bench = Bench(seat)
-    bench.spoiled = True
+    context = ConformanceContext(device)
+    context.spoiled = True
     try:
-        bench.active()
-        lease = bench.arm.acquire("bench") if TwistSink in seat.rig.spec.capabilities.provides else None
+        context.active()
+        lease = context.arm.acquire("bench") if TwistSink in device.rig.spec.capabilities.provides else None
         with suppress(DeviceError):
-            bench.read()
-        bench.sleep(0.2)
-        bench.emulator.freeze()
-        return {"frozen_ms": 1e3 * bench.reach_faulted(5.0, lease)}
+            context.read()
+        context.sleep(0.2)
+        context.emulator.freeze()
+        return {"frozen_ms": 1e3 * context.reach_faulted(5.0, lease)}
     finally:
-        bench.close()
+        context.close()

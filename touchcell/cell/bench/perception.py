@@ -1,9 +1,9 @@
 """``touchcell bench perception``: every estimator in every runtime, run time and memory against error and calibration.
 
-Each estimator serves in a fresh process for each runtime: its memory, the time until its first estimate, and the time
-per 640x480 grey frame on one thread are its own. Images that are published after cropping and thresholding are put
+Each estimator runs in a fresh process for each runtime: its memory, the time until its first estimate, and the time
+per 640x480 grey frame on one thread are its own. Images that are published after cropping and thresholding are pasted
 back into camera frames for that, so that the whole chain of a cell is timed; errors are those on the published images.
-Without ``--data``, the model that ships and simulated camera frames are measured.
+Without ``--data``, the shipped model and simulated camera frames are measured.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ SHIPPED = MODELS / "sim_gdn.safetensors"
 _PARTS = {
     "all": "all images",
     "slip_free": "shear below 0.6 of the depth",
-    "slipping": "the others, which slip",
-    "camera": "the timed frames: images put back into camera frames, where they were cut out",
+    "slipping": "the others, with slip",
+    "camera": "the timed frames: images pasted back into camera frames, where they were cropped",
 }
-SHARES = tuple(np.linspace(0.05, 0.95, 19).round(2).tolist())
-# Sensors scatter as little as those that the shipped model was trained on.
+PROBABILITIES = tuple(np.linspace(0.05, 0.95, 19).round(2).tolist())
+# Sensors vary as little as those that the shipped model was trained on.
 _VARIATION = Variation(parameters=0.01, turn_rad=0.002, shift_px=0.3, marker_px=0.1, disc_radius=0.03, missing=0.002)
 
 
@@ -63,7 +63,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
         if options.data is None:
             options.data = Path(scratch)
             write_simulated(options.data / options.split, options.images)
-            about = f"{options.images} simulated camera frames and the model that ships; --data measures real images"
+            about = f"{options.images} simulated camera frames and the shipped model; --data measures real images"
         else:
             about = f"{options.data}, split {options.split}"
         rows, scores = _measured(options, Path(scratch))
@@ -75,10 +75,16 @@ def run(arguments: Sequence[str], out: Path) -> None:
     text = "\n".join([about, table(rows), *_turn_lines(turns)])
     print(text)
     (out / "perception.txt").write_text(text + "\n")
-    report = {"provenance": provenance(), "about": about, "shares": SHARES, "rows": rows, "by_turns": turns}
+    report = {
+        "provenance": provenance(),
+        "about": about,
+        "probabilities": PROBABILITIES,
+        "rows": rows,
+        "by_turns": turns,
+    }
     (out / "perception.json").write_text(json.dumps(report, indent=1) + "\n")
     perception_figures.write_run_time_against_error(out / "perception.png", rows)
-    perception_figures.write_reliability(out / "perception_reliability.png", SHARES, rows)
+    perception_figures.write_reliability(out / "perception_reliability.png", PROBABILITIES, rows)
     for name, each in scores.items():
         write_predictions(
             out / f"perception_{name}.png",
@@ -106,7 +112,7 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def _measured(options: argparse.Namespace, scratch: Path) -> tuple[list[dict[str, Any]], dict[str, Scores]]:
-    """One row for each estimator and runtime, and each estimator's scores in the first of its runtimes."""
+    """Return one row for each estimator and runtime, and each estimator's scores in the first of its runtimes."""
     labels = read_split(options.data, options.split).contact_mm_deg
     headers = {path: load_model(path).header for path in options.models}
     served, shown = _frames(options, headers)
@@ -122,7 +128,7 @@ def _measured(options: argparse.Namespace, scratch: Path) -> tuple[list[dict[str
             program = [sys.executable, "-m", "touchcell.cell.bench.perception_serving"]
             words = list(map(str, [path, runtime, frames, len(served), options.data, options.split, result]))
             environment = as_installed(scratch)
-            # Modules are compiled once, before anything is measured.
+            # Modules are byte-compiled once, before anything is measured.
             subprocess.run([*program, *words, "0", "--start-only"], check=True, env=environment)
             subprocess.run([*program, *words, str(time.monotonic_ns())], check=True, env=environment)
             with np.load(result) as found:
@@ -151,7 +157,7 @@ def _measured(options: argparse.Namespace, scratch: Path) -> tuple[list[dict[str
                     "camera": _scored(camera),
                     "in_range": float(each.in_range.mean()),
                     "joint_coverage": {"68": each.joint_coverage(0.68), "95": each.joint_coverage(0.95)},
-                    "reliability": each.reliability(SHARES),
+                    "reliability": each.reliability(PROBABILITIES),
                     "apart_from_first_runtime": float(np.abs(each.xi - first.xi).max()),
                 }
             )
@@ -174,7 +180,7 @@ def _quantiles(times_ns: np.ndarray) -> dict[str, dict[str, float]]:
 
 
 def _frames(options: argparse.Namespace, headers: Mapping[Path, Header]) -> tuple[list[ImageArray], list[int]]:
-    """Camera frames of images spread over the split, and which images they are."""
+    """Return camera frames of images spread over the split, and their indices."""
     split = read_split(options.data, options.split)
     step = max(1, len(split.images) // options.frames)
     sizes = {from_camera(header.preprocessing).input_size for header in headers.values()}
@@ -185,7 +191,10 @@ def _frames(options: argparse.Namespace, headers: Mapping[Path, Header]) -> tupl
 
 
 def camera_frame(image: ImageArray, seed: int) -> ImageArray:
-    """A thresholded image as a camera might have seen it, in the middle of a grey 640x480 frame; frames stay."""
+    """Return a thresholded image as a camera frame: in the centre of a grey 640x480 frame.
+
+    Camera frames are unchanged.
+    """
     height, width = image.shape
     if (height, width) == FRAME_SIZE:
         return image
@@ -199,7 +208,7 @@ def camera_frame(image: ImageArray, seed: int) -> ImageArray:
 
 
 def write_simulated(folder: Path, images: int, seed: int = 0) -> None:
-    """A split of simulated grey camera frames, in the layout of the public data sets."""
+    """Write a split of simulated grey camera frames, in the layout of the public data sets."""
     (folder / IMAGE_FOLDER).mkdir(parents=True)
     renderer = FrameRenderer(seed=seed)
     with (folder / LABEL_FILES[0]).open("w", newline="") as stream:
@@ -212,7 +221,7 @@ def write_simulated(folder: Path, images: int, seed: int = 0) -> None:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """What a person reads of the measured rows."""
+    """Format the measured rows as text."""
     return "\n".join([*_error_lines(rows), "", *_cost_lines(rows), *_stage_lines(rows)])
 
 
@@ -232,12 +241,12 @@ def _error_lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
                 + f"{figures['nll']:>8.2f}"
             )
             for percent in ("68", "95"):
-                shares = figures["coverage"][percent]
-                yield f"  {'':<{width + 5}}" + "".join(f"{100 * shares[c]:>9.1f} %" for c in SCORE_NAMES)
+                fractions = figures["coverage"][percent]
+                yield f"  {'':<{width + 5}}" + "".join(f"{100 * fractions[c]:>9.1f} %" for c in SCORE_NAMES)
 
 
 def _cost_lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    yield "one thread, from a grey 640x480 frame unlike the one before; ms by the CPU and by the wall, median and p99"
+    yield "one thread, grey 640x480 frames that differ from the previous one; ms of CPU and wall time, median and p99"
     yield (
         f"{'':<22}{'runtime':<13}{'CPU':>7}{'p99':>7}{'wall':>7}{'p99':>7}{'again':>7}{'start s':>9}{'CPU s':>7}"
         f"{'MB':>7}{'peak':>7}{'training CPU s':>16}{'apart':>10}"
@@ -257,7 +266,7 @@ def _cost_lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 def _stage_lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     names = list(dict.fromkeys(name for row in rows for name in row["stages_ms"]))
-    yield "\nby stage, frames unlike the ones before; ms CPU, median and p99"
+    yield "\nby stage, frames that differ from the previous ones; ms CPU, median and p99"
     yield f"{'':<22}{'runtime':<13}" + "".join(f"{name:>16}" for name in names)
     for row in rows:
         stages = row["stages_ms"]

@@ -12,7 +12,7 @@ _MARKERS = {"onnxruntime": "o", "opencv": "v", "openvino": "s", "torch": "^", "o
 
 
 def write_run_time_against_error(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """MAE of each component over CPU time per camera frame, one point for each estimator and runtime."""
+    """Plot the MAE of each component over CPU time per camera frame, one point for each estimator and runtime."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import StrMethodFormatter
 
@@ -39,8 +39,8 @@ def write_run_time_against_error(path: Path, rows: Sequence[Mapping[str, Any]]) 
     figure.savefig(path, dpi=110)
 
 
-def write_reliability(path: Path, shares: Sequence[float], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Share of labels inside the predicted central intervals, over the share that was promised."""
+def write_reliability(path: Path, probabilities: Sequence[float], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Plot the fraction of labels inside the predicted central intervals over their nominal probability."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 8.5), layout="constrained")
@@ -48,9 +48,9 @@ def write_reliability(path: Path, shares: Sequence[float], rows: Sequence[Mappin
     for axes, component in zip(figure.subplots(2, 3).flat, SCORE_NAMES, strict=True):
         axes.plot([0, 1], [0, 1], color="black", lw=0.8)
         for name, row in reversed(first.items()):
-            axes.plot(shares, row["reliability"][component], "o-", ms=3, label=name)
+            axes.plot(probabilities, row["reliability"][component], "o-", ms=3, label=name)
         axes.set(title=component, xlabel="promised", ylabel="found", xlim=(0, 1), ylim=(0, 1), aspect="equal")
         axes.grid(alpha=0.3)
     figure.axes[0].legend(fontsize=8)
-    figure.suptitle("Reliability of the predicted sigmas: above the line too wide, below it too sure")
+    figure.suptitle("Reliability of the predicted sigmas: above the line too wide, below it overconfident")
     figure.savefig(path, dpi=110)

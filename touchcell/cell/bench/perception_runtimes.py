@@ -1,6 +1,6 @@
-"""Other libraries that can compute a contact network, to compare the product's own choice with.
+"""Alternative runtimes of a contact network, for comparison with the product's own.
 
-Each is given what it needs to be at its best on one thread and batches of one.
+Each is configured for best performance on one thread and batches of one.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from touchcell.perception.runtime.inference import Runner, onnx_runtime
 
 
 def openvino(model: Model) -> Runner:
-    """OpenVINO, tuned for latency, one stream on one thread."""
+    """Load the network in OpenVINO, tuned for latency, one stream on one thread."""
     from openvino import Core
 
     core = Core()
-    # Left to itself it computes in half precision where the processor can, which is another estimator.
+    # By default it computes in half precision where the processor can, which is another estimator.
     settings = {
         "PERFORMANCE_HINT": "LATENCY",
         "INFERENCE_NUM_THREADS": 1,
@@ -43,7 +43,7 @@ def openvino(model: Model) -> Runner:
 
 
 def torch(model: Model) -> Runner:
-    """PyTorch: traced, frozen, optimized for inference, channels last."""
+    """Load the network in PyTorch: traced, frozen, optimized for inference, channels last."""
     import torch as pytorch
     from torch.nn import functional
 
@@ -70,7 +70,7 @@ def torch(model: Model) -> Runner:
 
     example = pytorch.zeros(1, 1, *architecture.input_size)
     with warnings.catch_warnings(), pytorch.inference_mode():
-        # TorchScript is on its way out, and still the fastest that PyTorch offers without a minute of compiling.
+        # TorchScript is deprecated, and still the fastest in PyTorch without a minute of compiling.
         warnings.simplefilter("ignore")
         traced = pytorch.jit.trace(Folded().eval(), example)  # type: ignore[no-untyped-call]
         frozen = pytorch.jit.optimize_for_inference(pytorch.jit.freeze(traced))
@@ -84,7 +84,7 @@ def torch(model: Model) -> Runner:
 
 
 def opencv(model: Model) -> Runner:
-    """OpenCV's DNN module, which every serving process has loaded anyway."""
+    """Load the network in OpenCV's DNN module, which every serving process has loaded anyway."""
     import cv2
 
     network = cv2.dnn.readNetFromONNX(np.frombuffer(onnx_model(model), np.uint8))
@@ -106,10 +106,9 @@ RUNTIMES: dict[str, Callable[[Model], Runner]] = {
 
 
 def by_turns(model: Model, runtimes: Sequence[str], rounds: int) -> dict[str, dict[str, float]]:
-    """Milliseconds that the network alone takes in each runtime, all of them by turns in one process.
+    """Return milliseconds of the network alone in each runtime, all of them alternating in one process.
 
-    On a machine that does other work, processes one after the other meet different competition; runtimes that take
-    turns meet the same.
+    On a machine with other load, consecutive processes meet different competition; alternating runtimes meet the same.
     """
     architecture = model.header.architecture
     assert isinstance(architecture, Architecture)
@@ -125,5 +124,5 @@ def by_turns(model: Model, runtimes: Sequence[str], rounds: int) -> dict[str, di
 
 
 def installed() -> list[str]:
-    """The runtimes that are here."""
+    """Return the installed runtimes."""
     return [name for name in RUNTIMES if find_spec(name.replace("opencv", "cv2")) is not None]

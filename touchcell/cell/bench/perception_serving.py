@@ -1,7 +1,7 @@
-"""One estimator in one runtime, serving in a process of its own, as ``touchcell bench perception`` starts it.
+"""One estimator in one runtime in its own process, as started by ``touchcell bench perception``.
 
-Run as ``python -m touchcell.cell.bench.perception_serving MODEL RUNTIME FRAMES COUNT DATA SPLIT RESULT SPAWNED_NS``
-with ``--start-only`` behind it or not.
+Run as ``python -m touchcell.cell.bench.perception_serving MODEL RUNTIME FRAMES COUNT DATA SPLIT RESULT SPAWNED_NS
+[--start-only]``.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ FRAME_SIZE = (480, 640)
 THRESHOLD = AdaptiveThreshold(block_px=61, offset=-5.0)
 MEDIAN_PX = 5
 OWN = "own"
-"""Runtime of an estimator that is no single network: what the product runs it in."""
+"""Runtime of an estimator that is not a single network: the product's own."""
 
 
 def from_camera(preprocessing: Preprocessing) -> Preprocessing:
-    """The chain that takes a grey 640x480 frame, for a model that was taught images cut out and thresholded already.
+    """Return the preprocessing of a grey 640x480 frame for a model trained on cropped and thresholded images.
 
-    What comes before the model's own steps is the paper's chain (Lloyd & Lepora 2024, 3.1.3): a crop from the middle, a
-    5x5 median and an adaptive threshold. A model that was taught camera frames keeps its own chain.
+    The steps before the model's own are the paper's (Lloyd & Lepora 2024, 3.1.3): a central crop, a 5x5 median and an
+    adaptive threshold. A model that was trained on camera frames keeps its own preprocessing.
     """
     height, width = preprocessing.input_size
     if preprocessing.input_size == FRAME_SIZE or height > FRAME_SIZE[0] or width > FRAME_SIZE[1]:
@@ -59,7 +59,7 @@ def from_camera(preprocessing: Preprocessing) -> Preprocessing:
 
 
 def main(arguments: list[str]) -> None:
-    """Serve frames, then every image of a split, and leave the figures in RESULT (.npz).
+    """Serve frames, then every image of a split, and write the figures to RESULT (.npz).
 
     MODEL is a model file, RUNTIME one of ``perception_runtimes.RUNTIMES`` or ``OWN``, FRAMES a file of COUNT raw grey
     frames, DATA and SPLIT a data set, SPAWNED_NS the time.monotonic_ns() at which the process was started. With
@@ -126,7 +126,7 @@ def _estimator(model: Model, runtime: str) -> ContactEstimator:
 
 
 def _latency(estimator: ContactEstimator, frames: _Frames) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 2) nanoseconds by the wall and of the process's CPUs, for a frame unlike the one before and for it again."""
+    """Return (n, 2) nanoseconds of wall and CPU time, for a new frame and for its repetition."""
     times: list[list[tuple[int, int]]] = [[], []]
     for i in range(frames.count):
         image = frames.read(i)
@@ -138,8 +138,7 @@ def _latency(estimator: ContactEstimator, frames: _Frames) -> tuple[np.ndarray, 
 
 
 def _stages(estimator: ContactEstimator, frames: _Frames) -> dict[str, dict[str, float]]:
-    """Milliseconds of CPU time, median and p99, of the steps that ``predict`` is made of, for frames unlike the ones
-    before."""
+    """Return the CPU time in ms, median and p99, of the steps of ``predict``, for new frames."""
     times: dict[str, list[int]] = {}
 
     def timed(name: str, step: Callable[..., T], *arguments: Any) -> T:

@@ -1,4 +1,4 @@
-"""Where and when a benchmark was measured, and the environment in which it starts processes."""
+"""Provenance of a benchmark's figures, and the environment of the processes that it starts."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ __all__ = ["as_installed", "provenance"]
 
 
 def as_installed(folder: Path) -> dict[str, str]:
-    """Environment of a process that finds its modules compiled, as an installed package's are, in ``folder``."""
+    """Return an environment in which a process finds its modules byte-compiled in ``folder``, as if installed."""
     inherited = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     return {**inherited, "PYTHONPYCACHEPREFIX": str(folder / "bytecode")}

@@ -1,4 +1,4 @@
-"""Median and 99th percentile, as the benchmarks print them."""
+"""Median and 99th percentile for benchmark tables."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ from touchcell.geometry.types import Array
 
 
 def median_and_p99(values: Sequence[float] | Array, unit: float = 1.0) -> dict[str, float]:
-    """``median`` and ``p99`` of some values, times ``unit``."""
+    """Return ``median`` and ``p99`` of some values, times ``unit``."""
     return {"median": unit * float(np.median(values)), "p99": unit * float(np.percentile(values, 99))}

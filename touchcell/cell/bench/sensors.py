@@ -1,8 +1,8 @@
-"""``touchcell bench sensors``: several sensors in one cell, in real time: how old their estimates are, and who starves.
+"""``touchcell bench sensors``: several sensors in one cell in real time: age of their estimates, and starvation.
 
 Cameras play recorded JPEG frames of 640x480 px, as fast as real ones and decoded when they are read. One control loop
-at 100 Hz reads all of them. It either perceives in its own thread, as the product does, or reads what one worker thread
-for each sensor has left. An estimate's age is counted from the exposure of its frame until the loop has it in hand.
+at 100 Hz reads all of them. It either perceives in its own thread, as the product does, or reads the results of one
+worker thread per sensor. An estimate's age is counted from the exposure of its frame until the loop has read it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _WARM_UP_S = 0.5
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Print the table; writes ``sensors.json`` into ``out``."""
+    """Print the table; write ``sensors.json`` into ``out``."""
     parser = argparse.ArgumentParser("touchcell bench sensors --", description=__doc__.partition("\n")[0])
     parser.add_argument("--sensors", type=int, nargs="+", default=[1, 2], help="how many")
     parser.add_argument("--rates", type=float, nargs="+", default=[30.0, 60.0], help="frames per second of each")
@@ -65,13 +65,13 @@ def run(arguments: Sequence[str], out: Path) -> None:
                     row = measure(Path(folder), count, rate_hz, options.seconds, options.model, workers=workers)
                     rows.append(row)
                     print(_line(row), flush=True)
-    print("ages of the sensor that fares worst; late: cycles longer than their 10 ms; CPU: of one core")
+    print("ages of the worst sensor; late: cycles longer than their 10 ms; CPU: of one core")
     report = {**provenance(), "load_average": os.getloadavg()[0], "rows": rows}
     (out / "sensors.json").write_text(json.dumps(report, indent=1) + "\n")
 
 
 def measure(frames: Path, sensors: int, rate_hz: float, seconds: float, model: str, *, workers: bool) -> dict[str, Any]:
-    """Run one cell with that many sensors for that long; the figures of a row of the table."""
+    """Run one cell with that many sensors for that long; return a row of the table."""
     stop = StopRequest()
     fresh: dict[str, list[float]] = {}
     ages: dict[str, list[float]] = {}
@@ -125,7 +125,7 @@ def _line(row: dict[str, Any]) -> str:
 
 
 def _write_frames(folder: Path, n: int) -> None:
-    """JPEG camera frames of simulated contacts; the same few over and over."""
+    """Write JPEG camera frames of simulated contacts; the same few repeatedly."""
     renderer = FrameRenderer()
     kinds = [
         cv2.imencode(".jpg", renderer.raw(contact.pixels, i))[1].tobytes()
@@ -136,7 +136,7 @@ def _write_frames(folder: Path, n: int) -> None:
 
 
 def _cell(frames: Path, sensors: int, rate_hz: float, model: str) -> Cell:
-    """A cell that only looks, with as many sensors as wanted: more than its task asks for."""
+    """Return an observing cell with any number of sensors: more than its task asks for."""
     estimator = {
         "kind": "network",
         "model": model,
@@ -163,8 +163,8 @@ def _cell(frames: Path, sensors: int, rate_hz: float, model: str) -> Cell:
     )
 
 
-class _Worker(threading.Thread):
-    """Perceives in a thread of its own, as soon as there is a frame; the loop takes what is there."""
+class _Worker(threading.Thread, ContactSource):
+    """Perceives in its own thread, as soon as there is a frame; the loop reads the latest result."""
 
     def __init__(self, source: ContactSource, clock: Clock) -> None:
         super().__init__(daemon=True)
@@ -187,7 +187,7 @@ class _Worker(threading.Thread):
         return self._newest
 
     def run(self) -> None:
-        """Look for a new frame every half millisecond."""
+        """Poll for a new frame every half millisecond."""
         try:
             while not self._finished.wait(_POLL_S):
                 self._newest = self._source.update(self._clock.now_ns())

@@ -82,12 +82,12 @@ def calibrate_sim(
     training = read_split(data, "train")
     with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
         told = _teller(bar)
-        markers = learn_sensor(data, images=images, rings=rings, guess_steps=guess_steps, seed=seed, told=told)
+        markers = learn_sensor(data, images=images, rings=rings, guess_steps=guess_steps, seed=seed, progress=told)
         chosen = evenly(len(training.images), frames)
         rest = np.setdiff1d(np.arange(len(training.images)), chosen)
         others = rest[evenly(len(rest), _HELD_OUT)]
         contacts, fitted_to = markers.contacts(training, np.array(chosen), told)
-        sensor = fit_tip(contacts, markers.reference, rings, told=lambda done, total: told("fitted", done, total))
+        sensor = fit_tip(contacts, markers.reference, rings, progress=lambda done, total: told("fitted", done, total))
         sensor = replace(sensor, tip=replace(sensor.tip, disc_radius_px=markers.disc_radius_px))
         held_out, shown = markers.contacts(training, others, told)
         sets = {"fitted to": contacts, "train, held out": held_out}

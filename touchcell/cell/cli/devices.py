@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from touchcell import compiled
 from touchcell.cell.cli import discovery
 from touchcell.cell.cli.discovery import Found
 from touchcell.cell.config.schema import CellPlan, plan_cell
@@ -49,6 +50,8 @@ def print_devices() -> None:
             print(f"  {device.address}{at}: {device.description}")
             for need in device.needs:
                 print(f"    {need}")
+    for line in compiled.missing():
+        print(line)
 
 
 def probe_cell(path: Path) -> list[Probe]:

@@ -99,13 +99,15 @@ class CellEmulator(Emulator):
     Args:
         plan: the cell.
         folder: where the cameras' sockets live.
+        command: runs the cell on it; printed once everything has started.
 
     Raises:
         ConfigError: the cell has no ``emulated_scene:``, or a device that this cannot emulate.
     """
 
-    def __init__(self, plan: CellPlan, folder: Path) -> None:
+    def __init__(self, plan: CellPlan, folder: Path, command: str = "") -> None:
         super().__init__()
+        self._command = command
         if plan.cell.emulated_scene is None:
             raise ConfigError("there is nothing to touch", key="emulated_scene", hint="describe it as a `scene:`")
         self._scene_config = SceneConfig.model_validate(plan.cell.emulated_scene)
@@ -137,6 +139,8 @@ class CellEmulator(Emulator):
         self._ticker = Ticker(scene.timeline.step_ns, lambda late: _advance(scene))
         for camera in self._cameras.values():
             await camera.start()
+        if self._command:
+            print(self._command, file=sys.stderr)
 
     async def stop(self) -> None:
         for camera in self._cameras.values():
@@ -217,9 +221,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def build(arguments: argparse.Namespace) -> CellEmulator:
-    """Make the emulator, not yet started, and tell how to run the cell on it."""
-    file = find_cell(arguments.cell)
-    emulator = CellEmulator(plan_cell(file), arguments.folder)
+    """Make the emulator, not yet started; once started it prints how to run the cell on it."""
     variables = [f"{key}={value}" for key, value in environment(arguments.folder).items()]
-    print(shlex.join(["env", *variables, "touchcell", "run", str(arguments.cell)]), file=sys.stderr)
-    return emulator
+    command = shlex.join(["env", *variables, "touchcell", "run", str(arguments.cell)])
+    return CellEmulator(plan_cell(find_cell(arguments.cell)), arguments.folder, command)

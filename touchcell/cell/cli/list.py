@@ -5,13 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from touchcell import compiled
 from touchcell.cell.bench.catalog import benchmark_names
 from touchcell.cell.experiments.runner import EXPERIMENTS
+from touchcell.cell.experiments.trials import EXECUTORS
 from touchcell.control.interlocks.spec import INTERLOCKS
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
+from touchcell.perception.runtime.estimator_spec import ESTIMATORS
+from touchcell.perception.runtime.filter_spec import FILTERS
 from touchcell.registry import Registry
+from touchcell.simulation.shape_spec import OBJECTS, SURFACES
 from touchcell.tasks.interface import TASKS
 from touchcell.testing.emulation.launcher import EMULATORS
 
@@ -26,11 +31,16 @@ def listing() -> dict[str, list[tuple[str, str]]]:
             ("missing", "every arm and sensor is in the view; always on"),
             *_rows(INTERLOCKS),
         ],
+        "estimators": _rows(ESTIMATORS),
+        "filters": _rows(FILTERS),
+        "surfaces": _rows(SURFACES),
+        "objects": _rows(OBJECTS),
         "emulators": [(name, "") for name in EMULATORS.names()],
         "experiments": _rows(EXPERIMENTS),
+        "executors": _rows(EXECUTORS),
         "benchmarks": [(name, "") for name in benchmark_names()],
         "cells that ship": [(f"configs/{path.name}", _first_comment(path)) for path in _shipped()],
-    }
+    } | ({"missing": [(line, "") for line in lines]} if (lines := compiled.missing()) else {})
 
 
 def _rows(registry: Registry[Any]) -> list[tuple[str, str]]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from touchcell.cell.analysis.report import write_report
-from touchcell.cell.cli.exit_codes import EXIT_LOST, EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
+from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
 from touchcell.cell.cli.output import say, warn
 from touchcell.cell.config.schema import CellPlan, plan_cell
 from touchcell.cell.recording.mcap import RECORDING, Recorder
@@ -30,8 +30,12 @@ from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.errors import TouchcellError
+from touchcell.logs import log_to_file
 
-logger = logging.getLogger(__name__)
+_logger = logging.getLogger(__name__)
+
+LOG = "run.log"
+"""Name of the log file in a run folder."""
 
 _EXIT = {
     Outcome.DONE: EXIT_OK,
@@ -62,7 +66,7 @@ class FinishedRun:
     def exit_code(self) -> int:
         """Exit code of ``touchcell run``."""
         if self.result.lost or isinstance(self.leaving, DeviceError):
-            return EXIT_LOST
+            return EXIT_DEVICE_LOST
         code = _EXIT[self.result.outcome]
         return EXIT_TASK_FAILED if code == EXIT_OK and self.leaving is not None else code
 
@@ -119,13 +123,17 @@ def run_plan(plan: CellPlan, *, out: Path | None = None, live: bool = False) -> 
     folder = out or Path("runs") / f"{plan.cell.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "cell.yaml").write_text(plan.text())
-    try:
-        result, leaving = _run(cell, folder, live)
-    except FolderInUse:
-        raise
-    except Exception as error:
-        _write_result(folder, _not_started_json(plan, error))
-        raise
+    with log_to_file(folder / LOG):
+        _logger.info("%s: task %s of %s, in %s", plan.cell.name, plan.task.name, plan.file, folder)
+        try:
+            result, leaving = _run(cell, folder, live)
+        except FolderInUse:
+            raise
+        except Exception as error:
+            _write_result(folder, _not_started_json(plan, error))
+            raise
+        ended = f"{result.outcome.value} after {result.duration_s:.2f} s"
+        _logger.info("%s: %s%s", plan.cell.name, ended, f" ({result.reason})" if result.reason else "")
     return FinishedRun(result, folder, _report(folder), leaving)
 
 
@@ -147,7 +155,7 @@ def _run(cell: Cell, folder: Path, live: bool) -> tuple[RunResult, Exception | N
     except Exception as error:
         if result is None:
             raise
-        logger.exception("after the run")
+        _logger.exception("after the run")
         warn(f"after the run: {error}")
         _write_result(folder, {**_result_json(cell.plan, result), "after_the_run": str(error)})
         return result, error
@@ -208,7 +216,7 @@ def _dump(box: BlackBox, folder: Path, cell: Cell, result: RunResult) -> None:
         }
         box.dump(folder, result, about)
     except Exception as error:
-        logger.exception("no black box")
+        _logger.exception("no black box")
         # What happened is reported all the same.
         warn(f"no black box: {error}")
 

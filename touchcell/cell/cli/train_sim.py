@@ -31,7 +31,7 @@ from touchcell.simulation.tip import Tip, TipParameters
 from touchcell.simulation.tip_file import TipFile, load_tip
 
 if TYPE_CHECKING:
-    from touchcell.perception.networks.marker_training import MarkedContacts
+    from touchcell.perception.networks.marker_training import LabelledDiscs
 
 PREPROCESSING = Preprocessing(
     input_size=(FRAME_SIZE[1], FRAME_SIZE[0]),
@@ -170,9 +170,9 @@ def _train_markers(
     )
 
 
-def _discs(imagined: Imagined, samples: int, seed: int) -> MarkedContacts:
+def _discs(imagined: Imagined, samples: int, seed: int) -> LabelledDiscs:
     """Discs of simulated frames, without the frames."""
-    from touchcell.perception.networks.marker_training import MarkedContacts
+    from touchcell.perception.networks.marker_training import LabelledDiscs
 
     height, width = PUBLIC_SIZE
     frames, labels = [], []
@@ -182,7 +182,7 @@ def _discs(imagined: Imagined, samples: int, seed: int) -> MarkedContacts:
         whole = ((centres >= reach) & (centres <= np.array([width, height]) - 1.0 - reach)).all(axis=1)
         frames.append(Discs(centres[whole], np.full(int(whole.sum()), np.pi * reach**2)))
         labels.append(contact.T_f_s)
-    return MarkedContacts(frames, se3.log(se3.inverse(np.stack(labels))))
+    return LabelledDiscs(frames, se3.log(se3.inverse(np.stack(labels))))
 
 
 def draw(samples: int, seed: int, split: str, observer: Observer, imagined: Imagined | None = None) -> LabelledImages:

@@ -6,7 +6,7 @@ task fit, and says which devices the task does not need, so that they are not ev
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -14,24 +14,25 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, PositiveFloat, Tag, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
 from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile
 from touchcell.control.interlocks.basic import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
-from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_TOUCH, InterlocksConfig
+from touchcell.control.interlocks.config import REQUIRED_TO_MOVE, REQUIRED_TO_READ, REQUIRED_TO_TOUCH, InterlocksConfig
 from touchcell.control.interlocks.spec import INTERLOCKS
 from touchcell.control.interlocks.violation import Severity
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.device import DeactivatePolicy
-from touchcell.drivers.core.protocols import JointSource, TwistSink, protocol_names
+from touchcell.drivers.core.protocols import JointSource, ReadingSource, TwistSink, protocol_names
 from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DRIVERS, AnyDriver, DriverConfig
 from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.perception.runtime.estimator_spec import EstimatorSection
 from touchcell.tasks.interface import TASKS, AnyTask, TaskConfig
 
 M = TypeVar("M", bound=BaseModel)
@@ -47,83 +48,6 @@ class _OpenSection(BaseModel):
     """A section whose other keys belong to the driver or task that it names."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
-
-
-class StillSurfaceSection(_Section):
-    """The SE(3) Bayesian filter: how fast certainty is lost when no frame comes (slip, curvature)."""
-
-    model: Literal["still_surface"] = "still_surface"
-    drift_mm_per_sqrt_s: PositiveFloat
-    drift_deg_per_sqrt_s: PositiveFloat
-
-
-class MovingSurfaceSection(_Section):
-    """The filter that also estimates the surface's velocity, for surfaces that move steadily.
-
-    ``speed_*`` is how fast a surface may be when it is first touched (one standard deviation), ``accel_*`` how fast its
-    velocity stops being known.
-    """
-
-    model: Literal["moving_surface"]
-    drift_mm_per_sqrt_s: PositiveFloat
-    drift_deg_per_sqrt_s: PositiveFloat
-    speed_mm_s: PositiveFloat
-    speed_deg_s: PositiveFloat
-    accel_mm_s_per_sqrt_s: PositiveFloat
-    accel_deg_s_per_sqrt_s: PositiveFloat
-
-
-def _filter_model(value: Any) -> str | None:
-    """Which model a filter section means: a file that names none means a still surface."""
-    if isinstance(value, Mapping):
-        return str(value.get("model", "still_surface"))
-    return getattr(value, "model", None)
-
-
-FilterSection = Annotated[
-    Annotated[StillSurfaceSection, Tag("still_surface")] | Annotated[MovingSurfaceSection, Tag("moving_surface")],
-    Discriminator(
-        _filter_model,
-        custom_error_type="filter_model",
-        custom_error_message="must say `model: still_surface` or `model: moving_surface`",
-    ),
-]
-
-
-class GateSection(_Section):
-    """The contact gate: mean marker-image change, in per cent, that begins and ends a contact."""
-
-    touch_percent: PositiveFloat
-    release_percent: PositiveFloat
-
-
-class NetworkEstimator(_Section):
-    """Image -> network -> filter. ``calibration`` is a file of ``touchcell calibrate``."""
-
-    kind: Literal["network"]
-    model: str
-    calibration: str | None = None
-    gate: GateSection | None = None
-    filter: FilterSection | None = None
-
-
-class TrueContact(_Section):
-    """The simulator's own contact state, to see control error apart from estimation error."""
-
-    kind: Literal["true_contact"]
-
-
-class KnownSurface(_Section):
-    """The contact from the arm's pose over a surface that stands where the file says, for collecting labels.
-
-    ``surface_mm_deg`` is where the sensor frame is, in the arm's base, when it just touches the surface, upright.
-    """
-
-    kind: Literal["known_surface"]
-    surface_mm_deg: Six
-
-
-EstimatorSection = Annotated[NetworkEstimator | TrueContact | KnownSurface, Field(discriminator="kind")]
 
 
 class CapsuleSection(_Section):
@@ -186,12 +110,26 @@ class SensorSection(_OpenSection):
         return se3.from_euler_mm_deg(self.tcp_to_sensor_mm_deg)
 
 
+class DeviceSection(_OpenSection):
+    """A device that is neither an arm nor a tactile sensor, as a force-torque sensor or a gripper: its driver, the arm
+    that carries it, what happens when it is deactivated, and the driver's own keys.
+    """
+
+    driver: str
+    mounted_on: str | None = None
+    deactivate: DeactivatePolicy = DeactivatePolicy.HOLD
+
+
 class TaskSection(_OpenSection):
-    """The task, which arms and sensors play its roles, and the task's own keys; ``steps:`` alone names the task too."""
+    """The task, which arms, sensors and devices play its roles, and the task's own keys.
+
+    ``steps:`` alone names the task too.
+    """
 
     name: str
     arms: dict[str, str] = {}
     sensors: dict[str, str] = {}
+    devices: dict[str, str] = {}
 
     @model_validator(mode="before")
     @classmethod
@@ -246,6 +184,7 @@ class CellFile(_Section):
     obstacles: dict[str, BoxSection] = {}
     arms: dict[str, ArmSection] = {}
     sensors: dict[str, SensorSection] = {}
+    devices: dict[str, DeviceSection] = {}
     pairs: tuple[PairSection, ...] = ()
     interlocks: InterlocksConfig = {}
     on_trip: Literal["end", "wait_for_reset"] = "end"
@@ -279,6 +218,8 @@ class CellPlan:
         stopping_distances: by the name of a workspace or clearance, how far its arm gets beyond it, or the two fastest
             arms towards each other, before they stand.
         settings: values that were set in place of the file's own, by dotted key.
+        auxiliaries: other devices that the task needs or that are read, by name in the cell.
+        auxiliary_roles: role in the task -> name in the cell; a device without a role has its own name as role.
     """
 
     file: Path
@@ -293,10 +234,17 @@ class CellPlan:
     devices: Mapping[str, DevicePlan]
     stopping_distances: Mapping[str, StoppingDistance] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
+    auxiliaries: Mapping[str, DevicePlan] = field(default_factory=dict)
+    auxiliary_roles: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        devices = [f"{name} {device.spec.name}" for name, device in {**self.arms, **self.sensors}.items()]
+        devices = [f"{name} {device.spec.name}" for name, device in self.built.items()]
         return f"<CellPlan {self.cell.name!r}: task {self.task.name}, {', '.join(devices)}>"
+
+    @property
+    def built(self) -> Mapping[str, DevicePlan]:
+        """Every device that is built, each after those that it may depend on."""
+        return {**self.arms, **self.sensors, **self.auxiliaries}
 
     def text(self) -> str:
         """The cell file as it is planned: the file itself, or YAML of what comes of it and of what it extends."""
@@ -349,18 +297,30 @@ class _Planner:
         task, task_config = self._task(cell)
         arm_roles = self._roles(cell, "arms", task.arms, cell.arms) if task else {}
         sensor_roles = self._roles(cell, "sensors", task.sensors, cell.sensors) if task else {}
+        auxiliary_roles = self._roles(cell, "devices", task.devices, cell.devices) if task else {}
+        others = {name: plan for name in cell.devices if (plan := self._auxiliary(cell, name))}
+        auxiliaries = {
+            name: plan
+            for name, plan in others.items()
+            if name in auxiliary_roles.values() or ReadingSource in plan.spec.capabilities.provides
+        }
+        auxiliary_roles |= {name: name for name in auxiliaries if name not in auxiliary_roles.values()}
         needed_sensors = set(sensor_roles.values())
-        mounts = {cell.sensors[name].mounted_on for name in needed_sensors} - {None}
-        needed_arms = set(arm_roles.values()) | mounts
+        carried = [cell.sensors[name] for name in needed_sensors] + [cell.devices[name] for name in auxiliaries]
+        needed_arms = set(arm_roles.values()) | {section.mounted_on for section in carried} - {None}
         devices = {name: plan for name in cell.arms if (plan := self._arm(cell, name))}
         devices |= {name: plan for name in cell.sensors if (plan := self._sensor(cell, name))}
         arms = {name: plan for name, plan in devices.items() if name in needed_arms}
         sensors = {name: plan for name, plan in devices.items() if name in needed_sensors}
+        devices |= others
+        self._require_names(cell)
         if task:
             self._require_collection(cell, task)
-            self._require_protocols(task, arm_roles, arms)
+            self._require_protocols(task, "arms", task.arms, arm_roles, arms)
+            self._require_protocols(task, "devices", task.devices, auxiliary_roles, others)
             self._require_interlocks(cell, task)
             self._require_processes(cell, task, arm_roles)
+            self._require_data_is_used(cell, {**arms, **sensors})
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
         self._require_pairs(cell)
         stopping_distances = self._require_margins(cell, arm_roles, sensor_roles, arms)
@@ -368,7 +328,7 @@ class _Planner:
             raise InvalidCell(self._problems)
         assert task is not None
         assert task_config is not None
-        skipped = sorted((set(cell.arms) - set(arms)) | (set(cell.sensors) - set(sensors)))
+        skipped = sorted({*cell.arms, *cell.sensors, *cell.devices} - {*arms, *sensors, *auxiliaries})
         return CellPlan(
             file.path,
             cell,
@@ -382,6 +342,8 @@ class _Planner:
             devices,
             stopping_distances,
             self._settings,
+            auxiliaries,
+            auxiliary_roles,
         )
 
     def _require_scene_fits(self, cell: CellFile) -> None:
@@ -399,7 +361,7 @@ class _Planner:
         return spec, self._validated(spec.config, cell.task.model_extra or {}, ("task",))
 
     def _roles(
-        self, cell: CellFile, kind: str, roles: Any, devices: Mapping[str, ArmSection] | Mapping[str, SensorSection]
+        self, cell: CellFile, kind: str, roles: Collection[str], devices: Mapping[str, _OpenSection]
     ) -> dict[str, str]:
         """Role -> device name. A role that the file does not assign goes to the device of the same name."""
         assigned: dict[str, str] = getattr(cell.task, kind)
@@ -436,32 +398,51 @@ class _Planner:
 
     def _sensor(self, cell: CellFile, name: str) -> DevicePlan | None:
         section = cell.sensors[name]
-        if section.mounted_on is not None and section.mounted_on not in cell.arms:
+        self._require_mount(cell, ("sensors", name), section.mounted_on)
+        if section.estimator.needs_truth and cell.scene is None:
             self._add(
-                ("sensors", name, "mounted_on"),
-                f"there is no arm {section.mounted_on!r}",
-                value=section.mounted_on,
-                hint=suggest(section.mounted_on, sorted(cell.arms)),
+                ("sensors", name, "estimator"), f"{section.estimator.kind} needs a `scene:`", hint="use kind: network"
             )
-        if section.estimator.kind == "true_contact" and cell.scene is None:
-            self._add(("sensors", name, "estimator"), "true_contact needs a `scene:`", hint="use kind: network")
         shared = {"mounted_on": section.mounted_on, "tcp_to_sensor_mm_deg": section.tcp_to_sensor_mm_deg}
         return self._device(cell, ("sensors", name), section, shared, "camera")
+
+    def _auxiliary(self, cell: CellFile, name: str) -> DevicePlan | None:
+        section = cell.devices[name]
+        self._require_mount(cell, ("devices", name), section.mounted_on)
+        shared = {"mounted_on": section.mounted_on, "deactivate": section.deactivate}
+        return self._device(cell, ("devices", name), section, shared, None)
+
+    def _require_mount(self, cell: CellFile, at: tuple[str, str], arm: str | None) -> None:
+        if arm is not None and arm not in cell.arms:
+            self._add((*at, "mounted_on"), f"there is no arm {arm!r}", value=arm, hint=suggest(arm, sorted(cell.arms)))
+
+    def _require_names(self, cell: CellFile) -> None:
+        """A device is known by its name alone, to drivers and in messages."""
+        taken: set[str] = set()
+        for kind in ("arms", "sensors", "devices"):
+            for name in getattr(cell, kind):
+                if name in taken:
+                    self._add(
+                        (kind, name), "another device has this name", value=name, hint="give it a name of its own"
+                    )
+                taken.add(name)
 
     def _device(
         self,
         cell: CellFile,
         at: tuple[str, str],
-        section: ArmSection | SensorSection,
+        section: ArmSection | SensorSection | DeviceSection,
         shared: Mapping[str, Any],
-        kind: str,
+        kind: str | None,
     ) -> DevicePlan | None:
         try:
             spec = DRIVERS.load(section.driver)
         except ConfigError as error:
             self._add((*at, "driver"), error.reason, value=section.driver, hint=error.hint)
             return None
-        if spec.capabilities.kind != kind:
+        if kind is None and spec.capabilities.kind == "arm":
+            self._add((*at, "driver"), f"{spec.name} drives an arm", value=spec.name, hint="list it under `arms:`")
+        if kind is not None and spec.capabilities.kind != kind:
             self._add(
                 (*at, "driver"),
                 f"{spec.name} drives {_a(spec.capabilities.kind)}, not {_a(kind)}",
@@ -483,6 +464,8 @@ class _Planner:
         required = REQUIRED_TO_MOVE if moves else frozenset()
         if moves and task.sensors:
             required |= REQUIRED_TO_TOUCH
+        if moves and any(ReadingSource in protocols for protocols in task.devices.values()):
+            required |= REQUIRED_TO_READ
         stopping = {entry.kind for entry in cell.interlocks.values() if entry.level is not Severity.LIMIT}
         for kind in sorted(required - stopping):
             self._add(
@@ -490,6 +473,20 @@ class _Planner:
                 f"no interlock of kind {kind!r} that stops, which a task that moves an arm must have",
                 hint=f"add one: {INTERLOCKS.load(kind).summary}",
             )
+
+    def _require_data_is_used(self, cell: CellFile, devices: Mapping[str, DevicePlan]) -> None:
+        """A data set that is given is there, and something reads it or writes it."""
+        data = self._overrides.get("data")
+        if data is None or cell.collect is not None:
+            return
+        readers = [name for name, device in devices.items() if "data" in type(device.config).model_fields]
+        if not readers:
+            reason, hint = "no driver of this cell replays a data set", "leave out --data"
+        elif not Path(data).is_dir():
+            reason, hint = f"{data}: there is no such folder", f"{', '.join(readers)} would replay it"
+        else:
+            return
+        self._problems.append(ConfigError(reason, key="--data", value=data, hint=hint))
 
     def _require_processes(self, cell: CellFile, task: AnyTask, arm_roles: Mapping[str, str]) -> None:
         """What devices in other processes cannot do is not asked of them."""
@@ -597,17 +594,24 @@ class _Planner:
             )
         return both
 
-    def _require_protocols(self, task: AnyTask, arm_roles: Mapping[str, str], arms: Mapping[str, DevicePlan]) -> None:
-        for role, protocols in task.arms.items():
-            name = arm_roles.get(role)
-            if name is None or name not in arms:
+    def _require_protocols(
+        self,
+        task: AnyTask,
+        kind: str,
+        needed: Mapping[str, frozenset[type]],
+        names: Mapping[str, str],
+        devices: Mapping[str, DevicePlan],
+    ) -> None:
+        for role, protocols in needed.items():
+            name = names.get(role)
+            if name is None or name not in devices:
                 continue
-            missing = protocols - arms[name].spec.capabilities.provides
+            missing = protocols - devices[name].spec.capabilities.provides
             if missing:
                 self._add(
-                    ("arms", name, "driver"),
-                    f"{arms[name].spec.name} does not provide {protocol_names(missing)}, which {task.name} needs",
-                    value=arms[name].spec.name,
+                    (kind, name, "driver"),
+                    f"{devices[name].spec.name} does not provide {protocol_names(missing)}, which {task.name} needs",
+                    value=devices[name].spec.name,
                     hint="choose another driver; `touchcell list` names all",
                 )
 

@@ -1,1 +1,1 @@
-"""The paper's experiments (section 5), one module each; ``touchcell.cell.experiments.runner`` runs them."""
+"""Experiments of the paper (section 5), one module each; ``touchcell.cell.experiments.runner`` runs them."""

@@ -1,4 +1,4 @@
-"""``touchcell run|report ... --animate``: a run as a small moving picture, made from its recording."""
+"""``touchcell run|report ... --animate``: an animated GIF of a run, made from its recording."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _FRAMES_PER_S = 12
 _COLOURS = 128
 _TIP_COLOURS = ("#4c72b0", "#dd8452", "#55a868")
 _BODY_COLOUR, _OBJECT_COLOUR, _TABLE_COLOUR, _TARGET_COLOUR = "#e8e8e8", "#e5c494", "#bfb8ae", "#d62728"
-# Over the tips, so that a tip looks pressed flat where it is.
+# Above the tips, so that a pressed tip appears flattened.
 _TOUCHED = 3
 _MARGIN_MM = 45.0
 
@@ -45,7 +45,7 @@ Images = Callable[[float], ImageArray]
 
 @dataclass(frozen=True)
 class _Shown:
-    """What there is to be seen: poses over time, by name."""
+    """Poses over time of everything that is drawn, by name."""
 
     run: RunFolder
     scene: SceneConfig
@@ -54,7 +54,7 @@ class _Shown:
     images: Mapping[str, Images]
 
     def extent_mm(self, view: View) -> Array:
-        """(2, 2) least and greatest coordinates of everything that moves."""
+        """Return (2, 2) smallest and largest coordinates of everything that moves."""
         points = [1e3 * poses.T_world[:, list(view), 3] for poses in (*self.tips.values(), *self.objects.values())]
         every = np.concatenate([np.reshape(each, (-1, 2)) for each in points])
         tall = max((1e3 * config.shape.build().height_m for config in self.scene.objects.values()), default=0.0)
@@ -63,20 +63,20 @@ class _Shown:
 
 
 def animate(folder: Path, *, max_frames: int = 90) -> Path:
-    """Write ``animation.gif`` into a run's folder, from above and from the side, with what each sensor sees.
+    """Write ``animation.gif`` into a run's folder: top and side view, and the image of each sensor.
 
-    Tactile images are the recorded ones; where none were recorded, they are drawn from the true contact.
+    Tactile images are the recorded ones; where none were recorded, they are rendered from the true contact.
 
     Args:
         folder: of a run in a simulated scene.
-        max_frames: the run is shown as fast as these allow, and never slower than it was.
+        max_frames: largest number of frames; the run is never shown slower than real time.
 
     Raises:
         RecordingError, ConfigError: the folder holds no run, or one of real devices.
     """
     run = RunFolder(folder)
     if run.plan.cell.scene is None:
-        raise ConfigError("only a simulated run can be animated: nobody knows where things were", key="scene")
+        raise ConfigError("only a simulated run can be animated: the true poses are unknown", key="scene")
     names = {name: role for role, name in run.plan.sensor_roles.items()}
     roles = [names[name] for name in run.plan.cell.sensors if name in names]
     shown = _Shown(
@@ -90,7 +90,7 @@ def animate(folder: Path, *, max_frames: int = 90) -> Path:
     start_s, end_s = float(poses.t_s[0]), float(poses.t_s[-1])
     count = max(2, min(max_frames, round((end_s - start_s) * _FRAMES_PER_S)))
     path = folder / "animation.gif"
-    # The first frame is encoded with those after it, and the last one stays for a while.
+    # The first frame is encoded with the following ones, and the last one is shown longer.
     pictures = list(_pictures(shown, np.linspace(start_s, end_s, count)))
     pause_ms = [1000 // _FRAMES_PER_S] * (count - 1) + [1500]
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=pause_ms, loop=0, optimize=True)
@@ -108,10 +108,10 @@ def _pictures(shown: _Shown, times_s: Array) -> Iterator[Image]:
         for t_s in times_s:
             stage.show(float(t_s))
             canvas.draw()
-            # What has been laid out once stays there.
+            # The layout is computed once.
             figure.set_layout_engine("none")
             picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-            # One palette for all, so that what stands still is the same in every frame and costs nothing.
+            # One palette for all, so that static parts are identical in every frame and take no space.
             palette = palette or picture.quantize(_COLOURS)
             yield picture.quantize(palette=palette, dither=Image.Dither.NONE)
     finally:
@@ -119,7 +119,7 @@ def _pictures(shown: _Shown, times_s: Array) -> Iterator[Image]:
 
 
 class _Stage:
-    """The figure: what stands still is drawn once, what moves is taken away and drawn again."""
+    """The figure: static parts are drawn once, moving ones are removed and redrawn."""
 
     def __init__(self, shown: _Shown, figure: Any, *, faster: float) -> None:
         self._shown = shown
@@ -147,7 +147,7 @@ class _Stage:
         self._draw_still()
 
     def show(self, t_s: float) -> None:
-        """Draw what is so at ``t_s``."""
+        """Draw the state at ``t_s``."""
         while self._moving:
             self._moving.pop().remove()
         shown, radius_m = self._shown, 1e-3 * self._shown.scene.tip.radius_mm
@@ -201,7 +201,7 @@ class _Stage:
                 self._moving += self._draw_profile(config.build(), t_s)
 
     def _draw_profile(self, surface: Any, t_s: float) -> list[Artist]:
-        """A surface from the side, below the first tip."""
+        """Draw a surface from the side, below the first tip."""
         axis = self._views[SIDE]
         T_world_s = next(iter(self._shown.tips.values())).at(np.array([t_s]))[0]
         low = axis.get_ylim()[0]
@@ -219,7 +219,7 @@ class _Stage:
 
 
 def _tactile(run: RunFolder, role: str) -> Images | None:
-    """What a sensor sees at any time of the scene; None where nothing tells."""
+    """Return a function from scene time to a sensor's image; None where neither images nor contacts are known."""
     topic = f"/sensors/{role}/image"
     recorded = [message for message in read(run.path / "run.mcap") if message.topic == topic]
     if recorded:

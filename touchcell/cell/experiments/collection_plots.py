@@ -1,4 +1,4 @@
-"""What was collected, to be looked at."""
+"""Plot of collected samples."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from touchcell.drivers.replay.dataset import Split, read_image
 
 
 def plot_samples(split: Split, path: Path, *, count: int = 8) -> Path:
-    """The first frames of a split with their labels."""
+    """Plot the first frames of a split with their labels."""
     figure, axes = plt.subplots(2, count // 2, figsize=(2.6 * count // 2, 6), layout="constrained")
     for axis, image, label in zip(axes.flat, split.images, split.contact_mm_deg, strict=False):
         axis.imshow(read_image(image), cmap="gray")

@@ -1,7 +1,7 @@
-"""Data collection (paper 5.2, Algorithm 1): touch a plane in many ways, train on what was seen, and evaluate.
+"""Data collection (paper 5.2, Algorithm 1): varied contacts with a plane, training on them, and evaluation.
 
-The labels are the contacts that were asked for, as in the public data; the simulator knows what slipped away of them,
-so the table also tells how far labels are from what the tip felt. Training needs the extra ``train``.
+The labels are the commanded contacts, as in the public data; the simulator knows how much of them slipped, so the table
+also shows the distance between labels and true contacts. Training needs the extra ``train``.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from touchcell.geometry.types import Array
 
 SENSOR = "sensor"
 _MODEL = "model.safetensors"
-# The estimator that learns most from few images, in a minute.
+# The estimator that performs best on few images, trained in a minute.
 _KIND: Literal["markers"] = "markers"
-# Below this depth most of a shear slips away (SIMULATION part 5); the public models are judged above it as well.
+# Below this depth most of a shear slips (docs/glossary.md); the public models are evaluated above it as well.
 _DEEP_MM = 3.0
 
 
 def trials(scale: Scale) -> list[Trial]:
-    """A thousand samples, a fifth of that when quick; each repetition draws others."""
+    """Return trials of a thousand samples, a fifth of that when quick; each repetition draws others."""
     samples = 200 if scale.quick else 1000
     return [
         Trial(f"collect_{samples}_{seed}", "plane", "collect_sim.yaml", {"task.samples": samples, "task.seed": seed})
@@ -39,7 +39,7 @@ def trials(scale: Scale) -> list[Trial]:
 
 
 def measure(trial: RunFolder) -> Mapping[str, float]:
-    """How many, how fast, how far labels are from what was felt, and what a model learns from them."""
+    """Return number and rate of samples, distance of labels from true contacts, and a trained model's errors."""
     data = trial.path / COLLECTED
     labels = np.concatenate([read_split(data, split).contact_mm_deg for split in ("train", "val")])
     task = trial.recording.series("/task")
@@ -53,7 +53,7 @@ def measure(trial: RunFolder) -> Mapping[str, float]:
 
 
 def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
-    """Some of the frames with their labels, and what the model makes of the validation images against the labels."""
+    """Plot some of the frames with their labels, and the model's predictions of the validation images."""
     from touchcell.cell.experiments.collection_plots import plot_samples
 
     first = finished[0].folder.path
@@ -65,7 +65,7 @@ def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
 
 
 def _grabbed(trial: RunFolder) -> tuple[Array, Array]:
-    """Contacts (n, 6) asked for and felt at the end of each grab."""
+    """Return contacts (n, 6) commanded and true at the end of each grab."""
     asked = trial.recording.series(f"/sensors/{SENSOR}/contact")
     series, felt = true_contacts(trial, SENSOR)
     assert asked is not None
@@ -75,7 +75,7 @@ def _grabbed(trial: RunFolder) -> tuple[Array, Array]:
 
 
 def _learned(folder: Path, data: Path) -> dict[str, float]:
-    """Errors of a model trained on the collection; nothing where PyTorch is not installed."""
+    """Return errors of a model trained on the collection; empty where PyTorch is not installed."""
     if importlib.util.find_spec("torch") is None:
         return {}
     from rich.console import Console
@@ -92,7 +92,7 @@ def _learned(folder: Path, data: Path) -> dict[str, float]:
 
 SPEC = ExperimentSpec(
     name="data_collection",
-    summary="Algorithm 1 over a plane; the marker estimator, trained on three quarters of it and judged on the rest",
+    summary="Algorithm 1 over a plane; the marker estimator, trained on three quarters of it and evaluated on the rest",
     trials=trials,
     measure=measure,
     columns=(
@@ -114,5 +114,5 @@ SPEC = ExperimentSpec(
     ),
     draw=draw,
     paper={"plane": "10 000 samples"},
-    notes=("labels are the contacts asked for; slipped: mean distance of shear asked for and felt",),
+    notes=("labels are the commanded contacts; slipped: mean distance of commanded and true shear",),
 )

@@ -1,4 +1,4 @@
-"""The paper's figures 16 and 17: where the sensor went over ramp and dome, with depth and tilt along the way."""
+"""The paper's figures 16 and 17: paths of the sensor over ramp and dome, with depth and tilt over time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SIDE, _ABOVE = (0, 2), (0, 1)
 
 
 def plot_ramp(trial: RunFolder, path: Path) -> Path:
-    """From the side with the ramp's profile, from above, and the errors along the way."""
+    """Plot the path from the side with the ramp's profile and from above, and the errors over time."""
     figure, axes = plt.subplots(2, 2, figsize=(13, 7.5), layout="constrained")
     poses = _while_running(trial)
     way_mm = 1e3 * poses.T_world[:, 0, 3]
@@ -32,7 +32,7 @@ def plot_ramp(trial: RunFolder, path: Path) -> Path:
 
 
 def plot_dome(trials: Sequence[RunFolder], path: Path) -> Path:
-    """All paths from above, each from the side along its own direction, and the errors along the way."""
+    """Plot all paths from above, each from the side along its own direction, and the errors over time."""
     figure, axes = plt.subplots(2, 2, figsize=(13, 9), layout="constrained")
     names = []
     for number, trial in enumerate(trials, 1):
@@ -50,7 +50,7 @@ def plot_dome(trials: Sequence[RunFolder], path: Path) -> Path:
             _profile(axes[0, 1], trial, np.linspace(-20, 105, 300), direction)
     label_2d(axes[0, 0], _ABOVE, "sensor frames once a second, from above")
     label_2d(axes[0, 1], _SIDE, "sensor centres, each path along its own direction")
-    axes[0, 1].set_xlabel("away from the middle (mm)")
+    axes[0, 1].set_xlabel("distance from the centre (mm)")
     _errors(axes[1], trials, names)
     return save(figure, path)
 
@@ -81,7 +81,7 @@ def _while_running(trial: RunFolder) -> Poses:
 
 
 def _profile(axis: plt.Axes, trial: RunFolder, along_mm: Array, direction: Array) -> None:
-    """The surface's height over a line through the origin, from its own closed form."""
+    """Plot the surface's height over a line through the origin, from its closed form."""
     x, y = 1e-3 * along_mm * direction[0], 1e-3 * along_mm * direction[1]
     heights = height_mm(surface(trial), x, y, 0.0)
     axis.fill_between(along_mm, heights, heights.min() - 8, color=GREY, alpha=0.35, lw=0)

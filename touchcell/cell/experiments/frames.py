@@ -11,10 +11,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from touchcell.cell.analysis.run_folder import Poses
-from touchcell.geometry.types import Array
 
 AXIS_COLOURS = ("#d62728", "#2ca02c", "#1f77b4")
-BLUE, ORANGE, GREEN, GREY = "#4c72b0", "#dd8452", "#55a868", "#8c8c8c"
+BLUE, ORANGE, GREY = "#4c72b0", "#dd8452", "#8c8c8c"
 
 
 def frames_2d(axis: plt.Axes, poses: Poses, view: tuple[int, int], *, every_s: float = 1.0, length_mm: float) -> None:
@@ -27,7 +26,7 @@ def frames_2d(axis: plt.Axes, poses: Poses, view: tuple[int, int], *, every_s: f
 
 
 def path_2d(axis: plt.Axes, poses: Poses, view: tuple[int, int], **style: object) -> None:
-    """Draw the way of the origin of ``poses``."""
+    """Draw the path of the origin of ``poses``."""
     points = 1e3 * poses.T_world[:, :3, 3]
     axis.plot(points[:, view[0]], points[:, view[1]], **style)
 
@@ -43,12 +42,7 @@ def label_2d(axis: plt.Axes, view: tuple[int, int], title: str = "") -> None:
 
 
 def save(figure: plt.Figure, path: Path, *, dpi: int = 90) -> Path:
-    """Write the picture and forget it."""
+    """Save and close the figure."""
     figure.savefig(path, dpi=dpi)
     plt.close(figure)
     return path
-
-
-def clipped(poses: Poses, selected: Array) -> Poses:
-    """The poses at which ``selected`` (n,) is true."""
-    return Poses(poses.t_s[selected], poses.T_world[selected])

@@ -1,7 +1,9 @@
-"""Object tracking (paper 5.4): a plate moves one component at a time, then all six at once; the sensor keeps 6 mm.
+"""Object tracking (paper 5.4): a plate moves one component at a time, then all six at once.
 
-Errors are geometric, of the sensor against where it would be had it stuck to the plate where it first touched it, so
-what slips away unfelt counts as well. The motion in all six components also runs at other frame rates and latencies.
+The sensor holds 6 mm depth.
+
+Errors are geometric, of the sensor against its pose if it stuck to the plate where it first touched it, so undetected
+slip counts as well. The motion in all six components also runs at other frame rates and latencies.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ ALL_SIX = "all six"
 RATES_HZ = (15, 30, 60)
 LATENCIES_MS = (0, 10, 30)
 _START_S, _MOVE_S = 4.0, 10.0
-# The way of each component alone, and where the plate begins so that the way lies in the arm's box.
+# Motion of each single component, and the plate's start such that it stays inside the arm's workspace.
 _MOVES: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "x, 200 mm": ((200, 0, 0, 0, 0, 0), (-100, 0, 0)),
     "y, 200 mm": ((0, 200, 0, 0, 0, 0), (0, -100, 0)),
@@ -35,7 +37,7 @@ _MOVES: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 
 
 def trials(scale: Scale) -> list[Trial]:
-    """Each component alone and all six at the cell's own camera; all six again over frame rates and latencies."""
+    """Return trials of each component and all six at the cell's own camera; all six over frame rates and latencies."""
     found = []
     for row, (way, start) in _MOVES.items():
         x, y, z = start
@@ -72,13 +74,13 @@ def _repeated(row: str, name: str, changes: Mapping[str, Any], scale: Scale) -> 
 
 
 def measure(trial: RunFolder) -> Mapping[str, float]:
-    """RMS of each component of the sensor's pose against a sensor that sticks where it first touched."""
+    """Return the RMS error of each component of the sensor's pose against a sensor that sticks on first touch."""
     _, _, error = tracking(trial)
     return {f"{name}_rms": rms(error[:, i]) for i, name in enumerate(COMPONENTS)}
 
 
 def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
-    """The paper's figures 14 and 15, and error against frame rate and latency."""
+    """Plot the paper's figures 14 and 15, and the error over frame rate and latency."""
     from touchcell.cell.experiments.tracking_plots import plot_all_six, plot_components, plot_sweep
 
     first = {each.trial.row: each for each in finished if each.trial.name.endswith("_1")}
@@ -91,7 +93,7 @@ def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
 
 SPEC = ExperimentSpec(
     name="object_tracking",
-    summary="a plate moves one component at a time and all six at once; the sensor keeps 6 mm of contact",
+    summary="a plate moves one component at a time and all six at once; the sensor holds 6 mm depth",
     trials=trials,
     measure=measure,
     columns=tuple(

@@ -1,4 +1,4 @@
-"""What is measured in the recording of a push."""
+"""Measures from the recording of a push."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ OBJECT = "prism"
 
 
 def target_mm(run: RunFolder) -> Array:
-    """(2,) the target, from above."""
+    """Return the target (2,), top view."""
     return np.array(run.plan.task_config.model_dump()["target_mm"], dtype=np.float64)
 
 
 def pushed_until_s(run: RunFolder) -> float | None:
-    """When the task stopped pushing, in time of the scene; None if it never pushed."""
+    """Return the scene time at which the task stopped pushing; None if it never pushed."""
     task = run.recording.series("/task")
     if task is None:
         return None
@@ -27,14 +27,14 @@ def pushed_until_s(run: RunFolder) -> float | None:
 
 
 def off_normal_mm(T_world_f: Array, target_mm: Array) -> float:
-    """Distance, from above, of a target (2,) from the line of the contact normal of a surface frame (4, 4)."""
+    """Return the distance, in top view, of a target (2,) from the contact normal of a surface frame (4, 4)."""
     x, y = target_mm - 1e3 * T_world_f[:2, 3]
     along_x, along_y = T_world_f[:2, 2] / math.hypot(*T_world_f[:2, 2])
     return float(abs(along_x * y - along_y * x))
 
 
 def lean_deg(run: RunFolder) -> Array:
-    """(n,) angle of the object's axis from upright over time."""
+    """Return the (n,) angle of the object's axis from the vertical over time."""
     upright = object_poses(run)[OBJECT].T_world[:, 2, 2]
     angle: Array = np.degrees(np.arccos(np.clip(upright, -1.0, 1.0)))
     return angle

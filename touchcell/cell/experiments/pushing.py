@@ -1,7 +1,7 @@
-"""What the pushing experiments share: the paper's objects, how a trial starts, and what is measured at its end.
+"""Common parts of the pushing experiments: the paper's objects, the start of a trial, and the measures at its end.
 
-The paper tells masses and not sizes, and that the sensor is 45 mm above the table. Sizes here follow from its masses at
-one density: squares of 80 and 60 mm, a circle of 80 mm and a hexagon of 70 mm across flats, all 80 mm high.
+The paper states masses but not sizes, and that the sensor is 45 mm above the table. Sizes here follow from its masses
+at one density: squares of 80 and 60 mm, a circle of 80 mm and a hexagon of 70 mm across flats, all 80 mm high.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ PUSH_HEIGHT_MM = 45.0
 _HEIGHT_MM = 80.0
 _GAP_MM = 5.0
 _TIP_MM = 20.0
-# How far an object stands from where it should: a person puts it there.
+# Placement error of an object that is positioned by hand.
 _OFFSET_MM, _TURN_DEG = 3.0, 2.0
 
 ESTIMATORS: Mapping[str, Mapping[str, Any] | None] = {"learned": None, "true contact": {"kind": "true_contact"}}
-"""Estimator sections by what rows call them; None for the cell file's own."""
+"""Estimator sections by their name in rows; None for the cell file's own."""
 
 
 COLUMNS = (
     Column("error_mm", "error mm", below=2.0),
     Column("error_mm", "worst", "worst"),
-    Column("object_center_offset_mm", "middle to target mm"),
+    Column("object_center_offset_mm", "centre to target mm"),
     Column("lean_max_deg", "lean deg", "worst"),
 )
-ERROR_NOTE = "error: from the target to the true contact normal when the push ends, from above"
+ERROR_NOTE = "error: distance of the target from the true contact normal at the end of the push, in top view"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,10 +47,10 @@ class Pushed:
     """An object that is pushed.
 
     Attributes:
-        name: as the paper calls it.
+        name: name in the paper.
         shape: of the cell file's ``scene.objects``.
         mass_g: its mass.
-        reach_mm: from its middle to where it is pushed.
+        reach_mm: distance from its centre to the contact.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Pushed:
     reach_mm: float
 
     def taller(self, height_mm: float, mass_g: float) -> Pushed:
-        """One of the same outline, that high."""
+        """Return an object of the same outline with that height."""
         tall = dict(self.shape)
         if "size_mm" in tall:
             tall["size_mm"] = [*tall["size_mm"][:2], height_mm]
@@ -78,7 +78,7 @@ PRISMS = (
 
 @dataclass(frozen=True, slots=True)
 class Arms:
-    """Who pushes.
+    """Pushing arms.
 
     Attributes:
         name: in a row of a table.
@@ -93,7 +93,7 @@ class Arms:
     sensors: tuple[str, ...]
 
     def around(self, pushed: Pushed, surface: str, height_mm: float) -> dict[str, Any]:
-        """Keys of the cell in which they stand about an object, at that height, 5 mm from touching it."""
+        """Return cell keys that place them around an object, at that height, 5 mm from touching it."""
         x_mm = -(pushed.reach_mm + _TIP_MM + _GAP_MM)
         changes: dict[str, Any] = {
             "scene.physics": "dynamic",
@@ -102,12 +102,12 @@ class Arms:
             "task.object_center_offset_mm": pushed.reach_mm + _TIP_MM,
         }
         if len(self.sensors) > 1:
-            # The follower's base is a metre away and turned round.
+            # The follower's base is a metre away and rotated by 180 degrees.
             changes["arms.follower.start_pose_mm_deg"] = [1000 + x_mm, 0, height_mm, 180, 0, 0]
         return changes
 
     def estimating(self, estimator: str) -> dict[str, Any]:
-        """Keys that give every sensor one of ``ESTIMATORS``."""
+        """Return cell keys that give every sensor one of ``ESTIMATORS``."""
         section = ESTIMATORS[estimator]
         return {} if section is None else {f"sensors.{sensor}.estimator": dict(section) for sensor in self.sensors}
 
@@ -117,14 +117,14 @@ TWO_ARMS = Arms("two arms", "dual_push_sim.yaml", "leader", ("leader_sensor", "f
 
 
 def row_trials(row: str, cell: str, pushed: Pushed, changes: Mapping[str, Any], count: int) -> list[Trial]:
-    """``count`` trials of a row, each from another start near the origin, a little aside and turned.
+    """Return ``count`` trials of a row, each from another start near the origin, slightly shifted and rotated.
 
     Args:
         row: its name.
         cell: the cell file.
         pushed: the object.
         changes: keys of the cell, the same for all; they may change the object's as well.
-        count: how many.
+        count: number of trials.
     """
     return [
         Trial(f"{_slug(row)}_{seed}", row, cell, {"scene.objects": {OBJECT: section}} | dict(changes) | {"seed": seed})
@@ -146,17 +146,17 @@ def _slug(row: str) -> str:
 
 
 def prism_experiment(name: str, summary: str, arms: Arms, paper: Mapping[str, str]) -> ExperimentSpec:
-    """The paper's four prisms over two surfaces, five trials each.
+    """Return the experiment with the paper's four prisms over two surfaces, five trials each.
 
     Args:
         name: of the experiment.
         summary: one line.
-        arms: who pushes.
+        arms: pushing arms.
         paper: its figure, by prism.
     """
 
     def trials(scale: Scale) -> list[Trial]:
-        """Every prism on every surface with both estimators."""
+        """Return trials of every prism on every surface with both estimators."""
         return [
             trial
             for estimator in ESTIMATORS
@@ -184,7 +184,7 @@ def prism_experiment(name: str, summary: str, arms: Arms, paper: Mapping[str, st
 
 
 def _draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
-    """The paper's figures 18 and 19, and every trial's error."""
+    """Plot the paper's figures 18 and 19, and every trial's error."""
     from touchcell.cell.experiments.pushing_plots import plot_errors, plot_pushes
 
     return [
@@ -194,10 +194,10 @@ def _draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
 
 
 def push_measures(run: RunFolder) -> dict[str, float]:
-    """Where the object and the contact normal were to the target when the push ended, and how far the object leant.
+    """Return the errors of object and contact normal at the end of the push, and the object's largest lean.
 
     The sensor is the one that pushes: with two arms the leader's. ``error_mm`` is the paper's: the distance from the
-    target to the true line of the contact normal, from above. A push that never arrived has none.
+    target to the true line of the contact normal, in top view. A push that never arrived has none.
     """
     found = {"lean_max_deg": float(np.max(lean_deg(run)))}
     found["toppled"] = float(found["lean_max_deg"] > 45.0)
@@ -215,7 +215,7 @@ def push_measures(run: RunFolder) -> dict[str, float]:
 
 
 def _surface_pose(run: RunFolder, sensor: str, t_s: float) -> Array:
-    """T_world_f (4, 4) of the true contact."""
+    """Return T_world_f (4, 4) of the true contact."""
     T_world_s = sensor_poses(run, sensor).at(np.array([t_s]))[0]
     series, contacts = true_contacts(run, sensor)
     felt = Poses(scene_time(run, series), np.asarray(se3.from_euler_mm_deg(np.nan_to_num(contacts))))

@@ -1,4 +1,4 @@
-"""The paper's figures 18 to 20: pushes from above with sensor frames and outlines, and the errors of all trials."""
+"""The paper's figures 18 to 20: pushes in top view with sensor frames and outlines, and the errors of all trials."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _RED = "#d62728"
 
 
 def plot_pushes(finished: Sequence[Finished], path: Path, *, view: View = ABOVE) -> Path:
-    """Each trial in its panel: ways and frames of the sensors, the object at start and end, the target."""
+    """Plot each trial in a panel: paths and frames of the sensors, the object at start and end, the target."""
     columns = min(4, len(finished))
     rows = -(-len(finished) // columns)
     figure, axes = plt.subplots(rows, columns, figsize=(4.6 * columns, 2.9 * rows), layout="constrained", squeeze=False)
@@ -34,7 +34,7 @@ def plot_pushes(finished: Sequence[Finished], path: Path, *, view: View = ABOVE)
 
 
 def plot_errors(finished: Sequence[Finished], path: Path, *, aim_mm: float) -> Path:
-    """Every trial's error, by row, with the aim."""
+    """Plot every trial's error, by row, with the goal."""
     rows = list(dict.fromkeys(each.trial.row for each in finished))
     figure, axis = plt.subplots(figsize=(0.55 * len(rows) + 3.0, 4.6), layout="constrained")
     for i, row in enumerate(rows):
@@ -78,7 +78,7 @@ def _draw_push(axis: plt.Axes, run: RunFolder, view: View) -> None:
 
 
 def plot_leans(finished: Mapping[str, Sequence[Finished]], path: Path) -> Path:
-    """How far each object leant over time, one panel for each of ``finished``."""
+    """Plot each object's lean over time, one panel for each of ``finished``."""
     figure, axes = plt.subplots(1, len(finished), figsize=(6 * len(finished), 4.4), sharey=True, layout="constrained")
     for axis, (title, trials) in zip(axes, finished.items(), strict=True):
         for each in trials:
@@ -88,6 +88,6 @@ def plot_leans(finished: Mapping[str, Sequence[Finished]], path: Path) -> Path:
         axis.set_xlabel("time (s)")
         axis.set_yscale("symlog", linthresh=1.0)
         axis.grid(alpha=0.3)
-    axes[0].set_ylabel("lean from upright (deg)")
+    axes[0].set_ylabel("lean from the vertical (deg)")
     axes[-1].legend(fontsize=8, ncols=2)
     return save(figure, path, dpi=80)

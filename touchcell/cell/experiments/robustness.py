@@ -1,6 +1,7 @@
-"""Robustness: one arm and two push the large square prism while one thing after another is made worse.
+"""Robustness: one arm and two push the large square prism while one condition at a time is degraded.
 
-Friction and mass by 30 % and latency by 20 ms are what a cell has to stand; the rest goes on until it breaks.
+A cell has to tolerate 30 % of friction and mass and 20 ms of latency; the other conditions are increased until it
+fails.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ _QUICK = (
 
 
 def trials(scale: Scale) -> list[Trial]:
-    """Every change with one arm and with two, from the same few starts."""
+    """Return trials of every change with one arm and with two, from the same few starts."""
     return [
         trial
         for arms in _ARMS
@@ -84,7 +85,7 @@ def _for_every_sensor(changes: Mapping[str, Any], arms: Arms) -> dict[str, Any]:
 
 
 def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
-    """Every trial's error, by what was made worse; a picture for one arm and one for two."""
+    """Plot every trial's error by changed condition; one figure for one arm and one for two."""
     from touchcell.cell.experiments.pushing_plots import plot_errors
 
     return [
@@ -96,7 +97,7 @@ def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
 
 SPEC = ExperimentSpec(
     name="robustness",
-    summary="one arm and two push the large square prism, with one thing after another made worse",
+    summary="one arm and two push the large square prism, with one condition at a time degraded",
     trials=trials,
     measure=push_measures,
     columns=COLUMNS,

@@ -1,7 +1,7 @@
-"""``touchcell experiment``: what an experiment is, and how it is run from its trials to its table.
+"""``touchcell experiment``: definition of an experiment, and its execution from trials to table.
 
 A trial is one run of a cell file with some keys changed. Each leaves a folder with its recording and ``trial.json``; an
-experiment that is run again with the same settings does only what is missing, so that it may be broken off at any time.
+experiment that is run again with the same settings runs only missing trials, so it may be interrupted at any time.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from touchcell.registry import Registry
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """How much of an experiment to do.
+    """Amount of an experiment to run.
 
     Attributes:
-        trials: repetitions of each row; None for as many as the experiment has by itself.
-        quick: the smallest share that still shows every kind of row.
+        trials: repetitions of each row; None for the experiment's own number.
+        quick: the smallest set that still contains every kind of row.
     """
 
     trials: int | None = None
     quick: bool = False
 
     def repetitions(self, usual: int) -> int:
-        """How often to repeat a row that is usually repeated ``usual`` times."""
+        """Return the number of repetitions of a row that is usually repeated ``usual`` times."""
         if self.trials is not None:
             return self.trials
         return 1 if self.quick else usual
@@ -44,13 +44,13 @@ class ExperimentSpec:
     """An experiment's entry point (group ``touchcell.experiments``).
 
     Attributes:
-        name: the word on the command line.
+        name: name on the command line.
         summary: one line for ``touchcell list``.
-        trials: all trials at a scale; the same for the same scale.
-        measure: named numbers of a trial that has run, from what was true in it.
-        columns: which of them the table shows.
-        draw: makes the pictures from the trials that have finished, into a folder; returns them.
-        paper: what the paper reports, by row.
+        trials: all trials at a scale; deterministic.
+        measure: named numbers of a finished trial, from its ground truth.
+        columns: measures that the table shows.
+        draw: makes the figures from the finished trials, into a folder; returns them.
+        paper: results of the paper, by row.
         notes: lines below the table.
     """
 
@@ -68,23 +68,34 @@ EXPERIMENTS: Final = Registry("touchcell.experiments", "experiment", ExperimentS
 """All installed experiments."""
 
 
-def run_experiment(experiment: ExperimentSpec, folder: Path, scale: Scale, *, jobs: int = 1, live: bool = False) -> str:
-    """Do what is missing, then write table and pictures into ``folder``; returns the table.
+def run_experiment(
+    experiment: ExperimentSpec,
+    folder: Path,
+    scale: Scale,
+    *,
+    jobs: int = 1,
+    executor: str = "local",
+    live: bool = False,
+) -> str:
+    """Run missing trials, then write table and figures into ``folder``; return the table.
 
     Args:
-        experiment: which.
-        folder: for ``trials/``, ``summary.txt``, ``summary.json`` and the pictures.
-        scale: how much of it.
-        jobs: trials at a time, each in a process of its own; 1 stays in this one.
+        experiment: its spec.
+        folder: for ``trials/``, ``summary.txt``, ``summary.json`` and the figures.
+        scale: amount of it.
+        jobs: number of parallel trials, each in its own process; 1 runs in this process.
+        executor: name of what runs the trials.
         live: show progress.
 
     Raises:
-        ConfigError: a trial's cell file makes no sense.
-        KeyboardInterrupt: every trial that had finished is kept.
+        ConfigError: a trial's cell file is invalid.
+        KeyboardInterrupt: every finished trial is kept.
     """
     folder.mkdir(parents=True, exist_ok=True)
     perform = Perform(experiment.measure, folder / "trials")
-    finished = perform_all(perform, experiment.trials(scale), jobs=jobs, live=live, title=experiment.name)
+    finished = perform_all(
+        perform, experiment.trials(scale), jobs=jobs, executor=executor, live=live, title=experiment.name
+    )
     rows = _rows(finished)
     text = table(f"{experiment.name}: {experiment.summary}", rows, experiment.columns, experiment.paper)
     pictures = experiment.draw(finished, folder)
@@ -112,7 +123,7 @@ def _rows(finished: Sequence[Finished]) -> list[Row]:
 
 
 def _troubles(finished: Sequence[Finished]) -> list[str]:
-    """Why trials did not come to their end, one line for each reason of a row."""
+    """Return why trials did not finish, one line for each reason of a row."""
     lines = [f"{each.trial.row}: {each.outcome}: {each.reason}" for each in finished if not each.done]
     return [f"{line} ({count}x)" for line, count in Counter(lines).items()]
 

@@ -1,4 +1,4 @@
-"""The scene of a simulated run, as its cell file has it."""
+"""The scene of a simulated run, from its cell file."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from touchcell.simulation.surfaces import Surface
 
 
 def surface(run: RunFolder) -> Surface:
-    """The first surface of the run's scene, with its motion."""
+    """Return the first surface of the run's scene, with its motion."""
     return next(iter(scene(run).surfaces.values())).build()
 
 
 def scene(run: RunFolder) -> SceneConfig:
-    """The scene of a simulated run."""
+    """Return the scene of a simulated run."""
     return SceneConfig.model_validate(run.plan.cell.scene)

@@ -1,7 +1,7 @@
 """Surface following (paper 5.5): a straight line over a curved ramp, and eight paths down a dome, 45 degrees apart.
 
-Each path runs with the learned estimator and again on the true contact, which shows what control alone leaves. Errors
-are of the true contact, so a wrong estimate counts as what it makes the arm do.
+Each path runs with the learned estimator and again on the true contact, which shows the error of control alone. Errors
+are of the true contact, so an estimation error counts by its effect on the arm.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ESTIMATORS = {"learned": None, "true contact": {"kind": "true_contact"}}
 
 
 def trials(scale: Scale) -> list[Trial]:
-    """Ramp and dome with both estimators, each repetition with other camera noise."""
+    """Return trials of ramp and dome with both estimators, each repetition with other camera noise."""
     paths: list[tuple[str, str, str, dict[str, Any]]] = [("ramp", "ramp", "surface_follow_sim.yaml", {})] + [
         ("dome, 8 paths", f"dome_{angle}", "surface_follow_dome_sim.yaml", {"task.direction_deg": angle})
         for angle in (DIRECTIONS_DEG[::4] if scale.quick else DIRECTIONS_DEG)
@@ -45,7 +45,7 @@ def trials(scale: Scale) -> list[Trial]:
 
 
 def measure(trial: RunFolder) -> Mapping[str, float]:
-    """RMS while the task ran: true contact against the reference, and estimate against true contact."""
+    """Return RMS errors while the task ran: true contact against the reference, and estimate against true contact."""
     series, contacts = true_contacts(trial, SENSOR)
     task = trial.recording.series("/task")
     assert task is not None
@@ -64,7 +64,7 @@ def measure(trial: RunFolder) -> Mapping[str, float]:
 
 
 def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
-    """The paper's figures 16 and 17 with the learned estimator, and depth and tilt along the way."""
+    """Plot the paper's figures 16 and 17 with the learned estimator, and depth and tilt over time."""
     from touchcell.cell.experiments.following_plots import plot_dome, plot_ramp
 
     first = [each for each in finished if each.trial.name.endswith("learned_1")]

@@ -1,4 +1,4 @@
-"""An experiment's table: one row for each kind of trial, statistics over its trials, the paper's figure beside them."""
+"""An experiment's table: one row per kind of trial, statistics over its trials, and the paper's figures beside them."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ class Column:
 
     Attributes:
         measure: its name.
-        title: above it, with the unit.
-        statistic: over the trials of a row. ``mean`` shows the standard deviation as well, ``count`` how many were not
-            zero.
-        digits: behind the point.
-        below: what it is to stay below, by whichever trial is worst; None where there is no aim.
+        title: column header, with the unit.
+        statistic: over the trials of a row. ``mean`` shows the standard deviation as well, ``count`` the number that
+            were
+            not zero.
+        digits: after the decimal point.
+        below: limit for the worst trial; None where there is none.
     """
 
     measure: str
@@ -32,12 +33,12 @@ class Column:
     below: float | None = None
 
     def values(self, row: Row) -> Array:
-        """The measure in every trial that has it."""
+        """Return the measure in every trial that has it."""
         found = np.array([trial.get(self.measure, np.nan) for trial in row.measures], dtype=np.float64)
         return found[np.isfinite(found)]
 
     def text(self, row: Row) -> str:
-        """What stands in the table; a ``!`` marks what misses the aim."""
+        """Return the text of the cell; a ``!`` marks a missed limit."""
         values = self.values(row)
         if not len(values):
             return "-"
@@ -52,7 +53,7 @@ class Row:
     Attributes:
         name: in the first column.
         measures: of each trial.
-        done: how many trials came to their task's end.
+        done: number of trials whose task finished.
     """
 
     name: str
@@ -61,7 +62,7 @@ class Row:
 
 
 def table(title: str, rows: Sequence[Row], columns: Sequence[Column], paper: Mapping[str, str]) -> str:
-    """The table as text."""
+    """Return the table as text."""
     head = ["", "done", *(column.title for column in columns)] + (["paper"] if paper else [])
     lines = [head]
     for row in rows:
@@ -78,12 +79,12 @@ def table(title: str, rows: Sequence[Row], columns: Sequence[Column], paper: Map
         for line in lines
     ]
     if any(cell.endswith("!") for line in lines for cell in line):
-        text.append("! misses the aim in at least one trial")
+        text.append("! misses its limit in at least one trial")
     return "\n".join(text)
 
 
 def to_json(rows: Sequence[Row], columns: Sequence[Column], paper: Mapping[str, str]) -> dict[str, Any]:
-    """The same for machines, with every trial's value."""
+    """Return the table as JSON data, with every trial's value."""
     return {
         row.name: {
             "trials": len(row.measures),

@@ -1,8 +1,8 @@
 """Tall objects (paper 5.7.2): four tall prisms and five bottles, pushed high up, with and without follower.
 
-The paper tells masses and neither sizes nor how high it pushes. Prisms are those of the other experiments, but 200 mm
-high; bottles are turned bodies about as thick as those that the paper names. Each is pushed at 80 % of its height, or
-just below the top of its straight part.
+The paper states masses but neither sizes nor push heights. Prisms are those of the other experiments, but 200 mm
+high; bottles are solids of revolution about as thick as those that the paper names. Each is pushed at 80 % of its
+height, or just below the top of its straight part.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ _PRISM_MM = 200.0
 _PUSHED_AT = 0.8
 _BELOW_TOP_MM = 15.0
 _FOLLOWER_MM = 3.0
-# Each tip's share of the object's weight, shear stiffness of the cells' tips, and how far they may be sheared: 80 % of
-# what sticks under _FOLLOWER_MM, and under the 2 mm that friction on the table leaves the leader before it pushes.
+# Each tip's fraction of the object's weight, shear stiffness of the cells' tips, and their largest shear: 80 % of what
+# sticks at _FOLLOWER_MM, and at the 2 mm that friction on the table leaves the leader before it pushes.
 _SHARE = 0.35
 _SHEAR_N_MM = 0.4
 _LIFT_MAX_MM = 3.2
 _PRESS_MAX_MM = 2.2
 _LOST_DEG = 10.0
 _ROUND = ("cylinder", "bottle")
-# The cell's follower gives way sideways but slowly, for objects with flat sides: on these its contact would wander off
-# the line of the push, and the squeeze then turns a light slim one as much as friction on the table resists. The
-# squeeze on a round one always points at its axis. There the leader steers by going round it; of one that is squeezed
-# harder than the table holds it, a follower that only gives way comes too late, and wide ones weave by centimetres.
+# The cell's follower yields laterally but slowly, for objects with flat sides: on these its contact would drift off the
+# line of the push, and the squeeze then turns a light slim one as much as friction on the table resists. The squeeze
+# on a round one always points at its axis. There the leader steers by moving around it; for one squeezed harder than
+# the table holds it, a follower that only complies reacts too late, and wide ones weave by centimetres.
 _FOLLOWER_OF_ROUND = {
     "task.follower.kp_per_s": [4, 10, 10, 10, 0, 0],
     "task.follower.ki_per_s2": [0, 25, 25, 25, 0, 0],
@@ -71,7 +71,7 @@ OBJECTS = (
 
 
 def trials(scale: Scale) -> list[Trial]:
-    """Every object with both arms, and with the leader alone from the same starts; with both estimators."""
+    """Return trials of every object with both arms, and with the leader alone from the same starts; both estimators."""
     return [
         trial
         for estimator in ESTIMATORS
@@ -89,7 +89,7 @@ def trials(scale: Scale) -> list[Trial]:
 
 def _cell_changes(pushed: Pushed, arms: str) -> dict[str, Any]:
     height_mm = pushed_at_mm(pushed)
-    # Both in the same world: the cells that ship differ in this.
+    # Both in the same world: the shipped cells differ in this.
     same = {"scene.step_ms": 5} | _ARMS[arms].around(pushed, "mdf", height_mm)
     if arms == WITHOUT:
         return same | _boxes_up_to(height_mm, "workspace")
@@ -104,13 +104,13 @@ def _cell_changes(pushed: Pushed, arms: str) -> dict[str, Any]:
 
 
 def measure(run: RunFolder) -> Mapping[str, float]:
-    """See ``pushing.push_measures``; ``lost`` are those that leant too far to be pushed on, fallen or not."""
+    """Return ``pushing.push_measures`` plus ``lost``: leant too far to be pushed on, fallen or not."""
     found = push_measures(run)
     return found | {"lost": float(found["lean_max_deg"] > _LOST_DEG)}
 
 
 def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
-    """The paper's figure 20, the same from the side without follower, and how far each leant; learned estimator."""
+    """Plot the paper's figure 20, the same in side view without follower, and each object's lean; learned estimator."""
     from touchcell.cell.experiments.pushing_plots import plot_leans, plot_pushes
     from touchcell.simulation.outlines import SIDE
 
@@ -126,7 +126,7 @@ def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
 
 
 def pushed_at_mm(pushed: Pushed) -> float:
-    """Height of the push: 80 % of the object's, or just below the top of its straight part."""
+    """Return the height of the push: 80 % of the object's, or just below the top of its straight part."""
     if "sections_mm" in pushed.shape:
         heights_mm = [float(height_mm) for height_mm, _ in pushed.shape["sections_mm"]]
         return min(_PUSHED_AT * sum(heights_mm), heights_mm[0] - _BELOW_TOP_MM)
@@ -134,10 +134,10 @@ def pushed_at_mm(pushed: Pushed) -> float:
 
 
 def held_with_mm(pushed: Pushed) -> tuple[float, float]:
-    """Shear with which the leader presses down where it pushes, and with which the follower lifts where it holds.
+    """Return the shear with which the leader presses down at its contact, and the follower lifts at its contact.
 
-    Both make a moment against toppling. Too little and the object topples over its leading edge while it is pushed;
-    too much and it tips backwards while it stands.
+    Both create a moment against toppling. Too little and the object topples over its leading edge while it is pushed;
+    too much and it topples backwards at rest.
     """
     shear_mm = _SHARE * 1e-3 * pushed.mass_g * GRAVITY_M_S2 / _SHEAR_N_MM
     return round(min(shear_mm, _PRESS_MAX_MM), 2), round(min(shear_mm, _LIFT_MAX_MM), 2)
@@ -172,5 +172,5 @@ SPEC = ExperimentSpec(
         for arms in _ARMS
         for pushed in OBJECTS
     },
-    notes=(ERROR_NOTE, "aims: none of nine topples with the follower, at least seven without"),
+    notes=(ERROR_NOTE, "goals: none of nine topples with the follower, at least seven without"),
 )

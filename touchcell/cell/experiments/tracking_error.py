@@ -1,4 +1,4 @@
-"""Where a tracking sensor was beside the plate that it tracks."""
+"""Error of a tracking sensor relative to the plate that it tracks."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from touchcell.tasks.servoing import SENSOR
 
 
 def tracking(trial: RunFolder) -> tuple[Poses, Array, Array]:
-    """The sensor's poses, the plate's at the same times, and the errors (n, 6) in mm and degrees.
+    """Return the sensor's poses, the plate's at the same times, and the errors (n, 6) in mm and degrees.
 
-    The surface frame is that of the first touch, carried along by the plate; the error is the sensor's pose in it
+    The surface frame is that of the first touch, moved with the plate; the error is the sensor's pose in it
     against the reference. NaN while the task does not track.
     """
     plate = surface(trial)

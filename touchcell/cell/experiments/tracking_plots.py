@@ -1,4 +1,4 @@
-"""The paper's figures 14 and 15: poses of leader and follower; and error against frame rate and latency."""
+"""The paper's figures 14 and 15: poses of leader and follower; and error over frame rate and latency."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 
 
 def plot_components(trials: Mapping[str, RunFolder], path: Path) -> Path:
-    """The moved component of plate and sensor over time, each trial in its panel, with the error below."""
+    """Plot the moved component of plate and sensor over time, each trial in a panel, with the error below."""
     figure, axes = plt.subplots(
         2, 6, figsize=(18, 6), sharex=True, height_ratios=(3, 2), layout="constrained", squeeze=False
     )
     for i, (row, trial) in enumerate(trials.items()):
         poses, T_world_plate, error = tracking(trial)
         moved = np.asarray(se3.to_euler_mm_deg(se3.inverse(T_world_plate[0]) @ T_world_plate))
-        # Signs differ, as the sensor looks against the plate's z axis.
+        # Signs differ, as the sensor's axis is opposite to the plate's z axis.
         sign = np.array([1, -1, -1, 1, -1, -1])[i]
         axes[0, i].plot(poses.t_s, moved[:, i], color="black", lw=1.4, label="plate")
         axes[0, i].plot(poses.t_s, moved[:, i] + sign * error[:, i], color=ORANGE, lw=1.2, ls="--", label="sensor")
@@ -41,7 +41,7 @@ def plot_components(trials: Mapping[str, RunFolder], path: Path) -> Path:
 
 
 def plot_all_six(trial: RunFolder, path: Path) -> Path:
-    """Ways of plate and sensor with their frames, from above and from the side, and all errors over time."""
+    """Plot the paths of plate and sensor with their frames, in top and side view, and all errors over time."""
     figure, axes = plt.subplots(1, 3, figsize=(18, 6), layout="constrained")
     poses, T_world_plate, error = tracking(trial)
     felt = np.isfinite(error[:, 0])
@@ -64,7 +64,7 @@ def plot_all_six(trial: RunFolder, path: Path) -> Path:
 
 
 def plot_sweep(finished: Sequence[Finished], path: Path) -> Path:
-    """RMS of each component over latency, one line for each frame rate."""
+    """Plot the RMS of each component over latency, one line for each frame rate."""
     figure, axes = plt.subplots(2, 3, figsize=(13, 6.5), sharex=True, layout="constrained")
     points: dict[tuple[float, float], list[Mapping[str, float]]] = {}
     for each in finished:

@@ -1,4 +1,4 @@
-"""Trials: cell files with some keys changed, run beside each other in processes, kept once they have finished."""
+"""Trials: runs of cell files with some keys changed, in parallel processes, kept once they have finished."""
 
 from __future__ import annotations
 
@@ -6,16 +6,12 @@ import copy
 import hashlib
 import json
 import math
-import multiprocessing
 import os
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Protocol
 
 import yaml
 
@@ -28,19 +24,20 @@ from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.run_result import Outcome
 from touchcell.errors import ConfigError, suggest
 from touchcell.paths import CONFIGS
+from touchcell.registry import Registry
 
 COLLECTED = "data"
-"""Folder, in a trial's own, of the frames that a trial collects."""
+"""Subfolder of a trial's folder for collected frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One run that an experiment asks for.
+    """One run of an experiment.
 
     Attributes:
-        name: its folder; no two trials of an experiment share one.
+        name: its folder; unique within an experiment.
         row: the row of the table that it belongs to.
-        cell: a cell file, among those that ship unless it is a path.
+        cell: a cell file, among the shipped ones unless it is a path.
         changes: values in place of the file's own, by dotted key ("task.depth_mm").
     """
 
@@ -50,7 +47,7 @@ class Trial:
     changes: Mapping[str, Any] = field(default_factory=dict)
 
     def cell_data(self) -> dict[str, Any]:
-        """The whole cell file with the changes. Raises ConfigError for a key that leads nowhere."""
+        """Return the whole cell file with the changes. Raises ConfigError for a key whose section does not exist."""
         path = Path(self.cell)
         data: dict[str, Any] = yaml.safe_load((path if path.is_absolute() else CONFIGS / path).read_text())
         data = copy.deepcopy(data)
@@ -67,13 +64,13 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """A trial that has run.
+    """A finished trial.
 
     Attributes:
-        trial: which.
-        folder: what it left.
-        outcome: a word of ``touchcell.cell.runtime.run_result.Outcome``.
-        reason: why it ended so.
+        trial: the trial.
+        folder: its run folder.
+        outcome: value of ``touchcell.cell.runtime.loop.Outcome``.
+        reason: reason of the outcome.
         measures: named numbers.
     """
 
@@ -85,16 +82,16 @@ class Finished:
 
     @property
     def done(self) -> bool:
-        """Whether the task came to its end."""
+        """True if the task finished."""
         return self.outcome == Outcome.DONE.value
 
 
 @dataclass(frozen=True, slots=True)
 class Perform:
-    """Runs trials into ``root``; as a whole it is handed to other processes.
+    """Runs trials into ``root``; picklable, to be passed to other processes.
 
     Attributes:
-        measure: named numbers of a trial that has run.
+        measure: named numbers of a finished trial.
         root: holds one folder for each trial.
     """
 
@@ -102,7 +99,7 @@ class Perform:
     root: Path
 
     def __call__(self, trial: Trial) -> Finished:
-        """Run a trial, measure it, and only then say that it has finished."""
+        """Run a trial and measure it; mark it as finished last."""
         started = time.perf_counter()
         folder = self.root / trial.name
         folder.mkdir(parents=True, exist_ok=True)
@@ -123,15 +120,15 @@ class Perform:
             "reason": result.reason,
             "duration_s": result.duration_s,
             "wall_s": round(time.perf_counter() - started, 3),
-            # What could not be measured is left out, as JSON knows no number for it.
+            # Measures that are not finite are left out, as JSON has no number for them.
             "measures": {name: float(value) for name, value in measures.items() if math.isfinite(value)},
         }
         _write_whole(marker, json.dumps(record, indent=1))
-        # A folder of its own: the one that was measured holds its whole recording in memory.
+        # A new RunFolder: the measured one holds its whole recording in memory.
         return _finished(trial, RunFolder(folder), record)
 
     def kept(self, trial: Trial) -> Finished | None:
-        """The trial as an earlier run of the experiment left it, if it had the same settings."""
+        """Return the trial's result from an earlier run of the experiment, if it had the same settings."""
         folder = self.root / trial.name
         try:
             record = json.loads((folder / "trial.json").read_text())
@@ -140,20 +137,57 @@ class Perform:
         return _finished(trial, RunFolder(folder), record) if record["settings"] == _digest(trial.cell_data()) else None
 
 
+class Executor(Protocol):
+    """Runs trials somewhere: in processes of this machine, or on others."""
+
+    def __call__(self, perform: Perform, trials: Sequence[Trial], jobs: int, /) -> Iterator[Finished]:
+        """Run every trial by ``perform(trial)``, at most ``jobs`` at a time; yield each as it finishes, in any order.
+
+        Closing the iterator, or an interrupt, ends what runs.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class ExecutorSpec:
+    """Entry point of an executor (group ``touchcell.executors``).
+
+    Attributes:
+        name: value of ``--executor`` on the command line.
+        summary: one line for ``touchcell list``.
+        run: the executor.
+    """
+
+    name: str
+    summary: str
+    run: Executor
+
+
+EXECUTORS: Final = Registry("touchcell.executors", "executor", ExecutorSpec)
+"""All installed executors."""
+
+
 def perform_all(
-    perform: Perform, trials: Sequence[Trial], *, jobs: int = 1, live: bool = False, title: str = ""
+    perform: Perform,
+    trials: Sequence[Trial],
+    *,
+    jobs: int = 1,
+    executor: str = "local",
+    live: bool = False,
+    title: str = "",
 ) -> list[Finished]:
-    """Run what is missing of ``trials``; returns all of them in order.
+    """Run the missing ones of ``trials``; return all of them in order.
 
     Args:
-        perform: how to run one.
-        trials: which.
-        jobs: how many at a time; 1 runs them in this process.
+        perform: runs one.
+        trials: all trials.
+        jobs: number in parallel; 1 runs them in this process.
+        executor: name of what runs them.
         live: show a progress bar.
         title: on it.
 
     Raises:
-        KeyboardInterrupt: what runs is ended; what has finished is kept.
+        KeyboardInterrupt: running trials are ended; finished ones are kept.
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -162,43 +196,10 @@ def perform_all(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, transient=True, disable=not live) as progress:
         bar = progress.add_task(title, total=len(trials), completed=len(found))
-        for finished in _each(perform, missing, jobs):
+        for finished in EXECUTORS.load(executor).run(perform, missing, jobs):
             found[finished.trial.name] = finished
             progress.update(bar, advance=1, description=f"{title}: {finished.trial.name} {finished.outcome}")
     return [found[trial.name] for trial in trials]
-
-
-def _each(perform: Perform, trials: Sequence[Trial], jobs: int) -> Iterator[Finished]:
-    if jobs == 1 or len(trials) < 2:
-        for trial in trials:
-            yield perform(trial)
-        return
-    # Fresh processes: a fork would inherit the threads of libraries that do not outlive it.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(trials)), context, initializer=_belong_to_parent) as executor:
-        running = [executor.submit(perform, trial) for trial in trials]
-        try:
-            for future in as_completed(running):
-                yield future.result()
-        except BaseException:
-            executor.shutdown(wait=False, cancel_futures=True)
-            for child in multiprocessing.active_children():
-                child.terminate()
-            raise
-
-
-def _belong_to_parent() -> None:
-    # A terminal's Ctrl-C reaches every process of the group.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # A worker whose parent was killed would wait for work forever.
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _finished(trial: Trial, folder: RunFolder, record: Mapping[str, Any]) -> Finished:

@@ -1,1 +1,1 @@
-"""What a run writes while it runs."""
+"""Recording of a run: MCAP files and data sets."""

@@ -1,6 +1,6 @@
-"""Labelled frames on disk while they are taken, in the layout that ``touchcell.drivers.replay.dataset`` reads.
+"""Writer for labelled frames, in the layout that ``touchcell.drivers.replay.dataset`` reads.
 
-Each sample is an image and then a row, so that whatever ends a run leaves whole samples, and the next run goes on.
+Each sample is an image and then a row, so that an interrupted run leaves complete samples, and the next run continues.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ _HEADER = (IMAGE_COLUMN, *LABEL_COLUMNS)
 
 
 class Collection:
-    """A data set that grows.
+    """A data set that is extended by each run.
 
     Args:
-        root: its folder; made if it is not there.
-        shares: how many of each few samples go to which split, in turn ("train": 3, "val": 1).
-        about: how it is taken; a collection that was begun otherwise is not continued.
+        root: its folder; created if missing.
+        shares: number of samples per cycle that go to each split, in turn ("train": 3, "val": 1).
+        about: how it is taken; a collection with other settings is not continued.
 
     Raises:
-        ConfigError: the folder holds a collection that was begun otherwise, or something else.
+        ConfigError: the folder holds a collection with other settings, or something else.
         RecordingError: the folder cannot be written.
     """
 
     def __init__(self, root: Path, shares: Mapping[str, int], about: Mapping[str, Any]) -> None:
         self.root = root
-        self._turn = [split for split, share in shares.items() for _ in range(share)]
+        self._turn = [split for split, count in shares.items() for _ in range(count)]
         try:
             root.mkdir(parents=True, exist_ok=True)
             self._begin({"shares": dict(shares), **about})
@@ -61,12 +61,12 @@ class Collection:
                 table.write(row.getvalue())
         except OSError as error:
             raise RecordingError(
-                self.root, f"cannot be written: {error.strerror}", hint="free some space and run it again: it goes on"
+                self.root, f"cannot be written: {error.strerror}", hint="free some space and run it again: it continues"
             ) from None
         self.kept += 1
 
     def keep_rest(self, image: ImageArray) -> None:
-        """Keep what the sensor sees out of contact, if that is not there yet. Raises RecordingError."""
+        """Store the sensor's image out of contact, if there is none yet. Raises RecordingError."""
         if self._has_rest:
             return
         path = self.root / REST_IMAGE
@@ -78,7 +78,7 @@ class Collection:
 
     def _begin(self, about: Mapping[str, Any]) -> None:
         file = self.root / _ABOUT
-        # As JSON has it, so that tuples equal the lists that they become.
+        # Round trip through JSON, so that tuples equal the lists that they become.
         about = json.loads(json.dumps(about))
         if not file.exists():
             if any(self.root.iterdir()):
@@ -88,14 +88,14 @@ class Collection:
             file.write_text(json.dumps(about, indent=1) + "\n")
         elif json.loads(file.read_text()) != about:
             raise ConfigError(
-                "the folder holds samples that were taken otherwise",
+                "the folder holds samples taken with other settings",
                 key="collect.data",
                 value=str(self.root),
                 hint=f"compare {file}, or name a new folder",
             )
 
     def _whole_rows(self, split: str) -> int:
-        """Rows of a split's table, after cutting off one that was not written to its end."""
+        """Return the number of rows of a split's table, after removing an incomplete last one."""
         table = self._table(split)
         (table.parent / IMAGE_FOLDER).mkdir(parents=True, exist_ok=True)
         text = table.read_text() if table.exists() else ",".join(_HEADER) + "\n"

@@ -1,4 +1,4 @@
-"""MCAP recordings that survive a kill: small chunks, flushed as they close, and a reader that takes what is whole.
+"""MCAP recordings that survive a kill: small chunks, flushed as they close, and a reader for truncated files.
 
 Messages are JSON with a JSON schema, so that Foxglove and the ``mcap`` command line read them without touchcell.
 """
@@ -27,7 +27,7 @@ from mcap.writer import CompressionType, Writer
 
 from touchcell.cell.errors import RecordingError
 
-# A kill loses the open chunk at most: 16 KiB is a fraction of a second of a cell's usual 100 kB/s.
+# A kill loses at most the open chunk: 16 KiB is a fraction of a second of a cell's usual 100 kB/s.
 CHUNK_BYTES = 16 * 1024
 RECORDING = "run.mcap"
 """Name of the recording in a run folder."""
@@ -47,10 +47,10 @@ class Message:
 
 
 class Recorder:
-    """Writes one recording.
+    """Writer of one recording.
 
     Args:
-        path: the file, made anew.
+        path: the file; overwritten.
         stream: where to write instead of opening ``path``; the recorder closes it.
 
     Raises:
@@ -70,11 +70,11 @@ class Recorder:
 
     @property
     def failed(self) -> bool:
-        """Whether a write has failed; nothing more is written then."""
+        """True if a write has failed; nothing more is written then."""
         return self._failed
 
     def write(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
-        """Append one message; numpy values become lists, and what is not finite becomes null."""
+        """Append one message; numpy values become lists, and non-finite numbers become null."""
         if self._failed:
             raise RecordingError(self.path, "was closed by an earlier failure")
         try:
@@ -82,7 +82,7 @@ class Recorder:
             if channel is None:
                 channel = self._register(topic)
             self._writer.add_message(channel, t_ns, _encode(data), t_ns)
-            # A chunk that is complete leaves the process at once; between chunks this finds nothing to do.
+            # A complete chunk is flushed at once; between chunks this does nothing.
             self._stream.flush()
         except OSError as error:
             raise self._failure(error) from None
@@ -118,10 +118,10 @@ class Recorder:
 
 
 def read(path: Path) -> Iterator[Message]:
-    """All whole messages of a recording in file order, also of one whose writer was killed.
+    """Yield all complete messages of a recording in file order, also of one whose writer was killed.
 
     Raises:
-        RecordingError: ``path`` is missing or no MCAP file at all.
+        RecordingError: ``path`` is missing or not an MCAP file.
     """
     try:
         stream = path.open("rb")
@@ -129,7 +129,7 @@ def read(path: Path) -> Iterator[Message]:
         raise RecordingError(path, f"cannot be read: {error.strerror}") from None
     with stream:
         if stream.read(len(_MAGIC)) != _MAGIC:
-            raise RecordingError(path, "is no MCAP file")
+            raise RecordingError(path, "is not an MCAP file")
         stream.seek(0)
         messages = NonSeekingReader(stream, validate_crcs=False).iter_messages(log_time_order=False)
         while True:
@@ -142,14 +142,14 @@ def read(path: Path) -> Iterator[Message]:
 
 
 def follow(path: Path, wait: Callable[[], bool]) -> Iterator[Message]:
-    """All messages of a recording that may still be written, and those that are added to it, until it is finished.
+    """Yield all messages of a recording that may still be written, and those added to it, until it is finished.
 
     Args:
         path: the recording.
-        wait: called when there is nothing new; False gives up.
+        wait: called when there is nothing new; returns False to stop waiting.
 
     Raises:
-        RecordingError: ``path`` is missing or no MCAP file at all.
+        RecordingError: ``path`` is missing or not an MCAP file.
     """
     try:
         stream = path.open("rb")
@@ -163,7 +163,7 @@ def follow(path: Path, wait: Callable[[], bool]) -> Iterator[Message]:
             if len(held) < len(_MAGIC) and not wait():
                 return
         if held != _MAGIC:
-            raise RecordingError(path, "is no MCAP file")
+            raise RecordingError(path, "is not an MCAP file")
         held = b""
         while True:
             held += stream.read(_BLOCK_BYTES)
@@ -200,7 +200,7 @@ def _plain(value: Any) -> Any:
 
 
 def _finite(value: Any) -> Any:
-    """The same with None for what JSON cannot say."""
+    """Return the value with None in place of what JSON cannot represent."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, Mapping):

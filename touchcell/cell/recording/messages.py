@@ -1,4 +1,4 @@
-"""What a recording says, in the units that people think in: millimetres and degrees, with the unit in every key."""
+"""Messages of a recording, in millimetres and degrees, with the unit in every key."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ COMPONENTS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 
 
 def pose_message(T: Array) -> dict[str, float]:
-    """A pose (4, 4) as extrinsic-xyz Euler components (SPEC part 1); NaN for what is not finite, to be on file too."""
+    """Return a pose (4, 4) as extrinsic-xyz Euler components; NaN for a non-finite pose, so that it is recorded too."""
     if not np.isfinite(T).all():
         return dict.fromkeys(COMPONENTS, float("nan"))
     return dict(zip(COMPONENTS, se3.to_euler_mm_deg(T).tolist(), strict=True))
 
 
 def tcp_message(state: Stamped[TcpState]) -> dict[str, Any]:
-    """Pose and speed of a tool centre point."""
+    """Return pose and speed of a tool centre point."""
     return {
         "seq": state.seq,
         **pose_message(state.value.T_base_tcp),
@@ -34,14 +34,14 @@ def tcp_message(state: Stamped[TcpState]) -> dict[str, Any]:
 
 
 def command_message(sent: Sent[TwistCommand]) -> dict[str, Any]:
-    """What was really sent, and which limits changed it."""
+    """Return the command as sent, and the limits that changed it."""
     command = sent.command
     message: dict[str, Any] = {
         "twist": command.twist,
         "frame": command.frame.value,
         "ttl_s": command.ttl_s,
         "limited_by": [adjustment.limit for adjustment in sent.adjustments],
-        "asked": [adjustment.asked for adjustment in sent.adjustments],
+        "asked": [adjustment.requested for adjustment in sent.adjustments],
         "allowed": [adjustment.allowed for adjustment in sent.adjustments],
         "speed_mm_s": 1e3 * float(np.linalg.norm(command.twist[:3])),
     }
@@ -51,7 +51,7 @@ def command_message(sent: Sent[TwistCommand]) -> dict[str, Any]:
 
 
 def verdict_message(verdict: Verdict) -> dict[str, Any]:
-    """What the supervisor found wrong in one cycle, and whether motion may go on."""
+    """Return the supervisor's violations of one cycle, and whether motion is allowed."""
     return {
         "allow": verdict.allow,
         "speed": verdict.speed,
@@ -60,7 +60,7 @@ def verdict_message(verdict: Verdict) -> dict[str, Any]:
 
 
 def contact_message(estimate: ContactEstimate) -> dict[str, Any]:
-    """A contact estimate: pose of the sensor in the surface frame, standard deviations of the belief."""
+    """Return a contact estimate: pose of the sensor in the surface frame, standard deviations of the belief."""
     message: dict[str, Any] = {
         "seq": estimate.seq,
         "t_frame_ns": estimate.t_frame_ns,
@@ -74,7 +74,7 @@ def contact_message(estimate: ContactEstimate) -> dict[str, Any]:
 
 
 def belief_message(belief: PoseGaussian) -> dict[str, Any]:
-    """A Gaussian over ``T_s_f`` as the pose ``T_f_s`` that people read, and its standard deviations.
+    """Return a Gaussian over ``T_s_f`` as the pose ``T_f_s``, and its standard deviations.
 
     The deviations are those of right perturbations of ``T_f_s``, which are the belief's own up to sign: along and about
     the sensor's axes.

@@ -31,6 +31,7 @@ class Cell:
         clock: its time.
         arms: by role in the task, and those that only carry a sensor by their own name.
         sensors: by role.
+        auxiliaries: devices that are neither arms nor cameras, by role, or by name where they have none.
         task: what the cell does.
         new_task: makes it anew, in its first state, after a trip.
         stop_categories: by which each arm stops when something is wrong, by role.
@@ -49,6 +50,7 @@ class Cell:
     supervisor: Supervisor
     task: Task
     new_task: Callable[[], Task]
+    auxiliaries: Mapping[str, Device] = field(default_factory=dict)
     stop_categories: Mapping[str, StopCategory] = field(default_factory=dict)
     holding: frozenset[str] = frozenset()
     watched_joints: frozenset[str] = frozenset()
@@ -98,10 +100,12 @@ class Cell:
         self._exit.close()
 
     def _devices(self) -> list[Device]:
-        unique = {id(device): device for device in [*self.arms.values(), *self.cameras.values()]}
+        unique = {
+            id(device): device for device in [*self.arms.values(), *self.cameras.values(), *self.auxiliaries.values()]
+        }
         return list(unique.values())
 
     def _deactivate(self, device: Device) -> None:
-        section = self.plan.cell.arms.get(device.name)
+        section = self.plan.cell.arms.get(device.name) or self.plan.cell.devices.get(device.name)
         if device.state is Lifecycle.ACTIVE:
             device.deactivate(section.deactivate) if section is not None else device.deactivate()

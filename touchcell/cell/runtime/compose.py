@@ -35,7 +35,7 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
     """
     role_of = _arm_roles(plan)
     world = build_world(plan, role_of, clock)
-    wanted = {name: device for name, device in {**plan.arms, **plan.sensors}.items() if name not in world.hosted}
+    wanted = {name: device for name, device in plan.built.items() if name not in world.hosted}
     devices = build_devices(plan, wanted, world.clock, world.scene, world.hosted)
     arms = {role: cast(Arm, devices[name]) for name, role in role_of.items()}
     sensors = {
@@ -68,6 +68,7 @@ def compose(plan: CellPlan, *, clock: Clock | None = None) -> Cell:
         supervisor=Supervisor(interlocks, Latch()),
         task=new_task(),
         new_task=new_task,
+        auxiliaries={role: devices[name] for role, name in plan.auxiliary_roles.items()},
         stop_categories={role: StopCategory(plan.cell.arms[name].stop_category) for name, role in role_of.items()},
         holding=frozenset(
             role_of[pair.follower] for pair in plan.cell.pairs if pair.on_stop == "hold" and pair.follower in role_of

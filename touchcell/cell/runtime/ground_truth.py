@@ -13,15 +13,14 @@ from touchcell.geometry import se3
 from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.perception.runtime.pipeline import ContactSource
 
 # As good as exact, yet a proper covariance: a micrometre and a microradian.
 _COVARIANCE = np.eye(6) * 1e-12
 
 
-class TrueContactSource:
+class TrueContactSource(ContactSource):
     """A ``ContactSource`` that asks the scene."""
-
-    ended = False
 
     def __init__(self, scene: SceneTruth, sensor: str) -> None:
         self._scene = scene
@@ -38,10 +37,8 @@ class TrueContactSource:
         return ContactEstimate(contact.value.in_contact, belief, contact.t_ns, contact.seq, contact.t_ns)
 
 
-class LabelledContactSource:
+class LabelledContactSource(ContactSource):
     """A ``ContactSource`` that asks the arm which remembers where the images were taken."""
-
-    ended = False
 
     def __init__(self, arm: ReplayArm, T_tcp_sensor: Array) -> None:
         self._arm = arm

@@ -36,7 +36,7 @@ from touchcell.control.supervisor import Verdict
 from touchcell.drivers.core.commands import Sent, TwistCommand
 from touchcell.drivers.core.errors import ConnectError, DeviceError, DeviceGone
 from touchcell.drivers.core.lease import Lease
-from touchcell.drivers.core.protocols import ServoArm, TwistSink
+from touchcell.drivers.core.protocols import ServoArm, SettingSink, TwistSink
 from touchcell.errors import TouchcellError
 from touchcell.tasks.interface import Action, Observation, Task, TransitionRecord
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, TaskMachine, state_name
@@ -227,6 +227,7 @@ class RunLoop:
             reading.contacts,
             operator_stop=self._stop.orderly,
             ended=self._observer.exhausted,
+            devices=reading.devices,
         )
         action = cell.task.tick(observation)
         thought = time.perf_counter_ns()
@@ -266,6 +267,9 @@ class RunLoop:
         for role, arm in self._arms.items():
             if role not in action.twists:
                 call_driver(arm.name, arm.stop)
+        for role, setting in action.settings.items():
+            device = self._cell.auxiliaries[role]
+            call_driver(device.name, partial(cast(SettingSink, device).apply, setting))
         return sent
 
     def _wait(self) -> None:

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.sensor import Sensor
 from touchcell.cell.runtime.timing import CycleTimes
-from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
+from touchcell.control.interlocks.snapshot import ArmView, CellView, DeviceView, SensorView
 from touchcell.drivers.core.commands import Sent, TwistCommand
 from touchcell.drivers.core.errors import DeviceFault
+from touchcell.drivers.core.protocols import ReadingSource
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.errors import TouchcellError
 from touchcell.geometry import se3
@@ -33,11 +34,13 @@ class Reading:
         now_ns: time that it is for.
         states: of the arms, by role.
         contacts: of the sensors that have seen a frame, by role.
+        devices: of the other devices that are read, by role.
     """
 
     now_ns: int
     states: Mapping[str, Stamped[TcpState]]
     contacts: Mapping[str, ContactEstimate]
+    devices: Mapping[str, Stamped[Mapping[str, float]]] = field(default_factory=dict)
 
 
 class Observer:
@@ -77,8 +80,14 @@ class Observer:
             estimate = call_driver(self._device(role), partial(self._perceive, sensor, states))
             if estimate is not None:
                 contacts[role] = estimate
+        devices = {}
+        for role, device in cell.auxiliaries.items():
+            if device.fault is not None:
+                raise device.fault
+            if isinstance(device, ReadingSource):
+                devices[role] = call_driver(device.name, device.read)
         # Only now: what a device's own thread brought in the meantime would seem to come from the future.
-        return Reading(cell.clock.now_ns(), states, contacts)
+        return Reading(cell.clock.now_ns(), states, contacts, devices)
 
     def view(
         self,
@@ -93,16 +102,19 @@ class Observer:
             action: what the task asks for; None while no task is at work.
             sent: what was sent in the cycle before.
         """
-        twists, sent = ({} if action is None else action.twists), sent or {}
+        asked, sent = action or Action(), sent or {}
         return CellView(
             reading.now_ns,
             {
-                role: ArmView(state, twists.get(role), sent.get(role), self._joints(role))
+                role: ArmView(state, asked.twists.get(role), sent.get(role), self._joints(role))
                 for role, state in reading.states.items()
             },
             {role: _sensor_view(estimate, self._cell.sensors[role]) for role, estimate in reading.contacts.items()},
             self._cell.task.state,
             at_work=action is not None,
+            devices={
+                role: DeviceView(reading.devices.get(role), asked.settings.get(role)) for role in self._cell.auxiliaries
+            },
         )
 
     def _device(self, sensor_role: str) -> str:

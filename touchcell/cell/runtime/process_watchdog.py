@@ -44,7 +44,7 @@ def process_lines(plan: CellPlan) -> list[str]:
     """What `touchcell check` says about the processes of a cell."""
     groups = hosted_groups(plan)
     hosted = {device.name for group in groups for device in group.devices}
-    local = [name for name in (*plan.arms, *plan.sensors) if name not in hosted]
+    local = [name for name in plan.built if name not in hosted]
     lines = [f"task: control at {plan.cell.rate_hz:g} Hz" + (f"; {', '.join(local)}: not moved" if local else "")]
     lines += [
         f"host {group.name!r}: {', '.join(each.name for each in group.devices)} at "
@@ -117,7 +117,7 @@ class ProcessWatchdog:
                 "watchdog",
                 severity,
                 subject,
-                cause.reason.words,
+                cause.reason.description,
                 cause.t_ns,
                 value=cause.value_s if timed else None,
                 limit=cause.limit_s if timed else None,

@@ -95,6 +95,11 @@ class RunRecord:
         for role, sensor in cell.sensors.items():
             for topic, t_ns, message in sensor.extra_messages(now_ns):
                 self.write(f"/sensors/{role}/{topic}", t_ns, message, boxed=topic != "image")
+        for role, sample in reading.devices.items():
+            self.write(f"/devices/{role}/reading", sample.t_ns, {"seq": sample.seq, **sample.value})
+        if verdict.allow:
+            for role, setting in action.settings.items():
+                self.write(f"/devices/{role}/setting", now_ns, setting)
         if cell.scene is not None:
             objects = cell.scene.objects()
             for name, T_world_object in objects.value.items():

@@ -6,35 +6,22 @@ import base64
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from touchcell.cell.config.schema import (
-    CellPlan,
-    KnownSurface,
-    MovingSurfaceSection,
-    NetworkEstimator,
-    SensorSection,
-    StillSurfaceSection,
-)
+from touchcell.cell.config.schema import CellPlan
 from touchcell.cell.recording.messages import belief_message, pose_message
-from touchcell.cell.runtime.known_surface import KnownSurfaceSource
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.protocols import FrameSource
 from touchcell.drivers.core.samples import Frame, Stamped
-from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.paths import MODELS
+from touchcell.perception.runtime.estimator_spec import EstimatorContext
 from touchcell.perception.runtime.pipeline import ContactPipeline, ContactSource
 
 if TYPE_CHECKING:
     from touchcell.drivers.core.scene import SceneTruth
-    from touchcell.perception.runtime.filter import ContactFilter
-
-BUILTIN = "builtin:"
 
 
 @dataclass
@@ -63,12 +50,11 @@ class Sensor:
     @property
     def frame(self) -> Stamped[Frame] | None:
         """The newest frame that was looked at; None from a source that looks at none."""
-        return self.source.frame if isinstance(self.source, ContactPipeline | KnownSurfaceSource) else None
+        return self.source.frame
 
     def await_frame(self) -> None:
         """Wait for the first frame, so that no control cycle has to. Raises DeviceError."""
-        if isinstance(self.source, ContactPipeline | KnownSurfaceSource):
-            self.source.await_frame()
+        self.source.await_frame()
 
     def picture(self) -> tuple[int | None, float | None]:
         """A checksum and the mean grey level of every third pixel of the newest frame; (None, None) if not watched."""
@@ -135,17 +121,9 @@ def build_sensor(
     section = plan.cell.sensors[name]
     T_tcp_sensor = section.T_tcp_sensor
     truth = _truth(name, devices.get(section.mounted_on or ""), scene, T_tcp_sensor)
-    source: ContactSource
-    if isinstance(section.estimator, NetworkEstimator):
-        source = _pipeline(section, section.estimator, devices[name])
-    elif isinstance(section.estimator, KnownSurface):
-        T_base_f = se3.from_euler_mm_deg(np.array(section.estimator.surface_mm_deg))
-        source = KnownSurfaceSource(cast(FrameSource, devices[name]), T_base_f)
-    else:
-        assert truth is not None
-        source = truth
+    context = EstimatorContext(name, cast(FrameSource, devices[name]), truth)
     return Sensor(
-        source=source,
+        source=section.estimator.build(context),
         arm_role=role_of[section.mounted_on] if section.mounted_on else None,
         T_tcp_sensor=T_tcp_sensor,
         truth=truth,
@@ -161,51 +139,6 @@ def _truth(name: str, mount: Device | None, scene: SceneTruth | None, T_tcp_sens
     if scene is not None:
         return TrueContactSource(scene, name)
     return LabelledContactSource(mount, T_tcp_sensor) if isinstance(mount, ReplayArm) else None
-
-
-def model_path(name: str) -> Path:
-    """The file behind a cell file's ``model:``: a path, or ``builtin:NAME`` for one that ships with touchcell."""
-    return MODELS / f"{name.removeprefix(BUILTIN)}.safetensors" if name.startswith(BUILTIN) else Path(name)
-
-
-def _pipeline(section: SensorSection, estimator: NetworkEstimator, camera: Device) -> ContactPipeline:
-    import cv2
-
-    from touchcell.perception.runtime.contact_gate import ContactGate
-    from touchcell.perception.runtime.estimators import load_estimator
-
-    # A second thread gains nothing on images of this size (PERCEPTION part 5), and takes a core from other sensors.
-    cv2.setNumThreads(1)
-    calibration = None if estimator.calibration is None else Path(estimator.calibration)
-    model = load_estimator(model_path(estimator.model), calibration)
-    pose_filter = None if estimator.filter is None else build_filter(estimator.filter)
-    contact_gate = None
-    if (gate := estimator.gate) is not None:
-        if model.reference is None:
-            raise ConfigError(
-                f"model {estimator.model} holds no image out of contact, which a contact gate compares with",
-                key=f"sensors.{camera.name}.estimator.gate",
-                value=estimator.model,
-                hint="leave out `gate:`, so that every frame goes through the network",
-            )
-        contact_gate = ContactGate(model.reference, enter=gate.touch_percent / 100, leave=gate.release_percent / 100)
-    return ContactPipeline(cast(FrameSource, camera), model, contact_gate=contact_gate, pose_filter=pose_filter)
-
-
-def build_filter(settings: StillSurfaceSection | MovingSurfaceSection) -> ContactFilter:
-    """The filter that a cell file's ``filter:`` describes."""
-    from touchcell.perception.runtime.filter import PoseFilter, isotropic_noise
-
-    drift = isotropic_noise(1e-3 * settings.drift_mm_per_sqrt_s, np.deg2rad(settings.drift_deg_per_sqrt_s))
-    if isinstance(settings, StillSurfaceSection):
-        return PoseFilter(drift)
-    from touchcell.perception.runtime.moving_surface import MovingSurfaceFilter
-
-    return MovingSurfaceFilter(
-        drift,
-        isotropic_noise(1e-3 * settings.accel_mm_s_per_sqrt_s, np.deg2rad(settings.accel_deg_s_per_sqrt_s)),
-        isotropic_noise(1e-3 * settings.speed_mm_s, np.deg2rad(settings.speed_deg_s)),
-    )
 
 
 def _image_message(image: Any, kind: str, seq: int, t_ns: int) -> dict[str, Any]:

@@ -6,10 +6,12 @@ import logging
 from collections.abc import Mapping
 
 from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.observer import call_driver
 from touchcell.cell.runtime.run_record import RunRecord
 from touchcell.cell.runtime.stopping import Stopper, StopReport
 from touchcell.control.interlocks.violation import Severity, Violation
-from touchcell.drivers.core.protocols import ServoArm
+from touchcell.drivers.core.errors import DeviceError
+from touchcell.drivers.core.protocols import ServoArm, Stoppable
 from touchcell.drivers.core.samples import Stamped, TcpState
 
 logger = logging.getLogger(__name__)
@@ -31,12 +33,21 @@ class StopProcedure:
         self._stopper = Stopper(arms, cell.stop_categories, cell.clock, 1.0 / cell.rate_hz, cell.holding)
 
     def begin(self, *, tripped: bool) -> None:
-        """Tell all arms to stop: as the cell file says when something is wrong, else holding where they are."""
+        """Tell all arms to stop: as the cell file says when something is wrong, else holding where they are.
+
+        Other devices that can be stopped then stop and hold; nothing waits for them.
+        """
         distrusted = {c.subject for c in self._cell.supervisor.latch.causes if c.severity is Severity.FAULT}
         failed = self._stopper.stop(tripped=tripped, distrusted=distrusted)
         for role, error in failed.items():
             logger.error("%s could not be told to stop", role, exc_info=error)
             self._record.event("stop failed", f"{role}: {error}")
+        for role, device in self._cell.auxiliaries.items():
+            if isinstance(device, Stoppable):
+                try:
+                    call_driver(device.name, device.stop)
+                except DeviceError as error:
+                    self._record.event("stop failed", f"{role}: {error}")
 
     def await_rest(self) -> Mapping[str, StopReport]:
         """Watch the arms that were told to stop until they stand."""

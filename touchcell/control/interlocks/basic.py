@@ -56,6 +56,11 @@ class Finite:
             ):
                 if value is not None:
                     yield role, sensor.seq, what, value
+        for role, device in view.devices.items():
+            for name, number in ({} if device.reading is None else device.reading.value).items():
+                yield role, None, name, float(number)
+            for name, number in (device.setting or {}).items():
+                yield role, None, f"set {name}", float(number)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,6 +28,8 @@ REQUIRED_TO_MOVE: Final = frozenset({"workspace", "tcp_speed", "arm_state_age"})
 """Kinds that a task which moves an arm requires."""
 REQUIRED_TO_TOUCH: Final = frozenset({"depth", "frame_age"})
 """Kinds that such a task also requires if it uses a tactile sensor."""
+REQUIRED_TO_READ: Final = frozenset({"reading_age"})
+"""Kinds that such a task also requires if it uses the readings of another device."""
 
 
 def parse_interlocks(section: Mapping[str, Any]) -> dict[str, InterlockSettings]:

@@ -79,8 +79,21 @@ class SensorView:
 
 
 @dataclass(frozen=True, slots=True)
+class DeviceView:
+    """Snapshot of a device that is neither an arm nor a tactile sensor.
+
+    Attributes:
+        reading: newest named numbers; None for a device that is not read.
+        setting: named set values about to be applied; None when they stay as they are.
+    """
+
+    reading: Stamped[Mapping[str, float]] | None = None
+    setting: Mapping[str, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class CellView:
-    """Snapshot of the cell at ``now_ns``: arms and sensors by their role in the task, and the task's state.
+    """Snapshot of the cell at ``now_ns``: arms, sensors and other devices by their role, and the task's state.
 
     ``at_work`` is False while a tripped run waits for an operator: then nothing is being pushed or held.
     """
@@ -90,6 +103,7 @@ class CellView:
     sensors: Mapping[str, SensorView] = field(default_factory=dict)
     task_state: str = ""
     at_work: bool = True
+    devices: Mapping[str, DeviceView] = field(default_factory=dict)
 
     def works_in(self, states: frozenset[str]) -> bool:
         """Return True if the task is at work, and in one of ``states`` if any are named."""

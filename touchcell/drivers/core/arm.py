@@ -7,6 +7,7 @@ and within the limits.
 
 from __future__ import annotations
 
+import logging
 from abc import abstractmethod
 from collections.abc import Iterable
 from contextlib import suppress
@@ -37,6 +38,9 @@ from touchcell.drivers.kinematics.chain import DifferentialIk, LocalIk
 from touchcell.drivers.kinematics.joint_limits import IkSettings
 from touchcell.geometry.finite import all_finite
 from touchcell.geometry.types import Array
+from touchcell.logs import OncePerCause
+
+_logger = logging.getLogger(__name__)
 
 _REST_POLL_NS = 5_000_000
 _REST_MARGIN_S = 1.0
@@ -94,6 +98,7 @@ class Arm(Device):
         self._stop_categories = frozenset(StopCategory(category) for category in stop_categories)
         self._max_state_age_s = max_state_age_s
         self._desk = LeaseManager(name)
+        self._refusals = OncePerCause(_logger)
         self._gate = TwistGate(name, limits, self._desk, clock, max_ttl_s=max_ttl_s)
         self._stop_count = 0
 
@@ -136,9 +141,14 @@ class Arm(Device):
             StaleData: the pose is too old to turn a twist along tool axes, or the joints to be kept within limits.
         """
         stop_count = self._stop_count
-        sent = self._gate.admit(
-            command, lease, self.state, self._tool_pose(command), self._project_to_feasible, self._local_ik
-        )
+        try:
+            sent = self._gate.admit(
+                command, lease, self.state, self._tool_pose(command), self._project_to_feasible, self._local_ik
+            )
+        except CommandRejected as error:
+            self._refusals.warning(error.reason, "%s", error)
+            raise
+        self._refusals.forget()
         admitted = sent.command
         left_s = admitted.ttl_s - (sent.t_ns - admitted.t_ns) * 1e-9
         self._stream_twist(admitted.twist, max(left_s, _SHORTEST_TTL_S), sent.t_ns)
@@ -327,5 +337,5 @@ class JointLimitsConfig(DriverConfig):
             singular_floor_m=1e-3 * self.singular_floor_mm,
             damping_m=0.0 if own_controller else 1e-3 * self.singular_value_mm,
             limit_margin_rad=float(np.deg2rad(self.margin_deg)),
-            goes_round=not own_controller,
+            uses_null_space=not own_controller,
         )

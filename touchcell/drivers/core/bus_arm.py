@@ -5,6 +5,7 @@ A control loop in a thread of the driver sends setpoints, collects replies, and 
 
 from __future__ import annotations
 
+import logging
 import threading
 from abc import abstractmethod
 from collections import deque
@@ -36,6 +37,9 @@ from touchcell.drivers.core.spec import DriverConfig
 from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain, Tool
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
+from touchcell.logs import OncePerCause
+
+_logger = logging.getLogger(__name__)
 
 Positive = Annotated[float, Field(gt=0.0)]
 
@@ -121,16 +125,17 @@ class BusArm(JointArm):
         self._closing = threading.Event()
         # Held by the loop for one cycle, and by any code that needs the bus or changes what the loop sends.
         self._lock = threading.RLock()
-        self._forget()
+        self._reset_state()
 
-    def _forget(self) -> None:
+    def _reset_state(self) -> None:
         """Discard samples and faults of an earlier connection."""
-        self._trouble: DeviceError | None = None
+        self._latched_fault: DeviceError | None = None
         self._enabled = [False] * self._chain.joint_count
         self._joints: Stamped[JointState] | None = None
         self._seq = 0
         self._implausible = 0
         self._overruns = 0
+        self._delays = OncePerCause(_logger)
         self._latest_s = 0.0
         self._missed: deque[bool] = deque(maxlen=_MISS_WINDOW)
         self._follows_until_ns = 0
@@ -175,7 +180,7 @@ class BusArm(JointArm):
         """Let the motors hold their position by themselves, where supported."""
 
     def _open(self) -> None:
-        self._forget()
+        self._reset_state()
         self._open_bus()
         self._closing.clear()
         self._thread = threading.Thread(target=self._run, name=f"{self.name} bus", daemon=True)
@@ -183,7 +188,7 @@ class BusArm(JointArm):
         deadline_ns = self._clock.now_ns() + round(_FIRST_SAMPLE_S * 1e9)
         while self._joints is None:
             if self._clock.now_ns() >= deadline_ns or not self._thread.is_alive():
-                causes = [self._trouble] if self._trouble is not None else []
+                causes = [self._latched_fault] if self._latched_fault is not None else []
                 raise ConnectError(self.name, f"no complete state within {_FIRST_SAMPLE_S:g} s", causes)
             self._clock.sleep_until_ns(self._clock.now_ns() + 1_000_000)
 
@@ -218,8 +223,8 @@ class BusArm(JointArm):
         return DeactivatePolicy(self._config.on_disconnect)
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
-        if self._trouble is not None:
-            raise CommandRejected(self.name, Rejection.MODE, "device is faulted", hint=str(self._trouble))
+        if self._latched_fault is not None:
+            raise CommandRejected(self.name, Rejection.MODE, "device is faulted", hint=str(self._latched_fault))
         expires_ns = now_ns + round(ttl_s * 1e9)
         self._setpoint.follow(twist_base, expires_ns)
         self._follows_until_ns = expires_ns if twist_base.any() else 0
@@ -235,8 +240,8 @@ class BusArm(JointArm):
             )
         self._setpoint.go_to(np.deg2rad(self._config.park_deg), _PARK_SPEED_FRACTION)
         while not self.at_rest():
-            if self._trouble is not None:
-                raise self._trouble
+            if self._latched_fault is not None:
+                raise self._latched_fault
             self._clock.sleep_until_ns(self._clock.now_ns() + 5_000_000)
 
     def _parked(self) -> bool:
@@ -254,8 +259,8 @@ class BusArm(JointArm):
             try:
                 with self._lock:
                     now_ns = self._clock.now_ns()
-                    if self._trouble is not None:
-                        self._latch(self._trouble)
+                    if self._latched_fault is not None:
+                        self._latch(self._latched_fault)
                     self._cycle(now_ns, min(now_ns - last_ns, 2 * period_ns) * 1e-9, now_ns + period_ns * 3 // 4)
             except DeviceGone as error:
                 self._latch(error)
@@ -271,6 +276,7 @@ class BusArm(JointArm):
             self._latest_s = max(self._latest_s, late_ns * 1e-9)
             if late_ns > 0:
                 self._overruns += 1
+                self._delays.warning("overrun", "%s: bus cycle %.1f ms late", self.name, late_ns * 1e-6)
                 next_ns += late_ns
             self._clock.sleep_until_ns(next_ns)
 

@@ -67,21 +67,21 @@ class UnsupportedSetting(ConfigError):
     Attributes:
         device: name of the camera in the cell.
         setting: key of the setting.
-        asked: configured value.
+        requested: configured value.
         given: value read back from the device; None if it has no such setting.
     """
 
-    def __init__(self, device: str, setting: str, asked: object, given: object) -> None:
+    def __init__(self, device: str, setting: str, requested: object, given: object) -> None:
         reason = "the camera has no such setting" if given is None else f"the camera gives {given}"
         super().__init__(
-            f"{asked} refused, {reason}",
+            f"{requested} refused, {reason}",
             key=f"{device}.{setting}",
-            value=asked,
+            value=requested,
             hint="leave it out" if given is None else "`v4l2-ctl --list-ctrls --list-formats-ext` shows what it offers",
         )
         self.device = device
         self.setting = setting
-        self.asked = asked
+        self.requested = requested
         self.given = given
 
 
@@ -119,7 +119,7 @@ class Camera(Device):
     def __init__(self, name: str, clock: Clock, config: CameraConfig) -> None:
         super().__init__(name, clock)
         self._config = config
-        self._watch = FrameMonitor()
+        self._monitor = FrameMonitor(name)
         self._newest: RawFrame | None = None
         self._last_seq = -1
         self._decoded: Stamped[Frame] | None = None
@@ -175,13 +175,13 @@ class Camera(Device):
         return {
             "state": self._state.value,
             "frame_age_s": self._age_s(),
-            **self._watch.readings(),
+            **self._monitor.readings(),
             **self._settings(),
         }
 
     def _begin_stream(self) -> None:
         """Wait for the first good frame; call once the stream runs. Raises TransportTimeout, DeviceGone."""
-        self._watch.reset_errors()
+        self._monitor.reset_errors()
         self._overflowed = False
         self._since_ns = self._clock.now_ns()
         before = self._last_seq
@@ -189,7 +189,7 @@ class Camera(Device):
         if self._last_seq == before:
             raise TransportTimeout(self.name, "first frame", _FIRST_FRAME_S, hint="is the camera in use elsewhere?")
 
-    def _keep(self, frame: RawFrame) -> None:
+    def _store(self, frame: RawFrame) -> None:
         """Store a good frame; ``_collect`` calls this in order of arrival."""
         self._newest = frame
         self._last_seq = frame.seq
@@ -200,7 +200,7 @@ class Camera(Device):
 
     def _refresh(self) -> None:
         self._empty_queue()
-        self._judge(self._config.stall_s)
+        self._check_stream(self._config.stall_s)
 
     def _silence_s(self) -> float:
         # Counted from the latest event: the newest frame may date from before a recovery or an overflow.
@@ -221,18 +221,18 @@ class Camera(Device):
     def _await_after(self, after_seq: int, timeout_s: float, stall_s: float) -> None:
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         self._empty_queue()
-        self._judge(stall_s)
+        self._check_stream(stall_s)
         while self._newest is None or self._newest.seq <= after_seq:
             left_s = (deadline_ns - self._clock.now_ns()) * 1e-9
             if left_s <= 0.0:
                 return
             self._wait(min(left_s, max(stall_s - self._silence_s(), _SHORTEST_WAIT_S)))
             self._collect()
-            self._judge(stall_s)
+            self._check_stream(stall_s)
 
-    def _judge(self, stall_s: float) -> None:
-        if self._watch.out_of_budget:
-            worst = max(self._watch.bad, key=lambda reason: self._watch.bad[reason])
+    def _check_stream(self, stall_s: float) -> None:
+        if self._monitor.has_too_many_bad:
+            worst = max(self._monitor.bad, key=lambda reason: self._monitor.bad[reason])
             raise CorruptMessage(
                 self.name, f"too many bad frames, most of them {worst}", hint="check the cable and the USB bandwidth"
             )
@@ -244,10 +244,10 @@ class Camera(Device):
             try:
                 image = self._decode(raw)
             except CorruptMessage:
-                self._watch.refuse("undecodable")
+                self._monitor.count_bad("undecodable")
                 self._newest = None
                 raise
-            self._watch.look(image)
+            self._monitor.record_brightness(image)
             frame = Frame(image, *self._exposure_and_gain())
             self._decoded = Stamped(frame, raw.t_ns, raw.seq, raw.t_device_ns, raw.quality)
         return self._decoded
@@ -283,7 +283,7 @@ class Camera(Device):
 
     @abstractmethod
     def _collect(self) -> bool:
-        """Take every waiting frame and ``_keep`` the good ones; True if an overflow followed the newest one."""
+        """Take every waiting frame and ``_store`` the good ones; True if an overflow followed the newest one."""
 
     @abstractmethod
     def _wait(self, timeout_s: float) -> None:

@@ -8,6 +8,7 @@ PASSIVE only reads: nothing that changes power, mode or zero has been sent. ``ac
 
 from __future__ import annotations
 
+import logging
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -19,6 +20,8 @@ from typing import Self, final
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import CommandRejected, DeviceError, LifecycleError, TransportError
+
+_logger = logging.getLogger(__name__)
 
 
 class Lifecycle(Enum):
@@ -124,6 +127,7 @@ class Device(ABC):
             self._require("recover", Lifecycle.FAULTED)
             self._fault_error = None
             self._state = Lifecycle.READY
+        _logger.info("%s: recovered on request of %s", self.name, token.operator)
 
     @final
     def disconnect(self) -> None:
@@ -138,6 +142,7 @@ class Device(ABC):
         finally:
             self._forget_state()
             self._close()
+            _logger.info("%s: disconnected", self.name)
 
     def __enter__(self) -> Self:
         if self._state is Lifecycle.DISCONNECTED:
@@ -160,6 +165,7 @@ class Device(ABC):
             if self._fault_error is not None:
                 raise self._fault_error
             self._state = state
+        _logger.info("%s: %s", self.name, state.value)
 
     def _change_state(self, expected: Lifecycle, state: Lifecycle) -> bool:
         """Compare and set: enter ``state`` if the device is in ``expected``; returns whether it was."""
@@ -182,6 +188,7 @@ class Device(ABC):
                 # The error first: who reads the state from another thread finds it.
                 self._fault_error = error
                 self._state = Lifecycle.FAULTED
+                _logger.error("faulted: %s", error)
         return error
 
     def _attempt(self, step: Callable[[], None]) -> None:

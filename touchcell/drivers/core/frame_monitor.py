@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import zlib
 from collections import deque
 
 import numpy as np
 
 from touchcell.geometry.types import ImageArray
+from touchcell.logs import OncePerCause
+
+_logger = logging.getLogger(__name__)
 
 _BUDGET_FRAMES = 30
 _BUDGET_BAD = 10
@@ -24,9 +28,15 @@ class FrameMonitor:
     time, *frozen* when its bytes equal those of the previous frame (sensor noise makes that next to impossible on a
     live sensor), and *bad* when it was rejected. Brightness is compared with that of the first 60 frames that were
     read.
+    The first loss of each kind in a stream is logged.
+
+    Args:
+        camera: name of the camera, for the log.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, camera: str = "camera") -> None:
+        self._camera = camera
+        self._losses = OncePerCause(_logger)
         self.good = 0
         self.lost = 0
         self.unread = 0
@@ -39,18 +49,22 @@ class FrameMonitor:
         self._brightness = 0.0
 
     @property
-    def out_of_budget(self) -> bool:
+    def has_too_many_bad(self) -> bool:
         """Return whether more than 10 of the last 30 frames were bad."""
         return sum(self._recent_bad) > _BUDGET_BAD
 
-    def miss(self, frames: int, *, overrun: bool) -> None:
+    def count_lost(self, frames: int, *, overrun: bool) -> None:
         """Count ``frames`` that never arrived; ``overrun``: the queue was full, so the reader was too slow."""
+        if not frames:
+            return
         if overrun:
             self.unread += frames
+            self._losses.warning("unread", "%s: dropped %d frames that were not read in time", self._camera, frames)
         else:
             self.lost += frames
+            self._losses.warning("lost", "%s: %d frames were lost on their way", self._camera, frames)
 
-    def admit(self, data: bytes) -> None:
+    def count_good(self, data: bytes) -> None:
         """Count a good frame; ``data``: its bytes as received."""
         self.good += 1
         # Sampled over the whole image, as its border may be black without noise; an odd stride hits both bytes of YUYV.
@@ -63,12 +77,13 @@ class FrameMonitor:
         self._fingerprint = fingerprint
         self._recent_bad.append(False)
 
-    def refuse(self, reason: str) -> None:
+    def count_bad(self, reason: str) -> None:
         """Count a frame rejected for ``reason``, a short name such as "short"."""
         self.bad[reason] = self.bad.get(reason, 0) + 1
         self._recent_bad.append(True)
+        self._losses.warning(reason, "%s: dropped a bad frame (%s)", self._camera, reason.replace("_", " "))
 
-    def look(self, image: ImageArray) -> None:
+    def record_brightness(self, image: ImageArray) -> None:
         """Record the brightness of a frame that was read."""
         brightness = float(np.mean(image[::_BRIGHTNESS_STEP, ::_BRIGHTNESS_STEP]))
         if len(self._baseline) < _BASELINE_FRAMES:
@@ -80,6 +95,7 @@ class FrameMonitor:
     def reset_errors(self) -> None:
         """Begin a new stream: no previous frame, no recent errors. Counters continue."""
         self._recent_bad.clear()
+        self._losses.forget()
         self._fingerprint = None
         self.frozen_run = 0
 

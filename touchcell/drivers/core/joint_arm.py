@@ -13,7 +13,7 @@ from touchcell.geometry.types import Array
 
 
 class JointArm(Arm):
-    """An arm with a kinematic chain, a joint-space setpoint, and a loop that sets ``_joints`` and ``_trouble``.
+    """An arm with a kinematic chain, a joint-space setpoint, and a loop that sets ``_joints`` and ``_latched_fault``.
 
     Subclasses create the attributes below before the loop starts.
     """
@@ -22,7 +22,7 @@ class JointArm(Arm):
     _ik: DifferentialIk
     _setpoint: JointSetpoint
     _joints: Stamped[JointState] | None
-    _trouble: DeviceError | None
+    _latched_fault: DeviceError | None
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
         """Return the newest joint states, stamped at the request. Raises StaleData."""
@@ -50,8 +50,8 @@ class JointArm(Arm):
         q = self._admitted_joint_goal(
             q, lease, speed_fraction, self._chain.lower, self._chain.upper, self._chain.joint_count
         )
-        if self._trouble is not None:
-            raise CommandRejected(self.name, Rejection.MODE, f"device fault: {self._trouble}")
+        if self._latched_fault is not None:
+            raise CommandRejected(self.name, Rejection.MODE, f"device fault: {self._latched_fault}")
         self._setpoint.go_to(q, speed_fraction)
 
     def kinematics(self) -> DifferentialIk:
@@ -63,9 +63,9 @@ class JointArm(Arm):
 
     def _latch(self, error: DeviceError) -> None:
         """Store the first fault, stop the setpoint, and set FAULTED."""
-        if self._trouble is None:
-            self._trouble = error
+        if self._latched_fault is None:
+            self._latched_fault = error
             self._setpoint.stop()
         # A concurrent transition in another thread may have overwritten the state, so every cycle sets it again.
         if self.state not in (Lifecycle.DISCONNECTED, Lifecycle.FAULTED):
-            self._to_faulted(self._trouble)
+            self._to_faulted(self._latched_fault)

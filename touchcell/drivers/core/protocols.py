@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from enum import IntEnum
 from typing import Final, Protocol, runtime_checkable
 
@@ -136,6 +136,32 @@ class NativeWatchdog(Protocol):
 
     def watchdog_s(self) -> float:
         """Return the watchdog period as read back from the device: silence for this long stops it."""
+        ...
+
+
+@runtime_checkable
+class ReadingSource(Protocol):
+    """Delivers named numbers: a force-torque sensor, a gripper, a scale."""
+
+    def read(self, max_age_s: float | None = None) -> Stamped[Mapping[str, float]]:
+        """Return the newest reading, with units in the names ("force_z_n").
+
+        Raises:
+            StaleData: the newest reading is older than ``max_age_s``.
+        """
+        ...
+
+
+@runtime_checkable
+class SettingSink(Protocol):
+    """Follows named set values: a gripper, a conveyor."""
+
+    def apply(self, setting: Mapping[str, float]) -> None:
+        """Begin to follow ``setting``, with units in the names ("width_mm"). Never blocks for longer than a cycle.
+
+        Raises:
+            CommandRejected: a name is unknown, or a value is not finite or out of range.
+        """
         ...
 
 

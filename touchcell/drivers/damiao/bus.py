@@ -115,9 +115,9 @@ class MotorBus:
         self._fence_lost_after_ns = round(0.5e9 * max_silence_s)
         self._fd = fd
         self._bus: Any = None
-        self._forget()
+        self._reset_state()
 
-    def _forget(self) -> None:
+    def _reset_state(self) -> None:
         """Reset to the state of a bus that was never open."""
         n = len(self._addresses)
         self._ranges: list[Ranges | None] = [None] * n
@@ -145,7 +145,7 @@ class MotorBus:
         Raises:
             ConnectError: no bus, or motors that do not reply or not as configured; ``causes`` names each.
         """
-        self._forget()
+        self._reset_state()
         self._bus = self._connect()
         causes: list[Exception] = []
         for index, address in enumerate(self._addresses):

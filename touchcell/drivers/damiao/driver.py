@@ -154,8 +154,8 @@ class DamiaoCanArm(BusArm):
             fd=config.fd,
         )
 
-    def _forget(self) -> None:
-        super()._forget()
+    def _reset_state(self) -> None:
+        super()._reset_state()
         self._answers: list[Answer | None] = [None] * len(self._config.motors)
 
     def watchdog_s(self) -> float:
@@ -203,8 +203,8 @@ class DamiaoCanArm(BusArm):
 
     def _activate(self) -> None:
         with self._lock:
-            if self._trouble is not None:
-                raise self._trouble
+            if self._latched_fault is not None:
+                raise self._latched_fault
             q = self.joints(self._config.max_silence_s).value.q
             outside = (q < self._chain.lower) | (q > self._chain.upper)
             if outside.any():
@@ -237,7 +237,7 @@ class DamiaoCanArm(BusArm):
                 self._enabled[index] = self._enabled[index] and status == codec.ENABLED
             self._configure()
             self._missed.clear()
-            self._trouble = None
+            self._latched_fault = None
 
     def _fresh_answer(self, index: int) -> Answer:
         """Return the loop's newest reply. Waiting for a silent motor here would let the others' timeouts expire."""
@@ -371,9 +371,11 @@ class DamiaoCanArm(BusArm):
         return None
 
     def _publish(self, answers: list[Answer]) -> None:
-        told = np.array([(a.feedback.q, a.feedback.dq, a.feedback.tau) for a in answers])
+        feedback = np.array([(a.feedback.q, a.feedback.dq, a.feedback.tau) for a in answers])
         state = JointState(
-            self._direction * told[:, 0] + self._offset, self._direction * told[:, 1], self._direction * told[:, 2]
+            self._direction * feedback[:, 0] + self._offset,
+            self._direction * feedback[:, 1],
+            self._direction * feedback[:, 2],
         )
         self._seq += 1
         self._joints = Stamped(state, min(answer.t_ns for answer in answers), self._seq)

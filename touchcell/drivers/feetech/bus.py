@@ -150,7 +150,7 @@ class ServoBus:
             start = codec.STATE_STARTS[self._turn]
             length = codec.state_length(start)
             self._drain()
-            asked_ns = self._clock.now_ns()
+            requested_ns = self._clock.now_ns()
             answers: dict[int, Answer] = {}
             if self._send(codec.sync_read(self._ids, start, length)):
                 while len(answers) < len(self._ids):
@@ -158,12 +158,12 @@ class ServoBus:
                     if packets is None:
                         break
                     for packet in packets:
-                        self._take_state(packet, length, asked_ns, answers)
+                        self._take_state(packet, length, requested_ns, answers)
             self.counters.answered += len(answers)
             self.counters.missed += len(self._ids) - len(answers)
             return [answers.get(servo) for servo in self._ids]
 
-    def _take_state(self, packet: Packet, length: int, asked_ns: int, answers: dict[int, Answer]) -> None:
+    def _take_state(self, packet: Packet, length: int, requested_ns: int, answers: dict[int, Answer]) -> None:
         if packet.servo in self._ids and len(packet.data) != length:
             self.counters.late += 1
             return
@@ -171,7 +171,7 @@ class ServoBus:
             self.counters.unexpected += 1
             return
         try:
-            answers[packet.servo] = Answer(codec.decode_state(packet.data), asked_ns)
+            answers[packet.servo] = Answer(codec.decode_state(packet.data), requested_ns)
         except CodecError:
             self.counters.corrupt += 1
 

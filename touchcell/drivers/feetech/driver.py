@@ -43,14 +43,14 @@ from touchcell.drivers.feetech.bus import Answer, ServoBus
 from touchcell.drivers.feetech.codec import FaultBit, Register, ServoState
 from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain
-from touchcell.drivers.kinematics.twist_projection import followable
+from touchcell.drivers.kinematics.twist_projection import project_to_feasible
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 
 Ticks = Annotated[int, Field(ge=0, lt=codec.TICKS_PER_TURN)]
 
 _MAX_BUS_LOAD = 0.8
-_ASKED_IN_VAIN = 3
+_MAX_UNANSWERED = 3
 _UNSEEN_CYCLES = 2
 _TRIES = 3
 _ANSWER_TIMEOUT_S = 0.15
@@ -126,15 +126,15 @@ class FeetechSerialConfig(BusArmConfig):
                 f"max_silence_s {self.max_silence_s:g} is more than {len(codec.STATE_STARTS)} cycles of "
                 f"{self.rate_hz:g} Hz, within which a late reply can be distinguished from a fresh one"
             )
-        if self.max_silence_s * self.rate_hz < _ASKED_IN_VAIN:
+        if self.max_silence_s * self.rate_hz < _MAX_UNANSWERED:
             raise ValueError(f"max_silence_s {self.max_silence_s:g} is less than three cycles of {self.rate_hz:g} Hz")
         return self
 
     @property
     def calibration_hash(self) -> str:
         """Return twelve hexadecimal digits that change with any number of the calibration."""
-        told = "\n".join(servo.model_dump_json() for servo in self.servos)
-        return hashlib.sha256(told.encode()).hexdigest()[:12]
+        calibration = "\n".join(servo.model_dump_json() for servo in self.servos)
+        return hashlib.sha256(calibration.encode()).hexdigest()[:12]
 
     def describe(self) -> ChainDescription:
         """Return the chain description, with joint ranges narrowed to the calibrated ones.
@@ -177,12 +177,12 @@ class FeetechSerialArm(BusArm):
         self._ids = [servo.id for servo in config.servos]
         self._bus = ServoBus(name, self._ids, partial(_open_port, name, config), clock, echo=config.echo)
 
-    def _forget(self) -> None:
-        super()._forget()
+    def _reset_state(self) -> None:
+        super()._reset_state()
         self._answers: list[Answer | None] = [None] * len(self._config.servos)
         # A servo holds its goal by itself: goals are sent only between activation and rest.
         self._driving = False
-        self._in_vain = [0] * len(self._config.servos)
+        self._unanswered = [0] * len(self._config.servos)
         self._lost: tuple[Adjustment, ...] = ()
 
     def health(self) -> dict[str, float | int | str | bool]:
@@ -191,7 +191,7 @@ class FeetechSerialArm(BusArm):
         readings |= super().health()
         readings |= {
             "calibration": self._config.calibration_hash,
-            "not_followed": ", ".join(f"{a.limit} {a.allowed:.3g} for {a.asked:.3g}" for a in self._lost),
+            "not_followed": ", ".join(f"{a.limit} {a.allowed:.3g} for {a.requested:.3g}" for a in self._lost),
         }
         for joint, answer in zip(self._chain.joint_names, self._answers, strict=True):
             if answer is not None:
@@ -229,8 +229,8 @@ class FeetechSerialArm(BusArm):
 
     def _activate(self) -> None:
         with self._lock:
-            if self._trouble is not None:
-                raise self._trouble
+            if self._latched_fault is not None:
+                raise self._latched_fault
             states = [answer.state for _, answer in self._fresh_answers()]
             for index, state in enumerate(states):
                 self._check_state(index, state)
@@ -265,10 +265,10 @@ class FeetechSerialArm(BusArm):
             self._driving = False
             self._configure()
             self._missed.clear()
-            self._trouble = None
+            self._latched_fault = None
 
     def _project_to_feasible(self, twist_base: Array) -> tuple[Array, tuple[Adjustment, ...]]:
-        twist, self._lost = followable(self._chain.jacobian(self._setpoint.q), twist_base)
+        twist, self._lost = project_to_feasible(self._chain.jacobian(self._setpoint.q), twist_base)
         return twist, self._lost
 
     @property
@@ -283,16 +283,16 @@ class FeetechSerialArm(BusArm):
         return int(np.ceil(max(_SPEED_MARGIN * abs(dq), _SLOWEST_RAD_S) / unit))
 
     def _check_servo(self, index: int) -> None:
-        servo, told = self._config.servos[index], self._bus.identity(self._ids[index])
+        servo, identity = self._config.servos[index], self._bus.identity(self._ids[index])
         for key, found, wanted, hint in (
-            ("model", told.model, codec.STS3215, "this driver supports STS3215 servos only"),
-            ("id", told.servo, servo.id, "two servos on one line may share an id"),
-            ("mode", told.mode, codec.POSITION_MODE, "set register 33 to 0; a driver does not change modes"),
-            ("multi_turn", told.multi_turn, False, "clear bit 4 of register 18: counted turns are lost with power"),
-            ("acknowledges", told.acknowledges, True, "set register 8 to 1"),
+            ("model", identity.model, codec.STS3215, "this driver supports STS3215 servos only"),
+            ("id", identity.servo, servo.id, "two servos on one line may share an id"),
+            ("mode", identity.mode, codec.POSITION_MODE, "set register 33 to 0; a driver does not change modes"),
+            ("multi_turn", identity.multi_turn, False, "clear bit 4 of register 18: counted turns are lost with power"),
+            ("acknowledges", identity.acknowledges, True, "set register 8 to 1"),
             (
                 "homing_offset_ticks",
-                told.homing_offset_ticks,
+                identity.homing_offset_ticks,
                 servo.homing_offset_ticks,
                 "the servo was calibrated again or replaced: calibrate the arm again",
             ),
@@ -302,9 +302,9 @@ class FeetechSerialArm(BusArm):
                     f"servo {servo.id} has {key} {found}, not {wanted}", key=f"servos[{index}].{key}", hint=hint
                 )
         ends = [servo.ticks(float(end[index])) for end in (self._chain.lower, self._chain.upper)]
-        if min(ends) < told.min_ticks or max(ends) > told.max_ticks:
+        if min(ends) < identity.min_ticks or max(ends) > identity.max_ticks:
             raise ConfigError(
-                f"servo {servo.id} limits itself to {told.min_ticks} and {told.max_ticks} ticks, "
+                f"servo {servo.id} limits itself to {identity.min_ticks} and {identity.max_ticks} ticks, "
                 f"its joint range is {min(ends)} to {max(ends)}",
                 key=f"servos[{index}]",
                 hint="narrow min_ticks and max_ticks to registers 9 and 11",
@@ -365,7 +365,7 @@ class FeetechSerialArm(BusArm):
             found = [(servo, a) for servo, a in zip(self._ids, answers, strict=True) if a is not None]
             if len(found) == len(self._ids):
                 self._answers = list(answers)
-                self._in_vain = [0] * len(self._ids)
+                self._unanswered = [0] * len(self._ids)
                 return found
             silent = [servo for servo, answer in zip(self._ids, answers, strict=True) if answer is None]
         raise TransportTimeout(self.name, f"state of servos {silent}", _TRIES * _ANSWER_TIMEOUT_S)
@@ -375,7 +375,7 @@ class FeetechSerialArm(BusArm):
         if self._driving and any(self._enabled):
             q, dq = due, np.zeros_like(due)
             # One lost reply must not jerk the arm, but no further step is sent without feedback.
-            if max(self._in_vain) < _UNSEEN_CYCLES:
+            if max(self._unanswered) < _UNSEEN_CYCLES:
                 q, dq = self._setpoint.step(now_ns, dt_s)
             self._bus.write_goals(
                 {
@@ -389,9 +389,9 @@ class FeetechSerialArm(BusArm):
     def _take(self, answers: list[Answer | None], due: Array) -> None:
         good = [self._plausible(index, answer) for index, answer in enumerate(answers)]
         for index, answer in enumerate(good):
-            self._in_vain[index] += 1
+            self._unanswered[index] += 1
             if answer is not None:
-                self._in_vain[index] = 0
+                self._unanswered[index] = 0
                 self._answers[index] = answer
                 self._check_servo_in_use(index, answer.state)
         complete = [answer for answer in good if answer is not None]
@@ -444,9 +444,9 @@ class FeetechSerialArm(BusArm):
     def _check_silence(self) -> None:
         now_ns = self._clock.now_ns()
         limit_s = self._config.max_silence_s
-        for servo, answer, asked in zip(self._ids, self._answers, self._in_vain, strict=True):
+        for servo, answer, requested in zip(self._ids, self._answers, self._unanswered, strict=True):
             # A host that was busy elsewhere has received nothing either: it must have requested.
-            if answer is not None and asked >= _ASKED_IN_VAIN and (now_ns - answer.t_ns) * 1e-9 > limit_s:
+            if answer is not None and requested >= _MAX_UNANSWERED and (now_ns - answer.t_ns) * 1e-9 > limit_s:
                 self._latch(TransportTimeout(self.name, f"reply of servo {servo}", limit_s))
         self._check_missed()
 

@@ -402,8 +402,8 @@ class FeetechArm(Emulator):
                     servo.prepared = None
             self._answer([(servo, b"") for servo in addressed if alone and servo.acknowledges])
         elif packet.code == Instruction.SYNC_READ and len(data) > 2:
-            asked = [listening[number] for number in data[2:] if number in listening]
-            self._answer([(servo, servo.get(data[0], data[1])) for servo in asked])
+            addressed = [listening[number] for number in data[2:] if number in listening]
+            self._answer([(servo, servo.get(data[0], data[1])) for servo in addressed])
         elif packet.code == Instruction.SYNC_WRITE and len(data) > 2:
             size = data[1] + 1
             for at in range(2, len(data), size):
@@ -449,16 +449,16 @@ class FeetechArm(Emulator):
     def _spoilt(self, packet: Packet) -> Packet:
         end = Register.CURRENT + 2
         at = len(packet.data) - (end - Register.POSITION)
-        told = codec.from_signed_word(packet.data[at : at + 2]) if at >= 0 else 0
+        ticks = codec.from_signed_word(packet.data[at : at + 2]) if at >= 0 else 0
         if at >= 0 and self.spend("wild"):
-            told += codec.TICKS_PER_TURN
+            ticks += codec.TICKS_PER_TURN
         elif at >= 0 and self.spend("jump"):
-            told = (told + codec.TICKS_PER_TURN // 2) % codec.TICKS_PER_TURN
+            ticks = (ticks + codec.TICKS_PER_TURN // 2) % codec.TICKS_PER_TURN
         elif self.spend("foreign"):
             return Packet(packet.servo + 100, packet.code, packet.data)
         else:
             return packet
-        return Packet(packet.servo, packet.code, packet.data[:at] + codec.signed_word(told) + packet.data[at + 2 :])
+        return Packet(packet.servo, packet.code, packet.data[:at] + codec.signed_word(ticks) + packet.data[at + 2 :])
 
     def _put(self, data: bytes) -> None:
         if self._master is None:

@@ -168,11 +168,11 @@ class FrankaArm(Arm):
     def at_rest(self) -> bool:
         """Return whether the arm stands still and no motion runs. Raises the error that ended a motion."""
         self._require("check for standstill", *_READABLE)
-        self._surface()
+        self._raise_failure()
         reader, reading = self._open_reader(), self._newest()
         if self._age_s(reading) > _FRESH_S:
             return False
-        if reader.in_motion or reader.looked_ns <= self._moved_ns:
+        if reader.in_motion or reader.polled_ns <= self._moved_ns:
             return False
         return bool(np.abs(reading.dq).max() < _REST_SPEED_RAD_S)
 
@@ -283,7 +283,7 @@ class FrankaArm(Arm):
         try:
             self._robot.set_collision_behavior([_JOINT_TORQUE_NM] * 7, [force] * 3 + [torque] * 3)
             self._set_frames()
-            self._ik = self._modelled()
+            self._ik = self._read_kinematics()
             # An earlier reading would have another tool centre point.
             self._await_reading(_FIRST_STATE_S, "state", after_ms=self._robot.state.time.to_msec())
         except (self._franky.Exception, RuntimeError) as error:
@@ -307,7 +307,7 @@ class FrankaArm(Arm):
             self._robot.set_k(np.eye(4).ravel())
             self._verify_frame("EE_T_K", np.eye(4))
 
-    def _modelled(self) -> DifferentialIk:
+    def _read_kinematics(self) -> DifferentialIk:
         """Return the kinematics with the joint limits that the controller reports and its present tool."""
         state = self._robot.state
         tool = se3.to_euler_mm_deg(np.asarray(state.F_T_EE.matrix)).tolist()
@@ -360,12 +360,12 @@ class FrankaArm(Arm):
         try:
             self._robot.recover_from_errors()
         except (self._franky.Exception, RuntimeError) as error:
-            raise self._translated(error) from None
+            raise self._to_device_error(error) from None
         deadline_ns = self._clock.now_ns() + round(_RECOVERY_S * 1e9)
         while (reading := self._await_reading(_FIRST_STATE_S, "state after recovery")).mode != "Idle":
             if self._clock.now_ns() >= deadline_ns:
                 raise self._fault(reading)
-        reader.forget()
+        reader.clear_abort()
         self._contact.clear()
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
@@ -408,7 +408,7 @@ class FrankaArm(Arm):
             if running is not None:
                 self._move(stops[running](self._config.stop_dynamics_factor))
         except (franky.Exception, RuntimeError) as error:
-            raise self._translated(error) from None
+            raise self._to_device_error(error) from None
 
     def _start(self, motion: Any, stop_motion: Any, kind: Any) -> None:
         franky = self._franky
@@ -432,7 +432,7 @@ class FrankaArm(Arm):
         try:
             self._move(motion)
         except (franky.Exception, RuntimeError) as error:
-            raise self._to_faulted(self._translated(error)) from None
+            raise self._to_faulted(self._to_device_error(error)) from None
 
     def _move(self, motion: Any) -> None:
         with _scheduled(self._control_scheduling):
@@ -468,14 +468,14 @@ class FrankaArm(Arm):
 
     def _reading(self, purpose: str, max_age_s: float | None) -> Reading:
         self._require(purpose, *_READABLE)
-        self._surface()
+        self._raise_failure()
         reading = self._newest()
         age_s = self._age_s(reading)
         if max_age_s is not None and age_s > max_age_s:
             raise StaleData(self.name, age_s, max_age_s, reading.device_ms)
         return reading
 
-    def _surface(self) -> None:
+    def _raise_failure(self) -> None:
         """Raise and latch a failure since the last call; a FAULTED arm stays FAULTED."""
         if self.state is Lifecycle.FAULTED:
             return
@@ -491,15 +491,15 @@ class FrankaArm(Arm):
         if self._contact.is_set():
             raise self._to_faulted(self._contact_fault("contact force limit reached"))
 
-    def _fault(self, reading: Reading, said: str | None = None) -> DeviceFault:
-        """Return the fault that the controller reports; ``said``: franky's message when a motion aborted."""
+    def _fault(self, reading: Reading, message: str | None = None) -> DeviceFault:
+        """Return the fault that the controller reports; ``message``: franky's message when a motion aborted."""
         if reading.mode in _NEEDS_A_PERSON:
             return self._by_table(MODES[reading.mode], reading.mode)
-        if names := reading.errors or (reading.last_errors if said else ()):
+        if names := reading.errors or (reading.last_errors if message else ()):
             return self._by_table(BY_NAME[names[0]], ERRORS.index(BY_NAME[names[0]]))
         if reading.mode in MODES:
             return self._by_table(MODES[reading.mode], reading.mode)
-        return DeviceFault(self.name, f"motion aborted: {said}", fault_class=FaultClass.MOTION)
+        return DeviceFault(self.name, f"motion aborted: {message}", fault_class=FaultClass.MOTION)
 
     def _by_table(self, entry: VendorError, code: int | str) -> DeviceFault:
         return DeviceFault(
@@ -520,7 +520,7 @@ class FrankaArm(Arm):
             hint="clear the contact by hand, then recover",
         )
 
-    def _translated(self, error: Exception) -> DeviceError:
+    def _to_device_error(self, error: Exception) -> DeviceError:
         if isinstance(error, self._franky.ControlException):
             try:
                 return self._fault(self._await_reading(_FRESH_S, "state"), str(error))

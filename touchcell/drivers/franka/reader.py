@@ -7,6 +7,7 @@ polls.
 
 from __future__ import annotations
 
+import logging
 import threading
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,9 @@ from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import CorruptMessage, DeviceError, DeviceGone
 from touchcell.drivers.franka.errors import BY_NAME
 from touchcell.geometry.types import Array
+from touchcell.logs import OncePerCause
+
+_logger = logging.getLogger(__name__)
 
 PERIOD_S = 0.002
 _BAD_IN_A_ROW = 50
@@ -78,9 +82,10 @@ class StateReader:
         self._failure: DeviceError | None = None
         self._aborted: str | None = None
         self._in_motion = False
-        self._looked_ns = 0
+        self._polled_ns = 0
         self._bad = 0
         self._bad_in_a_row = 0
+        self._losses = OncePerCause(_logger)
         self._states = 0
         self._device_ms = -1
         self._read_ns = clock.now_ns()
@@ -99,7 +104,7 @@ class StateReader:
 
     @property
     def aborted(self) -> str | None:
-        """The message with which franky aborted a motion, until ``forget``."""
+        """The message with which franky aborted a motion, until ``clear_abort``."""
         return self._aborted
 
     @property
@@ -108,9 +113,9 @@ class StateReader:
         return self._in_motion
 
     @property
-    def looked_ns(self) -> int:
+    def polled_ns(self) -> int:
         """Time of the last poll for a running motion."""
-        return self._looked_ns
+        return self._polled_ns
 
     @property
     def bad(self) -> int:
@@ -133,7 +138,7 @@ class StateReader:
             self._thread.join(_JOIN_S)
         self._robot = None
 
-    def forget(self) -> None:
+    def clear_abort(self) -> None:
         """Discard an aborted motion."""
         self._aborted = None
 
@@ -152,21 +157,21 @@ class StateReader:
     def _read(self) -> None:
         last_ns, self._read_ns = self._read_ns, self._clock.now_ns()
         franky = self._franky
-        said = None
+        message = None
         try:
             self._robot.poll_motion()
         except (franky.ControlException, franky.CommandException, franky.ProtocolException) as error:
-            said = str(error)
-        looked_ns = self._clock.now_ns()
+            message = str(error)
+        polled_ns = self._clock.now_ns()
         self._in_motion = self._robot.is_in_control
-        self._looked_ns = looked_ns
+        self._polled_ns = polled_ns
         try:
             self._take(self._robot.state, last_ns)
         except franky.ProtocolException as error:
             self._count_bad(str(error))
         # Only now, so that the newest reading includes the reason of the abort.
-        if said is not None:
-            self._aborted = said
+        if message is not None:
+            self._aborted = message
 
     def _take(self, state: Any, t_ns: int) -> None:
         device_ms = state.time.to_msec()
@@ -178,7 +183,9 @@ class StateReader:
         if not reading.is_finite():
             self._count_bad("state with non-finite numbers")
             return
-        self._bad_in_a_row = 0
+        if self._bad_in_a_row:
+            self._bad_in_a_row = 0
+            self._losses.forget()
         self._newest = reading
 
     def _convert(self, state: Any, t_ns: int, device_ms: int) -> Reading:
@@ -203,6 +210,7 @@ class StateReader:
     def _count_bad(self, what: str) -> None:
         self._bad += 1
         self._bad_in_a_row += 1
+        self._losses.warning("bad", "%s: dropped a bad state: %s", self._device, what)
         if self._bad_in_a_row >= _BAD_IN_A_ROW:
             raise CorruptMessage(self._device, f"{_BAD_IN_A_ROW} consecutive bad states, the last: {what}")
 

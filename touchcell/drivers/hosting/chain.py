@@ -31,9 +31,9 @@ from touchcell.drivers.hosting.layouts import (
     Reason,
     RecordReader,
     RecordWriter,
-    cause_of,
     close_fd,
-    new_block,
+    create_block,
+    read_cause,
 )
 from touchcell.drivers.hosting.link import Child, HostLink
 from touchcell.drivers.hosting.proxies import RemoteArm, RemoteCamera, RemoteDevice, RemoteJointArm
@@ -115,13 +115,13 @@ class Chain:
         self.beat()
         deadline_ns = self._clock.now_ns() + round(1e9 * _GUARD_S)
         while not self.guarding:
-            if self.watchdog.end_words() or self._clock.now_ns() > deadline_ns:
-                words = self.watchdog.end_words() or f"does not reply within {_GUARD_S:g} s"
-                raise DeviceFault("watchdog", words, fault_class=FaultClass.COMMUNICATION, needs=Remedy.OPERATOR)
+            if self.watchdog.describe_end() or self._clock.now_ns() > deadline_ns:
+                description = self.watchdog.describe_end() or f"does not reply within {_GUARD_S:g} s"
+                raise DeviceFault("watchdog", description, fault_class=FaultClass.COMMUNICATION, needs=Remedy.OPERATOR)
             self.sleep(self.period_s / 10)
             self.beat()
         for link in self._links:
-            link.judged = True
+            link.monitored = True
 
     def beat(self) -> None:
         """Send a heartbeat; once per cycle of the loop."""
@@ -138,7 +138,7 @@ class Chain:
     def end(self) -> None:
         """End guarding: all arms have been ordered to stop, and hosts refuse motion from here on."""
         for link in self._links:
-            link.judged = False
+            link.monitored = False
         self._task.value["guard"] = False
         self.beat()
 
@@ -153,25 +153,25 @@ class Chain:
     def alarm(self) -> Cause | None:
         """Return why all arms have been stopped, or None. Without guarding: why guarding cannot begin."""
         if not self._task.value["guard"]:
-            return self._trouble(max(self.silence_s, _UNGUARDED_SILENCE_S))
+            return self._find_cause(max(self.silence_s, _UNGUARDED_SILENCE_S))
         watch = self._watch.read()
         cause: Cause | None
-        if watch["stop"] and (cause := cause_of(watch)).reason is not Reason.HOST_LATCHED:
+        if watch["stop"] and (cause := read_cause(watch)).reason is not Reason.HOST_LATCHED:
             return cause
         for number, link in enumerate(self._links):
             if (cause := link.latched()) is not None:
                 return cause
-            if link.judged and link.end_words():
+            if link.monitored and link.describe_end():
                 return Cause(Reason.HOST_GONE, self._clock.now_ns(), host=number)
             if too_long_s := link.silent_too_long():
                 return Cause(Reason.HOST_SILENT, self._clock.now_ns(), too_long_s, self.silence_s, number)
         return self._watchdog_silent(self.silence_s)
 
-    def _trouble(self, longest_s: float) -> Cause | None:
+    def _find_cause(self, longest_s: float) -> Cause | None:
         """Return a process that has ended or has been silent for longer than ``longest_s``; None if all run."""
         for number, link in enumerate(self._links):
             now_ns = self._clock.now_ns()
-            if link.end_words():
+            if link.describe_end():
                 return Cause(Reason.HOST_GONE, now_ns, host=number)
             if (silent_s := link.silent_s()) > longest_s:
                 return Cause(Reason.HOST_SILENT, now_ns, silent_s, longest_s, number)
@@ -196,10 +196,10 @@ class Chain:
         """
         deadline_ns = self._clock.now_ns() + round(1e9 * _GUARD_S)
         # Calls to processes that do not reply would wait for long.
-        while (cause := self._trouble(self.silence_s)) is not None or self.guarding:
+        while (cause := self._find_cause(self.silence_s)) is not None or self.guarding:
             if self._clock.now_ns() > deadline_ns:
-                words = "the watchdog still guards" if cause is None else cause.reason.words
-                raise DeviceFault("chain", words, fault_class=FaultClass.COMMUNICATION, needs=Remedy.OPERATOR)
+                description = "the watchdog still guards" if cause is None else cause.reason.description
+                raise DeviceFault("chain", description, fault_class=FaultClass.COMMUNICATION, needs=Remedy.OPERATOR)
             self.sleep(self.period_s / 4)
         self.watchdog.call("clear")
         for link in self._links:
@@ -291,7 +291,7 @@ class Chain:
         return {kind: self._block(f"{device.name}-{kind}", dtype) for kind, dtype in wanted.items()}
 
     def _block(self, name: str, dtype: Any) -> int:
-        fd = new_block(name, dtype)
+        fd = create_block(name, dtype)
         self._exit.callback(close_fd, fd)
         return fd
 

@@ -57,5 +57,5 @@ class Group:
 
     def rate_hz(self, control_hz: float) -> float:
         """Return the device cycles per second: the state rate of its arms, and at least twice the control rate."""
-        told = max((each.spec.capabilities.state_rate_hz for each in self.devices if each.is_arm), default=0.0)
-        return max(2.0 * control_hz, min(told, FASTEST_HZ))
+        reported = max((each.spec.capabilities.state_rate_hz for each in self.devices if each.is_arm), default=0.0)
+        return max(2.0 * control_hz, min(reported, FASTEST_HZ))

@@ -42,10 +42,10 @@ from touchcell.drivers.hosting.layouts import (
     Reason,
     RecordReader,
     RecordWriter,
-    cause_of,
-    put_cause,
+    read_cause,
+    write_cause,
 )
-from touchcell.drivers.hosting.realtime import ask_for_realtime
+from touchcell.drivers.hosting.realtime import request_realtime
 from touchcell.drivers.hosting.watchdog import silence_s
 from touchcell.drivers.hosting.wire import encode_adjustments, encode_error, error_note, receive, send
 from touchcell.errors import TouchcellError
@@ -93,7 +93,7 @@ class HostedArm:
             self.arm.release(lease)
         return {}
 
-    def obey(self, refuse: str, now_ns: int) -> bool:
+    def execute(self, refuse: str, now_ns: int) -> bool:
         """Execute the newest command; return whether there is a reply for the task to read.
 
         Args:
@@ -105,7 +105,7 @@ class HostedArm:
         if stop > self._stop_seen:
             self._stop_seen = stop
             if not self._state.value["at_rest"]:
-                self._state.value["asked_ns"] = now_ns
+                self._state.value["requested_ns"] = now_ns
             # A driver that cannot stop its arm has latched its fault, which the state reports.
             with suppress(DeviceError):
                 self.arm.stop(StopCategory(int(command["category"])))
@@ -129,7 +129,7 @@ class HostedArm:
         answer["refused"], answer["t_ns"], answer["twist"] = False, sent.t_ns, sent.command.twist
         self._answers.publish(encode_adjustments(sent.adjustments))
         self._state.value["obeyed"] += 1
-        self._state.value["obeyed_ns"] = sent.t_ns
+        self._state.value["executed_ns"] = sent.t_ns
 
     def _lease(self, epoch: int) -> Lease:
         # A lease that was never granted passes no gate.
@@ -157,18 +157,18 @@ class HostedArm:
         self._deadline_ns = 0
         self._state.value["stop_ns"] = self._state.value["rest_ns"] = 0
 
-    def stands(self) -> bool:
+    def at_rest(self) -> bool:
         """Return whether the last reading showed it at rest; a disconnected arm counts as at rest."""
         return self.arm.state is Lifecycle.DISCONNECTED or bool(self._state.value["at_rest"])
 
-    def free(self) -> bool:
+    def is_released(self) -> bool:
         """Return whether it is at rest and its lease is released."""
-        return self.arm.owner is None and self.stands()
+        return self.arm.owner is None and self.at_rest()
 
-    def look(self, now_ns: int) -> None:
+    def update(self, now_ns: int) -> None:
         """Publish its state, and monitor the progress of a stop."""
         value, note = self._state.value, b""
-        value["lifecycle"], value["told_ns"] = LIFECYCLES.index(self.arm.state), now_ns
+        value["lifecycle"], value["read_ns"] = LIFECYCLES.index(self.arm.state), now_ns
         if self.arm.state is not Lifecycle.DISCONNECTED:
             try:
                 sample = self.arm.tcp()
@@ -186,7 +186,7 @@ class HostedArm:
             if not value["at_rest"]:
                 value["moved_ns"] = now_ns
         if self._deadline_ns:
-            self._follow_stop(now_ns)
+            self._monitor_stop(now_ns)
         self._state.publish(note)
 
     def _put_joints(self, sample: Stamped[JointState]) -> None:
@@ -197,7 +197,7 @@ class HostedArm:
         if joints.tau is not None:
             value["tau"][:count] = joints.tau
 
-    def _follow_stop(self, now_ns: int) -> None:
+    def _monitor_stop(self, now_ns: int) -> None:
         value = self._state.value
         if value["rest_ns"]:
             return
@@ -222,7 +222,7 @@ class HostedCamera:
         self._frames = RecordWriter(fd, FRAME)
         self._seq = -1
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Publish the newest frame if it is new."""
         if self.camera.state is not Lifecycle.ACTIVE:
             return
@@ -298,56 +298,56 @@ class Host:
             self.cycle()
             if self._control.fileno() in ready:
                 self._serve()
-        self._come_to_rest()
+        self._stop_and_deactivate()
 
     def cycle(self) -> None:
         """Poll the watchdog and the task, and publish the state of all devices when due."""
         now_ns = self._clock.now_ns()
-        self._heed_watchdog(now_ns)
-        self._obey(now_ns)
+        self._poll_watchdog(now_ns)
+        self._execute(now_ns)
         if now_ns >= self._due_ns:
-            self._tell(now_ns)
+            self._publish(now_ns)
             self._due_ns = max(self._due_ns + self._period_ns, now_ns)
 
-    def _heed_watchdog(self, now_ns: int) -> None:
+    def _poll_watchdog(self, now_ns: int) -> None:
         watch = self._watch.read()
         was_guarded, self._guarded = self._guarded, bool(watch["guarding"])
         if self._cause is not None:
             return
         silent_s = (now_ns - int(watch["t_ns"])) * 1e-9
         if watch["stop"]:
-            self._latch(cause_of(watch), now_ns)
+            self._latch(read_cause(watch), now_ns)
         elif self._guarded and silent_s > self._silence_s:
             self._latch(Cause(Reason.WATCHDOG_SILENT, now_ns, silent_s, self._silence_s), now_ns)
         elif was_guarded and not self._guarded:
-            for seat in self._arms.values():
-                seat.stop()
+            for hosted in self._arms.values():
+                hosted.stop()
 
     def _latch(self, cause: Cause, now_ns: int) -> None:
         self._cause = cause
-        for seat in self._arms.values():
-            seat.latch(now_ns)
+        for hosted in self._arms.values():
+            hosted.latch(now_ns)
         self._beat.value["latched"] = True
-        put_cause(self._beat.value, cause)
-        self._tell(now_ns)
+        write_cause(self._beat.value, cause)
+        self._publish(now_ns)
 
-    def _obey(self, now_ns: int) -> None:
+    def _execute(self, now_ns: int) -> None:
         refuse = "" if self._guarded else "not guarded by a watchdog"
         if self._cause is not None:
-            refuse = f"stopped, {self._cause.reason.words}"
-        answers = [seat.obey(refuse, now_ns) for seat in self._arms.values()]
+            refuse = f"stopped, {self._cause.reason.description}"
+        answers = [hosted.execute(refuse, now_ns) for hosted in self._arms.values()]
         if any(answers):
             os.eventfd_write(self._answered, 1)
 
-    def _tell(self, now_ns: int) -> None:
-        for seat in self._arms.values():
-            seat.look(now_ns)
+    def _publish(self, now_ns: int) -> None:
+        for hosted in self._arms.values():
+            hosted.update(now_ns)
         if self._truth is not None:
-            self._truth.look()
+            self._truth.update()
         if self._cameras:
             # One per cycle: rendering or decoding an image takes as long as many cycles.
             self._turn = (self._turn + 1) % len(self._cameras)
-            self._cameras[self._turn].look()
+            self._cameras[self._turn].update()
         beat = self._beat.value
         beat["count"] += 1
         beat["t_ns"] = self._clock.now_ns()
@@ -365,7 +365,7 @@ class Host:
         except TouchcellError as error:
             answer = {"ok": False, "error": encode_error(error)}
         # So that the caller sees the outcome.
-        self._tell(self._clock.now_ns())
+        self._publish(self._clock.now_ns())
         with suppress(OSError):
             send(self._control, {**answer, "number": message["number"]})
 
@@ -408,29 +408,29 @@ class Host:
 
     def _clear(self) -> dict[str, Any]:
         watch = self._watch.read()
-        free = all(seat.free() for seat in self._arms.values())
-        if watch["stop"] or watch["guarding"] or not free:
+        is_released = all(hosted.is_released() for hosted in self._arms.values())
+        if watch["stop"] or watch["guarding"] or not is_released:
             raise LifecycleError("host", "clear its latch", "stopped", ["at rest, without lease and stop flag"])
         self._cause = None
         self._beat.value["latched"] = False
-        for seat in self._arms.values():
-            seat.clear()
+        for hosted in self._arms.values():
+            hosted.clear()
         return {}
 
-    def _come_to_rest(self) -> None:
+    def _stop_and_deactivate(self) -> None:
         """Stop the arms, wait until they are at rest or their time has passed, then deactivate the active ones."""
-        for seat in self._arms.values():
-            seat.stop()
-        self._tell(self._clock.now_ns())
+        for hosted in self._arms.values():
+            hosted.stop()
+        self._publish(self._clock.now_ns())
         deadline_ns = self._clock.now_ns() + _LAST_REST_NS
-        while any(not seat.stands() for seat in self._arms.values()) and self._clock.now_ns() < deadline_ns:
+        while any(not hosted.at_rest() for hosted in self._arms.values()) and self._clock.now_ns() < deadline_ns:
             self._clock.sleep_until_ns(self._clock.now_ns() + self._period_ns)
-            self._tell(self._clock.now_ns())
+            self._publish(self._clock.now_ns())
         for name, device in self.devices.items():
             if device.state is Lifecycle.ACTIVE:
                 with suppress(DeviceError):
                     device.deactivate(self._policies.get(name, DeactivatePolicy.HOLD))
-        self._tell(self._clock.now_ns())
+        self._publish(self._clock.now_ns())
 
 
 def _build(spec: Mapping[str, Any], clock: Clock) -> tuple[dict[str, Device], Scene | None]:
@@ -477,7 +477,7 @@ def main() -> None:
     with ExitStack() as exits:
         for device in host.devices.values():
             exits.callback(device.disconnect)
-        realtime = ask_for_realtime()
+        realtime = request_realtime()
         # The first heartbeat: from now on silence counts.
         host.cycle()
         send(control, {"ok": True, "number": 0, "realtime": realtime})

@@ -37,12 +37,12 @@ class Reason(IntEnum):
     HOST_GONE = 7
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """Description for operators."""
-        return _WORDS[self]
+        return _DESCRIPTIONS[self]
 
 
-_WORDS: Final = {
+_DESCRIPTIONS: Final = {
     Reason.NONE: "nothing",
     Reason.TASK_SILENT: "the task's loop has missed two heartbeats",
     Reason.TASK_SLOW: "the task's loop is too slow",
@@ -117,12 +117,12 @@ ARM: Final = np.dtype(
         ("dq", "f8", (MAX_JOINTS,)),
         ("tau", "f8", (MAX_JOINTS,)),
         ("at_rest", "u8"),
-        ("told_ns", "i8"),  # time of the host's reading
+        ("read_ns", "i8"),  # time of the host's reading
         # The host's own record, for analysis after a stop.
         ("moved_ns", "i8"),  # when it was last seen moving
         ("obeyed", "u8"),
-        ("obeyed_ns", "i8"),
-        ("asked_ns", "i8"),  # when the task last requested a stop while it moved
+        ("executed_ns", "i8"),
+        ("requested_ns", "i8"),  # when the task last requested a stop while it moved
         ("stop_ns", "i8"),
         ("rest_ns", "i8"),
         ("stop_speed_m_s", "f8"),
@@ -171,7 +171,7 @@ def layout_number(dtype: np.dtype[Any]) -> int:
     return VERSION << 32 | zlib.crc32(repr(dtype.descr).encode())
 
 
-def new_block(name: str, dtype: np.dtype[Any]) -> int:
+def create_block(name: str, dtype: np.dtype[Any]) -> int:
     """Create a block for records of ``dtype``; return its file descriptor."""
     return create(name, layout_number(dtype), dtype.itemsize + _TAILS.get(id(dtype), 0))
 
@@ -233,12 +233,12 @@ class RecordReader:
         self.close()
 
 
-def put_cause(record: Any, cause: Cause) -> None:
+def write_cause(record: Any, cause: Cause) -> None:
     """Write ``cause`` into a record that has one."""
     record["cause"] = (int(cause.reason), cause.host, cause.t_ns, cause.value_s, cause.limit_s)
 
 
-def cause_of(record: Any) -> Cause:
+def read_cause(record: Any) -> Cause:
     """Return the cause in a record."""
     found = record["cause"]
     return Cause(

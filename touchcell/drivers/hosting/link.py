@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import DeviceFault, DeviceGone, FaultClass, LifecycleError, Remedy, TransportTimeout
-from touchcell.drivers.hosting.layouts import Cause, RecordReader, cause_of
+from touchcell.drivers.hosting.layouts import Cause, RecordReader, read_cause
 from touchcell.drivers.hosting.wire import decode_error, receive, send
 
 _START_S: Final = 30.0
@@ -96,9 +96,9 @@ class Child:
         return message
 
     def _gone(self) -> DeviceGone:
-        return DeviceGone(self.name, f"its process {self.pid} {self.end_words() or 'has closed its socket'}")
+        return DeviceGone(self.name, f"its process {self.pid} {self.describe_end() or 'has closed its socket'}")
 
-    def end_words(self) -> str:
+    def describe_end(self) -> str:
         """Describe how it ended; empty while it runs."""
         code = self.process.poll()
         if code is None:
@@ -130,7 +130,7 @@ class HostLink(Child):
         clock: CLOCK_MONOTONIC.
 
     Attributes:
-        judged: whether silence counts: not while it executes a call.
+        monitored: whether silence counts: not while it executes a call.
     """
 
     def __init__(
@@ -149,11 +149,11 @@ class HostLink(Child):
         self.beats = beats
         self._silence_s = silence_s
         self._clock = clock
-        self.judged = False
+        self.monitored = False
 
     def check(self, device: str) -> None:
         """Raise DeviceFault if the host has died, or is silent while it should beat."""
-        ended, too_long_s = self.end_words(), self.silent_too_long()
+        ended, too_long_s = self.describe_end(), self.silent_too_long()
         if ended or too_long_s:
             raise DeviceFault(
                 device,
@@ -166,7 +166,7 @@ class HostLink(Child):
     def silent_too_long(self) -> float:
         """Return the silence in s if it is too long; 0 while its arms are not guarded."""
         silent_s = self.silent_s()
-        return silent_s if self.judged and silent_s > self._silence_s else 0.0
+        return silent_s if self.monitored and silent_s > self._silence_s else 0.0
 
     def silent_s(self) -> float:
         """Return the seconds since its last heartbeat."""
@@ -179,7 +179,7 @@ class HostLink(Child):
     def latched(self) -> Cause | None:
         """Return the cause for which it has stopped its arms, or None."""
         beat = self.beats.read()
-        return cause_of(beat) if beat["latched"] else None
+        return read_cause(beat) if beat["latched"] else None
 
     def wake(self) -> None:
         """Make the host poll for a command now."""

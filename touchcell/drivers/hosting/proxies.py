@@ -104,7 +104,7 @@ class RemoteDevice(Device):
 
     def _close(self) -> None:
         # A host that has ended has disconnected; the chain kills one that hangs.
-        if self._link is not None and not self._link.end_words() and not self._link.hangs():
+        if self._link is not None and not self._link.describe_end() and not self._link.hangs():
             try:
                 self._link.call("disconnect", device=self.name)
             except DeviceError:
@@ -172,7 +172,7 @@ class RemoteArm(RemoteDevice):
             DeviceFault: the host has died or is silent; the arm is FAULTED.
             DeviceError: error raised by the driver in the host.
         """
-        record, note = self._look()
+        record, note = self._poll()
         if record["failed"]:
             raise decode_note(note, self.name)
         state = TcpState(record["T_base_tcp"].copy(), record["twist"].copy())
@@ -185,12 +185,12 @@ class RemoteArm(RemoteDevice):
 
     def at_rest(self) -> bool:
         """Return whether the host saw it at rest after the last command or stop."""
-        record, _ = self._look()
-        return bool(record["at_rest"]) and int(record["told_ns"]) > self._written_ns
+        record, _ = self._poll()
+        return bool(record["at_rest"]) and int(record["read_ns"]) > self._written_ns
 
     def rested_ns(self) -> int | None:
         """Time at which its host saw it at rest after the latest stop by the chain; None before."""
-        record, _ = self._look()
+        record, _ = self._poll()
         return int(record["rest_ns"]) or None
 
     def kinematics(self) -> DifferentialIk | None:
@@ -262,7 +262,7 @@ class RemoteArm(RemoteDevice):
                 raise TransportTimeout(self.name, "reply of its host", seconds)
             link.await_answer(left_s)
 
-    def _look(self) -> tuple[Any, bytes]:
+    def _poll(self) -> tuple[Any, bytes]:
         self._check_host()
         _, record, note = self._arm.read_all()
         if self._state is Lifecycle.DISCONNECTED:
@@ -301,7 +301,7 @@ class RemoteJointArm(RemoteArm):
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
         """Return the newest joint state published by the host. Raises as ``tcp``."""
-        record, note = self._look()
+        record, note = self._poll()
         if record["failed"]:
             raise decode_note(note, self.name)
         count = int(record["joint_count"])
@@ -314,10 +314,12 @@ class RemoteJointArm(RemoteArm):
         return sample
 
     def _configure(self) -> None:
-        told = self._call("configure").get("kinematics")
-        if told is not None:
-            chain = SerialChain(ChainDescription.model_validate(told["chain"]), Tool.model_validate(told["tool"]))
-            self._ik = DifferentialIk(chain, IkSettings(**told["settings"]))
+        reported = self._call("configure").get("kinematics")
+        if reported is not None:
+            chain = SerialChain(
+                ChainDescription.model_validate(reported["chain"]), Tool.model_validate(reported["tool"])
+            )
+            self._ik = DifferentialIk(chain, IkSettings(**reported["settings"]))
 
 
 class RemoteCamera(RemoteDevice):

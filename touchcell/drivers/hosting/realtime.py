@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import logging
 import os
 import resource
 import signal
 from typing import Any, Final
+
+_logger = logging.getLogger(__name__)
 
 PRIORITY: Final = 40
 """Below the kernel's own interrupt threads (50), above all ordinary processes."""
@@ -17,14 +20,16 @@ LONGEST_US: Final = 200_000
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
-def ask_for_realtime() -> str:
+def request_realtime() -> str:
     """Request SCHED_FIFO and mlockall for this process; return a description of what was granted. Never fails."""
-    return f"{_scheduling()}, {_memory()}"
+    granted = f"{_scheduling()}, {_memory()}"
+    _logger.info("%s", granted)
+    return granted
 
 
 def _scheduling() -> str:
     try:
-        signal.signal(signal.SIGXCPU, _give_way)
+        signal.signal(signal.SIGXCPU, _lower_priority)
         resource.setrlimit(resource.RLIMIT_RTTIME, (LONGEST_US, resource.RLIM_INFINITY))
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except OSError as error:
@@ -32,7 +37,7 @@ def _scheduling() -> str:
     return f"SCHED_FIFO {PRIORITY}"
 
 
-def _give_way(*_: Any) -> None:
+def _lower_priority(*_: Any) -> None:
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 

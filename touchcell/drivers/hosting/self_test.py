@@ -53,7 +53,7 @@ class SelfTestFailed(DeviceError):
 
 
 @dataclass(frozen=True, slots=True)
-class Proof:
+class SelfTestResult:
     """Passed part of the self-test.
 
     Attributes:
@@ -70,7 +70,7 @@ class Proof:
         return f"self-test, {self.link} withheld: all arms at rest after {self.time_s:.3f} s ({self.declared_s:.3f} s)"
 
 
-def self_test(chain: Chain) -> tuple[Proof, ...]:
+def self_test(chain: Chain) -> tuple[SelfTestResult, ...]:
     """Withhold the task's heartbeats, then the watchdog's, while every arm of an active chain moves at 1 mm/s.
 
     Afterwards the stop is cleared, nothing moves and all leases are released. Without arms nothing is tested.
@@ -99,18 +99,18 @@ def declared_s(chain: Chain) -> float:
     return chain.silence_s + cycles_s + braking_s + MARGIN_S
 
 
-def _part(chain: Chain, link: str, reason: Reason, withhold: Callable[[], None] | None) -> Proof:
+def _part(chain: Chain, link: str, reason: Reason, withhold: Callable[[], None] | None) -> SelfTestResult:
     arms, within_s = chain.arms, declared_s(chain)
     leases = {name: arm.acquire("self-test") for name, arm in arms.items()}
     chain.begin()
     try:
-        _until_all_move(chain, leases, link, within_s)
+        _wait_until_all_move(chain, leases, link, within_s)
         # The last heartbeat: the withheld process is silent from here on.
         chain.beat()
         last_ns = chain.now_ns()
         if withhold is not None:
             withhold()
-        cause = _until_stopped(chain, leases, within_s, beats=withhold is not None)
+        cause = _wait_until_stopped(chain, leases, within_s, beats=withhold is not None)
         standing = {name: _rested_ns(chain, arm, last_ns + round(1e9 * within_s)) for name, arm in arms.items()}
     finally:
         if withhold is not None:
@@ -124,17 +124,19 @@ def _part(chain: Chain, link: str, reason: Reason, withhold: Callable[[], None] 
             raise SelfTestFailed(name, link, f"not at rest within {within_s:.3f} s", within_s, None)
     time_s = (max(t_ns for t_ns in standing.values() if t_ns is not None) - last_ns) * 1e-9
     if cause is None or cause.reason is not reason:
-        found = "nothing" if cause is None else cause.reason.words
-        raise SelfTestFailed("chain", link, f"it stopped because of {found}, not {reason.words}", within_s, time_s)
+        found = "nothing" if cause is None else cause.reason.description
+        raise SelfTestFailed(
+            "chain", link, f"it stopped because of {found}, not {reason.description}", within_s, time_s
+        )
     chain.clear()
     for arm in arms.values():
         # A stop category that removes power ends in READY.
         if arm.state is Lifecycle.READY:
             arm.activate()
-    return Proof(link, time_s, within_s)
+    return SelfTestResult(link, time_s, within_s)
 
 
-def _until_all_move(chain: Chain, leases: Mapping[str, Lease], link: str, within_s: float) -> None:
+def _wait_until_all_move(chain: Chain, leases: Mapping[str, Lease], link: str, within_s: float) -> None:
     arms = chain.arms
     started = {name: _position(arm) for name, arm in arms.items()}
     unseen, deadline_ns = set(arms), chain.now_ns() + round(1e9 * _SEEN_WITHIN_S)
@@ -151,7 +153,7 @@ def _until_all_move(chain: Chain, leases: Mapping[str, Lease], link: str, within
         }
 
 
-def _until_stopped(chain: Chain, leases: Mapping[str, Lease], within_s: float, *, beats: bool) -> Cause | None:
+def _wait_until_stopped(chain: Chain, leases: Mapping[str, Lease], within_s: float, *, beats: bool) -> Cause | None:
     """Continue commanding until the arms have been stopped; return the cause, or None after the time."""
     deadline_ns = chain.now_ns() + round(1e9 * within_s)
     while chain.now_ns() < deadline_ns:

@@ -34,7 +34,7 @@ class HostedScene:
         self._sensors = {name: RecordWriter(fd, TRUTH) for name, fd in fds.items()}
         self._objects = RecordWriter(objects_fd, OBJECTS)
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Publish the present truth."""
         for name, record in self._sensors.items():
             if self._scene.has(name):

@@ -1,6 +1,6 @@
 """Watchdog process: monitors the heartbeats of task and device hosts, and stops all arms when one is missing.
 
-``Judge`` contains all decisions, as a function of given times; ``main`` is the loop around it.
+``HeartbeatMonitor`` contains all decisions, as a function of given times; ``main`` is the loop around it.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from touchcell.drivers.hosting.layouts import (
     Reason,
     RecordReader,
     RecordWriter,
-    put_cause,
+    write_cause,
 )
-from touchcell.drivers.hosting.realtime import ask_for_realtime
+from touchcell.drivers.hosting.realtime import request_realtime
 from touchcell.drivers.hosting.wire import receive, send
 
 MISSED_BEATS: Final = 2.5
@@ -69,7 +69,7 @@ class Beat:
     late_ns: int = 0
 
 
-class Judge:
+class HeartbeatMonitor:
     """Decide whether all arms have to be stopped. Holds no clock.
 
     Args:
@@ -121,7 +121,7 @@ class _Watchdog:
         self._arms = {name: RecordReader(fd, ARM) for name, fd in fds["arms"].items()}
         self._wakes: list[int] = fds["wakes"]
         self._watch = RecordWriter(fds["watch"], WATCH)
-        self._judge = Judge(self._period_s)
+        self._monitor = HeartbeatMonitor(self._period_s)
         self._guarding = False
         self._cause: Cause | None = None
         self._notes: Path | None = None
@@ -134,19 +134,19 @@ class _Watchdog:
             # No reply is sent: the lifeline is polled only when there is time.
             waiting = [] if self._task_gone_ns else [self._lifeline]
             if select.select(waiting, [], [], step_s)[0]:
-                self._hear()
-            self._look(time.monotonic_ns())
+                self._receive()
+            self._poll(time.monotonic_ns())
 
-    def _look(self, now_ns: int) -> None:
+    def _poll(self, now_ns: int) -> None:
         task = self._task.read()
         wanted = bool(task["guard"]) and self._task_gone_ns is None
         if wanted and not self._guarding:
-            self._judge.begin(now_ns)
+            self._monitor.begin(now_ns)
         if self._guarding and self._cause is None:
             if self._task_gone_ns is not None:
                 self._cause = Cause(Reason.TASK_GONE, now_ns)
             elif wanted:
-                self._cause = self._judge.update(
+                self._cause = self._monitor.update(
                     now_ns, _task_beat(task), [_host_beat(host.read()) for host in self._hosts]
                 )
         self._guarding = wanted
@@ -157,18 +157,18 @@ class _Watchdog:
 
     def _publish(self, now_ns: int) -> None:
         value = self._watch.value
-        told = bool(value["stop"])
+        reported = bool(value["stop"])
         value["count"] += 1
         value["t_ns"] = now_ns
         value["guarding"] = self._guarding
         value["stop"] = self._cause is not None
-        put_cause(value, self._cause or Cause(Reason.NONE, 0))
+        write_cause(value, self._cause or Cause(Reason.NONE, 0))
         self._watch.publish()
-        if self._cause is not None and not told:
+        if self._cause is not None and not reported:
             for wake in self._wakes:
                 os.eventfd_write(wake, 1)
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         message = receive(self._lifeline)
         if message is None or message["call"] == "end":
             self._task_gone_ns = time.monotonic_ns()
@@ -192,7 +192,7 @@ class _Watchdog:
     def _write_notes(self, path: Path, cause: Cause) -> None:
         record = {
             "reason": cause.reason.name,
-            "words": cause.reason.words,
+            "words": cause.reason.description,
             "t_ns": cause.t_ns,
             "value_s": cause.value_s,
             "limit_s": cause.limit_s,
@@ -217,7 +217,7 @@ def stop_record(arm: Any) -> dict[str, Any]:
     return {
         "stopped_ns": stopped,
         "commands_obeyed": int(arm["obeyed"]),
-        "last_obeyed_ns": int(arm["obeyed_ns"]),
+        "last_executed_ns": int(arm["executed_ns"]),
         "speed_m_s": float(arm["stop_speed_m_s"]),
         "time_s": (rested - stopped) * 1e-9 if rested >= stopped > 0 else None,
         "distance_m": float(arm["stop_way_m"]),
@@ -236,7 +236,7 @@ def _host_beat(record: Any) -> Beat:
 def main() -> None:
     """Run as ``python -m touchcell.drivers.hosting.watchdog SPEC``, with the descriptors named in SPEC inherited."""
     watchdog = _Watchdog(json.loads(sys.argv[1]))
-    send(watchdog._lifeline, {"ok": True, "number": 0, "realtime": ask_for_realtime()})
+    send(watchdog._lifeline, {"ok": True, "number": 0, "realtime": request_realtime()})
     watchdog.run()
 
 

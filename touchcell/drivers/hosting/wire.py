@@ -39,7 +39,7 @@ def decode_error(data: dict[str, Any], device: str) -> TouchcellError:
     """Decode an error, with ``device`` in place of a missing name."""
     kind = _ERRORS.get(data["type"], DeviceError)
     error = kind.__new__(kind)
-    attributes = {name: _living(value) for name, value in data["attributes"].items()}
+    attributes = {name: _decoded_value(value) for name, value in data["attributes"].items()}
     Exception.__init__(error, attributes.get("message", ""))
     # Restored verbatim: a constructor would compose its message again.
     error.__dict__.update({"device": device, **attributes} if issubclass(kind, DeviceError) else attributes)
@@ -48,7 +48,7 @@ def decode_error(data: dict[str, Any], device: str) -> TouchcellError:
 
 def encode_adjustments(adjustments: tuple[Adjustment, ...]) -> bytes:
     """Encode the adjustments of a command; empty for none."""
-    return json.dumps([[a.limit, a.asked, a.allowed] for a in adjustments]).encode() if adjustments else b""
+    return json.dumps([[a.limit, a.requested, a.allowed] for a in adjustments]).encode() if adjustments else b""
 
 
 def decode_adjustments(note: bytes) -> tuple[Adjustment, ...]:
@@ -116,9 +116,9 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def _living(value: Any) -> Any:
+def _decoded_value(value: Any) -> Any:
     if isinstance(value, list):
-        return [_living(each) for each in value]
+        return [_decoded_value(each) for each in value]
     if not isinstance(value, dict):
         return value
     (kind, content) = next(iter(value.items()))
@@ -130,9 +130,9 @@ def _living(value: Any) -> Any:
         case "error":
             return decode_error(content, "")
         case "array":
-            return np.array(_living(content))
+            return np.array(_decoded_value(content))
         case "tuple":
-            return tuple(_living(each) for each in content)
+            return tuple(_decoded_value(each) for each in content)
         case "path":
             return Path(content)
         case "float":

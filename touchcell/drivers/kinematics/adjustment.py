@@ -10,5 +10,5 @@ class Adjustment:
     """One limit that made the sent command differ from the requested one."""
 
     limit: str
-    asked: float
+    requested: float
     allowed: float

@@ -320,7 +320,7 @@ class LocalIk:
         chain, settings = self._chain, self._settings
         lowest, highest = self._bounds
         dq = self._inverse @ (self._weights * twist)
-        if settings.goes_round and len(dq) > 6:
+        if settings.uses_null_space and len(dq) > 6:
             dq = self._saturated(dq, self._weights * twist, lowest, highest)
         scale, adjustments = within_bounds(dq, lowest, highest, chain.joint_names)
         # Rounding must not exceed a limit either.

@@ -32,7 +32,7 @@ class IkSettings:
         singular_gain_hz: the distance to the floor shrinks by at most this fraction per second.
         limit_margin_rad: within this distance of a limit the outward speed falls linearly to zero; inward motion is
             free.
-        goes_round: whether a redundant arm compensates with other joints when one reaches its limit.
+        uses_null_space: whether a redundant arm compensates with other joints when one reaches its limit.
     """
 
     characteristic_length_m: float = 0.25
@@ -42,7 +42,7 @@ class IkSettings:
     damping_m: float = 0.04
     singular_gain_hz: float = 10.0
     limit_margin_rad: float = np.deg2rad(5.0)
-    goes_round: bool = True
+    uses_null_space: bool = True
 
 
 def speed_bounds(q: Array, lower: Array, upper: Array, speed: Array, margin_rad: float) -> tuple[Array, Array]:

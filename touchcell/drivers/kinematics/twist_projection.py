@@ -18,7 +18,7 @@ _NEGLIGIBLE_M_S = 1e-5
 _NEGLIGIBLE_RAD_S = 1e-4
 
 
-def followable(J: Array, twist: Array) -> tuple[Array, tuple[Adjustment, ...]]:
+def project_to_feasible(J: Array, twist: Array) -> tuple[Array, tuple[Adjustment, ...]]:
     """Project ``twist`` (6,) onto the feasible motions of the joints.
 
     Args:

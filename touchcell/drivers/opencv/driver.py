@@ -98,7 +98,7 @@ class OpencvCamera(Camera):
     def _configure(self) -> None:
         capture = self._capture
         assert capture is not None
-        self._set_picture(capture)
+        self._set_format(capture)
         self._set_controls(capture)
         self._previous_ns = None
         self._reader = _Reader(self.name, capture, self._clock)
@@ -114,7 +114,7 @@ class OpencvCamera(Camera):
             self._reader.finish()
             self._reader = None
 
-    def _set_picture(self, capture: cv2.VideoCapture) -> None:
+    def _set_format(self, capture: cv2.VideoCapture) -> None:
         import cv2
 
         config = self._config
@@ -155,9 +155,9 @@ class OpencvCamera(Camera):
             self._expect(setting, value, given * unit if given >= 0 else None)
         return given * unit if given >= 0 else None
 
-    def _expect(self, setting: str, asked: object, given: object) -> None:
-        if asked != given:
-            raise UnsupportedSetting(self.name, setting, asked, given)
+    def _expect(self, setting: str, requested: object, given: object) -> None:
+        if requested != given:
+            raise UnsupportedSetting(self.name, setting, requested, given)
 
     def _collect(self) -> bool:
         reader = self._reader
@@ -178,17 +178,17 @@ class OpencvCamera(Camera):
         t_ns = stamp_ns if self._kernel_stamps else received_ns
         previous_ns, self._previous_ns = self._previous_ns, t_ns
         if previous_ns is not None and t_ns <= previous_ns:
-            self._watch.refuse("out_of_order")
+            self._monitor.count_bad("out_of_order")
             return
         if previous_ns is not None:
             periods = round((t_ns - previous_ns) * 1e-9 * self._config.rate_hz)
-            self._watch.miss(max(0, periods - 1), overrun=overrun)
+            self._monitor.count_lost(max(0, periods - 1), overrun=overrun)
         if codec.damage(data, self._config.pixel_format, self._config.width_px, self._config.height_px):
-            self._watch.refuse("damaged")
+            self._monitor.count_bad("damaged")
             return
-        self._watch.admit(data)
+        self._monitor.count_good(data)
         quality = Quality.GOOD if self._kernel_stamps else Quality.SUSPECT
-        self._keep(RawFrame(data, t_ns, self._last_seq + 1, None if self._kernel_stamps else stamp_ns, quality))
+        self._store(RawFrame(data, t_ns, self._last_seq + 1, None if self._kernel_stamps else stamp_ns, quality))
 
     def _wait(self, timeout_s: float) -> None:
         reader = self._reader

@@ -94,7 +94,7 @@ class ControlLink:
         """
         with self._lock:
             registers = self._start_program()
-            self._prove_watchdog(registers)
+            self._test_watchdog(registers)
             registers.close()
             registers = self._start_program()
             wanted = flange_to_tcp.tolist()
@@ -175,7 +175,7 @@ class ControlLink:
                 self.ttl_stops += 1
                 self.halt(self._stop_accel)
             elif now_ns - self._written_ns >= self._kick_ns:
-                self._registers.kick()
+                self._registers.feed_watchdog()
                 self._written_ns = now_ns
             self._registers.read()
         finally:
@@ -211,10 +211,10 @@ class ControlLink:
             "the control program does not start",
             "see the log on the pendant; only one program can run at a time",
         )
-        registers.kick()
+        registers.feed_watchdog()
         return registers
 
-    def _prove_watchdog(self, registers: Registers) -> None:
+    def _test_watchdog(self, registers: Registers) -> None:
         self._execute(registers, "setWatchdog", SET_WATCHDOG, [self._watchdog_hz])
         silent_ns = self._written_ns
         self._await(
@@ -233,7 +233,7 @@ class ControlLink:
         self._await_answer(registers, READY, what)
         registers.command(command, doubles, asynchronous)
         state = self._await_answer(registers, DONE, what)
-        registers.kick()
+        registers.feed_watchdog()
         self._written_ns = self._clock.now_ns()
         # Only then is the next streamed command sure to be executed, and no older DONE mistaken for its reply.
         self._await_answer(registers, READY, what)

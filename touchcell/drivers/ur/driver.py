@@ -180,7 +180,7 @@ class UrArm(Arm):
         snapshot = self._newest(None)
         age_s = snapshot.age_s(self._clock.now_ns())
         if age_s > self._config.state_timeout_s:
-            raise self._silence(snapshot, age_s)
+            raise self._silence_fault(snapshot, age_s)
         link = self._link
         return (
             float(np.abs(snapshot.qd_target).max()) < _STILL_TARGET_RAD_S
@@ -256,7 +256,7 @@ class UrArm(Arm):
         with dashboard(self.name, self._config.host) as client:
             self._model = f"{client.getRobotModel()}, PolyScope {client.polyscopeVersion()}"
         self._ending.clear()
-        self._supervision_thread = threading.Thread(target=self._keep, name=f"{self.name} keeper", daemon=True)
+        self._supervision_thread = threading.Thread(target=self._supervise, name=f"{self.name} keeper", daemon=True)
         self._supervision_thread.start()
 
     def _close(self) -> None:
@@ -274,10 +274,10 @@ class UrArm(Arm):
         self._stop_receiving()
 
     def _configure(self) -> None:
-        self._refuse_if_unsafe()
+        self._require_safe()
 
     def _activate(self) -> None:
-        self._refuse_if_unsafe()
+        self._require_safe()
         if self._power_off_by is not None:
             raise LifecycleError(self.name, "activate", "being powered off", [Lifecycle.READY.value])
         self._require_remote_control()
@@ -318,12 +318,12 @@ class UrArm(Arm):
             _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
             # The old reader serves the supervision thread until the new one has received a state.
             self._start_receiving()
-        self._opened().forget()
+        self._opened().reset_statistics()
         if self._program_is_ours:
             self._end_program()
         if self._fresh().safety_mode is SafetyMode.PROTECTIVE_STOP:
             self._unlock()
-        self._refuse_if_unsafe()
+        self._require_safe()
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
         link = self._link
@@ -336,7 +336,7 @@ class UrArm(Arm):
             self._gate.reset()
             raise
         except DeviceError as error:
-            raise self._to_faulted(self._explained(error)) from None
+            raise self._to_faulted(self._explain(error)) from None
 
     def _local_ik(self) -> LocalIk:
         return self._ik_at(self._ik, self.joints(self._max_state_age_s).value.q)
@@ -349,10 +349,10 @@ class UrArm(Arm):
         if link is not None:
             self._attempt(lambda: link.halt(self._config.stop_accel_m_s2))
 
-    def _keep(self) -> None:
+    def _supervise(self) -> None:
         try:
             while not self._ending.wait(_KEEPER_PERIOD_S):
-                self._keep_once()
+                self._supervise_once()
         except BaseException as error:
             self._to_faulted(
                 DeviceFault(
@@ -364,30 +364,30 @@ class UrArm(Arm):
                 )
             )
 
-    def _keep_once(self) -> None:
+    def _supervise_once(self) -> None:
         # Read the state before the flag: a program seen stopped after the flag was raised is a fault.
         snapshot = self._newest(None)
         supervised_from_seq = self._supervised_from_seq
-        trouble = self._trouble(snapshot, supervised_from_seq)
+        trouble = self._find_fault(snapshot, supervised_from_seq)
         link = self._link
         if trouble is None and link is not None:
             try:
                 link.tick()
             except DeviceError as error:
-                trouble = self._explained(error) if self._supervised_from_seq is not None else None
+                trouble = self._explain(error) if self._supervised_from_seq is not None else None
         if trouble is not None and self.state is not Lifecycle.DISCONNECTED:
             self._to_faulted(trouble)
         if self.state is Lifecycle.FAULTED:
             self._drop_program()
         if self._power_off_by is not None:
-            self._obey_power_off()
+            self._react_to_power_off()
 
-    def _trouble(self, snapshot: Snapshot, supervised_from_seq: int | None) -> DeviceError | None:
+    def _find_fault(self, snapshot: Snapshot, supervised_from_seq: int | None) -> DeviceError | None:
         reader = self._opened()
         age_s = snapshot.age_s(self._clock.now_ns())
         if age_s > self._config.state_timeout_s or not reader.connected:
-            return self._silence(snapshot, age_s)
-        if reader.over_budget:
+            return self._silence_fault(snapshot, age_s)
+        if reader.drops_too_many:
             return CorruptMessage(
                 self.name, f"too many bad state packets: {reader.corrupt} corrupt, {reader.out_of_order} out of order"
             )
@@ -399,16 +399,16 @@ class UrArm(Arm):
             return power_fault(self.name, snapshot.robot_mode) or program_fault(self.name, snapshot.runtime_state)
         return None
 
-    def _explained(self, error: DeviceError) -> DeviceError:
+    def _explain(self, error: DeviceError) -> DeviceError:
         """Return the fault in the state that explains a rejected command, up to one packet late; else ``error``."""
         deadline_ns = self._clock.now_ns() + _EXPLANATION_NS
-        while (trouble := self._trouble(self._newest(None), self._supervised_from_seq)) is None:
+        while (trouble := self._find_fault(self._newest(None), self._supervised_from_seq)) is None:
             if self._clock.now_ns() > deadline_ns:
                 return error
             self._clock.sleep_until_ns(self._clock.now_ns() + _POLL_NS)
         return trouble
 
-    def _silence(self, snapshot: Snapshot, age_s: float) -> DeviceError:
+    def _silence_fault(self, snapshot: Snapshot, age_s: float) -> DeviceError:
         error: DeviceError
         if self._opened().connected:
             error = TransportTimeout(
@@ -419,7 +419,7 @@ class UrArm(Arm):
         error.__cause__ = StaleData(self.name, age_s, self._config.state_timeout_s, snapshot.seq)
         return error
 
-    def _obey_power_off(self) -> None:
+    def _react_to_power_off(self) -> None:
         with suppress(DeviceError):
             if self._power_off_by is StopCategory.STOP_THEN_REMOVE_POWER and not self.at_rest():
                 return
@@ -476,10 +476,10 @@ class UrArm(Arm):
         snapshot = self._newest(None)
         age_s = snapshot.age_s(self._clock.now_ns())
         if age_s > self._config.state_timeout_s:
-            raise self._silence(snapshot, age_s)
+            raise self._silence_fault(snapshot, age_s)
         return snapshot
 
-    def _refuse_if_unsafe(self) -> None:
+    def _require_safe(self) -> None:
         snapshot = self._fresh()
         fault = safety_fault(self.name, snapshot.safety_mode, snapshot.safety_bits)
         if fault is not None:

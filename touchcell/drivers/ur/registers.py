@@ -120,7 +120,7 @@ class Registers:
         values = dict(zip(COMMAND, (number, int(asynchronous), *arguments), strict=True))
         self._wire.send(Packet(PacketType.DATA, self._command.pack(values)))
 
-    def kick(self) -> None:
+    def feed_watchdog(self) -> None:
         """Write "no command", which feeds the watchdog. Raises DeviceGone."""
         self._wire.send(Packet(PacketType.DATA, self._kick.pack({KICK[0]: 0})))
 

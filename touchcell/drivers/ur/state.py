@@ -8,6 +8,7 @@ RTDE has no checksum: a wrong value within the ranges below cannot be detected.
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 from collections import deque
@@ -19,6 +20,9 @@ import numpy as np
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyMode
 from touchcell.geometry.types import Array
+from touchcell.logs import OncePerCause
+
+_logger = logging.getLogger(__name__)
 
 RATE_HZ = 500.0
 VARIABLES = (
@@ -118,6 +122,7 @@ class StateReader:
         self._offset_ns: float | None = None
         self._offset_at_ns = 0
         self._misses: deque[bool] = deque(maxlen=_BUDGET_WINDOW)
+        self._losses = OncePerCause(_logger)
         self.corrupt = 0
         self.out_of_order = 0
 
@@ -127,14 +132,15 @@ class StateReader:
         return bool(self._receive.isConnected())
 
     @property
-    def over_budget(self) -> bool:
+    def drops_too_many(self) -> bool:
         """Return whether more packets are dropped than on a healthy link: over 10 of the last 50."""
         return sum(self._misses) > _BUDGET_MISSES
 
-    def forget(self) -> None:
+    def reset_statistics(self) -> None:
         """Reset the drop counter and the clock offset, after an operator has acknowledged the fault."""
         with self._lock:
             self._misses.clear()
+            self._losses.forget()
             self._offset_ns = None
 
     def poll(self) -> Snapshot | None:
@@ -184,6 +190,7 @@ class StateReader:
             passed_ns = t_device_ns - newest.t_device_ns
             if passed_ns <= 0:
                 self.out_of_order += 1
+                self._losses.warning("out of order", "dropped a packet that is older than the one before")
                 self._misses.append(True)
                 return None
             reach = _MAX_JOINT_SPEED_RAD_S * passed_ns * 1e-9 + _JUMP_SLACK_RAD
@@ -215,6 +222,7 @@ class StateReader:
 
     def _miss_corrupt(self) -> None:
         self.corrupt += 1
+        self._losses.warning("corrupt", "dropped a packet whose values cannot be true")
         self._misses.append(True)
 
     def _place(self, t_device_ns: int) -> int:

@@ -72,7 +72,7 @@ class V4l2Camera(Camera):
 
     def _configure(self) -> None:
         node = self._opened()
-        self._set_picture(node)
+        self._set_format(node)
         self._set_controls(node)
         try:
             depth = math.ceil(_LONGEST_PAUSE_S * self._config.rate_hz)
@@ -89,20 +89,20 @@ class V4l2Camera(Camera):
             node.stop()
             raise
 
-    def _set_picture(self, node: VideoNode) -> None:
+    def _set_format(self, node: VideoNode) -> None:
         config = self._config
-        picture = node.set_format(config.pixel_format, config.width_px, config.height_px)
+        applied = node.set_format(config.pixel_format, config.width_px, config.height_px)
         for setting, given in (
-            ("pixel_format", picture.pixel_format),
-            ("width_px", picture.width_px),
-            ("height_px", picture.height_px),
+            ("pixel_format", applied.pixel_format),
+            ("width_px", applied.width_px),
+            ("height_px", applied.height_px),
         ):
             if given != getattr(config, setting):
                 raise UnsupportedSetting(self.name, setting, getattr(config, setting), given)
         line = config.width_px * _BYTES_PER_PIXEL.get(config.pixel_format, 0)
-        if line and picture.bytes_per_line != line:
+        if line and applied.bytes_per_line != line:
             raise UnsupportedSetting(
-                self.name, "pixel_format", config.pixel_format, f"lines of {picture.bytes_per_line} bytes"
+                self.name, "pixel_format", config.pixel_format, f"lines of {applied.bytes_per_line} bytes"
             )
         rate_hz = node.set_rate(config.rate_hz)
         if not math.isclose(rate_hz, config.rate_hz, rel_tol=_RATE_TOLERANCE):
@@ -133,9 +133,9 @@ class V4l2Camera(Camera):
         self._expect(setting, value * unit, given * unit)
         return given
 
-    def _expect(self, setting: str, asked: int, given: int) -> None:
-        if asked != given:
-            raise UnsupportedSetting(self.name, setting, asked, given)
+    def _expect(self, setting: str, requested: int, given: int) -> None:
+        if requested != given:
+            raise UnsupportedSetting(self.name, setting, requested, given)
 
     def _collect(self) -> bool:
         node = self._opened()
@@ -148,7 +148,7 @@ class V4l2Camera(Camera):
                 raise
             except TransportError:
                 # DQBUF may fail with EIO for one frame (signal lost) and continue with the next.
-                self._watch.refuse("unreadable")
+                self._monitor.count_bad("unreadable")
                 break
             if arrival is None:
                 break
@@ -165,22 +165,22 @@ class V4l2Camera(Camera):
         previous = self._previous
         step = 1 if previous is None else codec.sequence_step(previous.sequence, arrival.sequence)
         if step <= 0 or (previous is not None and arrival.stamp_ns <= previous.stamp_ns):
-            self._watch.refuse("out_of_order")
+            self._monitor.count_bad("out_of_order")
             return
         if arrival.monotonic and arrival.stamp_ns > self._clock.now_ns() + _FUTURE_NS:
-            self._watch.refuse("from_the_future")
+            self._monitor.count_bad("from_the_future")
             return
         self._previous = arrival
         self._number += step
-        self._watch.miss(step - 1, overrun=self._overrun)
+        self._monitor.count_lost(step - 1, overrun=self._overrun)
         self._overrun = False
         if arrival.damaged:
-            self._watch.refuse("marked_damaged")
+            self._monitor.count_bad("marked_damaged")
         elif codec.damage(data, self._config.pixel_format, self._config.width_px, self._config.height_px):
-            self._watch.refuse("damaged")
+            self._monitor.count_bad("damaged")
         else:
-            self._watch.admit(data)
-            self._keep(self._stamped(arrival, data))
+            self._monitor.count_good(data)
+            self._store(self._stamped(arrival, data))
 
     def _stamped(self, arrival: codec.Arrival, data: bytes) -> RawFrame:
         if arrival.monotonic:

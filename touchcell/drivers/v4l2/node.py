@@ -66,7 +66,7 @@ class KernelCalls:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class AppliedFormat:
     """Image format applied by a device.
 
     Attributes:
@@ -132,14 +132,14 @@ class VideoNode:
                 raise self._error(error, "list the image formats") from None
             names.append(codec.fourcc_text(description.pixelformat))
 
-    def set_format(self, pixel_format: str, width_px: int, height_px: int) -> Picture:
+    def set_format(self, pixel_format: str, width_px: int, height_px: int) -> AppliedFormat:
         """Request a format and return the one that the device chose. Raises TransportError, DeviceGone."""
         request = codec.Format(type=codec.VIDEO_CAPTURE)
         request.pix.width, request.pix.height = width_px, height_px
         request.pix.pixelformat, request.pix.field = codec.fourcc(pixel_format), codec.FIELD_NONE
         self._ask(codec.S_FMT, request, "set the image format")
         pix = request.pix
-        return Picture(codec.fourcc_text(pix.pixelformat), pix.width, pix.height, pix.bytesperline)
+        return AppliedFormat(codec.fourcc_text(pix.pixelformat), pix.width, pix.height, pix.bytesperline)
 
     def set_rate(self, rate_hz: float) -> float:
         """Request a frame rate and return the one that the device chose, Hz. Raises TransportError, DeviceGone."""

@@ -1,1 +1,1 @@
-"""Fitting models to a particular sensor: its camera, its tip, and few-shot adaptation."""
+"""Fit models to a particular sensor: its camera, its tip, and few-shot adaptation."""

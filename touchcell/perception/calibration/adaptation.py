@@ -1,8 +1,8 @@
-"""Bringing a marker estimator to another sensor of its kind with a few labelled images. Needs the extra ``train``.
+"""Few-shot adaptation of a marker estimator to another sensor of its kind. Needs the extra ``train``.
 
-What differs between two such sensors is mostly where the camera looks from and how the labels' axes lie: six numbers
-that are found first, so that the old networks see markers and labels as they were taught. The rest - mounts, stiffness,
-skin - is left to a short training that holds on to the old weights.
+Two such sensors differ mostly in the pose of the camera and in the orientation of the label axes: six numbers that are
+estimated first, so that the old networks see markers and labels as in their training. The rest - mounts, stiffness,
+skin - is left to a short training regularised towards the old weights.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from touchcell.perception.models.model_file import Header, Labels, Model, load_m
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.displacement_network import Jitter, features_of
 from touchcell.perception.networks.marker_learning import fit_lattice
-from touchcell.perception.networks.marker_training import preprocessing_for
+from touchcell.perception.networks.marker_training import LabelledDiscs, preprocessing_for
 
-_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+_FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
 _REFINED_WITH = 60
 _TYPICAL_ERROR = 0.05
 _SHALLOW = 5
@@ -46,14 +46,14 @@ _MATCHED = 0.5
 
 @dataclass(frozen=True)
 class AdaptSettings:
-    """How the networks are brought near.
+    """Settings of the adaptation of the networks.
 
     Attributes:
         steps: of the training.
         batch_size: contacts per step and network.
         learning_rate: at its peak; it falls as a half cosine.
-        hold: how strongly weights are held to the old ones: the loss of one weight that is off by its layer's usual
-            size, times the number of weights.
+        hold: strength of the regularisation towards the old weights: the loss of one weight that is off by its layer's
+            typical magnitude, times the number of weights.
         dropout: after each hidden layer.
         shift_px, turn_rad, zoom: standard deviations of the jitter.
         seed: of everything random.
@@ -71,25 +71,12 @@ class AdaptSettings:
 
 
 @dataclass(frozen=True)
-class FewShotDataset:
-    """Discs of labelled images of the new sensor.
-
-    Attributes:
-        frames: of each image, in its preprocessed pixels.
-        xi: (n, 6) log(T_s_f), m and rad.
-    """
-
-    frames: list[Discs]
-    xi: Array
-
-
-@dataclass(frozen=True)
 class CameraAlignment:
-    """How a new sensor's images and labels are brought to those of the old.
+    """Mapping of a new sensor's images and labels to those of the old.
 
     Attributes:
         camera: from its pixels to the old sensor's.
-        turn_rad: of its label axes about the sensor's axis, to the old sensor's.
+        turn_rad: rotation of its label axes about the sensor's axis, to the old sensor's.
         gain: of its displacements.
         offset: (6,) of the old networks' outputs, in label half-ranges.
         displacements: (n, 2 m) px, as the old sensor would have seen them.
@@ -111,9 +98,9 @@ def adapt(
 
     Args:
         model: model file of kind markers.
-        data: data set; ``train`` is learned from.
+        data: data set; ``train`` is used.
         out: ``NAME.safetensors``.
-        frames: so many images, evenly chosen; None for all.
+        frames: number of images, evenly chosen; None for all.
         settings: None for the defaults.
 
     Raises:
@@ -128,55 +115,57 @@ def adapt(
             model,
             f"is {old.header.architecture.kind}; only marker estimators can be adapted",
             key="architecture.kind",
-            hint="train one with `touchcell train --kind markers`, or this kind anew on the new sensor's images",
+            hint="train one with `touchcell train --kind markers`, or train this kind again on the new sensor's images",
         )
     if old.header.camera is not None:
-        raise ModelError(model, "was adapted already", key="camera", hint="adapt the model that it came from")
+        raise ModelError(model, "was adapted already", key="camera", hint="adapt the original model")
     split = read_split(data, "train")
     chosen = evenly(len(split.images), len(split.images) if frames is None else frames)
     images = [read_image(split.images[i]) for i in chosen]
     preprocessing = preprocessing_for(images[0])
     size = typical_size(preprocessing.reduce(images[0]))
-    few = FewShotDataset(
+    dataset = LabelledDiscs(
         [detect_markers(preprocessing.reduce(image), size) for image in images],
         xi_from_contact(split.contact_mm_deg[chosen]),
     )
-    adapted = adapt_to(old, few, preprocessing=preprocessing, size=size, settings=settings)
+    adapted = adapt_to(old, dataset, preprocessing=preprocessing, size=size, settings=settings)
     save_model(adapted, out)
     return adapted
 
 
 def adapt_to(
     old: Model,
-    few: FewShotDataset,
+    dataset: LabelledDiscs,
     *,
     preprocessing: Preprocessing,
     size: MarkerSize,
     settings: AdaptSettings | None = None,
 ) -> Model:
-    """The model for another sensor, from discs in memory. Arguments as of the model; raises as ``adapt``."""
+    """Return the model for another sensor, from discs in memory. Arguments as of the model; raises as ``adapt``."""
     settings = settings or AdaptSettings()
     architecture = old.header.architecture
     assert isinstance(architecture, MarkerArchitecture)
-    brought = align_to_sensor(old, few)
-    xi, displacements = few.xi[brought.matched], brought.displacements[brought.matched]
-    layers, labels = _regained(layers_of(old), brought), old.header.labels
-    target = labels.targets(about_z(brought.turn_rad, xi))
-    # How far to go from the old weights, and how far to believe the sigmas, contacts tell that were left out.
+    alignment = align_to_sensor(old, dataset)
+    xi, displacements = dataset.xi[alignment.matched], alignment.displacements[alignment.matched]
+    layers, labels = _aligned(layers_of(old), alignment), old.header.labels
+    target = labels.targets(about_z(alignment.turn_rad, xi))
+    # Held-out contacts decide the step away from the old weights and the scale of the sigmas.
     even = np.arange(len(xi)) % 2 == 0
     halves = [tune(old, layers, displacements[half], target[half], settings) for half in (even, ~even)]
     errors, standardised = [], []
-    for share in _SHARES:
+    for fraction in _FRACTIONS:
         off, by_sigma = [], []
         for half, trained in zip((~even, even), halves, strict=True):
-            mean, sigma = outputs_of(_between(layers, trained, share), displacements[half], labels)
+            mean, sigma = outputs_of(_interpolated(layers, trained, fraction), displacements[half], labels)
             off.append(np.abs(target[half] - mean))
             by_sigma.append(labels.aligned(target[half] - mean, mean) / sigma ** np.array(old.header.sigma_power))
         errors.append(float(np.concatenate(off).mean()))
         standardised.append(np.concatenate(by_sigma))
     best = int(np.argmin(errors))
     scale = np.sqrt(np.mean(standardised[best] ** 2, axis=0))
-    tuned = _between(layers, tune(old, layers, displacements, target, settings), _SHARES[best]) if best else layers
+    tuned = (
+        _interpolated(layers, tune(old, layers, displacements, target, settings), _FRACTIONS[best]) if best else layers
+    )
     tensors = dict(old.tensors)
     for i, (weight, bias) in enumerate(tuned):
         tensors[f"layer{i}.weight"] = np.ascontiguousarray(weight, dtype=np.float32)
@@ -190,14 +179,14 @@ def adapt_to(
             labels=labels,
             sigma_scale=tuple(scale.tolist()),
             sigma_power=header.sigma_power,
-            camera=brought.camera,
-            label_turn_deg=math.degrees(brought.turn_rad),
+            camera=alignment.camera,
+            label_turn_deg=math.degrees(alignment.turn_rad),
             training_data=header.training_data,
             training={
                 **header.training,
-                "adapted_images": len(few.frames),
-                "adapted_images_matched": int(brought.matched.sum()),
-                "adapted_share": _SHARES[best],
+                "adapted_images": len(dataset.frames),
+                "adapted_images_matched": int(alignment.matched.sum()),
+                "adapted_fraction": _FRACTIONS[best],
                 **{f"adapted_{key}": value for key, value in asdict(settings).items()},
             },
         ),
@@ -205,32 +194,32 @@ def adapt_to(
     )
 
 
-def align_to_sensor(old: Model, few: FewShotDataset) -> CameraAlignment:
-    """Find camera and label axes.
+def align_to_sensor(old: Model, dataset: LabelledDiscs) -> CameraAlignment:
+    """Estimate the camera and the label axes.
 
-    A lattice looks the same after a sixth of a turn: of the six cameras that are possible, that one is right, together
-    with its turn of the label axes, with which the old networks err least.
+    A lattice is symmetric under rotation by 60 degrees: of the six possible cameras the right one, together with its
+    rotation of the label axes, is that with which the old networks err least.
     """
     architecture = old.header.architecture
     assert isinstance(architecture, MarkerArchitecture)
     matcher = matcher_of(old, architecture)
-    there = matcher.model.reference
-    # By how far |log| is, for want of a depth: the least deformed are the shallowest.
-    depth = np.abs(few.xi[:, 2])
-    fits = [fit_lattice(few.frames[i], architecture.rings) for i in np.argsort(depth)[:_SHALLOW]]
-    here, rms = min(fits, key=lambda each: each[1])
+    old_lattice = matcher.model.reference
+    # |log| stands in for the depth: the least deformed are the shallowest.
+    depth = np.abs(dataset.xi[:, 2])
+    fits = [fit_lattice(dataset.frames[i], architecture.rings) for i in np.argsort(depth)[:_SHALLOW]]
+    new_lattice, rms = min(fits, key=lambda each: each[1])
     if not np.isfinite(rms):
         raise TrainingError(
-            f"the shallowest images show no lattice of {architecture.rings} rings",
+            f"no lattice of {architecture.rings} rings found in the shallowest images",
             hint="only a sensor of the same kind can be adapted to; give an image of hardly any contact",
         )
     layers = layers_of(old)
-    some = np.linspace(0, len(few.frames) - 1, min(_TRIED, len(few.frames))).round().astype(int)
+    some = np.linspace(0, len(dataset.frames) - 1, min(_TRIED, len(dataset.frames))).round().astype(int)
     best: tuple[float, CameraChange, float] | None = None
     for order in lattice_turns(architecture.rings):
-        linear, off = similarity(here[order], there)
-        centre = here.mean(axis=0)
-        du, dv = there.mean(axis=0) - centre
+        linear, off = similarity(new_lattice[order], old_lattice)
+        centre = new_lattice.mean(axis=0)
+        du, dv = old_lattice.mean(axis=0) - centre
         camera = CameraChange(
             zoom=abs(linear),
             turn_deg=float(np.degrees(np.angle(linear))),
@@ -239,12 +228,12 @@ def align_to_sensor(old: Model, few: FewShotDataset) -> CameraAlignment:
             frames=1,
             rms_px=off,
         )
-        displacements, matched = _seen_by(camera, matcher, [few.frames[i] for i in some])
+        displacements, matched = _seen_by(camera, matcher, [dataset.frames[i] for i in some])
         if matched.mean() < _MATCHED or matched.sum() < min(_FEWEST, len(some)):
             continue
         mean, _ = outputs_of(layers, displacements[matched], old.header.labels)
         predicted = xi_from_contact(old.header.labels.contacts(mean))
-        turn, error = _label_turn(few.xi[some][matched], predicted)
+        turn, error = _label_turn(dataset.xi[some][matched], predicted)
         if best is None or error < best[0]:
             best = (error, camera, turn)
     if best is None:
@@ -253,31 +242,32 @@ def align_to_sensor(old: Model, few: FewShotDataset) -> CameraAlignment:
             hint="only a sensor of the same kind can be adapted to; check threshold and crop",
         )
     _, camera, turn = best
-    displacements, matched = _seen_by(camera, matcher, few.frames)
+    displacements, matched = _seen_by(camera, matcher, dataset.frames)
     if matched.sum() < _FEWEST:
         raise TrainingError(f"{int(matched.sum())} images could be matched, {_FEWEST} are needed", hint="give more")
-    refined = _refined(old, layers, there, displacements[matched], few.xi[matched], turn)
+    refined = _refined(old, layers, old_lattice, displacements[matched], dataset.xi[matched], turn)
     camera, turn = _composed(camera, refined), turn + float(refined[4])
-    displacements, matched = _seen_by(camera, matcher, few.frames)
+    displacements, matched = _seen_by(camera, matcher, dataset.frames)
     return CameraAlignment(camera, turn, float(refined[5]), refined[6:], displacements, matched)
 
 
 def _refined(
-    old: Model, layers: Layers, there: Array, displacements: NDArray[np.float32], xi: Array, turn: float
+    old: Model, layers: Layers, old_lattice: Array, displacements: NDArray[np.float32], xi: Array, turn: float
 ) -> Array:
-    """(12,) what makes the old networks err least: log zoom, turn, shift (2) px of the camera, turn of the label axes,
-    gain of the displacements, offset (6) of the outputs in label half-ranges.
+    """Return the (12,) parameters with which the old networks err least.
 
-    One image of hardly any contact gives the camera to 0.3 %, which depth would feel.
+    They are log zoom, rotation and shift (2) px of the camera, rotation of the label axes, gain of the displacements,
+    and offset (6) of the outputs in label half-ranges. One light contact determines the camera to 0.3 % only, which
+    would bias depth.
     """
     some = np.linspace(0, len(xi) - 1, min(_REFINED_WITH, len(xi))).round().astype(int)
-    middle = there.mean(axis=0)
+    middle = old_lattice.mean(axis=0)
     labels = old.header.labels
     moved = displacements[some].astype(np.float64).reshape(len(some), -1, 2)
 
     def residuals(x: Array) -> Array:
         linear = np.exp(x[0]) * np.array([[np.cos(x[1]), -np.sin(x[1])], [np.sin(x[1]), np.cos(x[1])]])
-        seen = (there + moved - middle) @ linear.T + middle + x[2:4] - there
+        seen = (old_lattice + moved - middle) @ linear.T + middle + x[2:4] - old_lattice
         mean, _ = outputs_of(layers, (x[5] * seen).reshape(len(some), -1).astype(np.float32), labels)
         aim = labels.targets(about_z(turn + x[4], xi[some]))
         flat: Array = (mean + x[6:] - aim).ravel() / _TYPICAL_ERROR
@@ -301,7 +291,7 @@ def _composed(camera: CameraChange, refined: Array) -> CameraChange:
 
 
 def about_z(turn_rad: float, xi: Array) -> Array:
-    """Labels (n, 6) about axes that are turned about the sensor's."""
+    """Return labels (n, 6) with axes rotated about the sensor's z axis."""
     turned = xi.copy()
     for first in (0, 3):
         plane = _plane(xi, first) * np.exp(1j * turn_rad)
@@ -318,7 +308,7 @@ def _seen_by(
 
 
 def _label_turn(xi: Array, predicted: Array) -> tuple[float, float]:
-    """Angle about z that brings labels xi (n, 6) to predictions, and the mean error that is left, mm or degrees."""
+    """Return the angle about z that maps labels xi (n, 6) to predictions, and the mean residual, mm or degrees."""
     a, b = (np.concatenate([_plane(each, 0) / 1e-3, _plane(each, 3) / np.radians(1.0)]) for each in (xi, predicted))
     turn = float(np.angle(np.vdot(a, b)))
     return turn, float(np.abs(a * np.exp(1j * turn) - b).mean())
@@ -333,7 +323,7 @@ Layers = list[tuple[Array, Array]]
 
 
 def layers_of(model: Model) -> Layers:
-    """The networks of a marker model."""
+    """Return the weights and biases of a marker model's networks."""
     architecture = model.header.architecture
     assert isinstance(architecture, MarkerArchitecture)
     return [
@@ -342,22 +332,22 @@ def layers_of(model: Model) -> Layers:
     ]
 
 
-def _regained(layers: Layers, brought: CameraAlignment) -> Layers:
+def _aligned(layers: Layers, alignment: CameraAlignment) -> Layers:
     first, last = layers[0], layers[-1]
-    shifted = (last[0], last[1] + np.concatenate([brought.offset, np.zeros(6)]))
-    return [(brought.gain * first[0], first[1]), *layers[1:-1], shifted]
+    shifted = (last[0], last[1] + np.concatenate([alignment.offset, np.zeros(6)]))
+    return [(alignment.gain * first[0], first[1]), *layers[1:-1], shifted]
 
 
-def _between(one: Layers, other: Layers, share: float) -> Layers:
-    """Weights a share of the way from one to the other."""
+def _interpolated(one: Layers, other: Layers, fraction: float) -> Layers:
+    """Return weights interpolated by ``fraction`` from one to the other."""
     return [
-        (weight + share * (to - weight), bias + share * (shift - bias))
+        (weight + fraction * (to - weight), bias + fraction * (shift - bias))
         for (weight, bias), (to, shift) in zip(one, other, strict=True)
     ]
 
 
 def outputs_of(layers: Layers, displacements: NDArray[np.float32], labels: Labels) -> tuple[Array, Array]:
-    """Means (n, 6) in label half-ranges and uncalibrated sigmas of the mixture, of displacements (n, 2 m) px."""
+    """Return means (n, 6) in label half-ranges and uncalibrated sigmas of the mixture, of displacements (n, 2 m) px."""
     x: Array = np.broadcast_to(displacements.astype(np.float64), (len(layers[0][0]), *displacements.shape))
     for i, (weight, bias) in enumerate(layers):
         x = x @ weight + bias
@@ -369,17 +359,17 @@ def outputs_of(layers: Layers, displacements: NDArray[np.float32], labels: Label
 def tune(
     old: Model, layers: Layers, displacements: NDArray[np.float32], target: Array, settings: AdaptSettings
 ) -> Layers:
-    """Layers whose means fit labelled displacements better and that stay near those given.
+    """Fine-tune layers to labelled displacements, regularised towards the given ones.
 
     Args:
-        old: whose displacement model scales the inputs.
-        layers: to begin with.
+        old: its displacement model scales the inputs.
+        layers: initial layers.
         displacements: (n, 2 m) px.
         target: (n, 6) in label half-ranges.
         settings: of the training.
 
     Raises:
-        TrainingError: the loss is no number.
+        TrainingError: the loss is not finite.
     """
     model = displacement_model_of(old)
     features = features_of(model)
@@ -391,7 +381,7 @@ def tune(
 
 
 class _Tuner:
-    """Changes of weights, that begin at zero."""
+    """Trainable changes of weights, initially zero."""
 
     def __init__(self, layers: Layers, features: Array, model: DisplacementModel, settings: AdaptSettings) -> None:
         self.settings = settings
@@ -403,7 +393,7 @@ class _Tuner:
         shapes = [(networks, features.shape[1], units), *(w.shape for w, _ in layers[1:])]
         self.weights = [torch.zeros(shape, requires_grad=True) for shape in shapes]
         self.biases = [torch.zeros(b.shape, requires_grad=True) for _, b in layers]
-        # The usual size of a layer's weights, from which a change is large or small.
+        # Typical magnitude of a layer's weights, by which changes are scaled.
         self.usual = [1.0 / math.sqrt(shape[1]) for shape in shapes]
 
     def fit(self, inputs: Tensor, targets: Tensor) -> None:
@@ -420,13 +410,13 @@ class _Tuner:
             held = sum(((w / usual) ** 2).mean() for w, usual in zip(self.weights, self.usual, strict=True))
             loss = off.sum(-1).mean() + settings.hold * held
             if not torch.isfinite(loss):
-                raise TrainingError("the loss is no number", hint="check the labels of the new images")
+                raise TrainingError("the loss is not finite", hint="check the labels of the new images")
             optimizer.zero_grad(set_to_none=True)
             (loss * networks).backward()  # type: ignore[no-untyped-call]
             optimizer.step()
 
     def layers(self) -> Layers:
-        """Old weights and changes together, as a model file has them."""
+        """Return the old weights plus the changes, in the format of a model file."""
         found: Layers = []
         for i, ((weight, bias), change, shift) in enumerate(zip(self.old, self.weights, self.biases, strict=True)):
             moved = self.features @ change if i == 0 else change

@@ -1,4 +1,4 @@
-"""Least squares with a robust loss and prior knowledge, for some dozens of parameters. NumPy only."""
+"""Robust nonlinear least squares with a prior, for some dozens of parameters. NumPy only."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ def robust_fit(
     prior: float,
     soft: float,
     turns: int = 30,
-    told: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Array:
-    """Parameters that make residuals small: Levenberg-Marquardt with the soft-L1 loss, Jacobian by differences.
+    """Minimise residuals by Levenberg-Marquardt with the soft-L1 loss and a finite-difference Jacobian.
 
     Minimises sum 2 soft^2 (sqrt(1 + (r / soft)^2) - 1) + prior^2 |(x - start) / scale|^2 within bounds.
 
     Args:
-        residuals: (n,) of parameters (k,).
-        start: (k,) where to begin, and what the prior holds on to.
-        scale: (k,) how far each parameter may be expected to lie from there.
+        residuals: (n,) as a function of the parameters (k,).
+        start: (k,) initial value and prior mean.
+        scale: (k,) prior standard deviation of each parameter.
         low, high: (k,) bounds.
         prior: residual that one scale away from the start is worth.
-        soft: residuals beyond count linearly rather than squared.
-        turns: at most so many.
-        told: of turns done, and turns in all.
+        soft: larger residuals count linearly rather than squared.
+        turns: largest number of iterations.
+        progress: called with the iterations done and ``turns``.
 
     Returns:
-        (k,).
+        (k,) parameters.
     """
     x = np.clip(start, low, high)
 
@@ -67,8 +67,8 @@ def robust_fit(
                 damping = max(0.2 * damping, 1e-9)
                 break
             damping *= 8.0
-        if told is not None:
-            told(turn + 1, turns)
+        if progress is not None:
+            progress(turn + 1, turns)
         if before - least < 1e-5 * before:
             break
     return x

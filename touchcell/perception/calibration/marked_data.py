@@ -1,4 +1,4 @@
-"""Which marker is where in the images of a data set, found without its labels."""
+"""Marker matching in the images of a data set, without its labels."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from touchcell.perception.networks.marker_training import preprocessing_for
 
 _BELIEVED = 0.97
 
-Told = Callable[[str, int, int], None]
-"""Told (what is done, how much of it, of how much)."""
+StageCallback = Callable[[str, int, int], None]
+"""Called with the name of the stage, the number of items done, and the total."""
 
 
 @dataclass(frozen=True)
 class SensorMarkers:
-    """Finds the markers of one sensor.
+    """Marker detector and matcher of one sensor.
 
     Attributes:
         preprocessing: camera image to black and white.
         size: of a marker.
         matcher: discs to markers.
-        origin: (2,) px, where the images' first pixel lies in the 640x480 frame.
+        origin: (2,) px, position of the images' first pixel in the 640x480 frame.
         disc_radius_px: of a circle with the median area of the discs.
     """
 
@@ -52,16 +52,21 @@ class SensorMarkers:
         return reference
 
     def field(self, image: ImageArray) -> MarkerField:
-        """Markers of one image, in its own pixels."""
+        """Match the markers of one image, in its own pixels."""
         return self.matcher.match(detect_markers(self.preprocessing.reduce(image), self.size))
 
-    def contacts(self, split: Split, which: Array, told: Told | None = None) -> tuple[MarkedContacts, Array]:
-        """Those of some images whose match can be believed, in the 640x480 frame, and which they are.
+    def contacts(
+        self, split: Split, which: Array, progress: StageCallback | None = None
+    ) -> tuple[MarkedContacts, Array]:
+        """Match the markers of some images, in the 640x480 frame, and drop uncertain matches.
 
         Args:
             split: labelled images.
-            which: (n,) their numbers.
-            told: of the images done.
+            which: (n,) indices of the images.
+            progress: called per image.
+
+        Returns:
+            The contacts with reliable matches, and their indices.
         """
         kept, pixels, seen = [], [], []
         for i, number in enumerate(which):
@@ -70,14 +75,14 @@ class SensorMarkers:
                 kept.append(int(number))
                 pixels.append(field.positions + self.origin)
                 seen.append(field.seen)
-            if told is not None:
-                told("matched", i + 1, len(which))
+            if progress is not None:
+                progress("matched", i + 1, len(which))
         labels = se3.from_euler_mm_deg(split.contact_mm_deg[kept])
         return MarkedContacts(labels, np.array(pixels), np.array(seen, bool)), np.array(kept)
 
 
 def frame_origin(size: tuple[int, int]) -> Array:
-    """(2,) px, where the first pixel of images of this (height, width) lies in the 640x480 frame.
+    """Return (2,) px, the position of the first pixel of images of this (height, width) in the 640x480 frame.
 
     Raises:
         ImageError: they are neither whole frames nor the public crop.
@@ -92,17 +97,17 @@ def frame_origin(size: tuple[int, int]) -> Array:
 
 
 def learn_sensor(
-    data: Path, *, images: int, rings: int, guess_steps: int = 600, seed: int = 0, told: Told | None = None
+    data: Path, *, images: int, rings: int, guess_steps: int = 600, seed: int = 0, progress: StageCallback | None = None
 ) -> SensorMarkers:
-    """Learn to find the markers from evenly chosen images of ``data/train``; their labels are not looked at.
+    """Learn to match the markers from evenly chosen images of ``data/train``, without using their labels.
 
     Args:
         data: data set.
-        images: how many.
+        images: number of images.
         rings: of the lattice.
         guess_steps: as of ``marker_learning.learn_markers``.
         seed: of everything random.
-        told: of what has been done.
+        progress: called per image and learning step.
 
     Raises:
         DataError: the data set is damaged.
@@ -118,22 +123,22 @@ def learn_sensor(
     discs = []
     for i, path in enumerate(chosen):
         discs.append(detect_markers(preprocessing.reduce(read_image(path)), size))
-        if told is not None:
-            told("images", i + 1, len(chosen))
+        if progress is not None:
+            progress("images", i + 1, len(chosen))
     learned = learn_markers(
         discs,
         preprocessing.output_size,
         rings=rings,
         guess_steps=guess_steps,
         seed=seed,
-        told=None if told is None else lambda done, total: told("markers learned", done, total),
+        progress=None if progress is None else lambda done, total: progress("markers learned", done, total),
     )
     area = float(np.median(np.concatenate([each.areas for each in discs])))
     return SensorMarkers(preprocessing, size, learned.matcher, origin, float(np.sqrt(area / np.pi)))
 
 
 def evenly(n: int, wanted: int) -> list[int]:
-    """``wanted`` numbers below ``n``, evenly spread and neither the first nor the last where there is a choice."""
+    """Return ``wanted`` evenly spaced numbers below ``n``, neither the first nor the last where there is a choice."""
     if wanted >= n:
         return list(range(n))
     return [int(each) for each in np.linspace(0, n - 1, wanted + 2).round()[1:-1]]
@@ -141,12 +146,12 @@ def evenly(n: int, wanted: int) -> list[int]:
 
 @dataclass(frozen=True)
 class MarkedContacts:
-    """Contacts that an arm was told to make, and where the markers were then.
+    """Commanded contacts, and the marker positions observed in them.
 
     Attributes:
         T_f_s: (n, 4, 4) commanded.
         pixels: (n, m, 2) px.
-        seen: (n, m) markers that were found.
+        seen: (n, m) markers that were detected.
     """
 
     T_f_s: Array
@@ -157,5 +162,5 @@ class MarkedContacts:
         return len(self.T_f_s)
 
     def chosen(self, which: Any) -> MarkedContacts:
-        """Some of the contacts."""
+        """Return some of the contacts."""
         return MarkedContacts(self.T_f_s[which], self.pixels[which], self.seen[which])

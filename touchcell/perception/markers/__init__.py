@@ -1,1 +1,1 @@
-"""Finding and matching the markers of a TacTip, and estimating a contact from them."""
+"""TacTip markers: detection, matching, tracking, and contact estimation from them."""

@@ -1,4 +1,4 @@
-"""Contact pose and shear from the markers of one image, in a running cell: NumPy and the compiled kernels alone."""
+"""Contact pose and shear from the markers of one image at run time: NumPy and the compiled kernels only."""
 
 from __future__ import annotations
 
@@ -24,18 +24,19 @@ if TYPE_CHECKING:
 class MarkerEstimator:
     """A trained marker model, ready to predict.
 
-    Images that follow each other are matched faster, as each starts from the one before; the result is the same. Not
-    safe for use from two threads at once.
+    Matching is faster in consecutive images, as each starts from the previous one; the result is the same. Not safe for
+    use from two threads at once.
 
     Attributes:
         header: of the model file.
         reference: preprocessed image out of contact, or None.
         field: the markers of the last image, None before the first.
-        change: between this camera and the one that taught the model, in pixels of the crop; None for none.
+        change: between this camera and the one the model was trained with, in pixels of the crop; None for none.
     """
 
     def __init__(self, model: Model) -> None:
-        """
+        """Create an estimator.
+
         Raises:
             TypeError: the model is of another kind.
         """
@@ -53,7 +54,7 @@ class MarkerEstimator:
             (model.tensors[f"layer{i}.weight"], model.tensors[f"layer{i}.bias"][:, 0])
             for i in range(len(architecture.hidden) + 1)
         ]
-        # One long product is faster than several short ones that read the same input.
+        # One long product is faster than several short ones with the same input.
         first, bias = self._layers.pop(0)
         self._first = np.ascontiguousarray(first.transpose(1, 0, 2)).reshape(first.shape[1], -1)
         self._first_bias = bias.reshape(-1)
@@ -71,39 +72,41 @@ class MarkerEstimator:
         return cls(model)
 
     def reduce(self, image: ImageArray) -> ImageArray:
-        """The model's preprocessing, uint8 (height, width): black and white, in the camera's resolution.
+        """Apply the model's preprocessing: uint8 (height, width), black and white, in the camera's resolution.
 
         Raises:
-            ImageError: the image is not what the model's preprocessing was made for.
+            ImageError: the image does not match the model's preprocessing.
         """
         return self.header.preprocessing.reduce(image)
 
     def predict(self, image: ImageArray) -> Prediction:
-        """Contact in one camera image. Raises as ``reduce``."""
+        """Estimate the contact in one camera image. Raises as ``reduce``."""
         return self.predict_reduced(self.reduce(image))
 
     def predict_reduced(self, reduced: ImageArray) -> Prediction:
-        """Contact in an image that ``reduce`` made.
+        """Estimate the contact in an image returned by ``reduce``.
 
-        Where the markers cannot be matched with certainty, ``in_range`` is False and sigmas are as wide as the taught
-        range. Where next to nothing can be, the prediction is the middle of that range.
+        Where the markers cannot be matched reliably, ``in_range`` is False and the sigmas are as wide as the training
+        range. Where almost none can be matched, the prediction is the centre of that range.
         """
         field = self.match(self.find(reduced))
         return self.decode(field, *self.infer(field))
 
     def find(self, reduced: ImageArray) -> Discs:
-        """First step of ``predict_reduced``: the discs of an image, where the camera that taught the model saw them."""
+        """First step of ``predict_reduced``: detect the discs, in the pixels of the model's own camera."""
         discs = detect_markers(reduced, self._size)
         return discs if self.change is None else Discs(self.change.points(discs.centres), discs.areas)
 
     def match(self, discs: Discs) -> MarkerField:
-        """Second step: which disc is which marker."""
+        """Second step: match the discs to markers."""
         self.field = self._matcher.match(discs, self.field)
         return self.field
 
     def infer(self, field: MarkerField) -> tuple[Array, Array]:
-        """Third step: mean (6,) in label half-ranges, and standard deviations (6,) in label units, of the mixture of
-        all networks' Gaussians; the middle of the range where no marker was seen."""
+        """Third step: return mean (6,) in label half-ranges and standard deviations (6,) in label units of the mixture.
+
+        Without any marker the result is the centre of the training range.
+        """
         if not field.seen.any():
             return np.zeros(6), np.ones(6)
         x = kernels.affine(self._first, self._first_bias, field.displacements.ravel().astype(np.float32))
@@ -117,25 +120,25 @@ class MarkerEstimator:
         return mixed(outputs[:, :6], log_precision, self.header.labels)
 
     def decode(self, field: MarkerField, mean: Array, sigma: Array) -> Prediction:
-        """Last step: what ``infer`` told, as a Gaussian over xi."""
+        """Last step: convert the result of ``infer`` to a Gaussian over xi."""
         labels = self.header.labels
         if not field.seen.any():
             return Prediction(*labels.xi_gaussian(mean, sigma), in_range=False, markers=0.0)
         in_range = field.valid and bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
         calibrated = self.header.calibrated(sigma)
-        # The networks know how sure to be of markers that were matched, and of no others.
+        # The networks' sigmas are valid only for markers that were matched.
         xi, covariance = labels.xi_gaussian(mean, calibrated if field.valid else np.maximum(calibrated, 1.0))
         return Prediction(xi, covariance, in_range, markers=field.score)
 
     def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:
-        """``predict`` of a camera's sample; the prediction keeps the stamp, number and quality of the frame."""
+        """Apply ``predict`` to a camera's sample; the prediction keeps the stamp, number and quality of the frame."""
         return Stamped(
             self.predict(sample.value.image), sample.t_ns, sample.seq, sample.t_device_ns, quality=sample.quality
         )
 
 
 def mixed(means: Array, log_precisions: Array, labels: Labels) -> tuple[Array, Array]:
-    """Mean and standard deviations of an even mixture of Gaussians.
+    """Return mean and standard deviations of a mixture of Gaussians with equal weights.
 
     Args:
         means: (networks, ..., 6) in label half-ranges.
@@ -152,7 +155,7 @@ def mixed(means: Array, log_precisions: Array, labels: Labels) -> tuple[Array, A
 
 
 def displacement_model_of(model: Model) -> DisplacementModel:
-    """How the markers of a marker model move."""
+    """Return the displacement model of a marker model."""
     reference, mean, basis, sd = (
         model.tensors[name].astype(np.float64)
         for name in ("lattice", "displacement.mean", "displacement.basis", "displacement.sd")
@@ -161,7 +164,7 @@ def displacement_model_of(model: Model) -> DisplacementModel:
 
 
 def matcher_of(model: Model, architecture: MarkerArchitecture) -> MarkerMatcher:
-    """The matcher that a marker model describes."""
+    """Return the matcher that a marker model describes."""
     return MarkerMatcher(
         displacement_model_of(model),
         FirstGuess(

@@ -1,4 +1,4 @@
-"""Pictures of markers: where a contact moves them, and where it crowds them."""
+"""Figures of markers: their displacement and the change of their density in a contact."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _BANDWIDTH_SPACINGS = 0.8
 
 
 def density_change(positions: Array, reference: Array, size: tuple[int, int], spacing_px: float) -> Array:
-    """Kernel density of markers relative to that of the undeformed tip (Lloyd & Lepora 2024, 5.1).
+    """Return the kernel density of markers relative to that of the undeformed tip (Lloyd & Lepora 2024, 5.1).
 
     Args:
         positions: (m, 2) px.
@@ -50,7 +50,7 @@ def write_markers(
     size: tuple[int, int],
     spacing_px: float,
 ) -> None:
-    """One column for each contact: displacement arrows above, change of density below.
+    """Write a figure with one column per contact: displacement arrows above, change of density below.
 
     Args:
         path: PNG to write.
@@ -84,17 +84,17 @@ def write_markers(
 def draw_contact(
     image: ImageArray, reference: Array, positions: Array, spacing_px: float, *, arrows: bool
 ) -> ImageArray:
-    """A contact as people see it live: the image with displacement arrows, and beside it the change of density.
+    """Draw a live contact image: the camera image with displacement arrows, and beside it the change of density.
 
     Args:
-        image: uint8 (height, width), as markers were looked for in it.
+        image: uint8 (height, width), the image in which the markers were detected.
         reference: (m, 2) px, undeformed.
         positions: (m, 2) px now.
         spacing_px: of neighbouring markers.
-        arrows: whether the positions are those of the same markers; their density is right in any order.
+        arrows: True if the positions are those of the same markers; density needs no such order.
 
     Returns:
-        uint8 (height, 2 width, 3) BGR; red where markers crowd, blue where they left.
+        uint8 (height, 2 width, 3) BGR; red where density rises, blue where it falls.
     """
     height, width = image.shape
     left = np.asarray(cv2.cvtColor(image // 2, cv2.COLOR_GRAY2BGR), dtype=np.uint8)

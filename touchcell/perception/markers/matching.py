@@ -1,13 +1,13 @@
-"""Which disc of an image is which marker of the lattice.
+"""Matching of an image's discs to the markers of the lattice.
 
-A marker's displacement says little by itself, as markers move further than half their spacing. All together move in few
-ways: a linear model with some two dozen coefficients leaves less than a pixel. So the coefficients are found, and the
-markers with them, by turns: predict the markers, pair each with its nearest disc, fit anew. From a near start (the
-frame before) this converges in two or three turns. Without one a small network looks at where the discs are dense, and
-guesses the coefficients; when the guess leads nowhere, learned contacts whose discs lie alike are tried.
+A single marker's displacement is ambiguous, as markers move further than half their spacing. All together have few
+degrees of freedom: a linear model with some two dozen coefficients leaves less than a pixel. So the coefficients are
+estimated together with the matching, alternately: predict the markers, pair each with its nearest disc, fit again. From
+a near start (the previous frame) this converges in two or three iterations. Without one a small network estimates the
+coefficients from the density of discs; when that fails, learned contacts with a similar density are tried.
 
-Pairing and fitting are in C (``kernels.py``); what is here decides where to begin and what to believe. Other products
-are written as ``einsum``, which never leaves its thread: a linear algebra library would spread products of this size
+Pairing and fitting are in C (``kernels.py``); this module decides where to start and what to accept. Other products
+are written as ``einsum``, which stays on its thread: a linear algebra library would spread products of this size
 over all cores, and wait for a busy core far longer than the product takes.
 """
 
@@ -31,7 +31,7 @@ _CONVINCING = 0.965
 _COMPLETE = 0.985
 _STILL_THERE = 0.6
 _BANKED_AT_ONCE = 32
-_NEAR = 0.3  # Spacings that a first guess may be off; those that fail are off by more.
+_NEAR = 0.3  # Largest accepted error of a first guess, in spacings; failed ones are off by more.
 _ALIKE = 6
 _MOST_STARTS = 2
 _RINGS_GROWN = 6
@@ -41,12 +41,12 @@ _ONWARD = 1.2
 
 @dataclass(frozen=True, slots=True)
 class DisplacementModel:
-    """The ways in which the markers of a sensor move together.
+    """Linear model of the joint displacements of a sensor's markers.
 
     Attributes:
         reference: (m, 2) px, markers of the undeformed tip.
         mean: (2 m,) px, mean displacement (u, v, u, v, ...).
-        basis: (k, 2 m) orthonormal rows, the widest way first.
+        basis: (k, 2 m) orthonormal rows, in order of decreasing variance.
         sd: (k,) px, standard deviations of the coefficients.
     """
 
@@ -63,25 +63,25 @@ class DisplacementModel:
 
     @property
     def spacing_px(self) -> float:
-        """Median distance of a reference marker from its nearest neighbour."""
+        """Median distance of a reference marker from its nearest neighbour, px."""
         distances = np.linalg.norm(self.reference[:, None] - self.reference[None], axis=2)
         np.fill_diagonal(distances, np.inf)
         return float(np.median(distances.min(axis=1)))
 
     def positions(self, coefficients: Array) -> Array:
-        """(..., m, 2) px of coefficients (..., k)."""
+        """Return (..., m, 2) px of coefficients (..., k)."""
         flat: Array = self.base + np.einsum("...k,kj->...j", coefficients, self.basis)
         return flat.reshape(*flat.shape[:-1], -1, 2)
 
     @classmethod
     def fit(cls, reference: Array, displacements: Array, seen: NDArray[np.bool_], modes: int) -> DisplacementModel:
-        """Principal components of displacements of which some are missing.
+        """Fit principal components to displacements with missing values.
 
         Args:
             reference: (m, 2) px.
-            displacements: (n, m, 2) px; those of unseen markers are taken for a first guess.
+            displacements: (n, m, 2) px; those of unseen markers serve as a first guess.
             seen: (n, m).
-            modes: how many components are kept, at most n - 1.
+            modes: number of components kept, at most n - 1.
         """
         flat = displacements.reshape(len(displacements), -1).astype(np.float64)
         known = np.repeat(seen, 2, axis=1)
@@ -99,7 +99,7 @@ class DisplacementModel:
 
 @dataclass(frozen=True, slots=True)
 class MarkerField:
-    """Where all markers of a lattice are in one image.
+    """Positions of all markers of a lattice in one image.
 
     Attributes:
         positions: (m, 2) px; of unseen markers as the displacement model fills them in.
@@ -108,7 +108,7 @@ class MarkerField:
         coefficients: (k,) px, of the displacement model.
         score: markers seen over those expected in view, or over the discs among them where these are more; 1 is best.
         rms_px: of the seen markers from the displacement model.
-        valid: the match can be believed.
+        valid: the match is reliable.
     """
 
     positions: Array
@@ -125,11 +125,11 @@ class FirstGuess:
     """A network with one hidden layer from the density of discs to the coefficients of a displacement model.
 
     Attributes:
-        low: (2,) px, corner of the square that is looked at.
-        cell_px: side of a cell of its grid.
+        low: (2,) px, corner of the grid.
+        cell_px: side of a cell of the grid.
         hidden_weight, hidden_bias: (hidden, grid * grid), (hidden,).
         weight, bias: (k, hidden), (k,); outputs are in standard deviations of the coefficients.
-        sd: (k,) px, how far its guesses are off.
+        sd: (k,) px, standard deviation of its errors.
     """
 
     low: Array
@@ -141,26 +141,26 @@ class FirstGuess:
     sd: Array
 
     def density(self, centres: Array) -> NDArray[np.float32]:
-        """(..., grid * grid) what it looks at, of discs (..., n, 2)."""
+        """Return its input (..., grid * grid), the density of discs (..., n, 2)."""
         grid = math.isqrt(self.hidden_weight.shape[1])
         batch = centres.reshape(-1, *centres.shape[-2:])
         density = disc_density(batch, np.ones(batch.shape[:2]), self.low, self.cell_px, grid)
         return density.reshape(*centres.shape[:-2], -1)
 
     def __call__(self, density: NDArray[np.float32]) -> Array:
-        """(k,) coefficients over their standard deviations, of a density (grid * grid,)."""
+        """Return (k,) coefficients over their standard deviations, of a density (grid * grid,)."""
         hidden = np.maximum(np.einsum("ij,j->i", self.hidden_weight, density) + self.hidden_bias, 0.0)
         guess: Array = (np.einsum("ij,j->i", self.weight, hidden) + self.bias).astype(np.float64)
         return guess
 
 
 def disc_density(centres: Array, weights: Array, low: Array, cell_px: float, grid: int) -> NDArray[np.float32]:
-    """How many discs lie in each cell of a grid, each shared bilinearly among the four cells around it.
+    """Return the density of discs in each cell of a grid, each distributed bilinearly over the four nearest cells.
 
     Args:
         centres: (b, n, 2) px.
-        weights: (b, n), zero for a disc that is not there.
-        low: (2,) px, where the grid begins.
+        weights: (b, n), zero for an absent disc.
+        low: (2,) px, corner of the grid.
         cell_px: side of a cell.
         grid: cells along each side.
 
@@ -172,16 +172,16 @@ def disc_density(centres: Array, weights: Array, low: Array, cell_px: float, gri
 
 
 class MarkerMatcher:
-    """Matches the discs of one frame after the other.
+    """Match the discs of consecutive frames to markers.
 
     Args:
-        model: how the markers move.
-        guess: a start for frames without a near frame before them.
+        model: displacement model of the markers.
+        guess: initial value for frames without a near previous frame.
         image_size: (height, width) px.
-        bank: (b, k) learned coefficients, one or more. Those whose discs lie alike are tried where the guess leads
-            nowhere.
-        least_score: below this a match is not believed.
-        most_rms_px: above this a match is not believed.
+        bank: (b, k) learned coefficients, one or more. Those with the most similar discs are tried where the guess
+            fails.
+        least_score: a match below this is not accepted.
+        most_rms_px: a match above this is not accepted.
     """
 
     def __init__(
@@ -206,23 +206,23 @@ class MarkerMatcher:
         self._reach = 0.3 * self._spacing_px
         apart = np.linalg.norm(model.reference[:, None] - model.reference[None], axis=2)
         nearest = np.argsort(apart, axis=1)[:, 1 : _NEIGHBOURS + 1]
-        # Markers of the rim have fewer neighbours: the number of markers stands for nobody.
+        # Markers of the rim have fewer neighbours: the number of markers is the index of a missing one.
         is_near = np.take_along_axis(apart, nearest, axis=1) < 1.5 * self._spacing_px
         self._neighbours = np.where(is_near, nearest, len(apart))
-        # Where a contact is far from those that taught it, a guess is off by more than its own standard deviation.
+        # Far from the training contacts, a guess is off by more than its own standard deviation.
         self._guess_sd = np.hypot(3.0 * guess.sd, 0.1 * model.sd)
-        # All at once would take 100 MB for a moment, which a process does not give back.
+        # All at once would briefly take 100 MB, which a process does not return to the system.
         parts = range(0, len(bank), _BANKED_AT_ONCE)
         self._bank_density = np.concatenate(
             [_in_bytes(guess.density(model.positions(bank[i : i + _BANKED_AT_ONCE]))) for i in parts]
         )
 
     def match(self, discs: Discs, previous: MarkerField | None = None) -> MarkerField:
-        """Markers of the image in which ``discs`` were found.
+        """Match the discs of one image.
 
         Args:
-            discs: what was found in the image.
-            previous: of the frame before, when there was one; an invalid one is not used.
+            discs: discs detected in the image.
+            previous: result for the previous frame, if any; an invalid one is not used.
         """
         if not len(self.model.reference) // 4 <= len(discs) <= 4 * len(self.model.reference):
             return self._nothing()
@@ -240,19 +240,19 @@ class MarkerMatcher:
         return max(tried, key=quality)
 
     def _is_near(self, previous: MarkerField, centres: Array) -> bool:
-        """Whether most markers of the frame before still have a disc close by."""
+        """Return True if most markers of the previous frame still have a disc close by."""
         _, square, _ = kernels.pair(self.model.positions(previous.coefficients), centres)
         return float(np.mean(square < self._reach**2)) > _STILL_THERE
 
     def match_from(self, discs: Discs, starts: Iterable[Array]) -> MarkerField:
-        """Best of the matches that begin at other contacts' coefficients (k,), far from the right ones maybe."""
+        """Return the best of the matches that start from other contacts' coefficients (k,), possibly far off."""
         prior_sd = 0.4 * self.model.sd
         return max((self._refine(start, discs.centres, prior_sd) for start in starts), key=quality)
 
     def _starts(self, centres: Array) -> Iterator[tuple[Array, Array]]:
-        """Coefficients (k,) to start a match from, the most promising first, with their uncertainties (k,).
+        """Yield initial coefficients (k,) for a match, the most promising first, with their uncertainties (k,).
 
-        A start is looked at once before it is followed: one that leads nowhere costs ten times as much.
+        Each is first tried with a single iteration: a start that fails costs ten times as much.
         """
         density = self._guess.density(centres)
         guess = self._guess(density) * self.model.sd
@@ -268,12 +268,12 @@ class MarkerMatcher:
             yield alike[i], 0.4 * self.model.sd
 
     def _off(self, coefficients: Array, centres: Array) -> float:
-        """Median distance px of the predicted markers from their nearest discs."""
+        """Return the median distance px of the predicted markers from their nearest discs."""
         _, square, _ = kernels.pair(self.model.positions(coefficients), centres)
         return math.sqrt(float(np.median(square)))
 
     def _alike(self, density: NDArray[np.float32]) -> Array:
-        """(s, k) coefficients of the learned contacts whose discs are dense where this image's are."""
+        """Return (s, k) coefficients of the learned contacts whose disc density is most similar to this image's."""
         apart = kernels.bytes_apart(self._bank_density, _in_bytes(density))
         return self._bank[np.argsort(apart)[:_ALIKE]]
 
@@ -283,7 +283,7 @@ class MarkerMatcher:
         field = self._field(coefficients, centres)
         if near or field.score >= _COMPLETE or field.seen.mean() < 0.5:
             return field
-        # Where a part of the rim is off by half a spacing, the part that is right leads on to it.
+        # Where a part of the rim is off by half a spacing, the correct part is extended to it.
         grown = self._grow(coefficients, start, ridge, centres)
         again = self._field(self._settle(grown, start, ridge, centres, self._reach), centres)
         return max(field, again, key=quality)
@@ -301,7 +301,7 @@ class MarkerMatcher:
         )
 
     def _grow(self, coefficients: Array, start: Array, ridge: Array, centres: Array) -> Array:
-        """Coefficients after markers without a disc were looked for where their neighbours' discs point."""
+        """Return the coefficients after markers without a disc were searched for where their neighbours predict."""
         predicted = self.model.positions(coefficients)
         partner, paired = pair(predicted, centres, self._reach)
         off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
@@ -355,7 +355,7 @@ class MarkerMatcher:
 
 
 def _in_bytes(density: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Densities to a hundredth of a disc, in a quarter of the memory."""
+    """Quantise densities to a hundredth of a disc, in a quarter of the memory."""
     rounded: NDArray[np.uint8] = np.minimum(100.0 * density + 0.5, 255.0).astype(np.uint8)
     return rounded
 
@@ -365,12 +365,12 @@ def _convincing(field: MarkerField) -> bool:
 
 
 def quality(field: MarkerField) -> tuple[bool, float]:
-    """Orders matches of one image, the better the greater."""
+    """Return a sort key of matches of one image; greater is better."""
     return field.valid, field.score - 0.05 * min(field.rms_px, 20.0)
 
 
 def pair(places: Array, points: Array, reach: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """(m,) point nearest to each place, and whether it is within reach and nearest to no other place.
+    """Return the (m,) nearest point to each place, and whether it is within reach and nearest to no other place.
 
     Args:
         places: (m, 2) px.

@@ -1,4 +1,4 @@
-"""Following the white discs of a sequence of images, without a model of how they move and without training."""
+"""Track the white discs through a sequence of images, without a displacement model and without training."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _LEAST_FOLLOWED = 0.8
 
 @dataclass(frozen=True, slots=True)
 class TrackedMarkers:
-    """Where the discs of the first image are now.
+    """Current positions of the discs of the first image.
 
     Attributes:
         reference: (m, 2) px in the first image.
-        positions: (m, 2) px now; of discs that were lost, where they were seen last.
-        seen: (m,) whether each has a disc in this image.
+        positions: (m, 2) px now; of lost discs their last position.
+        seen: (m,) True if it has a disc in this image.
     """
 
     reference: Array
@@ -33,15 +33,15 @@ class TrackedMarkers:
 
     @property
     def followed(self) -> bool:
-        """Whether enough discs were found again to believe the rest; not so where images jump between contacts."""
+        """True if enough discs were found again to be reliable; False where images jump between contacts."""
         return float(self.seen.mean()) >= _LEAST_FOLLOWED
 
 
 class MarkerTracker:
-    """Follows discs from the first image on, which should be out of contact.
+    """Track discs from the first image on, which should be out of contact.
 
     A disc may move by 0.45 of the spacing from one image to the next: a TacTip's, at 30 images per second, by 40 mm/s.
-    The contacts of a data set, each far from the one before, are for ``MarkerMatcher``.
+    The contacts of a data set, each far from the previous one, need ``MarkerMatcher``.
 
     Args:
         first: uint8 (height, width), black and white.
@@ -61,7 +61,7 @@ class MarkerTracker:
         self._positions = self._reference.copy()
 
     def update(self, image: ImageArray) -> TrackedMarkers:
-        """The discs in the next image. Raises ImageError where it is not uint8 (height, width)."""
+        """Return the discs in the next image. Raises ImageError where it is not uint8 (height, width)."""
         found = detect_markers(image, self._size).centres
         seen = np.zeros(len(self._positions), dtype=bool)
         if len(found):

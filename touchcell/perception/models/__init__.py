@@ -1,1 +1,1 @@
-"""Model files: what they hold and how they are read. The models that ship lie beside the code."""
+"""Model files: their contents and how they are read. The shipped models are in this folder."""

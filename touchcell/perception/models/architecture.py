@@ -1,5 +1,4 @@
-"""What a contact network looks like, without the library that trains it: the part of a model file that says which
-tensors there are and how they are joined."""
+"""Architecture of a contact network, independent of the training library: the tensors and graph of a model file."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ class Architecture(BaseModel):
     """Blocks of 3x3 convolution, 2x2 maximum, normalisation and ReLU, then a hidden layer and the outputs.
 
     Source: Lloyd & Lepora 2024, 3.1.4 (``cnn``: six means) and 3.1.5 (``gdn``: six means and six logarithms of inverse
-    standard deviations, each behind its own dropout, each bounded). The maximum is taken before the normalisation,
+    standard deviations, each with its own dropout, each bounded). The maximum is taken before the normalisation,
     which with positive scales is the same function for a third of the work.
 
     Attributes:
@@ -46,31 +45,31 @@ class Architecture(BaseModel):
     precision_dropout: SixRates = (0.0,) * 6
 
     @model_validator(mode="after")
-    def _something_is_left(self) -> Architecture:
+    def _features_remain(self) -> Architecture:
         if min(self.feature_size) < 1:
             raise ValueError(f"{len(self.channels)} halvings leave nothing of an image of {self.input_size}")
         return self
 
     @property
     def outputs(self) -> int:
-        """6 means, and for gdn 6 logarithms of inverse standard deviations after them."""
+        """Number of outputs: 6 means, and for gdn 6 logarithms of inverse standard deviations after them."""
         return 12 if self.kind == "gdn" else 6
 
     @property
     def feature_size(self) -> tuple[int, int]:
-        """(height, width) that the blocks leave."""
+        """(height, width) of the features after the blocks."""
         return self.input_size[0] >> len(self.channels), self.input_size[1] >> len(self.channels)
 
     @property
     def bounds(self) -> tuple[list[float], list[float]] | None:
-        """(low, high) of each output, or None for cnn, whose outputs are free."""
+        """(low, high) of each output, or None for cnn, whose outputs are unbounded."""
         if self.kind == "cnn":
             return None
         (mean_low, mean_high), (log_low, log_high) = MEAN_BOUNDS, LOG_PRECISION_BOUNDS
         return [mean_low] * 6 + [log_low] * 6, [mean_high] * 6 + [log_high] * 6
 
     def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Names and shapes of the tensors of a model file, normalisation folded into the convolutions."""
+        """Return names and shapes of the tensors of a model file, normalisation folded into the convolutions."""
         shapes: dict[str, tuple[int, ...]] = {}
         before = 1
         for i, features in enumerate(self.channels):

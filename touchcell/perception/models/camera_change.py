@@ -1,4 +1,4 @@
-"""How another camera sees a tip's markers, beside the one that a model was taught with."""
+"""Geometric difference between a camera and the one a model was trained with."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class CameraChange(BaseModel):
-    """A similarity from this sensor's image pixels to those of the sensor that taught the model.
+    """A similarity from this sensor's image pixels to those of the sensor the model was trained on.
 
     Attributes:
-        zoom: by which the taught camera sees the markers larger.
-        turn_deg: of the image about ``centre_px``, from u to v.
-        centre_px: middle of the undeformed markers here.
-        shift_px: from there to where the taught camera has it.
-        frames: images that it was found in.
-        rms_px: of the undeformed markers from the taught ones, after the change.
+        zoom: magnification of the training camera relative to this one.
+        turn_deg: rotation of the image about ``centre_px``, from u to v.
+        centre_px: centre of the undeformed markers in this camera.
+        shift_px: from there to their centre in the training camera.
+        frames: number of images that it was estimated from.
+        rms_px: residual of the undeformed markers after the change.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
@@ -40,14 +40,14 @@ class CameraChange(BaseModel):
 
     @property
     def matrix(self) -> Array:
-        """(2, 3) from homogeneous pixels here to pixels there."""
+        """(2, 3) matrix from homogeneous pixels of this camera to pixels of the training camera."""
         turn = np.deg2rad(self.turn_deg)
         linear = self.zoom * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
         centre = np.array(self.centre_px)
         return np.column_stack([linear, centre + np.array(self.shift_px) - linear @ centre])
 
     def after(self, first: CameraChange) -> CameraChange:
-        """One change for two: ``first``, which leads to where this one begins, and then this one."""
+        """Return the composition of two changes: ``first``, then this one."""
         there = self.points(first.points(np.array(first.centre_px)))
         du, dv = there - np.array(first.centre_px)
         return CameraChange(
@@ -60,13 +60,13 @@ class CameraChange(BaseModel):
         )
 
     def points(self, pixels: Array) -> Array:
-        """(..., 2) px there, of pixels (..., 2) here."""
+        """Return (..., 2) px of the training camera, of pixels (..., 2) of this one."""
         matrix = self.matrix
         moved: Array = pixels @ matrix[:, :2].T + matrix[:, 2]
         return moved
 
     def image(self, image: ImageArray) -> ImageArray:
-        """An image as the taught camera would have taken it; what lies outside is black, and grey levels stay two."""
+        """Return an image as the training camera would have taken it; outside is black, binary images stay binary."""
         height, width = image.shape[:2]
         warped = np.asarray(cv2.warpAffine(image, self.matrix, (width, height), flags=cv2.INTER_CUBIC), dtype=np.uint8)
         if ((image == 0) | (image == 255)).all():
@@ -74,7 +74,7 @@ class CameraChange(BaseModel):
         return warped
 
     def undone(self, image: ImageArray) -> ImageArray:
-        """An image of the taught camera as this one would have taken it."""
+        """Return an image of the training camera as this one would have taken it."""
         height, width = image.shape[:2]
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         return np.asarray(cv2.warpAffine(image, self.matrix, (width, height), flags=flags), dtype=np.uint8)
@@ -89,7 +89,7 @@ def load_change(path: Path) -> CameraChange:
     """Read a calibration file.
 
     Raises:
-        ConfigError: there is none, or it makes no sense.
+        ConfigError: the file is missing or invalid.
     """
     try:
         return CameraChange.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
@@ -97,7 +97,7 @@ def load_change(path: Path) -> CameraChange:
         hint = "make one with `touchcell calibrate`"
         raise ConfigError(f"cannot be read: {error.strerror}", file=str(path), hint=hint) from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"is no YAML: {error}", file=str(path)) from None
+        raise ConfigError(f"is not YAML: {error}", file=str(path)) from None
     except ValidationError as error:
         first = error.errors()[0]
         raise ConfigError(first["msg"], file=str(path), key=".".join(map(str, first["loc"]))) from None

@@ -1,4 +1,4 @@
-"""The ONNX graph of a model, built from its header and tensors. Needs neither PyTorch nor the ``onnx`` package."""
+"""ONNX graph of a model, built from its header and tensors. Needs neither PyTorch nor the ``onnx`` package."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ OUTPUTS = "outputs"
 
 
 def onnx_model(model: Model) -> bytes:
-    """A serialised ONNX model: float32 (n, 1, height, width) in [0, 1] to float32 (n, outputs).
+    """Return a serialised ONNX model: float32 (n, 1, height, width) in [0, 1] to float32 (n, outputs).
 
     The same function as ``networks.ContactNetwork`` in evaluation, softbound included.
 
     Raises:
-        TypeError: the model is no image network.
+        TypeError: the model is not an image network.
     """
     architecture = model.header.architecture
     if not isinstance(architecture, Architecture):
@@ -49,7 +49,7 @@ def onnx_model(model: Model) -> bytes:
         low, high = (np.array(bound, dtype=np.float32) for bound in architecture.bounds)
         c = np.exp(low - high)
         constants |= {"low": low, "high": high, "c": c, "rest": np.float32(1) - c, "one": np.array(1, np.float32)}
-        # exp of what is far below is infinite, and one over that zero: the bounds hold over the whole range of float32.
+        # exp overflows to infinity far below, and its inverse is zero: the bounds hold over the whole range of float32.
         add("Sub", before="low")
         add("Exp")
         add("Add", "c")

@@ -1,4 +1,4 @@
-"""A contact as people write it (mm and degrees) and as networks predict it (exponential coordinates)."""
+"""Labels: a contact in mm and degrees, and as the exponential coordinates that networks predict."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 CONTACT_NAMES = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
-"""Components of a contact: extrinsic-xyz Euler pose T_f_s, sensor in surface frame (SPEC part 2)."""
+"""Components of a contact: extrinsic-xyz Euler pose T_f_s, sensor in surface frame (docs/glossary.md)."""
 
 XI_UNITS = np.array([1e-3, 1e-3, 1e-3, np.pi / 180, np.pi / 180, np.pi / 180])
-"""(6,) one millimetre or one degree in SI, for every component of xi and of a contact."""
+"""(6,) SI value of one millimetre or one degree, for every component of xi and of a contact."""
 
 _NO_SHEAR_MM = 1e-6
 
 
 def xi_from_contact(contact_mm_deg: Array) -> Array:
-    """xi = log(T_s_f), m and rad, of contacts (..., 6) named as ``CONTACT_NAMES``."""
+    """Return xi = log(T_s_f), m and rad, of contacts (..., 6) named as ``CONTACT_NAMES``."""
     return se3.log(se3.inverse(se3.from_euler_mm_deg(contact_mm_deg)))
 
 
 def contact_from_xi(xi: Array) -> Array:
-    """Contact (..., 6) named as ``CONTACT_NAMES``, of exponential coordinates of T_s_f, m and rad."""
+    """Return the contact (..., 6) named as ``CONTACT_NAMES``, of exponential coordinates of T_s_f, m and rad."""
     return se3.to_euler_mm_deg(se3.inverse(se3.exp(xi)))
 
 
 def xi_gaussian(contact_mm_deg: Array, covariance: Array) -> tuple[Array, Array]:
-    """A Gaussian over contacts as one over xi = log(T_s_f), to first order.
+    """Convert a Gaussian over contacts to one over xi = log(T_s_f), to first order.
 
     Args:
         contact_mm_deg: (..., 6) means, named as ``CONTACT_NAMES``.
@@ -51,7 +51,7 @@ def xi_gaussian(contact_mm_deg: Array, covariance: Array) -> tuple[Array, Array]
 
 
 def shear_direction(contact_mm_deg: Array) -> Array:
-    """(..., 2) unit vectors along the shear (x, y) of contacts (..., 6); along x where there is none."""
+    """Return (..., 2) unit vectors along the shear (x, y) of contacts (..., 6); along x where there is none."""
     shear = np.asarray(contact_mm_deg)[..., :2]
     size = np.linalg.norm(shear, axis=-1, keepdims=True)
     return np.where(size > _NO_SHEAR_MM, shear / np.maximum(size, _NO_SHEAR_MM), [1.0, 0.0])

@@ -1,4 +1,4 @@
-"""What a marker model looks like: the part of its file that says which tensors there are."""
+"""Architecture of a marker model: the part of its file that defines the tensors."""
 
 from __future__ import annotations
 
@@ -15,24 +15,25 @@ LOG_PRECISION_BOUNDS = (-3.0, 6.0)
 
 
 class MarkerArchitecture(BaseModel):
-    """Markers are detected, matched to a lattice, and their displacements given to several small networks, of whose
-    Gaussians mean and variance are taken.
+    """Markers are detected and matched to a lattice, and their displacements are the input of several small networks.
+
+    The estimate is mean and variance of the mixture of the networks' Gaussians.
 
     Attributes:
         kind: markers.
         input_size: (height, width) of the preprocessed, black and white image; markers keep their pixels.
-        size: which white discs are markers.
+        size: bounds on the white discs that are markers.
         rings: of the lattice, beside its centre; ring k holds 6k markers.
-        modes: in which the markers move together.
-        bank: contacts that are kept to start a match from.
-        grid: cells along each side of what the first guess sees.
-        guess_low_px: (u, v) where that grid begins.
+        modes: number of components of the displacement model.
+        bank: number of stored contacts to start a match from.
+        grid: cells along each side of the first guess's input.
+        guess_low_px: (u, v) of the corner of that grid.
         guess_cell_px: side of its cells.
         guess_hidden: units of the first guess.
-        least_score: matches below are not believed.
-        most_rms_px: matches that leave more are not believed.
+        least_score: matches below are not accepted.
+        most_rms_px: matches with larger residuals are not accepted.
         hidden: units of the layers of each displacement network.
-        networks: how many there are.
+        networks: number of networks.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -54,11 +55,11 @@ class MarkerArchitecture(BaseModel):
 
     @property
     def markers(self) -> int:
-        """In the lattice."""
+        """Number of markers in the lattice."""
         return 1 + 3 * self.rings * (self.rings + 1)
 
     def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Names and shapes of the tensors of a model file."""
+        """Return names and shapes of the tensors of a model file."""
         m, k = self.markers, self.modes
         shapes: dict[str, tuple[int, ...]] = {
             "lattice": (m, 2),
@@ -81,11 +82,11 @@ class MarkerArchitecture(BaseModel):
 
 
 class MarkerSize(BaseModel):
-    """Which connected components are markers.
+    """Bounds on connected components that are markers.
 
     Attributes:
-        smallest_px: least area. Halo speckle is smaller.
-        largest_px: greatest area. Reflections and markers that touch each other are larger.
+        smallest_px: smallest area. Halo speckle is smaller.
+        largest_px: largest area. Reflections and markers that touch each other are larger.
         longest_side_px: of the bounding box.
     """
 
@@ -103,7 +104,7 @@ class MarkerSize(BaseModel):
 
     @classmethod
     def of_disc(cls, area_px: float) -> MarkerSize:
-        """Bounds for discs of about this area: half of it to not quite two."""
+        """Return bounds for discs of about this area: half of it to not quite two."""
         diameter = 2.0 * np.sqrt(area_px / np.pi)
         return cls(
             smallest_px=max(1, int(0.45 * area_px)),

@@ -1,4 +1,4 @@
-"""A trained model as one file, ``NAME.safetensors``: tensors, and in the header all that is needed to use them."""
+"""A trained model as one file, ``NAME.safetensors``: tensors, and all metadata needed to use them in the header."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ SixPositive = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
 
 
 class Labels(BaseModel):
-    """What the outputs mean, and the range that was taught.
+    """Meaning of the outputs, and the training range.
 
     A network's mean o stands for ``centre + o * half_range``: contacts in mm and degrees (``of_contacts``), or
     exponential coordinates log(T_s_f) in m and rad. Slip blurs x, y and gamma. In the coordinates of a contact it stays
     there, in exponential coordinates it also blurs depth and tilt.
 
-    The standard deviations that go with a contact are those of its shear along and across the shear's own direction,
+    The standard deviations that belong to a contact are those of its shear along and across the shear's own direction,
     then of z, alpha, beta and gamma, as slip errs along the shear (``xi_gaussian``).
 
     Attributes:
@@ -65,17 +65,17 @@ class Labels(BaseModel):
 
     @classmethod
     def of_contacts(cls, low: Six, high: Six) -> Labels:
-        """Contacts between ``low`` and ``high``, mm and degrees, in the order of ``labels.CONTACT_NAMES``."""
+        """Return labels for contacts between ``low`` and ``high``, mm and degrees, ordered as ``CONTACT_NAMES``."""
         return cls(names=CONTACT_NAMES, units=("mm", "mm", "mm", "deg", "deg", "deg"), low=low, high=high)
 
     @property
     def are_contacts(self) -> bool:
-        """Whether they are contacts rather than exponential coordinates."""
+        """True if they are contacts rather than exponential coordinates."""
         return self.names == CONTACT_NAMES
 
     @property
     def centre(self) -> Array:
-        """(6,) middle of the range."""
+        """(6,) centre of the range."""
         return _ranges(self.low, self.high)[0]
 
     @property
@@ -85,22 +85,22 @@ class Labels(BaseModel):
 
     @property
     def sigma_unit(self) -> Array:
-        """(6,) what a standard deviation of one stands for: the half range, one for both directions of shear."""
+        """(6,) unit of the standard deviations: the half range, one for both directions of shear."""
         return _ranges(self.low, self.high)[2 if self.are_contacts else 1]
 
     def targets(self, xi: Array) -> Array:
-        """(n, 6) what a network should answer for contacts with exponential coordinates (n, 6), m and rad."""
+        """Return (n, 6) training targets for contacts with exponential coordinates (n, 6), m and rad."""
         values = contact_from_xi(xi) if self.are_contacts else xi
         return np.divide(values - self.centre, self.half_range)
 
     def contacts(self, mean: Array) -> Array:
-        """(..., 6) contacts, mm and degrees, that outputs (..., 6) stand for."""
+        """Return (..., 6) contacts, mm and degrees, of outputs (..., 6)."""
         values = self.centre + self.half_range * mean
         contacts: Array = values if self.are_contacts else contact_from_xi(values)
         return contacts
 
     def aligned(self, residual: Array, mean: Array) -> Array:
-        """Residuals (..., 6) of outputs about ``mean`` (..., 6), in the directions and units of the sigmas."""
+        """Return residuals (..., 6) of outputs about ``mean`` (..., 6), in the directions and units of the sigmas."""
         if not self.are_contacts:
             return residual
         along = shear_direction(self.centre + self.half_range * mean)
@@ -110,7 +110,7 @@ class Labels(BaseModel):
         return np.concatenate([shear, values[..., 2:]], axis=-1)
 
     def xi_gaussian(self, mean: Array, sigma: Array) -> tuple[Array, Array]:
-        """Means (..., 6) and covariances (..., 6, 6) of xi = log(T_s_f), m and rad, that outputs and sigmas say."""
+        """Return means (..., 6) and covariances (..., 6, 6) of xi = log(T_s_f), m and rad, of outputs and sigmas."""
         values = self.centre + self.half_range * mean
         variance = (sigma * self.sigma_unit) ** 2
         covariance = variance[..., None] * np.eye(6)
@@ -127,7 +127,7 @@ class Labels(BaseModel):
 
 @lru_cache(maxsize=8)
 def _ranges(low: Six, high: Six) -> tuple[Array, Array, Array]:
-    """Middle, half range, and the half range with one for both directions of shear; read-only, as every frame asks."""
+    """Return centre, half range, and the half range with one for both directions of shear; read-only and cached."""
     half = 0.5 * np.subtract(high, low, dtype=np.float64)
     shared = half.copy()
     shared[:2] = half[:2].mean()
@@ -138,23 +138,23 @@ def _ranges(low: Six, high: Six) -> tuple[Array, Array, Array]:
 
 
 class Header(BaseModel):
-    """Everything about a model but its tensors.
+    """Metadata of a model.
 
     Attributes:
         format_version: of this header.
-        touchcell_version: that wrote it.
-        architecture: which tensors there are and how they are joined.
+        touchcell_version: version that wrote it.
+        architecture: the tensors and their graph.
         preprocessing: from camera image to network input.
-        labels: what the outputs mean.
-        sigma_scale: (6,) what a network's standard deviations, raised to ``sigma_power``, are multiplied by to be
-            calibrated; cnn: the standard deviations themselves. In ``labels.sigma_unit``, along ``labels.aligned``.
-            Found on the validation split.
-        sigma_power: (6,) see ``calibration.calibrate``.
-        camera: from the pixels of this model's sensor to those of the one that taught its networks, where it was
+        labels: meaning of the outputs.
+        sigma_scale: (6,) calibration factor of a network's standard deviations raised to ``sigma_power``; cnn: the
+            standard deviations themselves. In ``labels.sigma_unit``, along ``labels.aligned``. Found on the validation
+            split.
+        sigma_power: (6,) see ``sigma_scaling.calibrate``.
+        camera: from the pixels of this model's sensor to those of the one its networks were trained on, where it was
             adapted (``touchcell adapt``).
-        label_turn_deg: of its contacts' axes about the sensor's z axis, to those that its networks were taught with.
+        label_turn_deg: rotation of its contacts' axes about the sensor's z axis, to those of the networks' training.
         training_data: digest of the training set (``LabelledImages.digest``).
-        training: settings and outcome of the training, for people.
+        training: settings and results of the training, for information.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -172,7 +172,7 @@ class Header(BaseModel):
     training: dict[str, str | int | float | list[float] | None] = {}
 
     def calibrated(self, sigma: Array) -> Array:
-        """(..., 6) standard deviations of the network (..., 6) after calibration."""
+        """Return (..., 6) calibrated standard deviations of the network's (..., 6)."""
         calibrated: Array = np.array(self.sigma_scale) * sigma ** np.array(self.sigma_power)
         return calibrated
 
@@ -188,9 +188,9 @@ class Model:
     """A trained network.
 
     Attributes:
-        header: what it is.
+        header: its metadata.
         tensors: float32, as ``header.architecture.tensor_shapes`` names them.
-        reference: the preprocessed image (height, width) of the sensor out of contact, or None when nobody took one.
+        reference: the preprocessed image (height, width) of the sensor out of contact, or None when there is none.
     """
 
     header: Header
@@ -199,12 +199,12 @@ class Model:
 
 
 def touchcell_version() -> str:
-    """Version of the installed touchcell."""
+    """Return the version of the installed touchcell."""
     return version("touchcell")
 
 
 def save_model(model: Model, path: Path) -> None:
-    """Write a model file, whole or not at all.
+    """Write a model file atomically.
 
     Raises:
         ModelError: a tensor is missing, of the wrong shape or not finite.
@@ -226,8 +226,9 @@ def load_model(path: Path) -> Model:
     """Read a model file.
 
     Raises:
-        ModelError: the file is missing, truncated, not a touchcell model, of a newer format, or its tensors are not
-            those that its header announces.
+        ModelError: the file is missing, truncated, not a touchcell model, of a newer format, or its tensors do not
+            match
+            its header.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -241,7 +242,7 @@ def load_model(path: Path) -> Model:
     except (SafetensorError, OSError, ValueError) as error:
         if isinstance(error, ModelError):
             raise
-        raise ModelError(path, f"damaged or no safetensors file: {error}", hint="copy or train it again") from error
+        raise ModelError(path, f"damaged, or not a safetensors file: {error}", hint="copy or train it again") from error
     model = Model(header, tensors, reference=tensors.pop(_REFERENCE, None))
     _check_tensors(model, path)
     return model
@@ -249,11 +250,11 @@ def load_model(path: Path) -> Model:
 
 def _parse_header(text: str | None, path: Path) -> Header:
     if text is None:
-        raise ModelError(path, "a safetensors file, but no touchcell model", key=_METADATA_KEY)
+        raise ModelError(path, "a safetensors file, but not a touchcell model", key=_METADATA_KEY)
     try:
         fields = json.loads(text)
     except json.JSONDecodeError as error:
-        raise ModelError(path, f"header is no JSON: {error}", key=_METADATA_KEY) from error
+        raise ModelError(path, f"header is not JSON: {error}", key=_METADATA_KEY) from error
     found = fields.get("format_version") if isinstance(fields, dict) else None
     if found != FORMAT_VERSION:
         newer = isinstance(found, int) and found > FORMAT_VERSION
@@ -271,7 +272,7 @@ def _parse_header(text: str | None, path: Path) -> Header:
 
 
 def _key(error: str, location: tuple[int | str, ...]) -> str:
-    """The header's field that an error of pydantic speaks of; it names the architecture's kind among the fields."""
+    """Return the header field that an error of pydantic refers to; its path includes the architecture's kind."""
     parts = [str(part) for part in location]
     if error.startswith("union_tag"):
         parts.append("kind")
@@ -296,4 +297,4 @@ def _check_tensors(model: Model, path: Path) -> None:
     if reference is not None and (
         reference.dtype != np.uint8 or reference.shape != model.header.preprocessing.output_size
     ):
-        raise ModelError(path, "is not an image as the preprocessing leaves it", key=_REFERENCE)
+        raise ModelError(path, "is not an image of the preprocessing's output size", key=_REFERENCE)

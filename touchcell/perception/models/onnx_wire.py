@@ -1,7 +1,7 @@
-"""ONNX models written byte by byte: the few messages of onnx.proto that a contact network needs.
+"""Minimal ONNX serialisation: the few messages of onnx.proto that a contact network needs.
 
-A serving process that imports the ``onnx`` package for this pays 0.1 s and 7 MB or more. Source: onnx.proto (IR
-version 8) and the protocol-buffer wire format; ``tests/perception/models/test_onnx_wire.py`` holds the bytes against
+Importing the ``onnx`` package for this would cost a serving process 0.1 s and 7 MB or more. Source: onnx.proto (IR
+version 8) and the protocol-buffer wire format; ``tests/perception/models/test_onnx_wire.py`` compares the bytes with
 that package.
 """
 
@@ -19,7 +19,7 @@ _ATTRIBUTE_INT, _ATTRIBUTE_INTS = 2, 7
 
 
 def node(operator: str, inputs: Sequence[str], output: str, attributes: Mapping[str, int | Sequence[int]]) -> bytes:
-    """A NodeProto with one output, and whole numbers or lists of them as attributes."""
+    """Return a NodeProto with one output, and integers or lists of them as attributes."""
     parts = [_text(1, name) for name in inputs]
     parts += [_text(2, output), _text(4, operator)]
     for name, value in attributes.items():
@@ -37,12 +37,12 @@ def model(
     inputs: Mapping[str, Sequence[int | str]],
     outputs: Mapping[str, Sequence[int | str]],
 ) -> bytes:
-    """A ModelProto of float32 tensors.
+    """Return a ModelProto of float32 tensors.
 
     Args:
         nodes: in an order in which they can be computed.
-        constants: by the name that nodes take them under.
-        inputs: shape by name; a string stands for a size that is not known.
+        constants: by the name that nodes use.
+        inputs: shape by name; a string stands for an unknown size.
         outputs: likewise.
     """
     graph = [_block(1, encoded) for encoded in nodes]
@@ -80,7 +80,7 @@ def _block(field: int, content: bytes) -> bytes:
 
 
 def _varint(value: int) -> bytes:
-    """Seven bits a byte, lowest first; only for what is not negative."""
+    """Encode a non-negative integer: seven bits a byte, lowest first."""
     encoded = bytearray()
     while value > 0x7F:
         encoded.append(value & 0x7F | 0x80)

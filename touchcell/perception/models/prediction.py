@@ -1,4 +1,4 @@
-"""What a trained model says about one image, and what every trained model can do."""
+"""Prediction of a trained model for one image, and the interface of all trained models."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.models.model_file import Header
 
 RANGE_TOLERANCE = 0.05
-"""How far, in label half-ranges, a prediction may lie outside the taught range and still count as inside."""
+"""Tolerance, in label half-ranges, by which a prediction may exceed the training range and still count as inside."""
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """A Gaussian over the exponential coordinates of a contact, xi = log(T_s_f) (SPEC part 2).
+    """A Gaussian over the exponential coordinates of a contact, xi = log(T_s_f) (docs/glossary.md).
 
     Attributes:
         xi: (6,) mean [v, w], m and rad.
         covariance: (6, 6) of xi, m and rad.
-        in_range: the mean lies in the range of labels that the model was taught. Outside it, and out of contact, a
-            prediction means little.
-        markers: share of the markers expected in view that were seen, where the model looks for markers.
+        in_range: the mean lies in the model's training range of labels. Outside it, and out of contact, a prediction is
+            unreliable.
+        markers: fraction of the markers expected in view that were detected, for a marker model.
     """
 
     xi: Array
@@ -54,22 +54,22 @@ class ContactEstimator(Protocol):
 
     @property
     def header(self) -> Header:
-        """Of the model file."""
+        """Header of the model file."""
         ...
 
     @property
     def reference(self) -> ImageArray | None:
-        """Preprocessed image out of contact, or None when nobody took one."""
+        """Preprocessed image out of contact, or None when there is none."""
         ...
 
     def reduce(self, image: ImageArray) -> ImageArray:
-        """The model's preprocessing. Raises ImageError."""
+        """Apply the model's preprocessing. Raises ImageError."""
         ...
 
     def predict(self, image: ImageArray) -> Prediction:
-        """Contact in one camera image. Raises ImageError."""
+        """Estimate the contact in one camera image. Raises ImageError."""
         ...
 
     def predict_reduced(self, reduced: ImageArray) -> Prediction:
-        """Contact in an image that ``reduce`` made."""
+        """Estimate the contact in an image returned by ``reduce``."""
         ...

@@ -1,4 +1,4 @@
-"""From a camera image to what a network sees. Part of every model file, so that training and serving share it."""
+"""Preprocessing from a camera image to the network input. Part of every model file, shared by training and serving."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Crop(NamedTuple):
 
 
 class AdaptiveThreshold(BaseModel):
-    """White where a pixel exceeds its neighbourhood's mean less ``offset``.
+    """Adaptive threshold: white where a pixel exceeds its neighbourhood's mean less ``offset``.
 
     Attributes:
         block_px: side of the square neighbourhood, odd.
@@ -47,22 +47,22 @@ class AdaptiveThreshold(BaseModel):
 
 
 class Preprocessing(BaseModel):
-    """Steps in the order in which they are made: crop, grey, median, threshold, mask, resize, scale to [0, 1].
+    """Preprocessing steps, in this order: crop, grey, median, threshold, mask, resize, scale to [0, 1].
 
     The paper's chain (Lloyd & Lepora 2024, 3.1.3) is a square crop, ``median_px=5``, an adaptive threshold and a
     resize to 128x128. The public data sets are published after the threshold, so only the resize is left for them.
     The resize decides a model's accuracy (errors grow three- to fivefold when it differs from training), hence area
-    averaging, which keeps the sub-pixel place of a marker, is the default.
+    averaging, which keeps the sub-pixel position of a marker, is the default.
 
     Attributes:
-        input_size: (height, width) px of the images it takes; others are refused.
+        input_size: (height, width) px of the input images; others are refused.
         input_channels: 1 grey, 3 BGR.
         crop: region that is kept, or None for all of it.
         median_px: side of the median filter, odd, or None.
         threshold: adaptive threshold, or None.
         mask_radius_px: pixels further than this from the centre of the crop become black; None keeps all.
         output_size: (height, width) px of the result.
-        interpolation: how the resize samples.
+        interpolation: of the resize.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -89,16 +89,16 @@ class Preprocessing(BaseModel):
 
     @property
     def region(self) -> Crop:
-        """What is kept of the image, all of it without a crop."""
+        """The kept region of the image, all of it without a crop."""
         return self.crop or Crop(0, 0, self.input_size[1], self.input_size[0])
 
     def in_full_resolution(self) -> Preprocessing:
-        """The same steps but for the resize: what markers are looked for in."""
+        """Return the same steps without the resize, for marker detection."""
         left, top, right, bottom = self.region
         return self.model_copy(update={"output_size": (bottom - top, right - left)})
 
     def reduce(self, image: ImageArray) -> ImageArray:
-        """All steps but the scaling: what is cached while training.
+        """Apply all steps but the scaling; the result is cached in training.
 
         Args:
             image: uint8, ``input_size`` with ``input_channels``.
@@ -132,7 +132,7 @@ class Preprocessing(BaseModel):
         return cast(ImageArray, cv2.resize(image, (width, height), interpolation=_INTERPOLATIONS[self.interpolation]))
 
     def apply(self, image: ImageArray) -> NDArray[np.float32]:
-        """What the network sees: float32 (1, height, width) in [0, 1]. Raises as ``reduce``."""
+        """Return the network input: float32 (1, height, width) in [0, 1]. Raises as ``reduce``."""
         return scale(self.reduce(image))[None]
 
     def _check(self, image: ImageArray) -> None:
@@ -144,7 +144,9 @@ class Preprocessing(BaseModel):
             raise ImageError("shape", "(height, width) or (height, width, 3)", image.shape)
         channels = 1 if image.ndim == 2 else image.shape[2]
         if channels != self.input_channels:
-            raise ImageError("channels", self.input_channels, channels, hint="grey and colour cameras need own models")
+            raise ImageError(
+                "channels", self.input_channels, channels, hint="grey and colour cameras need their own models"
+            )
         if image.shape[:2] != self.input_size:
             raise ImageError(
                 "size",
@@ -161,7 +163,7 @@ def _median(image: ImageArray, side_px: int) -> ImageArray:
 
 
 def scale(reduced: ImageArray) -> NDArray[np.float32]:
-    """Grey levels 0-255 to float32 in [0, 1], any shape."""
+    """Scale grey levels 0-255 to float32 in [0, 1], any shape."""
     return np.multiply(reduced, np.float32(1.0 / 255.0), dtype=np.float32)
 
 

@@ -1,4 +1,4 @@
-"""An unfinished training on disk: ``NAME.checkpoint.safetensors``, rewritten whole after every epoch."""
+"""Checkpoint of an unfinished training: ``NAME.checkpoint.safetensors``, rewritten atomically after every epoch."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _METADATA_KEY = "touchcell_checkpoint"
 
 @dataclass(frozen=True)
 class EpochRecord:
-    """What one epoch brought.
+    """Results of one epoch.
 
     Attributes:
         epoch: its number, from 1.
         train_loss: mean over its batches, with dropout and jitter.
-        validation_loss: afterwards, without.
+        validation_loss: after the epoch, without dropout and jitter.
         mae: mean absolute error on the validation set, by ``labels.CONTACT_NAMES``.
         cpu_s: CPU time of the process, validation included.
     """
@@ -38,7 +38,7 @@ class EpochRecord:
 
 @dataclass
 class Progress:
-    """The epochs so far, and the network after the best of them."""
+    """The completed epochs, and the network after the best of them."""
 
     history: list[EpochRecord] = field(default_factory=list)
     best_epoch: int = 0
@@ -47,11 +47,11 @@ class Progress:
 
     @property
     def cpu_s(self) -> float:
-        """CPU seconds of all epochs, those before an interruption included."""
+        """CPU seconds of all epochs, including those before an interruption."""
         return sum(record.cpu_s for record in self.history)
 
     def add(self, record: EpochRecord, network: nn.Module) -> None:
-        """Take note of an epoch, and of the network if it is the best so far."""
+        """Add an epoch, and store the network if it is the best so far."""
         self.history.append(record)
         if record.validation_loss < self.best_loss:
             self.best_epoch, self.best_loss = record.epoch, record.validation_loss
@@ -59,7 +59,7 @@ class Progress:
 
 
 def checkpoint_path(out: Path) -> Path:
-    """Where the checkpoint of the training of ``out`` lies."""
+    """Return the path of the checkpoint of the training of ``out``."""
     return out.with_name(f"{out.stem}.checkpoint.safetensors")
 
 
@@ -71,7 +71,7 @@ def save_checkpoint(
     optimizer: torch.optim.Optimizer,
     progress: Progress,
 ) -> None:
-    """Write the state after an epoch; a reader sees the old file or the new one."""
+    """Write the state after an epoch atomically."""
     from safetensors.torch import save
 
     tensors = {f"network.{name}": tensor for name, tensor in network.state_dict().items()}
@@ -99,26 +99,26 @@ def save_checkpoint(
 def load_checkpoint(
     out: Path, recipe: dict[str, Any], network: nn.Module, average: nn.Module, optimizer: torch.optim.Optimizer
 ) -> Progress | None:
-    """Put network, average and optimizer into the state of the checkpoint; None when there is no checkpoint.
+    """Restore network, average and optimizer from the checkpoint; return None when there is none.
 
     Raises:
-        TrainingError: the checkpoint is damaged, or of a training with another recipe.
+        TrainingError: the checkpoint is damaged, or of a training with other settings.
     """
     from safetensors import SafetensorError, safe_open
 
     path = checkpoint_path(out)
     if not path.is_file():
         return None
-    anew = "delete it, or begin anew without resuming"
+    hint = "delete it, or start again without resuming"
     try:
         with safe_open(path, framework="pt") as stored:
             fields = json.loads((stored.metadata() or {})[_METADATA_KEY])
             tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, KeyError, ValueError) as error:
-        raise TrainingError(f"{path} cannot be read: {error}", hint=anew) from error
+        raise TrainingError(f"{path} cannot be read: {error}", hint=hint) from error
     before, now = fields["recipe"], json.loads(json.dumps(recipe))
     if differing := sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key)):
-        raise TrainingError(f"{path} is of a training with other {' and '.join(differing)}", hint=anew)
+        raise TrainingError(f"{path} is of a training with other {' and '.join(differing)}", hint=hint)
 
     def part(prefix: str) -> dict[str, Tensor]:
         return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
@@ -139,5 +139,5 @@ def load_checkpoint(
 
 
 def delete_checkpoint(out: Path) -> None:
-    """Remove the checkpoint of a training that is finished."""
+    """Remove the checkpoint of a finished training."""
     checkpoint_path(out).unlink(missing_ok=True)

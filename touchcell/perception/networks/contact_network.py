@@ -1,4 +1,4 @@
-"""The networks of ``Architecture`` in PyTorch, for training. A running cell never imports this module."""
+"""The networks of ``Architecture`` in PyTorch, for training. Never imported at run time."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from touchcell.perception.models.model_file import Labels
 
 
 def softbound(x: Tensor, low: Tensor | float, high: Tensor | float) -> Tensor:
-    """``low + softplus(x - low) - softplus(x - high)``: x where it lies well between the bounds, never beyond them.
+    """Return ``low + softplus(x - low) - softplus(x - high)``: x well inside the bounds, never beyond them.
 
     The three terms cancel for large x, in float32 to values outside the bounds and for infinities to NaN. The same
-    function as one logarithm, ``low + log(1 + (1 - c) / (exp(low - x) + c))`` with ``c = exp(low - high)``, has
-    nothing to cancel: for every x, infinite ones too, the result lies in [low, high], rises with x, and has a finite
-    gradient. Wants ``high - low`` below 80. Source: Lloyd & Lepora 2024, 3.1.5.
+    function as one logarithm, ``low + log(1 + (1 - c) / (exp(low - x) + c))`` with ``c = exp(low - high)``, does not
+    cancel: for every x, infinite ones too, the result lies in [low, high], rises with x, and has a finite gradient.
+    Requires ``high - low`` below 80. Source: Lloyd & Lepora 2024, 3.1.5.
     """
     low, high = torch.as_tensor(low, dtype=x.dtype), torch.as_tensor(high, dtype=x.dtype)
     # Beyond 40 the function is flat to 1e-17, and an unlimited exponential would make the gradient 0 * inf.
@@ -29,7 +29,7 @@ def softbound(x: Tensor, low: Tensor | float, high: Tensor | float) -> Tensor:
 
 
 class ContactNetwork(nn.Module):
-    """Images (n, 1, height, width) in [0, 1] to outputs (n, 6 or 12), as ``Architecture`` says.
+    """Map images (n, 1, height, width) in [0, 1] to outputs (n, 6 or 12), as ``Architecture`` defines.
 
     Outputs are in label half-ranges about the label centres; see ``model_file.Labels``.
     """
@@ -47,8 +47,8 @@ class ContactNetwork(nn.Module):
         for features in architecture.channels:
             self.convolutions.append(nn.Conv2d(before, features, 3, padding=1, bias=False))
             normalisation = nn.BatchNorm2d(features)
-            # A scale before ReLU and a convolution teaches nothing, and kept at one it cannot turn a maximum into a
-            # minimum, so that the normalisation folds into the convolution before the pooling.
+            # A scale before ReLU and a convolution is redundant, and fixed at one it cannot turn a maximum into a
+            # minimum, so the normalisation folds into the convolution before the pooling.
             normalisation.weight.requires_grad_(False)
             self.normalisations.append(normalisation)
             before = features
@@ -76,7 +76,7 @@ class ContactNetwork(nn.Module):
         return softbound(x, self.low, self.high) if self.architecture.kind == "gdn" else x
 
     def folded(self) -> dict[str, NDArray[np.float32]]:
-        """The tensors of a model file: ``Architecture.tensor_shapes``, normalisation folded into the convolutions."""
+        """Return the tensors of a model file (``Architecture.tensor_shapes``), with the normalisation folded in."""
         tensors: dict[str, Tensor] = {}
         for i, (convolution, normalisation) in enumerate(zip(self.convolutions, self.normalisations, strict=True)):
             assert isinstance(convolution, nn.Conv2d)
@@ -102,8 +102,8 @@ class ContactNetwork(nn.Module):
 class Alignment:
     """``Labels.aligned`` in PyTorch: residuals along and across the predicted shear, instead of in x and y.
 
-    The gradient does not turn the direction, which would let a network reduce its loss by turning the shear of contacts
-    that it cannot place.
+    The direction is detached from the gradient; otherwise a network could reduce its loss by rotating the shear of
+    contacts that it cannot locate.
     """
 
     def __init__(self, labels: Labels) -> None:
@@ -114,7 +114,7 @@ class Alignment:
         )
 
     def __call__(self, residual: Tensor, mean: Tensor) -> Tensor:
-        """Residuals (..., 6) about outputs ``mean`` (..., 6)."""
+        """Return residuals (..., 6) about outputs ``mean`` (..., 6), aligned."""
         if not self._are_contacts:
             return residual
         along = functional.normalize((self._centre + self._half_range * mean[..., :2]).detach(), dim=-1)
@@ -124,17 +124,20 @@ class Alignment:
 
 
 def gaussian_loss(outputs: Tensor, labels: Tensor, alignment: Alignment) -> Tensor:
-    """Mean negative log-likelihood of labels (n, 6) under gdn outputs (n, 12), summed over components, nats."""
+    """Return the mean negative log-likelihood, nats, of labels (n, 6) under gdn outputs (n, 12).
+
+    Components are summed.
+    """
     mean, log_precision = outputs[:, :6], outputs[:, 6:]
     residual = alignment(labels - mean, mean) * torch.exp(log_precision)
     return (0.5 * residual.square() - log_precision).sum(1).mean() + 3.0 * float(np.log(2.0 * np.pi))
 
 
 def weighted_square_loss(outputs: Tensor, labels: Tensor, weights: Tensor) -> Tensor:
-    """Mean over images of the weighted sum of squared errors of the six means."""
+    """Return the mean over images of the weighted sum of squared errors of the six means."""
     return (weights * (outputs[:, :6] - labels).square()).sum(1).mean()
 
 
 def weighted_absolute_loss(outputs: Tensor, labels: Tensor, weights: Tensor) -> Tensor:
-    """Mean over images of the weighted sum of absolute errors of the six means."""
+    """Return the mean over images of the weighted sum of absolute errors of the six means."""
     return (weights * (outputs[:, :6] - labels).abs()).sum(1).mean()

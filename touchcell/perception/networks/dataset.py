@@ -1,4 +1,4 @@
-"""From labelled images on disk to arrays that a network learns from."""
+"""Load labelled images from disk into training arrays."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from touchcell.perception.models.preprocessing import Preprocessing
 
 _SAME_MM_DEG = 1e-6
 
-Progress = Callable[[int, int], None]
-"""Told (images done, images in all)."""
+ProgressCallback = Callable[[int, int], None]
+"""Called with the number of items done and the total."""
 
 
 @dataclass(frozen=True)
 class LabelledImages:
-    """Preprocessed images and what they show.
+    """Preprocessed images and their labels.
 
     Attributes:
-        images: uint8 (n, height, width), as ``Preprocessing.reduce`` leaves them.
+        images: uint8 (n, height, width), as ``Preprocessing.reduce`` returns them.
         xi: (n, 6) log(T_s_f), m and rad.
     """
 
@@ -42,28 +42,31 @@ class LabelledImages:
         return len(self.images)
 
     def digest(self) -> str:
-        """SHA-256 of the content, the same on every machine."""
+        """Return the SHA-256 of the content, the same on every machine."""
         content = hashlib.sha256(repr(self.images.shape).encode())
         content.update(np.ascontiguousarray(self.images).data)
-        # To a picometre, so that the last bit of a logarithm does not make another data set.
+        # To a picometre, so that the last bit of a logarithm does not change the digest.
         content.update(np.round(self.xi, 12).astype("<f8").tobytes())
         return content.hexdigest()
 
 
 def load_reduced(
-    split: Split, preprocessing: Preprocessing, *, cache: Path | None = None, progress: Progress | None = None
+    split: Split, preprocessing: Preprocessing, *, cache: Path | None = None, progress: ProgressCallback | None = None
 ) -> ImageArray:
-    """All images of a split after ``preprocessing.reduce``, uint8 (n, height, width).
+    """Return all images of a split after ``preprocessing.reduce``, uint8 (n, height, width).
 
-    Decoding is done once: the result is kept in ``cache`` under a key made of the paths, sizes and times of the image
+    Decoding is done once: the result is stored in ``cache`` under a key of the paths, sizes and times of the image
     files and the preprocessing. An interrupted call leaves nothing behind.
 
     Args:
-        cache: folder for the result; None keeps nothing.
+        split: labelled images.
+        preprocessing: applied to each.
+        cache: folder for the result; None stores nothing.
+        progress: called per image.
 
     Raises:
         DataError: as ``Split.read``.
-        ImageError: the images are not what the preprocessing was made for.
+        ImageError: the images do not match the preprocessing.
     """
     kept = cache / f"{cache_key(split, preprocessing)}.npz" if cache is not None else None
     if kept is not None and kept.is_file():
@@ -88,12 +91,12 @@ def load_reduced(
 
 
 def default_cache() -> Path:
-    """``$XDG_CACHE_HOME/touchcell/images``, or the same under ``~/.cache``."""
+    """Return ``$XDG_CACHE_HOME/touchcell/images``, or the same under ``~/.cache``."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "touchcell" / "images"
 
 
 def cache_key(split: Split, preprocessing: Preprocessing) -> str:
-    """Names what the preprocessing makes of these very image files."""
+    """Return a key for the result of this preprocessing on these image files."""
     key = hashlib.sha256(f"{split.folder.resolve()}\0{preprocessing.model_dump_json()}\0".encode())
     for path in split.images:
         status = path.stat()
@@ -102,7 +105,7 @@ def cache_key(split: Split, preprocessing: Preprocessing) -> str:
 
 
 def label_range(training: Array, validation: Array) -> Labels:
-    """Contacts between the least and the greatest of the training set's, given as xi (n, 6), m and rad.
+    """Return labels that span the training set's contacts, given as xi (n, 6), m and rad.
 
     Raises:
         TrainingError: there are fewer than two labels in either set, they are not finite, or a component never varies.
@@ -114,5 +117,7 @@ def label_range(training: Array, validation: Array) -> Labels:
     low, high = contacts.min(axis=0), contacts.max(axis=0)
     for name, width in zip(CONTACT_NAMES, high - low, strict=True):
         if width < _SAME_MM_DEG:
-            raise TrainingError(f"all training labels have the same {name}", hint="collect contacts that vary in it")
+            raise TrainingError(
+                f"all training labels have the same {name}", hint="collect contacts with varied values of it"
+            )
     return Labels.of_contacts(tuple(low.tolist()), tuple(high.tolist()))

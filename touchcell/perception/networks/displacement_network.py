@@ -1,4 +1,4 @@
-"""The displacement networks in PyTorch, for training. A running cell never imports this module."""
+"""The displacement networks in PyTorch, for training. Never imported at run time."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _NARROWEST = 0.02
 
 
 class DisplacementNetwork(nn.Module):
-    """Marker displacements (networks, n, 2 m) px to outputs (networks, n, 18), in label half-ranges.
+    """Map marker displacements (networks, n, 2 m) px to outputs (networks, n, 18), in label half-ranges.
 
     Outputs are six means, the logarithms of their inverse Laplace scales, which only the training uses, and the
-    logarithms of their inverse standard deviations. Each network sees the displacements and, on an equal footing, the
-    displacement model's coefficients: the narrow ways of moving tell tilt and depth.
+    logarithms of their inverse standard deviations. Each network has the displacements and, with equal weight, the
+    displacement model's coefficients as input: the modes of small variance carry tilt and depth.
 
     Args:
         model: of the displacements.
         hidden: units of each layer.
-        networks: how many, trained side by side and independently.
+        networks: number of networks, trained side by side and independently.
     """
 
     mean: Tensor
@@ -59,7 +59,7 @@ class DisplacementNetwork(nn.Module):
             x = x + noise * torch.randn_like(x)
         for weight, bias in zip(list(self.weights)[:-1], list(self.biases)[:-1], strict=True):
             x = functional.silu(torch.baddbmm(bias, x, weight))
-        # The standard deviations are read off what the means have taught, and change nothing about it.
+        # The standard deviations use the features of the means, detached, so that they do not change them.
         weight, bias = self.weights[-1], self.biases[-1]
         outputs = torch.baddbmm(bias[:, :, :12], x, weight[:, :, :12])
         spread = torch.baddbmm(bias[:, :, 12:], x.detach(), weight[:, :, 12:])
@@ -67,7 +67,7 @@ class DisplacementNetwork(nn.Module):
         return torch.cat([outputs[..., :6], outputs[..., 6:].clamp(low, high), spread.clamp(low, high)], dim=-1)
 
     def folded(self) -> dict[str, NDArray[np.float32]]:
-        """Tensors of a model file: the first layer takes pixels, the last gives means and standard deviations."""
+        """Return the tensors of a model file: the first layer takes pixels, the last means and standard deviations."""
         weights = [weight.detach().double() for weight in self.weights]
         biases = [bias.detach().double() for bias in self.biases]
         m = len(self.mean)
@@ -83,13 +83,13 @@ class DisplacementNetwork(nn.Module):
 
 
 def features_of(model: DisplacementModel) -> Array:
-    """(2 m, f) what first layers learn from: markers alone, and together the ways in which they move."""
+    """Return the (2 m, f) inputs of the first layers: single markers, and the modes of the displacement model."""
     scaled = model.basis.T / np.maximum(model.sd, _NARROWEST * model.sd[0])
     return np.concatenate([np.eye(len(model.mean)) / _DISPLACEMENT_PX, scaled], axis=1)
 
 
 class Jitter:
-    """Displacements as a camera that moved, turned and zoomed a little sees them.
+    """Augment displacements as by small shifts, rotations and zooms of the camera.
 
     Args:
         reference: (m, 2) px, the markers at rest.
@@ -101,7 +101,7 @@ class Jitter:
         self._shift_px, self._turn_rad, self._zoom = shift_px, turn_rad, zoom
 
     def __call__(self, displacements: Tensor) -> Tensor:
-        """Displacements (networks, n, 2 m) px, each of another camera."""
+        """Return displacements (networks, n, 2 m) px, each with another random camera change."""
         networks, n, _ = displacements.shape
         place = self._around_middle + displacements.view(networks, n, -1, 2)
         across = torch.stack([-place[..., 1], place[..., 0]], dim=-1)
@@ -112,11 +112,11 @@ class Jitter:
 
 
 def displacement_loss(outputs: Tensor, labels: Tensor, alignment: Alignment) -> Tensor:
-    """Laplace likelihood of the means, each term weighted by the root of its own scale, and Gaussian likelihood of the
-    standard deviations about those means.
+    """Laplace likelihood of the means, weighted, plus Gaussian likelihood of the standard deviations about those means.
 
-    Slip makes heavy tails, for which a Laplace density is closer than a Gaussian. The weight (Seitzer et al. 2022,
-    beta-NLL with beta 0.5) keeps the likelihood from giving up on what is hard, gamma above all.
+    Slip causes heavy tails, for which a Laplace density is closer than a Gaussian. Each term is weighted by the root of
+    its own scale (Seitzer et al. 2022, beta-NLL with beta 0.5), so that components that are hard to predict, gamma
+    above all, are not neglected.
 
     Args:
         outputs: (networks, n, 18).

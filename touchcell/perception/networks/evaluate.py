@@ -1,4 +1,4 @@
-"""How good a model is on a split of a data set: errors, likelihood, calibration and time per frame."""
+"""Evaluate a model on a split of a data set: errors, likelihood, calibration and time per frame."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 from touchcell.drivers.core.clock import Clock, MonotonicClock
 from touchcell.drivers.replay.dataset import read_split
 from touchcell.perception.models.prediction import Prediction
-from touchcell.perception.networks.dataset import Progress
+from touchcell.perception.networks.dataset import ProgressCallback
 from touchcell.perception.networks.scores import Scores
 from touchcell.perception.runtime.estimators import load_estimator
 
@@ -29,10 +29,10 @@ _COVERAGE = {"68": 0.68, "95": 0.95}
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What a model achieved on a split.
+    """Results of a model on a split.
 
     Attributes:
-        n: images.
+        n: number of images.
         mae: mean absolute error of each component of the contact, mm or degrees.
         nll: mean negative log-likelihood of xi under the predicted Gaussian, summed over its components, in nats per
             image with xi in mm and degrees.
@@ -48,11 +48,11 @@ class Evaluation:
     coverage: dict[str, dict[str, float]]
 
     def to_json(self) -> str:
-        """One JSON object with the attributes as keys."""
+        """Return one JSON object with the attributes as keys."""
         return json.dumps(asdict(self), indent=2) + "\n"
 
     def write(self, path: Path) -> None:
-        """``to_json`` into a file, whole or not at all."""
+        """Write ``to_json`` to a file atomically."""
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
             unfinished = Path(scratch) / path.name
@@ -68,23 +68,23 @@ def evaluate(
     calibration: Path | None = None,
     deeper_than_mm: float | None = None,
     clock: Clock | None = None,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Evaluation:
-    """Predict every image of a split, one by one as a cell would, and compare with the labels.
+    """Predict every image of a split one by one, as at run time, and compare with the labels.
 
     Args:
-        data: data set, see ``dataset``.
+        data: data set, see ``touchcell.drivers.replay.dataset``.
         split: train, val or test.
         model: model file.
-        calibration: of the camera, as ``load_estimator`` takes it.
+        calibration: of the camera, see ``load_estimator``.
         deeper_than_mm: leave out shallower contacts.
         clock: measures the latency; None for the machine's.
-        progress: told (images done, images in all).
+        progress: called with the images done and the total.
 
     Raises:
         DataError: the data set is damaged.
         ModelError: the model file is damaged.
-        ImageError: the model was made for other images.
+        ImageError: the images do not match the model.
     """
     clock = clock or MonotonicClock()
     labelled = read_split(data, split)
@@ -97,7 +97,7 @@ def evaluate(
     with one_opencv_thread():
         for i, image in enumerate(labelled.read()):
             if i == 0:
-                contact_model.predict(image)  # The first run also plans the memory.
+                contact_model.predict(image)  # The first run also allocates memory.
             start_ns = clock.now_ns()
             predictions.append(contact_model.predict(image))
             latencies_ns[i] = clock.now_ns() - start_ns
@@ -117,7 +117,7 @@ def evaluate(
 
 
 def print_table(evaluation: Evaluation, console: Console | None = None) -> None:
-    """Show an evaluation to a person."""
+    """Print an evaluation as a table."""
     from rich.console import Console
     from rich.table import Table
 
@@ -140,7 +140,7 @@ def print_table(evaluation: Evaluation, console: Console | None = None) -> None:
 
 @contextmanager
 def one_opencv_thread() -> Iterator[None]:
-    """Within it OpenCV uses one thread, as a running cell does."""
+    """Limit OpenCV to one thread, as at run time, inside a ``with`` block."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

@@ -1,4 +1,4 @@
-"""What every training ends with: sigmas that agree with the validation set, a model file, two figures beside it."""
+"""End of every training: calibrate the sigmas on the validation set, write the model file and two figures."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ def write_trained(
     tensors: dict[str, NDArray[np.float32]],
     reference: ImageArray | None,
     training_data: str,
-    told: Mapping[str, Any],
+    metadata: Mapping[str, Any],
     progress: Progress,
     mean: Array,
     sigma: Array,
     validation_xi: Array,
 ) -> Model:
-    """Write the model file ``out``, ``NAME_predictions.png`` and ``NAME_curves.png``; the checkpoint goes.
+    """Write the model file ``out``, ``NAME_predictions.png`` and ``NAME_curves.png``, and remove the checkpoint.
 
     Args:
         out: ``NAME.safetensors``.
         architecture, preprocessing, labels, tensors, reference, training_data: of the model, see ``model_file``.
-        told: settings and counts that its header keeps for people; the outcome is added.
+        metadata: settings and counts for the header; the results are added.
         progress: of the training.
         mean, sigma: (n, 6) of the validation set, in label half-ranges, uncalibrated.
         validation_xi: (n, 6) its labels, m and rad.
@@ -57,7 +57,7 @@ def write_trained(
             sigma_power=tuple(power.tolist()),
             training_data=training_data,
             training={
-                **{key: list(value) if isinstance(value, tuple) else value for key, value in told.items()},
+                **{key: list(value) if isinstance(value, tuple) else value for key, value in metadata.items()},
                 "epochs_run": len(progress.history),
                 "best_epoch": progress.best_epoch,
                 "epochs_cpu_s": round(progress.cpu_s, 1),

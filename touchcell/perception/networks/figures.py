@@ -1,4 +1,4 @@
-"""Figures of a training: predicted against true, and learning curves."""
+"""Figures of a training: predictions over labels, and learning curves."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _TITLES = ("x (mm)", "y (mm)", "z (mm)", "α (deg)", "β (deg)", "γ (deg)")
 
 
 def write_predictions(path: Path, *, truth: Array, predicted: Array, sigma: Array) -> None:
-    """Predicted over true, one panel per component, coloured by precision (one over the predicted sigma).
+    """Plot predictions over labels, one panel per component, coloured by precision (one over the predicted sigma).
 
     Args:
         path: PNG to write.
@@ -39,7 +39,7 @@ def write_predictions(path: Path, *, truth: Array, predicted: Array, sigma: Arra
 
 
 def write_curves(path: Path, history: Sequence[EpochRecord]) -> None:
-    """Loss, and validation error of every component relative to its first epoch, over epochs."""
+    """Plot loss, and validation error of every component relative to its first epoch, over epochs."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 

@@ -1,13 +1,13 @@
-"""Learning how a sensor's markers move from its images alone, without labels.
+"""Learn a sensor's displacement model and marker matching from its images alone, without labels.
 
-The start is the analytic tip of the simulation, swept over contacts and laid onto the sensor's lattice: near enough
-to pair most markers of most real frames. What was paired well teaches a better model of this very sensor, which
-pairs the rest.
+The initial model is the analytic tip of the simulation, swept over contacts and fitted to the sensor's lattice: near
+enough to pair most markers of most real frames. The reliably matched frames train a better model of the individual
+sensor, which matches the rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol, runtime_checkable
 
@@ -26,6 +26,7 @@ from touchcell.perception.markers.matching import (
     pair,
     quality,
 )
+from touchcell.perception.networks.dataset import ProgressCallback
 from touchcell.registry import Registry
 
 GRID = 32
@@ -38,20 +39,17 @@ _SURE = 0.96
 _SPREADS = 2
 _ALIKE = 8
 
-Told = Callable[[int, int], None]
-"""Told (frames done, frames in all)."""
-
 
 @dataclass(frozen=True)
 class Learned:
-    """What the frames of a sensor taught.
+    """Result of learning from the frames of a sensor.
 
     Attributes:
         matcher: for further frames of this sensor.
         guess: its first guess.
         bank: (b, k) its coefficients to try.
         least_score, most_rms_px: its limits.
-        fields: of all frames that it was taught with.
+        fields: matches of all training frames.
     """
 
     matcher: MarkerMatcher
@@ -63,17 +61,17 @@ class Learned:
 
 
 def fit_lattice(discs: Discs, rings: int) -> tuple[Array, float]:
-    """The lattice laid over the discs of an undeformed, or hardly deformed, tip.
+    """Fit the lattice to the discs of an undeformed, or hardly deformed, tip.
 
-    A similarity with a scale that is a polynomial of the ring number, for the dome and the lens. Which of its six
-    equal directions is the first does not show in an image, and makes no difference.
+    A similarity with a scale that is a polynomial of the ring number, for the dome and the lens. The lattice is
+    symmetric under rotation by 60 degrees; which of the six directions is the first makes no difference.
 
     Args:
         discs: of one image.
         rings: of the lattice.
 
     Returns:
-        (m, 2) px marker places, and the root mean square px of the discs from them; infinite when nothing fits.
+        (m, 2) px marker positions, and the root mean square px of the discs from them; infinite when nothing fits.
     """
     centres = discs.centres
     flat = lattice(rings)
@@ -107,7 +105,7 @@ def fit_lattice(discs: Discs, rings: int) -> tuple[Array, float]:
 
 
 def find_reference(frames: Sequence[Discs], rings: int) -> Array:
-    """(m, 2) px lattice of that frame whose tip is deformed least.
+    """Return the (m, 2) px lattice of the least deformed frame.
 
     Raises:
         TrainingError: no frame shows a lattice of that many rings.
@@ -128,7 +126,7 @@ class DisplacementPrior(Protocol):
     """Where learning begins before any image has been matched."""
 
     def __call__(self, lattice: Array, rings: int, seed: int, /) -> Array:
-        """(n, m, 2) px displacements of markers in random contacts, from a lattice (m, 2) px and its rings."""
+        """Return (n, m, 2) px displacements of markers in random contacts, from a lattice (m, 2) px and its rings."""
         ...
 
 
@@ -146,20 +144,20 @@ def learn_markers(
     rounds: int = 2,
     guess_steps: int = 1200,
     seed: int = 0,
-    told: Told | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Learned:
     """Learn to match the frames of one sensor.
 
     Args:
-        frames: discs of each training image; they should cover the contacts that will be met.
+        frames: discs of each training image; they should cover the contacts that will occur.
         image_size: (height, width) px.
         rings: of the sensor's lattice.
-        modes: ways of moving that are kept.
+        modes: number of components of the displacement model.
         reference: (m, 2) px lattice out of contact; None finds the least deformed frame.
-        rounds: of matching and learning anew.
+        rounds: of matching and refitting.
         guess_steps: of the training of the first guess, each round; threefold in the last.
         seed: of everything random.
-        told: of the frames that have been matched.
+        progress: called per matched frame.
 
     Raises:
         TrainingError: there is no such lattice in the frames, or too few of them can be matched.
@@ -170,7 +168,7 @@ def learn_markers(
     everything = np.ones(displacements.shape[:2], bool)
     model = DisplacementModel.fit(reference, displacements, everything, modes)
     coefficients = (displacements.reshape(len(displacements), -1) - model.mean) @ model.basis.T
-    # The simulated tip is 2.5 px off the real one on average, and its coefficients scatter too little.
+    # The simulated tip is 2.5 px off the real one on average, and its coefficients vary too little.
     guess = train_guess(model, coefficients, everything, noise_px=2.0, scatter=0.15, steps=guess_steps, seed=seed)
     least_score, most_rms_px = 0.9, 0.2 * model.spacing_px
     bank = _bank(coefficients)
@@ -180,8 +178,8 @@ def learn_markers(
         fields = []
         for i, discs in enumerate(frames):
             fields.append(matcher.match(discs))
-            if told is not None:
-                told(number * len(frames) + i + 1, (rounds + 1) * len(frames))
+            if progress is not None:
+                progress(number * len(frames) + i + 1, (rounds + 1) * len(frames))
         for _ in range(_SPREADS):
             _spread(matcher, frames, fields, density)
         good = [field for field in fields if _surely(field)]
@@ -191,7 +189,7 @@ def learn_markers(
                 hint="check threshold, crop, mask and the number of rings",
             )
         if number > 0:
-            # A later round's misfits are outliers rather than a coarse model's.
+            # In later rounds misfits are outliers rather than errors of a coarse model.
             limit = 3.0 * float(np.median([field.rms_px for field in good]))
             good = [field for field in good if field.rms_px <= limit]
         displacements, seen = stacked(good)
@@ -202,7 +200,8 @@ def learn_markers(
         guess = train_guess(model, coefficients, seen, noise_px=noise_px, scatter=0.05, steps=steps, seed=seed)
         bank = _bank(coefficients)
         matcher = MarkerMatcher(model, guess, image_size, bank=bank, least_score=least_score, most_rms_px=most_rms_px)
-    fields = match_all(matcher, frames, None if told is None else lambda i, n: told(rounds * n + i, (rounds + 1) * n))
+    last_round = None if progress is None else lambda i, n: progress(rounds * n + i, (rounds + 1) * n)
+    fields = match_all(matcher, frames, last_round)
     _spread(matcher, frames, fields, density)
     return Learned(matcher, guess, bank, least_score, most_rms_px, fields)
 
@@ -218,13 +217,13 @@ def train_guess(
     seed: int,
     hidden: int = GUESS_HIDDEN,
 ) -> FirstGuess:
-    """Teach the first guess with fields made from ``coefficients``: mixed, scattered, with markers lost.
+    """Train the first guess with fields made from ``coefficients``: mixed, scattered, with markers removed.
 
-    Deep contacts push whole groups of markers together or out of view. A guess that was taught with markers lost
-    one by one was off by half a spacing in 10 % of the validation images, one that loses them as the frames did in 1 %.
+    Deep contacts push whole groups of markers together or out of view. A guess trained with markers removed one by one
+    was off by half a spacing in 10 % of the validation images, one with markers removed as in the frames in 1 %.
 
     Args:
-        model: whose coefficients are guessed.
+        model: its coefficients are estimated.
         coefficients: (n, k) of real or simulated contacts.
         seen: (n, m) their markers that have discs.
         noise_px: of each marker about the model.
@@ -246,10 +245,10 @@ def train_guess(
         network = nn.Sequential(nn.Linear(GRID * GRID, hidden), nn.ReLU(), nn.Linear(hidden, k))
         optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-3)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total_steps=steps)
-        # The wide ways of moving decide which marker a disc is; the narrow ones are found once that is known.
+        # The modes of large variance decide the matching; the others are fitted after it.
         weights = torch.from_numpy((model.sd / model.sd[0]).astype(np.float32))
         squares: list[NDArray[np.float32]] = []
-        # Far contacts are few and hard, so they come more often.
+        # Far contacts are few and hard, so they are oversampled.
         far = 0.5 + ((coefficients / model.sd) ** 2).mean(axis=1)
         often = far / far.sum()
         for _ in range(steps):
@@ -257,7 +256,7 @@ def train_guess(
             other = rng.integers(0, len(coefficients), _GUESS_BATCH)
             share = rng.uniform(-0.2, 0.5, (_GUESS_BATCH, 1)) * (rng.random((_GUESS_BATCH, 1)) < 0.5)
             chosen = coefficients[one] + share * (coefficients[other] - coefficients[one])
-            # What could not be matched so far lies beyond what could.
+            # Unmatched contacts lie beyond the matched ones.
             chosen = rng.uniform(0.8, 1.2, (_GUESS_BATCH, 1)) * chosen
             chosen = chosen + rng.normal(0.0, scatter, chosen.shape) * model.sd
             positions = model.positions(chosen) + rng.normal(0.0, noise_px, (_GUESS_BATCH, m, 2))
@@ -276,18 +275,20 @@ def train_guess(
     return FirstGuess(low, float(cell_px), hidden_weight, hidden_bias, weight, bias, sd)
 
 
-def match_all(matcher: MarkerMatcher, frames: Sequence[Discs], told: Told | None = None) -> list[MarkerField]:
-    """Every frame from a cold start."""
+def match_all(
+    matcher: MarkerMatcher, frames: Sequence[Discs], progress: ProgressCallback | None = None
+) -> list[MarkerField]:
+    """Match every frame from a cold start."""
     fields = []
     for i, discs in enumerate(frames):
         fields.append(matcher.match(discs))
-        if told is not None:
-            told(i + 1, len(frames))
+        if progress is not None:
+            progress(i + 1, len(frames))
     return fields
 
 
 def stacked(fields: Sequence[MarkerField]) -> tuple[Array, NDArray[np.bool_]]:
-    """Displacements (n, m, 2) px and seen markers (n, m)."""
+    """Return displacements (n, m, 2) px and seen markers (n, m)."""
     return np.stack([field.displacements for field in fields]), np.stack([field.seen for field in fields])
 
 
@@ -298,7 +299,7 @@ def _surely(field: MarkerField) -> bool:
 def _spread(
     matcher: MarkerMatcher, frames: Sequence[Discs], fields: list[MarkerField], density: NDArray[np.float32]
 ) -> None:
-    """Match the frames that failed from those that succeeded and look most alike, in place."""
+    """Match the frames that failed from those that succeeded and are most similar, in place."""
     sure = np.flatnonzero([_surely(field) for field in fields])
     if not len(sure):
         return
@@ -311,5 +312,5 @@ def _spread(
 
 
 def _bank(coefficients: Array) -> Array:
-    """Evenly chosen coefficients, as many as a model file should hold."""
+    """Return evenly chosen coefficients, as many as a model file should hold."""
     return coefficients[:: -(-len(coefficients) // _BANK)]

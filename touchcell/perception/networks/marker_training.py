@@ -1,4 +1,4 @@
-"""Teaching a marker estimator: from labelled images to a model file. Needs the extra ``train`` (PyTorch)."""
+"""Train a marker estimator: from labelled images to a model file. Needs the extra ``train`` (PyTorch)."""
 
 from __future__ import annotations
 
@@ -55,27 +55,27 @@ from touchcell.perception.networks.progress import Display, Observer
 
 _LEAST_SCORE_TAUGHT = 0.9
 _LEAST_BATCHES = 16
-_MATCHING = 2  # Counts the ways of matching there have been, so that no other way's result is taken from the cache.
+_MATCHING = 2  # Version of the matching, so that results of older versions are not taken from the cache.
 
 
 @dataclass(frozen=True)
 class MarkerSettings:
-    """How to train. The figures that chose the defaults are in docs/decisions/0006-markers.md.
+    """Training settings. The figures that chose the defaults are in docs/decisions/0006-markers.md.
 
     Attributes:
         epochs: passes over the training set; over few images, as many passes each as make 16 batches.
         seed: of everything random.
         rings: of the sensor's lattice.
-        modes: in which its markers move together.
+        modes: number of components of the displacement model.
         guess_steps: of the first guess's training (``marker_learning.learn_markers``).
         hidden: units of each layer of a displacement network.
         networks: trained side by side; their mixture is the estimate.
         batch_size: contacts per step and network.
         learning_rate: its peak, after a rise over 5 % of the steps; then it falls as a half cosine.
         weight_decay: of AdamW.
-        memory: of the running average of the networks, as the share that stays in a step.
+        memory: decay of the running average of the networks: the fraction that is kept per step.
         noise: standard deviation added to scaled inputs.
-        shift_px, turn_rad, zoom: standard deviations of the jitter, as of a camera taken off and put on again.
+        shift_px, turn_rad, zoom: standard deviations of the jitter, as of a camera that was remounted.
     """
 
     epochs: int = 80
@@ -102,8 +102,8 @@ class MarkerSettings:
 
 
 @dataclass(frozen=True)
-class MarkedContacts:
-    """Discs of labelled images.
+class LabelledDiscs:
+    """Detected discs of images, and their labels.
 
     Attributes:
         frames: discs of each image.
@@ -114,7 +114,7 @@ class MarkedContacts:
     xi: Array
 
     def digest(self) -> str:
-        """SHA-256 of the content."""
+        """Return the SHA-256 of the content."""
         content = hashlib.sha256(np.round(self.xi, 12).astype("<f8").tobytes())
         for discs in self.frames:
             content.update(np.round(discs.centres, 6).astype("<f8").tobytes())
@@ -122,7 +122,7 @@ class MarkedContacts:
 
 
 def preprocessing_for(image: ImageArray) -> Preprocessing:
-    """Full resolution, and black and white: as it is, or by the paper's median and adaptive threshold."""
+    """Return a preprocessing to binary images at full resolution: none, or the paper's median and threshold."""
     height, width = image.shape
     black_and_white = bool(np.isin(image, (0, 255)).all())
     return Preprocessing(
@@ -159,10 +159,10 @@ def train_markers(
     preprocessing = preprocessing_for(next(splits["train"].read()))
     cache = cache or default_cache()
     size = typical_size(preprocessing.reduce(next(splits["train"].read())))
-    told = observer.images
+    report = observer.images
     sets = {
-        name: MarkedContacts(
-            _discs(split, preprocessing, size, cache, partial(told, name)), xi_from_contact(split.contact_mm_deg)
+        name: LabelledDiscs(
+            _discs(split, preprocessing, size, cache, partial(report, name)), xi_from_contact(split.contact_mm_deg)
         )
         for name, split in splits.items()
     }
@@ -181,8 +181,8 @@ def train_markers(
 
 
 def train_on_discs(
-    training: MarkedContacts,
-    validation: MarkedContacts,
+    training: LabelledDiscs,
+    validation: LabelledDiscs,
     out: Path,
     *,
     preprocessing: Preprocessing,
@@ -196,16 +196,16 @@ def train_on_discs(
     """Train on discs in memory and write the model file ``out`` with three figures beside it.
 
     Args:
-        training: to learn from.
-        validation: to choose the best epoch by, and to calibrate sigma on.
+        training: training set.
+        validation: selects the best epoch and calibrates sigma.
         out: ``NAME.safetensors``.
-        preprocessing: that made the images; becomes part of the model.
+        preprocessing: of the images; becomes part of the model.
         size: with which the discs were found; likewise.
         settings: None for the defaults.
-        reference: preprocessed image out of contact, kept for the contact gate.
-        resume: go on with an interrupted training of the same data and settings.
-        cache: folder for the matched markers; None keeps nothing.
-        observer: is told of the progress.
+        reference: preprocessed image out of contact, stored for the contact gate.
+        resume: continue an interrupted training of the same data and settings.
+        cache: folder for the matched markers; None stores nothing.
+        observer: receives the progress.
 
     Raises:
         TrainingError: as ``train_markers``.
@@ -248,7 +248,7 @@ def train_on_discs(
         tensors={**matched.tensors, **run.average.folded()},
         reference=reference,
         training_data=training_data,
-        told={
+        metadata={
             **asdict(settings),
             "images": len(training.frames),
             "images_matched": int(matched.taught.sum()),
@@ -270,7 +270,7 @@ class _Matched:
         tensors: of the model file.
         frame: (5,) guess_low_px, guess_cell_px, least_score, most_rms_px.
         training, validation: (n, 2 m) px.
-        taught: (n,) training images that matched well enough to learn from.
+        taught: (n,) training images that matched well enough to be used.
     """
 
     tensors: dict[str, NDArray[np.float32]]
@@ -281,8 +281,8 @@ class _Matched:
 
 
 def _matched(
-    training: MarkedContacts,
-    validation: MarkedContacts,
+    training: LabelledDiscs,
+    validation: LabelledDiscs,
     image_size: tuple[int, int],
     training_data: str,
     settings: MarkerSettings,
@@ -297,7 +297,7 @@ def _matched(
         arrays = {key: stored.pop(key) for key in ("frame", "training", "validation", "taught")}
         return _Matched(tensors=stored, **arrays)
 
-    def told(what: str) -> Callable[[int, int], None]:
+    def report(what: str) -> Callable[[int, int], None]:
         return lambda done, total: None if observer is None else observer.images(what, done, total)
 
     learned = learn_markers(
@@ -307,10 +307,10 @@ def _matched(
         modes=settings.modes,
         guess_steps=settings.guess_steps,
         seed=settings.seed,
-        told=told("matched"),
+        progress=report("matched"),
     )
     displacements, _ = stacked(learned.fields)
-    fields = match_all(learned.matcher, validation.frames, told("matched, val"))
+    fields = match_all(learned.matcher, validation.frames, report("matched, val"))
     matched = _Matched(
         tensors=_tensors(learned),
         frame=np.array([*learned.guess.low, learned.guess.cell_px, learned.least_score, learned.most_rms_px]),
@@ -335,7 +335,7 @@ def _matched(
 def _write_examples(
     path: Path, model: DisplacementModel, displacements: NDArray[np.float32], size: tuple[int, int]
 ) -> None:
-    """A slight, a middling and a strong contact, so that a person sees whether the markers were matched."""
+    """Plot a slight, a medium and a strong contact, to check the matching by eye."""
     order = np.argsort(np.abs(displacements).mean(axis=1))
     shares = (0.1, 0.5, 0.95)
     chosen = [order[int(share * (len(order) - 1))] for share in shares]
@@ -363,7 +363,7 @@ def _tensors(learned: Learned) -> dict[str, NDArray[np.float32]]:
 
 @dataclass
 class _Run:
-    """One training: the networks, their optimizer, and how far they have come."""
+    """One training: the networks, their optimizer, and the progress."""
 
     settings: MarkerSettings
     labels: Labels
@@ -395,7 +395,7 @@ class _Run:
         self.jitter = Jitter(model.reference, settings.shift_px, settings.turn_rad, settings.zoom)
 
     def fit(self, out: Path, recipe: dict[str, Any], *, resume: bool) -> None:
-        """Run all epochs that are left and leave the best epoch's tensors in the average."""
+        """Run all remaining epochs and leave the best epoch's tensors in the average."""
         if resume:
             self.progress = load_checkpoint(out, recipe, self.network, self.average, self.optimizer) or self.progress
         try:
@@ -406,13 +406,13 @@ class _Run:
             delete_checkpoint(out)
             raise
         self.average.load_state_dict(self.progress.best_state)
-        # 0.5 is what the middle of the range errs by when labels are spread evenly.
+        # 0.5 is the mean error of the constant centre of the range for uniform labels.
         if self.progress.best_loss > 6 * 0.5:
             raise TrainingError("the training diverged", epoch=self.progress.best_epoch, hint="lower the learning rate")
 
     @torch.inference_mode()
     def predict(self) -> tuple[Array, Array]:
-        """Mean and uncalibrated sigma (n, 6) of the validation set, in label half-ranges."""
+        """Return mean and uncalibrated sigma (n, 6) of the validation set, in label half-ranges."""
         networks = self.settings.networks
         outputs = self.average(self.validation_inputs.expand(networks, -1, -1)).numpy().astype(np.float64)
         return mixed(outputs[..., :6], outputs[..., 12:], self.labels)
@@ -423,7 +423,7 @@ class _Run:
         mean, _ = self.predict()
         loss = float(np.abs(mean - self.validation_targets.numpy()).mean(axis=0).sum())
         if not math.isfinite(loss):
-            raise TrainingError("the validation loss is no number", epoch=epoch, hint="lower the learning rate")
+            raise TrainingError("the validation loss is not finite", epoch=epoch, hint="lower the learning rate")
         contacts = self.labels.contacts(mean)
         mae = np.abs(contacts - contact_from_xi(self.validation_xi)).mean(axis=0)
         errors = dict(zip(CONTACT_NAMES, mae.tolist(), strict=True))
@@ -433,11 +433,11 @@ class _Run:
             self.observer.epoch(record, best=self.progress.best_epoch == epoch)
 
     def _epoch(self, epoch: int) -> float:
-        # Every epoch has its own random numbers, so that a resumed training draws those of an uninterrupted one.
+        # Every epoch has its own seed, so that a resumed training draws the same numbers as an uninterrupted one.
         torch.manual_seed(int(np.random.SeedSequence((self.settings.seed, epoch)).generate_state(1)[0]))
         settings = self.settings
         self.network.train()
-        # Of few images, an epoch sees each several times: eighty steps would not teach a network to its end.
+        # With few images an epoch uses each several times: eighty steps would not train a network to convergence.
         passes = math.ceil(_LEAST_BATCHES * settings.batch_size / len(self.inputs))
         n, networks = len(self.inputs), range(settings.networks)
         order = torch.cat([torch.stack([torch.randperm(n) for _ in networks]) for _ in range(passes)], dim=1)
@@ -451,9 +451,9 @@ class _Run:
             outputs = self.network(self.jitter(self.inputs[chosen]), settings.noise)
             loss = displacement_loss(outputs, self.targets[chosen], self.alignment)
             if not torch.isfinite(loss):
-                raise TrainingError("the loss is no number", epoch=epoch, hint="lower the learning rate")
+                raise TrainingError("the loss is not finite", epoch=epoch, hint="lower the learning rate")
             self.optimizer.zero_grad(set_to_none=True)
-            # The networks are independent: each is to learn as fast as it would alone.
+            # The networks are independent: each shall train as fast as it would alone.
             (loss * settings.networks).backward()  # type: ignore[no-untyped-call]
             self.optimizer.step()
             self._follow(step)
@@ -473,14 +473,14 @@ class _Run:
 
 
 def _cosine(step: int, steps: int, peak: float) -> float:
-    """Learning rate: up in a straight line over 5 % of the steps, down as a half cosine over all of them."""
+    """Return the learning rate: linear rise over 5 % of the steps, times a half cosine over all of them."""
     return peak * min(1.0, (step + 1) / (0.05 * steps)) * 0.5 * (1.0 + math.cos(math.pi * step / steps))
 
 
 def _discs(
-    split: Split, preprocessing: Preprocessing, size: MarkerSize, cache: Path, told: Callable[[int, int], None]
+    split: Split, preprocessing: Preprocessing, size: MarkerSize, cache: Path, progress: Callable[[int, int], None]
 ) -> list[Discs]:
-    """Discs of every image of a split; found once."""
+    """Return the discs of every image of a split; cached."""
     key = hashlib.sha256((cache_key(split, preprocessing) + size.model_dump_json()).encode()).hexdigest()[:32]
     kept = cache / f"{key}.discs.npz"
     stored = _load(kept)
@@ -488,7 +488,7 @@ def _discs(
         found = []
         for i, image in enumerate(split.read()):
             found.append(detect_markers(preprocessing.reduce(image), size))
-            told(i + 1, len(split.images))
+            progress(i + 1, len(split.images))
         _save(
             kept,
             {

@@ -1,4 +1,4 @@
-"""What a person sees while a network trains."""
+"""Terminal display of a training."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from touchcell.perception.networks.checkpoint import EpochRecord
 
 
 class Observer(Protocol):
-    """Is told how a training goes."""
+    """Receives the progress of a training."""
 
     def images(self, split: str, done: int, total: int) -> None:
         """``done`` of ``total`` images of a split are decoded."""
         ...
 
     def batch(self, epoch: int, epochs: int, done: int, total: int, loss: float) -> None:
-        """``done`` of ``total`` batches of an epoch are learned; ``loss`` is their mean."""
+        """``done`` of ``total`` batches of an epoch are done; ``loss`` is their mean."""
         ...
 
     def epoch(self, record: EpochRecord, *, best: bool) -> None:
-        """An epoch is over and validated."""
+        """An epoch has been completed and validated."""
         ...
 
 
 class Display:
-    """Shows a bar with the time left, and one line per epoch; into a file, the lines alone."""
+    """Show a bar with the remaining time, and one line per epoch; into a file, the lines alone."""
 
     def __init__(self, console: Console | None = None) -> None:
         self._console = console or Console()
@@ -54,7 +54,7 @@ class Display:
     ) -> None:
         self._bar.stop()
         if kind is KeyboardInterrupt:
-            self._console.print("Interrupted. The same command goes on from the last whole epoch.")
+            self._console.print("Interrupted. The same command continues from the last complete epoch.")
 
     def images(self, split: str, done: int, total: int) -> None:
         self._show(f"images {split}", f"images {split}", done, total)
@@ -80,7 +80,7 @@ class Display:
         if self._task is None or self._task_name != name:
             if self._task is not None:
                 self._bar.remove_task(self._task)
-            # What a resumed training has behind it took no time now, and must not shorten the time left.
+            # Epochs done before a resume took no time now, and must not shorten the estimated remaining time.
             self._task = self._bar.add_task(description, total=total, completed=done - 1, loss=loss)
             self._task_name = name
         self._bar.update(self._task, description=description, completed=done, loss=loss)

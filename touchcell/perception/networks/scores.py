@@ -1,4 +1,4 @@
-"""How predictions compare with labels: errors, likelihood, coverage and reliability, over all images or a part."""
+"""Compare predictions with labels: errors, likelihood, coverage and reliability, over all images or a subset."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ if TYPE_CHECKING:
     from touchcell.perception.models.prediction import Prediction
 
 SCORE_NAMES = ("z_mm", "alpha_deg", "beta_deg", "x_mm", "y_mm", "gamma_deg")
-"""Components of a contact in the order in which tables show them: pose, then shear."""
+"""Components of a contact in the order of tables: pose, then shear."""
 
 SLIP_FREE_RATIO = 0.6
-"""Contacts sheared by less than this share of their depth have not slipped. Measured on franka_tactip_1, where errors
+"""Contacts with a smaller ratio of shear to depth have not slipped. Measured on franka_tactip_1, where errors
 in shear rise from a ratio of 0.6 on, and multiply beyond 1."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Labels of n images and the Gaussians that an estimator gave for them.
+    """Labels of n images and the Gaussians that an estimator predicted for them.
 
-    Everything probabilistic is about xi = log(T_s_f), under the full covariance that is served; the components of xi
-    carry the names of the contact's, seen from the surface's side. Errors are the contact's own.
+    Everything probabilistic is about xi = log(T_s_f), under the full predicted covariance; the components of xi carry
+    the names of the contact's, seen from the surface's side. Errors are the contact's own.
 
     Attributes:
         contact_mm_deg: (n, 6) labels, named as ``CONTACT_NAMES``.
         xi: (n, 6) means, m and rad.
         covariance: (n, 6, 6) of xi, m and rad.
-        in_range: (n,) what the estimator said of itself.
+        in_range: (n,) as reported by the estimator.
     """
 
     contact_mm_deg: Array
@@ -45,7 +45,7 @@ class Scores:
 
     @classmethod
     def of(cls, contact_mm_deg: Array, predictions: Sequence[Prediction]) -> Scores:
-        """Labels (n, 6) and the predictions for the same images."""
+        """Create scores from labels (n, 6) and the predictions for the same images."""
         return cls(
             contact_mm_deg,
             np.stack([prediction.xi for prediction in predictions]),
@@ -57,12 +57,12 @@ class Scores:
         return len(self.xi)
 
     def subset(self, chosen: NDArray[np.bool_]) -> Scores:
-        """Those images for which ``chosen`` (n,) is True."""
+        """Return the scores of the images for which ``chosen`` (n,) is True."""
         return Scores(self.contact_mm_deg[chosen], self.xi[chosen], self.covariance[chosen], self.in_range[chosen])
 
     @property
     def slip_free(self) -> NDArray[np.bool_]:
-        """(n,) whether the labelled shear is below ``SLIP_FREE_RATIO`` of the labelled depth."""
+        """(n,) True where the labelled shear is below ``SLIP_FREE_RATIO`` of the labelled depth."""
         shear = np.hypot(self.contact_mm_deg[:, 0], self.contact_mm_deg[:, 1])
         return np.asarray(shear < SLIP_FREE_RATIO * self.contact_mm_deg[:, 2])
 
@@ -73,13 +73,13 @@ class Scores:
 
     @property
     def errors(self) -> Array:
-        """(n, 6) predicted less labelled contact, mm and degrees."""
+        """(n, 6) predicted minus labelled contact, mm and degrees."""
         errors: Array = self.predicted_mm_deg - self.contact_mm_deg
         return errors
 
     @property
     def residuals(self) -> Array:
-        """(n, 6) labelled less predicted xi, mm and degrees."""
+        """(n, 6) labelled minus predicted xi, mm and degrees."""
         residuals: Array = (xi_from_contact(self.contact_mm_deg) - self.xi) / XI_UNITS
         return residuals
 
@@ -91,13 +91,13 @@ class Scores:
 
     @property
     def standardised(self) -> Array:
-        """(n, 6) residuals in predicted standard deviations; standard normal each, if sigma is right."""
+        """(n, 6) residuals in predicted standard deviations; each standard normal if sigma is correct."""
         standardised: Array = self.residuals / self.sigma
         return standardised
 
     @property
     def nees(self) -> Array:
-        """(n,) squared Mahalanobis distances of the labels; chi-squared of 6 degrees of freedom, if all is right."""
+        """(n,) squared Mahalanobis distances of the labels; chi-squared of 6 degrees of freedom if consistent."""
         nees: Array = np.square(self._whitened()[0]).sum(axis=1)
         return nees
 
@@ -109,22 +109,22 @@ class Scores:
         return nll
 
     def mae(self) -> dict[str, float]:
-        """Mean absolute error of each component of the contact, in the order of ``SCORE_NAMES``."""
+        """Return the mean absolute error of each component of the contact, in the order of ``SCORE_NAMES``."""
         return _named(np.abs(self.errors).mean(axis=0))
 
-    def coverage(self, share: float) -> dict[str, float]:
-        """Fraction of the labels that lie in the central interval of that predicted share, of each component."""
-        return _named((np.abs(self.standardised) <= _quantile(share)).mean(axis=0))
+    def coverage(self, probability: float) -> dict[str, float]:
+        """Return, per component, the fraction of labels in the predicted central interval of that probability."""
+        return _named((np.abs(self.standardised) <= _quantile(probability)).mean(axis=0))
 
-    def joint_coverage(self, share: float) -> float:
-        """Fraction of the labels that lie in the predicted ellipsoid of that share of all six components."""
-        # Chi-squared of 6 degrees of freedom has a cumulative distribution in closed form.
+    def joint_coverage(self, probability: float) -> float:
+        """Return the fraction of labels in the predicted ellipsoid of that probability, all six components together."""
+        # The cumulative distribution of chi-squared with 6 degrees of freedom has a closed form.
         half = 0.5 * self.nees
-        return float((1.0 - np.exp(-half) * (1.0 + half + 0.5 * half**2) <= share).mean())
+        return float((1.0 - np.exp(-half) * (1.0 + half + 0.5 * half**2) <= probability).mean())
 
-    def reliability(self, shares: Sequence[float]) -> dict[str, list[float]]:
-        """``coverage`` at each of the shares, by component: a calibrated estimator's equal the shares."""
-        rows = [self.coverage(share) for share in shares]
+    def reliability(self, probabilities: Sequence[float]) -> dict[str, list[float]]:
+        """Return ``coverage`` at each probability, by component: a calibrated estimator's equal the probabilities."""
+        rows = [self.coverage(probability) for probability in probabilities]
         return {name: [row[name] for row in rows] for name in SCORE_NAMES}
 
     def _whitened(self) -> tuple[Array, Array]:
@@ -138,6 +138,6 @@ def _named(values: Array) -> dict[str, float]:
     return {name: float(values[CONTACT_NAMES.index(name)]) for name in SCORE_NAMES}
 
 
-def _quantile(share: float) -> float:
-    """Half width, in standard deviations, of the central interval of a normal distribution that holds ``share``."""
-    return NormalDist().inv_cdf(0.5 + 0.5 * share)
+def _quantile(probability: float) -> float:
+    """Return the half width, in standard deviations, of a normal distribution's central interval."""
+    return NormalDist().inv_cdf(0.5 + 0.5 * probability)

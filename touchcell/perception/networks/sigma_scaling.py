@@ -1,4 +1,4 @@
-"""Making predicted standard deviations agree with the errors of a validation set."""
+"""Calibrate predicted standard deviations to the errors of a validation set."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ _POWERS = np.arange(0.4, 1.6, 0.02)
 
 
 def calibrate(residual: Array, sigma: Array) -> tuple[Array, Array]:
-    """Scale and power that make ``scale * sigma ** power`` the likeliest standard deviations of Gaussian residuals.
+    """Fit scale and power that make ``scale * sigma ** power`` the likeliest standard deviations of Gaussian residuals.
 
-    A network is surer of what it is sure of, and less sure of the rest, than other data bear out: a power below one
-    takes some of both back. Where sigma never varies, the power is one.
+    On other data a network's confident predictions are overconfident and its uncertain ones underconfident: a power
+    below one corrects both. Where sigma never varies, the power is one.
 
     Args:
         residual: (n, 6).
         sigma: (n, 6) predicted, uncalibrated.
 
     Returns:
-        (6,) and (6,).
+        (6,) scale and (6,) power.
     """
     scales, powers = np.empty(6), np.ones(6)
     for i in range(6):

@@ -1,4 +1,4 @@
-"""Teaching a contact network: from labelled images to a model file. Needs the extra ``train`` (PyTorch)."""
+"""Train a contact network: from labelled images to a model file. Needs the extra ``train`` (PyTorch)."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _LEAST_SIDE_PX = 32
 
 @dataclass(frozen=True)
 class Settings:
-    """How to train. The defaults, and the figures that chose them, are in docs/decisions/0002-training.md.
+    """Training settings. The defaults, and the figures that chose them, are in docs/decisions/0002-training.md.
 
     Attributes:
         epochs: passes over the training set; the learning rate's schedule is stretched over them.
@@ -57,10 +57,10 @@ class Settings:
         batch_size: images per step.
         learning_rate: its peak.
         weight_decay: of AdamW.
-        memory: of the running average of the network that is validated and kept, as the share that stays in a step.
+        memory: decay of the running average of the network that is validated and stored: the fraction kept per step.
         patience: epochs without a better validation loss after which training stops.
         gdn_weights: of the six absolute errors added to a density network's likelihood, in label half-ranges; the
-            likelihood alone learns nothing about gamma for ten epochs.
+            likelihood alone does not learn gamma for ten epochs.
         cnn_weights: of the six squared errors of a plain network.
         shift_px: standard deviation of the jitter of training images along each axis, in pixels of the network's input.
         rotation_deg: standard deviation of their rotation.
@@ -90,8 +90,10 @@ class Settings:
 
 
 def learning_rate(step: int, steps: int, peak: float) -> float:
-    """The paper's schedule (Lloyd & Lepora 2024, 3.1.4) stretched over ``steps``: up from a hundredth of the peak in
-    the first 5 %, held for 2 %, then down in a straight line to a ten-thousandth of it."""
+    """Return the learning rate of the paper's schedule (Lloyd & Lepora 2024, 3.1.4) stretched over ``steps``.
+
+    It rises from a hundredth of the peak in the first 5 %, is held for 2 %, then falls linearly to a ten-thousandth.
+    """
     ramp, hold = 0.05 * steps, 0.07 * steps
     if step < ramp:
         return peak * (0.01 + 0.99 * step / ramp)
@@ -113,27 +115,28 @@ def train(
     cache: Path | None = None,
     observer: Observer | None = None,
 ) -> None:
-    """Train on ``data/train``, choose by ``data/val``, and write the model file ``out`` with two figures beside it.
+    """Train on ``data/train``, select by ``data/val``, and write the model file ``out`` with two figures beside it.
 
-    A training that was interrupted goes on from its last whole epoch when the same call is made again, and ends in the
-    model that it would have ended in.
+    An interrupted training continues from its last complete epoch when the same call is made again, and ends in the
+    same model as an uninterrupted one.
 
     Args:
-        data: data set, see ``dataset``; its image out of contact, where it has one, is kept for the contact gate.
+        data: data set, see ``touchcell.drivers.replay.dataset``; its image out of contact, where it has one, is stored
+            for the contact gate.
         out: ``NAME.safetensors``; figures become ``NAME_predictions.png`` and ``NAME_curves.png``.
         kind: gdn predicts a Gaussian, cnn means alone; markers as ``marker_training``.
         epochs: None for the default of ``Settings`` or ``MarkerSettings``.
         networks: of a marker estimator; None for the default of ``MarkerSettings``.
-        short_side_px: least of the images that a gdn or cnn sees, see ``preprocessing_for``; None for its default.
-        seed: of everything random; the same seed on the same machine gives the same file, but for the time it took.
-        resume: go on with an interrupted training; False begins anew.
+        short_side_px: smallest short side of a gdn or cnn's input, see ``preprocessing_for``; None for its default.
+        seed: of everything random; the same seed on the same machine gives the same file, except for the time it took.
+        resume: continue an interrupted training; False starts again.
         cache: folder for preprocessed images; None for ``dataset.default_cache()``.
-        observer: is told of the progress; None shows it on the terminal.
+        observer: receives the progress; None shows it on the terminal.
 
     Raises:
         DataError: the data set is damaged.
-        TrainingError: the labels cannot be learned, the loss is no number, the training diverged, or the
-            interrupted training had other settings or data.
+        TrainingError: the labels cannot be learned, the loss is not finite, the training diverged, or the interrupted
+            training had other settings or data.
     """
     if observer is None:
         with Display() as display:
@@ -154,7 +157,9 @@ def train(
         from touchcell.perception.networks.marker_training import MarkerSettings, train_markers
 
         if short_side_px is not None:
-            raise TrainingError("markers are looked for in all pixels", hint="a short side is for --kind gdn or cnn")
+            raise TrainingError(
+                "markers are detected at full resolution", hint="--short-side applies to --kind gdn or cnn"
+            )
         marker_settings = MarkerSettings(seed=seed)
         if epochs is not None:
             marker_settings = replace(marker_settings, epochs=epochs)
@@ -163,7 +168,7 @@ def train(
         train_markers(data, out, settings=marker_settings, resume=resume, cache=cache, observer=observer)
         return
     if networks is not None:
-        raise TrainingError(f"a {kind} is one network", hint="the number of networks is for --kind markers")
+        raise TrainingError(f"kind {kind} is a single network", hint="the number of networks applies to --kind markers")
     splits = {name: read_split(data, name) for name in ("train", "val")}
     first = next(splits["train"].read())
     preprocessing = preprocessing_for(first, _SHORT_SIDE_PX if short_side_px is None else short_side_px)
@@ -193,10 +198,10 @@ def train(
 
 
 def preprocessing_for(image: ImageArray, short_side_px: int = _SHORT_SIDE_PX) -> Preprocessing:
-    """Whole pixels averaged into one, as many as leave the short side ``short_side_px`` or more.
+    """Return a preprocessing that averages whole pixels into one, leaving a short side of ``short_side_px`` or more.
 
-    OpenCV shrinks by whole numbers three times as fast as to the paper's 128x128. What is left over at the border is
-    cut off.
+    OpenCV shrinks by whole numbers three times as fast as to the paper's 128x128. The remainder at the border is cut
+    off.
 
     Raises:
         TrainingError: a short side of less than 32, of which a network's five halvings leave nothing.
@@ -231,16 +236,16 @@ def train_on_arrays(
     """Train on images in memory and write the model file ``out`` with two figures beside it.
 
     Args:
-        training: to learn from.
-        validation: to choose the best epoch by, and to calibrate sigma on.
+        training: training set.
+        validation: selects the best epoch and calibrates sigma.
         out: ``NAME.safetensors``.
-        preprocessing: that made the images; becomes part of the model.
+        preprocessing: of the images; becomes part of the model.
         kind: of network, when no architecture is given.
         architecture: None for the default one of this kind.
         settings: None for the defaults.
-        reference: preprocessed image out of contact, kept in the model file for the contact gate.
-        resume: go on with an interrupted training of the same data and settings.
-        observer: is told of the progress.
+        reference: preprocessed image out of contact, stored in the model file for the contact gate.
+        resume: continue an interrupted training of the same data and settings.
+        observer: receives the progress.
 
     Raises:
         TrainingError: as ``train``.
@@ -271,7 +276,7 @@ def train_on_arrays(
         tensors=run.average.folded(),
         reference=reference,
         training_data=training_data,
-        told={**asdict(settings), "images": len(training)},
+        metadata={**asdict(settings), "images": len(training)},
         progress=run.progress,
         mean=mean,
         sigma=sigma,
@@ -281,10 +286,10 @@ def train_on_arrays(
 
 @dataclass
 class _Run:
-    """One training: the network, its optimizer, and how far they have come.
+    """One training: the network, its optimizer, and the progress.
 
-    What is validated and kept is a running average of the network over the last few hundred steps: it errs less than
-    the network does while the learning rate is high, and it errs smoothly, so that the best epoch is no accident.
+    A running average of the network over the last few hundred steps is validated and stored: its error is lower than
+    the network's while the learning rate is high, and smoother, so that the best epoch is not a matter of chance.
     """
 
     network: ContactNetwork
@@ -309,19 +314,19 @@ class _Run:
         )
 
     def fit(self, out: Path, recipe: dict[str, object], *, resume: bool) -> None:
-        """Run all epochs that are left and leave the best epoch's tensors in the average."""
+        """Run all remaining epochs and leave the best epoch's tensors in the average."""
         if resume:
             self.progress = load_checkpoint(out, recipe, self.network, self.average, self.optimizer) or self.progress
         try:
             self._remaining_epochs(out, recipe)
         except TrainingError:
-            # There is nothing to go on with, and it must not stand in the way of another learning rate.
+            # The checkpoint cannot be continued, and must not block a training with another learning rate.
             delete_checkpoint(out)
             raise
         self.average.load_state_dict(self.progress.best_state)
 
     def outputs(self, images: ImageArray) -> NDArray[np.float32]:
-        """Network outputs (n, 6 or 12) for preprocessed images."""
+        """Return the network outputs (n, 6 or 12) for preprocessed images."""
         with torch.inference_mode():
             return np.concatenate(
                 [
@@ -331,7 +336,7 @@ class _Run:
             )
 
     def predict(self) -> tuple[Array, Array]:
-        """Mean and uncalibrated sigma (n, 6) of the validation set, in label half-ranges; sigma is 1 for cnn."""
+        """Return mean and uncalibrated sigma (n, 6) of the validation set, in label half-ranges; sigma is 1 for cnn."""
         outputs = self.outputs(self.validation.images).astype(np.float64)
         sigma = np.exp(-outputs[:, 6:]) if outputs.shape[1] > 6 else np.ones_like(outputs)
         return outputs[:, :6], sigma
@@ -345,7 +350,7 @@ class _Run:
             outputs = self.outputs(self.validation.images)
             loss = self._loss(torch.from_numpy(outputs), self.validation_labels).item()
             if not math.isfinite(loss):
-                raise TrainingError("the validation loss is no number", epoch=epoch, hint="lower the learning rate")
+                raise TrainingError("the validation loss is not finite", epoch=epoch, hint="lower the learning rate")
             mae = np.abs(
                 self.labels.contacts(outputs[:, :6].astype(np.float64)) - contact_from_xi(self.validation.xi)
             ).mean(axis=0)
@@ -364,7 +369,7 @@ class _Run:
             )
 
     def _epoch(self, epoch: int) -> float:
-        # Every epoch has its own random numbers, so that a resumed training draws those of an uninterrupted one.
+        # Every epoch has its own seed, so that a resumed training draws the same numbers as an uninterrupted one.
         torch.manual_seed(int(np.random.SeedSequence((self.settings.seed, epoch)).generate_state(1)[0]))
         self.network.train()
         order = torch.randperm(len(self.training)).numpy()
@@ -378,7 +383,7 @@ class _Run:
             images = _jittered(_as_input(self.training.images[chosen]), self.settings)
             loss = self._loss(self.network(images), self.training_labels[chosen])
             if not torch.isfinite(loss):
-                raise TrainingError("the loss is no number", epoch=epoch, hint="lower the learning rate")
+                raise TrainingError("the loss is not finite", epoch=epoch, hint="lower the learning rate")
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), 10.0)
@@ -391,7 +396,7 @@ class _Run:
 
     @torch.no_grad()
     def _follow(self, step: int) -> None:
-        # The first steps weigh more, so that the average soon forgets the untrained network.
+        # The first steps weigh more, so that the untrained network soon vanishes from the average.
         share = max(1.0 - self.settings.memory, 9.0 / (10.0 + step))
         for kept, new in zip(self.average.state_dict().values(), self.network.state_dict().values(), strict=True):
             if kept.is_floating_point():
@@ -411,7 +416,7 @@ def _as_input(images: ImageArray) -> Tensor:
 
 
 def _jittered(images: Tensor, settings: Settings) -> Tensor:
-    """Images moved, turned and zoomed a little, as a camera that was taken off and put on again sees them."""
+    """Return images randomly shifted, rotated and zoomed, as by a remounted camera."""
     n, _, height, width = images.shape
     angle = torch.randn(n) * math.radians(settings.rotation_deg)
     zoom = 1.0 + torch.randn(n) * settings.zoom

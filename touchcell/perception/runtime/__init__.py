@@ -1,1 +1,1 @@
-"""What runs in a cell: from a camera frame to a filtered estimate. It imports no training code."""
+"""Perception at run time: from a camera frame to a filtered estimate. It imports no training code."""

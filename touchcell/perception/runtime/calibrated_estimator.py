@@ -1,4 +1,4 @@
-"""An estimator behind another camera than the one that taught it."""
+"""Use an estimator with another camera than the one it was trained with."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 
 class CalibratedEstimator:
-    """An estimator whose camera images are brought to what its own sensor would have seen.
+    """An estimator whose camera images are transformed to those of the camera it was trained with.
 
-    A marker estimator gets its discs moved, at no cost to their accuracy; any other its images warped.
+    A marker estimator has its discs transformed, without loss of accuracy; for any other the images are warped.
     """
 
     def __init__(self, estimator: ContactEstimator, change: CameraChange) -> None:
@@ -34,32 +34,32 @@ class CalibratedEstimator:
 
     @property
     def header(self) -> Header:
-        """Of the model file."""
+        """Header of the model file."""
         return self._estimator.header
 
     @property
     def reference(self) -> ImageArray | None:
-        """The model's image out of contact, as ``reduce`` makes one of this sensor."""
+        """The model's image out of contact, as ``reduce`` produces it for this sensor."""
         reference = self._estimator.reference
         return reference if reference is None or self._warps else self._change.undone(reference)
 
     def reduce(self, image: ImageArray) -> ImageArray:
-        """The model's preprocessing, of the image as the model's own camera would have taken it. Raises ImageError."""
+        """Apply the model's preprocessing to the image as seen by the model's own camera. Raises ImageError."""
         return self._estimator.reduce(self._change.image(image) if self._warps else image)
 
     def predict(self, image: ImageArray) -> Prediction:
-        """Contact in one camera image. Raises ImageError."""
+        """Estimate the contact in one camera image. Raises ImageError."""
         return self.predict_reduced(self.reduce(image))
 
     def predict_reduced(self, reduced: ImageArray) -> Prediction:
-        """Contact in an image that ``reduce`` made."""
+        """Estimate the contact in an image returned by ``reduce``."""
         prediction = self._estimator.predict_reduced(reduced)
         turn_deg = self.header.label_turn_deg
         return prediction if turn_deg == 0.0 else turned(prediction, -turn_deg)
 
 
 def turned(prediction: Prediction, angle_deg: float) -> Prediction:
-    """A prediction about axes of sensor and surface that are turned about the sensor's z axis."""
+    """Return a prediction with the axes of sensor and surface rotated about the sensor's z axis."""
     turn = np.deg2rad(angle_deg)
     G = np.eye(6)
     for first in (0, 3):
@@ -68,6 +68,6 @@ def turned(prediction: Prediction, angle_deg: float) -> Prediction:
 
 
 def in_crop(change: CameraChange, preprocessing: Preprocessing) -> CameraChange:
-    """The same change in the pixels of the crop."""
+    """Return the same change in the pixels of the crop."""
     u, v = change.centre_px
     return change.model_copy(update={"centre_px": (u - preprocessing.region.left, v - preprocessing.region.top)})

@@ -1,4 +1,4 @@
-"""Whether a sensor touches anything, at a hundredth of the cost of a prediction."""
+"""Contact detection, at a hundredth of the cost of a prediction."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from touchcell.geometry.types import ImageArray
 from touchcell.perception.errors import ImageError
 
 BLOCKS = 8
-"""The image is compared in this many blocks along each side."""
+"""Number of blocks along each side in which the image is compared."""
 
 MOST_CHANGED = 8
-"""How many of the blocks, those that changed most, decide: a first touch moves markers in an eighth of the image."""
+"""Number of the most changed blocks that decide: a first touch moves markers in an eighth of the image."""
 
 
 class ContactGate:
-    """Compares preprocessed images with one taken out of contact, with hysteresis.
+    """Contact detector: compares preprocessed images with one taken out of contact, with hysteresis.
 
     The score of an image is the mean absolute difference from the reference, in grey levels over 255, in the blocks
     that differ most. Contact begins when it rises above ``enter`` and ends when it falls below ``leave``. On simulated
@@ -26,20 +26,21 @@ class ContactGate:
     by 0.1 per millimetre.
 
     Attributes:
-        in_contact: as of the last image.
-        score: of the last image.
+        in_contact: result for the last image.
+        score: score of the last image.
     """
 
     def __init__(self, reference: ImageArray, *, enter: float = 0.04, leave: float = 0.025) -> None:
-        """
+        """Create a gate.
+
         Args:
-            reference: uint8 (height, width), out of contact, as ``Preprocessing.reduce`` leaves it; a model file may
+            reference: uint8 (height, width), out of contact, as ``Preprocessing.reduce`` returns it; a model file may
                 hold one (``ContactModel.reference``).
             enter: score, in (0, 1].
             leave: score, in (0, enter].
 
         Raises:
-            ImageError: the reference is no such image, or smaller than the blocks.
+            ImageError: the reference is not such an image, or smaller than the blocks.
             ValueError: the scores are out of order.
         """
         if reference.dtype != np.uint8 or reference.ndim != 2 or min(reference.shape) < BLOCKS:
@@ -72,13 +73,13 @@ class ContactGate:
             raise ImageError("list", "two or more images of one size", [frame.shape for frame in frames])
         reference = np.median(np.stack(frames), axis=0).astype(np.uint8)
         gate = cls(reference)
-        # One grey level is the least that an 8-bit image can tell.
+        # One grey level is the resolution of an 8-bit image.
         noise = max(1.0 / 255.0, *(gate.compare(frame) for frame in frames))
         enter = min(1.0, margin * noise)
         return cls(reference, enter=enter, leave=2.0 / 3.0 * enter)
 
     def compare(self, reduced: ImageArray) -> float:
-        """Score of a preprocessed image, 0 for the reference itself; changes nothing.
+        """Return the score of a preprocessed image, 0 for the reference itself, without changing the state.
 
         Raises:
             ImageError: the image is not of the reference's size.
@@ -91,7 +92,7 @@ class ContactGate:
         return float(blocks[-MOST_CHANGED:].mean() / 255.0)
 
     def update(self, reduced: ImageArray) -> bool:
-        """Take the next image; whether the sensor is in contact. Raises as ``compare``."""
+        """Process the next image; return True if the sensor is in contact. Raises as ``compare``."""
         self.score = self.compare(reduced)
         self.in_contact = self.score > (self._leave if self.in_contact else self._enter)
         return self.in_contact

@@ -1,4 +1,4 @@
-"""What perception delivers: a stamped belief over contact pose and shear."""
+"""Output of perception: a stamped Gaussian over contact pose and shear."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from touchcell.geometry.gaussian import PoseGaussian
 
 @dataclass(frozen=True, slots=True)
 class ContactEstimate:
-    """Belief about one tactile sensor's contact.
+    """Estimate of one tactile sensor's contact.
 
     Attributes:
-        in_contact: whether the sensor touches anything.
-        belief: Gaussian over ``T_s_f``, the surface frame in the sensor frame (SPEC part 2), left perturbation,
-            m and rad; None without contact.
-        t_frame_ns: capture stamp of the newest frame behind it.
+        in_contact: True if the sensor touches anything.
+        belief: Gaussian over ``T_s_f``, the surface frame in the sensor frame (docs/glossary.md, "contact pose and
+            shear"), left perturbation, m and rad; None without contact.
+        t_frame_ns: capture stamp of the newest frame it is based on.
         seq: sequence number of that frame.
-        t_ns: time that the belief is for: the frame's, or later where the sensor's motion since has been replayed.
-        in_range: False when the network left the range that it was trained on.
+        t_ns: time of the estimate: the frame's, or later where it was propagated by the sensor's motion since.
+        in_range: False when the network's output is outside its training range.
         nis: normalised innovation squared of the last correction (6 degrees of freedom), None before the second frame.
-        markers: share of the markers expected in view that the estimator has seen, where it looks for markers.
+        markers: fraction of the markers expected in view that were detected, for a marker estimator.
     """
 
     in_contact: bool

@@ -1,4 +1,4 @@
-"""Any trained model by its file alone."""
+"""Load a trained model of any kind."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ def load_estimator(path: Path, calibration: Path | None = None) -> ContactEstima
 
     Args:
         path: model file.
-        calibration: of the camera, where it is not the one that taught the model (``touchcell calibrate``).
+        calibration: calibration file of the camera, where it is not the one the model was trained with
+            (``touchcell calibrate``).
 
     Raises:
         ModelError: as ``model_file.load_model``.
@@ -36,7 +37,7 @@ def load_estimator(path: Path, calibration: Path | None = None) -> ContactEstima
 
 
 def estimator_of(model: Model) -> ContactEstimator:
-    """The estimator that a model of any kind describes."""
+    """Build the estimator that a model of any kind describes."""
     if model.header.architecture.kind == "markers":
         from touchcell.perception.markers.estimator import MarkerEstimator
 

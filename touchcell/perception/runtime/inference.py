@@ -1,4 +1,4 @@
-"""Contact pose and shear from one image, in a running cell: ONNX Runtime on one thread, no PyTorch."""
+"""Contact pose and shear from one image at run time: ONNX Runtime on one thread, no PyTorch."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from touchcell.perception.models.prediction import RANGE_TOLERANCE, Prediction
 from touchcell.perception.models.preprocessing import scale
 
 Runner = Callable[[NDArray[np.float32]], NDArray[np.float32]]
-"""Computes a network: float32 (n, 1, height, width) in [0, 1] to its outputs (n, outputs)."""
+"""Network evaluation: float32 (n, 1, height, width) in [0, 1] to its outputs (n, outputs)."""
 
 
 def onnx_runtime(model: Model) -> Runner:
-    """A model's network in ONNX Runtime, on the thread that calls it and no other."""
+    """Load a model's network in ONNX Runtime, on the calling thread only."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -28,13 +28,14 @@ def onnx_runtime(model: Model) -> Runner:
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # On batches of one neither of these is faster: a memory plan for each input shape (1 MB), and a second, packed copy
-    # of the weights (3 MB).
+    # For batches of one neither of these is faster: a memory plan per input shape (1 MB), and a second, packed copy of
+    # the weights (3 MB).
     options.enable_mem_pattern = False
     options.add_session_config_entry("session.disable_prepacking", "1")
     session = onnxruntime.InferenceSession(onnx_model(model), options, providers=["CPUExecutionProvider"])
-    # It keeps the whole model for another provider that it might fall back to: 2 to 6 MB, and there is no other.
-    session._model_bytes = None
+    # The session keeps the serialised model for a fallback provider: 2 to 6 MB, and there is no other provider.
+    if hasattr(session, "_model_bytes"):
+        session._model_bytes = None
 
     def run(inputs: NDArray[np.float32]) -> NDArray[np.float32]:
         outputs: NDArray[np.float32] = session.run([OUTPUTS], {IMAGES: inputs})[0]
@@ -44,13 +45,13 @@ def onnx_runtime(model: Model) -> Runner:
 
 
 class ContactModel:
-    """A trained model, ready to predict.
+    """A trained image network, ready to predict.
 
     Memory does not grow with the number of predictions. Not safe for use from two threads at once.
 
     Args:
-        model: what was trained.
-        runner: computes its network; None for ``onnx_runtime``.
+        model: the trained model.
+        runner: evaluates its network; None for ``onnx_runtime``.
     """
 
     def __init__(self, model: Model, runner: Runner | None = None) -> None:
@@ -69,40 +70,43 @@ class ContactModel:
         return cls(load_model(path))
 
     def predict(self, image: ImageArray) -> Prediction:
-        """Contact in one camera image.
+        """Estimate the contact in one camera image.
 
         Raises:
-            ImageError: the image is not what the model's preprocessing was made for.
+            ImageError: the image does not match the model's preprocessing.
         """
         return self.predict_reduced(self.reduce(image))
 
     def reduce(self, image: ImageArray) -> ImageArray:
-        """The model's preprocessing, uint8 (height, width): what a contact gate compares. Raises as ``predict``."""
+        """Apply the model's preprocessing: uint8 (height, width), input of a contact gate. Raises as ``predict``."""
         return self._preprocessing.reduce(image)
 
     def predict_reduced(self, reduced: ImageArray) -> Prediction:
-        """Contact in an image that ``reduce`` made, so that a gate and a prediction share the preprocessing."""
+        """Estimate the contact in an image returned by ``reduce``.
+
+        A gate and a prediction can share the preprocessing.
+        """
         return self.decode(self.infer(reduced))
 
     def infer(self, reduced: ImageArray) -> NDArray[np.float32]:
-        """First step of ``predict_reduced``: the network's outputs."""
+        """First step of ``predict_reduced``: return the network's outputs."""
         outputs: NDArray[np.float32] = self._run(scale(reduced)[None, None])[0]
         return outputs
 
     def predict_batch(self, images: Sequence[ImageArray]) -> list[Prediction]:
-        """``predict`` of several images in one run; faster per image, and the whole batch is held in memory."""
+        """Apply ``predict`` to several images in one run; faster per image, and the whole batch is held in memory."""
         if not images:
             return []
         return [self.decode(row) for row in self._run(np.stack([self._preprocessing.apply(i) for i in images]))]
 
     def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:
-        """``predict`` of a camera's sample; the prediction keeps the stamp, number and quality of the frame."""
+        """Apply ``predict`` to a camera's sample; the prediction keeps the stamp, number and quality of the frame."""
         return Stamped(
             self.predict(sample.value.image), sample.t_ns, sample.seq, sample.t_device_ns, quality=sample.quality
         )
 
     def decode(self, output: NDArray[np.float32]) -> Prediction:
-        """Last step of ``predict_reduced``: the outputs of the network as a Gaussian over xi."""
+        """Last step of ``predict_reduced``: convert the network's outputs to a Gaussian over xi."""
         mean = output[:6].astype(np.float64)
         sigma = np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else np.ones(6)
         xi, covariance = self.header.labels.xi_gaussian(mean, self.header.calibrated(sigma))

@@ -1,4 +1,4 @@
-"""Where the sensor was at the moment a frame was captured: a short history of poses with interpolation on SE(3)."""
+"""Pose of the sensor at the capture time of a frame: a short history of poses with interpolation on SE(3)."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from touchcell.geometry.types import Array
 
 
 class PoseHistory:
-    """The last poses of a sensor in a fixed frame.
+    """Recent poses of a sensor in a fixed frame.
 
     Args:
-        keep_s: how far back poses are kept.
+        keep_s: duration of the history.
     """
 
     def __init__(self, keep_s: float = 1.0) -> None:
@@ -27,7 +27,7 @@ class PoseHistory:
         return len(self._times_ns)
 
     def record(self, t_ns: int, T_base_sensor: Array) -> None:
-        """Append a pose (4, 4); one that is not newer than the last replaces nothing and is ignored."""
+        """Append a pose (4, 4); one that is not newer than the last is ignored."""
         if self._times_ns and t_ns <= self._times_ns[-1]:
             return
         self._times_ns.append(t_ns)
@@ -37,7 +37,7 @@ class PoseHistory:
             self._poses.popleft()
 
     def at(self, t_ns: int) -> Array:
-        """Pose (4, 4) at ``t_ns``: on the geodesic between its neighbours, or the nearest one outside the history.
+        """Return the pose (4, 4) at ``t_ns``: on the geodesic between its neighbours, or the nearest recorded one.
 
         Raises:
             LookupError: no pose has been recorded.

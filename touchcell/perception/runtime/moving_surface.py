@@ -29,18 +29,21 @@ Applications to Tracking and Navigation, 2001, section 6.2 (white-noise accelera
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from pydantic import PositiveFloat
 
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.gaussian import NotPositiveDefinite, PoseGaussian
 from touchcell.geometry.types import Array
-from touchcell.perception.runtime.filter import FilterState, require_noise_density, require_pose
+from touchcell.perception.runtime.filter import FilterState, isotropic_noise, require_noise_density, require_pose
+from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec
 
 
 @dataclass(frozen=True, slots=True)
 class SurfaceMotion:
-    """How the surface is believed to move.
+    """Estimated motion of the surface.
 
     Attributes:
         twist: (6,) of the surface relative to the base, [v, w], m/s and rad/s, in the sensor frame.
@@ -52,12 +55,12 @@ class SurfaceMotion:
 
 
 class MovingSurfaceFilter:
-    """Filters observations of ``T_s_f`` of a surface that moves steadily, from a moving sensor.
+    """Filter for observations of ``T_s_f`` of a surface with constant twist, from a moving sensor.
 
     Args:
         noise_density: (6, 6) growth of the pose's covariance per second apart from the twist's, as for ``PoseFilter``.
         twist_noise_density: (6, 6) growth of the twist's covariance per second, m^2/s^3 and rad^2/s^3.
-        first_twist_covariance: (6, 6) of the twist before the first frames have told it, about zero.
+        first_twist_covariance: (6, 6) prior covariance of the twist about zero.
 
     Raises:
         NotPositiveDefinite: a matrix is not finite, or not positive definite (``noise_density``: semidefinite).
@@ -73,23 +76,23 @@ class MovingSurfaceFilter:
 
     @property
     def state(self) -> FilterState | None:
-        """The present state, None before the first observation."""
+        """The current state, None before the first observation."""
         return self._state
 
     @property
     def motion(self) -> SurfaceMotion | None:
-        """The surface's motion at the present state, None before the first observation."""
+        """The surface's motion at the current state, None before the first observation."""
         return self._motion
 
     def reset(self) -> None:
-        """Forget everything: the next observation starts a new contact."""
+        """Clear the state: the next observation starts a new contact."""
         self._state = self._motion = None
 
     def predict(self, T_base_sensor: Array, t_ns: int) -> PoseGaussian:
-        """Belief after sensor and surface have moved on to ``t_ns``; the state itself stays.
+        """Predict the estimate at ``t_ns`` by the motion of sensor and surface; the state is unchanged.
 
         Raises:
-            ValueError: no observation yet, or ``t_ns`` lies before the state's time.
+            ValueError: no observation yet, or ``t_ns`` is before the state's time.
         """
         way = self._way(T_base_sensor, t_ns)
         P = way.of_pose @ way.before.covariance @ way.of_pose.T
@@ -99,8 +102,8 @@ class MovingSurfaceFilter:
         """Fuse an observation made at ``t_ns`` with the sensor at ``T_base_sensor``; returns the new state.
 
         Raises:
-            GeometryError: ``T_base_sensor`` is no pose, or the fusion did not converge; the state stays as it was.
-            ValueError: ``t_ns`` lies before the state's time.
+            GeometryError: ``T_base_sensor`` is not a pose, or the fusion did not converge; the state is unchanged.
+            ValueError: ``t_ns`` is before the state's time.
         """
         if self._state is None:
             self._state = FilterState(observation, require_pose(T_base_sensor), t_ns)
@@ -150,13 +153,13 @@ class MovingSurfaceFilter:
 
 @dataclass(frozen=True, slots=True)
 class _Way:
-    """From the state to a later time, to first order.
+    """Transition from the state to a later time, to first order.
 
     Attributes:
-        dt_s: how much later.
-        T_s_f: (4, 4) mean of the pose then.
-        Ad_U: (6, 6) carries twists to the sensor frame then.
-        of_pose: (6, 12) pose perturbation then from that of pose and twist now.
+        dt_s: time step.
+        T_s_f: (4, 4) predicted mean of the pose.
+        Ad_U: (6, 6) maps twists to the sensor frame at the later time.
+        of_pose: (6, 12) Jacobian of the later pose perturbation with respect to the current (pose, twist).
         before: motion at the state.
     """
 
@@ -183,3 +186,30 @@ def _corrected(motion: SurfaceMotion, prior: PoseGaussian, fused: PoseGaussian) 
     covariance[:6, :6], covariance[:6, 6:], covariance[6:, :6] = S, KS.T, KS
     covariance[6:, 6:] = 0.5 * (rest + rest.T)
     return SurfaceMotion(motion.twist + G @ e, covariance)
+
+
+class MovingSurfaceConfig(FilterConfig):
+    """The filter that also estimates the surface's velocity, for surfaces that move steadily.
+
+    ``speed_*`` is the standard deviation of the surface's velocity when it is first touched, ``accel_*`` the growth of
+    the velocity's uncertainty.
+    """
+
+    model: Literal["moving_surface"]
+    drift_mm_per_sqrt_s: PositiveFloat
+    drift_deg_per_sqrt_s: PositiveFloat
+    speed_mm_s: PositiveFloat
+    speed_deg_s: PositiveFloat
+    accel_mm_s_per_sqrt_s: PositiveFloat
+    accel_deg_s_per_sqrt_s: PositiveFloat
+
+    def build(self) -> MovingSurfaceFilter:
+        """Return the ``MovingSurfaceFilter``."""
+        return MovingSurfaceFilter(
+            isotropic_noise(1e-3 * self.drift_mm_per_sqrt_s, np.deg2rad(self.drift_deg_per_sqrt_s)),
+            isotropic_noise(1e-3 * self.accel_mm_s_per_sqrt_s, np.deg2rad(self.accel_deg_s_per_sqrt_s)),
+            isotropic_noise(1e-3 * self.speed_mm_s, np.deg2rad(self.speed_deg_s)),
+        )
+
+
+MOVING_SURFACE = FilterSpec("moving_surface", "filter that also estimates the surface's velocity", MovingSurfaceConfig)

@@ -1,7 +1,7 @@
-"""From camera frames to stamped contact estimates, doing no more than the scene needs.
+"""Pipeline from camera frames to stamped contact estimates, with no more work than the cell needs.
 
-A frame that nobody asks for is never decoded, an image without contact is not put through the network, and without a
-filter configured none runs. Each stage's duration is kept for the latency budget.
+A frame that is not requested is never decoded, an image without contact skips the network, and the filter runs only
+where one is configured. The duration of each stage is recorded for the latency budget.
 """
 
 from __future__ import annotations
@@ -31,25 +31,34 @@ Timer = Callable[[], int]
 
 
 class ContactSource(Protocol):
-    """Anything that tells the contact of one tactile sensor."""
+    """Source of contact estimates of one tactile sensor."""
 
     @property
     def ended(self) -> bool:
         """Whether no further estimate will come (a recording has been played)."""
-        ...
+        return False
+
+    @property
+    def frame(self) -> Stamped[Frame] | None:
+        """Newest frame that was processed; None for a source that reads no camera."""
+        return None
+
+    def await_frame(self) -> None:
+        """Wait for the first frame, so that no control cycle has to. Raises DeviceError."""
+        return
 
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
-        """Tell where the sensor was; called before ``update``."""
+        """Record the sensor's pose at ``t_ns``; called before ``update``."""
         ...
 
     def update(self, now_ns: int) -> ContactEstimate | None:
-        """Newest estimate, for the time ``now_ns``; None before the first frame."""
+        """Return the newest estimate, for the time ``now_ns``; None before the first frame."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class StageTimes:
-    """Nanoseconds that the stages of one new frame took; zero for a stage that was skipped."""
+    """Duration in ns of each stage for one new frame; zero for a skipped stage."""
 
     read_ns: int = 0
     preprocess_ns: int = 0
@@ -59,7 +68,7 @@ class StageTimes:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """What one frame said by itself: the network's Gaussian before the filter, None without contact."""
+    """Measurement of a single frame: the network's Gaussian before the filter, None without contact."""
 
     seq: int
     t_ns: int
@@ -69,14 +78,14 @@ class Measurement:
 class ContactPipeline:
     """Camera, network, contact gate and filter of one sensor.
 
-    What an estimator says of an image outside the range that it was taught is told as such, and not fused: its sigma
-    means nothing there, and the filter carries the contact on by the sensor's own motion.
+    A prediction outside the estimator's training range is marked as such and not fused: its sigma is meaningless there,
+    and the filter propagates the contact by the sensor's own motion.
 
     Args:
         camera: an opened frame source.
         model: any estimator, with its preprocessing.
-        contact_gate: decides about contact without the network; None puts every frame through the network.
-        pose_filter: None takes each frame by itself.
+        contact_gate: detects contact without the network; None passes every frame through the network.
+        pose_filter: None treats each frame independently.
         timer: nanosecond counter for stage durations; it never influences an estimate.
     """
 
@@ -104,29 +113,29 @@ class ContactPipeline:
 
     @property
     def ended(self) -> bool:
-        """Whether the camera has come to its end."""
+        """True if the camera's stream has ended."""
         return self._ended
 
     @property
     def preprocessing(self) -> Preprocessing:
-        """Of the model, from camera images."""
+        """The model's preprocessing, from camera images."""
         return self._model.header.preprocessing
 
     def await_frame(self) -> None:
-        """Wait for the camera's first frame, which is processed by the next update. Raises DeviceError."""
+        """Wait for the camera's first frame, which the next update processes. Raises DeviceError."""
         with suppress(EndOfStream):
             self._camera.latest()
 
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
-        """Tell where the sensor was at ``t_ns``."""
+        """Record the sensor's pose at ``t_ns``."""
         self._poses.record(t_ns, T_base_sensor)
 
     def update(self, now_ns: int) -> ContactEstimate | None:
-        """Process the newest frame if there is a new one, then replay the sensor's motion up to ``now_ns``.
+        """Process the newest frame if it is new, then propagate the estimate by the sensor's motion to ``now_ns``.
 
         Raises:
             DeviceError: from the camera, except EndOfStream, which sets ``ended``.
-            ImageError: the camera's images are not what the model was made for.
+            ImageError: the camera's images do not match the model.
         """
         self.times = StageTimes()
         self.measurement = None
@@ -137,7 +146,7 @@ class ContactPipeline:
             self._ended = True
             return self._newest
         read_ns = self._timer() - start
-        # A frame that is older than the newest tells nothing, and there is no way back in a filter.
+        # The filter cannot go back in time, so a frame older than the newest is dropped.
         if self._newest is None or frame.t_ns > self._newest.t_frame_ns:
             self.frame = frame
             self._newest = self._process(frame, read_ns)
@@ -183,7 +192,7 @@ class ContactPipeline:
         )
 
     def _replayed(self, estimate: ContactEstimate, now_ns: int) -> ContactEstimate:
-        """The estimate carried from its frame to now by the sensor's own motion since."""
+        """Return the estimate propagated from its frame to now by the sensor's motion since."""
         if self._filter is None or not self._filtering or estimate.belief is None or now_ns <= estimate.t_frame_ns:
             return estimate
         belief = self._filter.predict(self._sensor_pose(now_ns), now_ns)

@@ -87,7 +87,7 @@ class SimArm(Arm):
         self._latency_ns = round(config.latency_ms * 1e6)
         self._on_the_way: deque[_Late] = deque()
         self._powered = False
-        self._told: Stamped[TcpState] | None = None
+        self._last_reported: Stamped[TcpState] | None = None
         self._timeline.add(Phase.MOTION, self._step)
         self._timeline.keep(self._snapshot)
 
@@ -99,9 +99,9 @@ class SimArm(Arm):
         if self.faults.nan_state:
             state = TcpState(np.full((4, 4), np.nan), np.full(6, np.nan))
         sample = Stamped(state, t_ns, t_ns // self._timeline.step_ns)
-        if self.faults.stale and self._told is not None:
-            sample = self._told
-        self._told = sample
+        if self.faults.stale and self._last_reported is not None:
+            sample = self._last_reported
+        self._last_reported = sample
         age_s = sample.age_s(self._clock.now_ns())
         if max_age_s is not None and age_s > max_age_s:
             raise StaleData(self.name, age_s, max_age_s, sample.seq)
@@ -136,18 +136,18 @@ class SimArm(Arm):
 
     def _begin_stop(self, category: StopCategory) -> None:
         self._timeline.advance()
-        if self.faults.deaf:
+        if self.faults.ignores_stops:
             return
         self._on_the_way.clear()
         self._powered = category is StopCategory.STOP_AND_HOLD
-        if not (self.faults.runs_on and self._powered):
+        if not (self.faults.ignores_expiry and self._powered):
             self._body.halt()
 
     def _step(self, t_ns: int) -> None:
         while self._on_the_way and self._on_the_way[0].due_ns <= t_ns - self._timeline.step_ns:
             late = self._on_the_way.popleft()
             self._body.follow(late.twist_base, late.expires_ns)
-        if self.faults.runs_on and self._powered:
+        if self.faults.ignores_expiry and self._powered:
             self._body.prolong(t_ns)
         self._body.step(t_ns)
         drift_m_s = self._drift_m_s()
@@ -183,12 +183,12 @@ class SimArm(Arm):
 
     def _close(self) -> None:
         self._timeline.advance()
-        self._forget()
+        self._reset_state()
 
     def _recover(self, token: OperatorToken) -> None:
-        self._forget()
+        self._reset_state()
 
-    def _forget(self) -> None:
+    def _reset_state(self) -> None:
         self._on_the_way.clear()
         self._body.freeze()
 

@@ -105,7 +105,7 @@ class SimJointArm(JointArm):
         self._chain = SerialChain(description, tool)
         self._ik = DifferentialIk(self._chain, config.joint_limits.settings())
         self._setpoint = JointSetpoint(self._chain, self._ik, self.limits)
-        self._trouble = None
+        self._latched_fault = None
         self.T_world_base = se3.from_euler_mm_deg(config.base_pose_mm_deg)
         self._timeline = timeline or Timeline(clock)
         step_s = self._timeline.step_ns * 1e-9
@@ -154,10 +154,10 @@ class SimJointArm(JointArm):
         """Return the present pose (4, 4), in any lifecycle state, without advancing time: for scenes."""
         return self.T_world_base @ self._body.T_base_tcp()
 
-    def bear(self, force_world: Array, point_world: Array) -> None:
+    def apply_force(self, force_world: Array, point_world: Array) -> None:
         """Apply ``force_world`` (3,) N at ``point_world`` (3,) m on the tool from now on: for scenes."""
         R, origin = self.T_world_base[:3, :3], self.T_world_base[:3, 3]
-        self._body.bear(force_world @ R, (point_world - origin) @ R)
+        self._body.apply_force(force_world @ R, (point_world - origin) @ R)
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
         self._timeline.advance()

@@ -19,7 +19,7 @@ from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.simulation.faults import FrameFaults
 from touchcell.simulation.render import FrameRenderer, Lighting
-from touchcell.simulation.scene import Carrier, LoadBearer, MeasuredCarrier, Scene
+from touchcell.simulation.scene import Carrier, LoadReceiver, MeasuredCarrier, Scene
 from touchcell.simulation.tip import Tip
 from touchcell.simulation.tip_file import load_tip
 
@@ -97,14 +97,14 @@ class SimTactip(Device):
         self._drawn = 0
         self._mount = mount
         self._T_tcp_s = se3.from_euler_mm_deg(config.tcp_to_sensor_mm_deg)
-        scene.timeline.keep(lambda: self._forget)
+        scene.timeline.keep(lambda: self._discard_image)
         if not isinstance(mount, MeasuredCarrier):
             self._touch()
 
     def latest(self, max_age_s: float | None = None) -> Stamped[Frame]:
         """Return the newest frame; wait for the very first. Raises StaleData if it is older than ``max_age_s``."""
         self._require("deliver frames", *_READABLE)
-        self._clock.sleep_until_ns(self._available_ns(self._from(self._first)))
+        self._clock.sleep_until_ns(self._available_ns(self._next_delivered(self._first)))
         now_ns = self._clock.now_ns()
         seq = self._newest_seq(now_ns)
         age_s = (now_ns - seq * self._period_ns) * 1e-9
@@ -116,9 +116,9 @@ class SimTactip(Device):
         """Return the newest frame if its ``seq > after_seq``, else wait for the next. Raises TransportTimeout."""
         self._require("deliver frames", *_READABLE)
         now_ns = self._clock.now_ns()
-        seq = self._from(max(self._newest_seq(now_ns), after_seq + 1, self._first))
+        seq = self._next_delivered(max(self._newest_seq(now_ns), after_seq + 1, self._first))
         deadline_ns = now_ns + round(timeout_s * 1e9)
-        if self._available_ns(seq) > deadline_ns or self._never_comes(seq):
+        if self._available_ns(seq) > deadline_ns or self._is_never_delivered(seq):
             self._clock.sleep_until_ns(deadline_ns)
             raise TransportTimeout(self.name, f"frame after {after_seq}", timeout_s)
         self._clock.sleep_until_ns(self._available_ns(seq))
@@ -138,21 +138,21 @@ class SimTactip(Device):
         seq = (now_ns - self._delay_ns()) // self._period_ns
         if self.faults.last_seq is not None:
             seq = min(seq, self.faults.last_seq)
-        while seq > self._first and not self._comes(seq):
+        while seq > self._first and not self._is_delivered(seq):
             seq -= 1
         return seq
 
-    def _from(self, seq: int) -> int:
+    def _next_delivered(self, seq: int) -> int:
         """Return the number of the first frame that is not dropped, from ``seq`` on."""
-        while not self._comes(seq):
+        while not self._is_delivered(seq):
             seq += 1
         return seq
 
-    def _comes(self, seq: int) -> bool:
+    def _is_delivered(self, seq: int) -> bool:
         """Return whether frame ``seq`` is not dropped: the same for the same seed."""
         return not self._dropped or np.random.default_rng((*self._seed, max(seq, 0), 1)).random() >= self._dropped
 
-    def _never_comes(self, seq: int) -> bool:
+    def _is_never_delivered(self, seq: int) -> bool:
         return self.faults.last_seq is not None and seq > self.faults.last_seq
 
     def _draw(self, seq: int) -> Stamped[Frame]:
@@ -171,7 +171,7 @@ class SimTactip(Device):
         self._drawn += 1
         return Frame(image)
 
-    def _forget(self, later_ns: int) -> None:
+    def _discard_image(self, later_ns: int) -> None:
         """Discard the newest image, which may show a state that a restored scene has undone."""
         self._newest = None
 
@@ -182,8 +182,8 @@ class SimTactip(Device):
 
     def _touch(self) -> None:
         mount, T_tcp_s = self._mount, self._T_tcp_s
-        bear = mount.bear if isinstance(mount, LoadBearer) else None
-        self._scene.mount(self.name, lambda: mount.T_world_tcp() @ T_tcp_s, bear)
+        apply_force = mount.apply_force if isinstance(mount, LoadReceiver) else None
+        self._scene.mount(self.name, lambda: mount.T_world_tcp() @ T_tcp_s, apply_force)
         self._first = math.ceil(self._scene.timeline.t_ns / self._period_ns)
 
     def _close(self) -> None:

@@ -1,7 +1,7 @@
-"""From steps to a checked table of states.
+"""Compile steps to a checked table of states.
 
-The compiler adds what every task needs and nobody should write by hand: waiting for fresh data, the answers to stop,
-trip and fault, a timeout for every state, and withdrawing before a task that did not succeed ends.
+The compiler adds what every task needs: waiting for fresh data, the reactions to stop, trip and fault, a timeout for
+every state, and withdrawing before a task that did not succeed ends.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Program:
     loops: tuple[Loop, ...]
 
     def state(self, name: str) -> Enum:
-        """The state of that name. Raises KeyError."""
+        """Return the state of that name. Raises KeyError."""
         return type(self.table.states[0].state)[name.upper()]
 
 
@@ -61,7 +61,7 @@ def compile_steps(config: StepsConfig, task: str = "steps") -> Program:
 
 
 def _names(steps: Sequence[Step]) -> list[str]:
-    """Names of the leaves' states in order: given, or kind and number."""
+    """Return the names of the leaves' states in order: given, or kind and number."""
     found: list[str] = []
     taken = {*RESERVED}
 

@@ -1,4 +1,4 @@
-"""The steps that a task can be written in, as validated data.
+"""The steps of a task as validated data.
 
 In a cell file each step is a mapping with one key, its kind:
 ``- move: {by_mm_deg: [0, 0, 30], until: {contact: true}}``.
@@ -53,7 +53,7 @@ class Until(TaskConfig):
 
     @property
     def feels(self) -> bool:
-        """Whether a condition needs the tactile sensor."""
+        """True if a condition needs the tactile sensor."""
         return self.contact is not None or self.depth_mm is not None
 
 
@@ -139,15 +139,15 @@ class Servo(_Step):
 
     @property
     def reference(self) -> Six:
-        """The contact to hold, mm and degrees."""
+        """Contact to hold, mm and degrees."""
         return self.reference_mm_deg or (0.0, 0.0, self.depth_mm or 0.0, 0.0, 0.0, 0.0)
 
 
 class Hold(_Step):
-    """Stand still.
+    """Hold the position.
 
     Attributes:
-        time_s: for how long.
+        time_s: duration.
     """
 
     kind: Literal["hold"] = "hold"
@@ -170,7 +170,7 @@ class Retract(_Step):
 
 
 class Record(_Step):
-    """Write tool pose and contact of this moment into the recording, as telemetry ``LABEL_x_mm`` and so on.
+    """Write the current tool pose and contact into the recording, as telemetry ``LABEL_x_mm`` and so on.
 
     Attributes:
         label: prefix of the numbers.

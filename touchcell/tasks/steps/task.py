@@ -1,4 +1,4 @@
-"""Runs compiled steps: one arm with the tactile sensor that it carries."""
+"""Run compiled steps: one arm with the tactile sensor that it carries."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ class _Steady:
         self.feedforward = feedforward
 
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
-        """Never done by itself."""
+        """Return False: it never finishes by itself."""
         return False
 
     def telemetry(self) -> Mapping[str, float]:
-        """Nothing beyond errors and references."""
+        """Return no further telemetry."""
         return {}
 
 
 class StepsTask(MachineTask):
-    """A task of steps in execution; ``touchcell.tasks.interface.Task`` documents its members.
+    """A running task of steps; ``touchcell.tasks.interface.Task`` documents its members.
 
-    The arm moves only on a fresh frame and a fresh arm state, but for retracting, which needs the arm's state alone.
+    The arm moves only on a fresh frame and a fresh arm state, except for retracting, which needs the arm's state only.
 
     Args:
         config: its steps and gains.
@@ -106,7 +106,7 @@ class StepsTask(MachineTask):
         return Action({ARM: command}, telemetry)
 
     def was_stopped(self) -> bool:
-        """Guard: an operator asked for the end."""
+        """Guard: the operator requested a stop."""
         return self._stop_seen
 
     def begin(self, record: TransitionRecord) -> None:
@@ -135,7 +135,7 @@ class StepsTask(MachineTask):
             self._counts[k] = 0
 
     def _watch(self, observation: Observation, dt_s: float) -> Mapping[str, float]:
-        """Post what this cycle means for the present state; return its telemetry."""
+        """Post the events of this cycle for the current state; return its telemetry."""
         if observation.operator_stop and not self._stop_seen:
             self._stop_seen = True
             self._post(STOP, "operator")
@@ -184,7 +184,7 @@ class StepsTask(MachineTask):
                 self._post("done", "arrived")
 
     def _can_act(self, step: Leaf) -> bool:
-        """Whether everything is fresh that ``step`` acts on."""
+        """Return True if all data that ``step`` needs is fresh."""
         needs_contact = isinstance(step, Servo) or (
             isinstance(step, Move) and step.frame == "contact" and self._goal is None
         )
@@ -196,7 +196,7 @@ class StepsTask(MachineTask):
             self._post(TRIP, f"no fresh frame, contact or arm state for {self._blind_s:.3f} s")
 
     def _met(self, until: Until) -> str:
-        """The first condition that holds, in words; empty if none does."""
+        """Return a description of the first condition that holds; empty if none does."""
         sight = self._sight
         if until.contact is not None and sight.in_contact is until.contact:
             return "contact" if until.contact else "free"
@@ -223,7 +223,7 @@ class StepsTask(MachineTask):
         self._machine.post(event, reason, epoch=self._machine.epoch)
 
     def _twist(self) -> Array | None:
-        """Twist (6,) of the tool in the present state; None where the arm has to stand still."""
+        """Return the twist (6,) of the tool in the current state; None where the arm has to rest."""
         sight, state = self._sight, self._machine.state
         step = self.program.steps.get(state)
         if sight.T_base_sensor is None:
@@ -258,7 +258,7 @@ class StepsTask(MachineTask):
         return V_tcp
 
     def _goal_of(self, step: Move) -> Array:
-        """T_base_tcp (4, 4) where the step arrives."""
+        """Return the goal pose T_base_tcp (4, 4) of the step."""
         if step.to_mm_deg is not None:
             return se3.from_euler_mm_deg(np.array(step.to_mm_deg))
         assert step.by_mm_deg is not None

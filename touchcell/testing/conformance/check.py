@@ -20,19 +20,19 @@ class Needs:
     Attributes:
         needs: Protocols that the device provides, and "arm", "camera", "truth" (an emulator), "process" (an emulator of
             its own), "limited axes".
-        on_bench: whether it may run on a real device.
+        on_hardware: whether it may run on a real device.
         of_faults: chooses among the rig's faults, by name, value and expected reaction, those for which it runs;
             None for a check without faults.
     """
 
     needs: tuple[type | Circumstance, ...]
-    on_bench: bool
+    on_hardware: bool
     of_faults: Callable[[str, Any, str], bool] | None
 
     def missing(self, rig: DeviceFixture) -> str | None:
         """Return why the check does not apply to ``rig``, or None."""
         capabilities = rig.spec.capabilities
-        if rig.start is None and not self.on_bench:
+        if rig.start is None and not self.on_hardware:
             return "not run on a real device"
         for need in self.needs:
             if isinstance(need, type):
@@ -53,12 +53,12 @@ class Needs:
 
 
 def check(
-    *needs: type | Circumstance, on_bench: bool = False, of_faults: Callable[[str, Any, str], bool] | None = None
+    *needs: type | Circumstance, on_hardware: bool = False, of_faults: Callable[[str, Any, str], bool] | None = None
 ) -> Callable[[C], C]:
-    """Mark a function of a ``Bench`` (and a fault's name) as a check of the suite; see ``Needs``."""
+    """Mark a function of a ``ConformanceContext`` (and a fault's name) as a check of the suite; see ``Needs``."""
 
     def mark(function: C) -> C:
-        function.conformance = Needs(needs, on_bench, of_faults)  # type: ignore[attr-defined]
+        function.conformance = Needs(needs, on_hardware, of_faults)  # type: ignore[attr-defined]
         return function
 
     return mark

@@ -77,8 +77,8 @@ class Track:
 class _Recorder:
     """Recorder of a track."""
 
-    def __init__(self, bench: Bench) -> None:
-        self._bench = bench
+    def __init__(self, context: ConformanceContext) -> None:
+        self._bench = context
         self.times: list[int] = []
         self.poses: list[Array] = []
         self._true: list[float] = []
@@ -86,13 +86,13 @@ class _Recorder:
 
     def note(self) -> None:
         """Record a sample."""
-        bench = self._bench
-        before_ns = bench.clock.now_ns()
-        self.truth = {} if bench.is_real else bench.truth()
-        self.poses.append(bench.pose(self.truth))
-        t_ns = (before_ns + bench.clock.now_ns()) // 2
+        context = self._bench
+        before_ns = context.clock.now_ns()
+        self.truth = {} if context.is_real else context.truth()
+        self.poses.append(context.pose(self.truth))
+        t_ns = (before_ns + context.clock.now_ns()) // 2
         self.times.append(t_ns)
-        self._true.append(t_ns * 1e-9 if bench.rig.time is None or bench.is_real else self.truth[bench.rig.time])
+        self._true.append(t_ns * 1e-9 if context.rig.time is None or context.is_real else self.truth[context.rig.time])
 
     def track(self, count: int | None = None) -> Track:
         """Return the first ``count`` samples, or all."""
@@ -132,11 +132,11 @@ class DeviceUnderTest:
         emulator.kill()
 
 
-class Bench:
+class ConformanceContext:
     """Context of one check; creates devices and cleans up after it.
 
     Attributes:
-        seat: the device fixture and its emulator.
+        under_test: the device fixture and its emulator.
         rig: the device fixture.
         clock: common clock; a virtual one advances only when code sleeps.
         device: the device under test, initially DISCONNECTED.
@@ -145,15 +145,15 @@ class Bench:
         spoiled: set it if the emulator cannot serve another check.
     """
 
-    def __init__(self, seat: DeviceUnderTest) -> None:
-        self.seat = seat
-        self.rig = seat.rig
+    def __init__(self, under_test: DeviceUnderTest) -> None:
+        self.under_test = under_test
+        self.rig = under_test.rig
         self.clock = self.rig.clock()
         self.late_s = 0.0
         self._devices: list[Device] = []
         self._began: set[str] = set()
         if self.rig.start is not None:
-            seat.emulator()
+            under_test.emulator()
         self.device = self.another()
         # An arm that sinks without power starts each check where it started the first.
         self.changed = self.rig.spec.capabilities.falls_on_power_loss or not self.rig.process
@@ -172,7 +172,7 @@ class Bench:
     @property
     def emulator(self) -> Emulated:
         """The emulator."""
-        return self.seat.emulator()
+        return self.under_test.emulator()
 
     @property
     def is_real(self) -> bool:
@@ -206,7 +206,7 @@ class Bench:
         for device in self._devices:
             device.disconnect()
         if self.spoiled and not self.is_real:
-            self.seat.clear()
+            self.under_test.clear()
         elif self.changed and not self.is_real:
             self.restore()
 
@@ -215,8 +215,8 @@ class Bench:
         if self.rig.reset is not None:
             self.emulator.fault(self.rig.reset)
             return
-        self.seat.clear()
-        self.seat.emulator()
+        self.under_test.clear()
+        self.under_test.emulator()
 
     def begin(self, fault: str, value: Any) -> None:
         """Inject a fault into the emulator; it ends with the check at the latest."""

@@ -12,7 +12,7 @@ from touchcell.drivers.core.errors import CommandRejected, DeviceError, Lifecycl
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.protocols import TwistSink
 from touchcell.testing.conformance.check import check
-from touchcell.testing.conformance.context import OWNER, Bench
+from touchcell.testing.conformance.context import OWNER, ConformanceContext
 
 _NOTICED_S = 3.0
 _CALM_S = 0.25
@@ -33,79 +33,79 @@ def _counted(fault: str, value: Any, answer: str) -> bool:
 
 
 @check("truth", of_faults=_every)
-def fault_triggers_expected_reaction(bench: Bench, fault: str) -> None:
+def fault_triggers_expected_reaction(context: ConformanceContext, fault: str) -> None:
     """Each fault of the device fixture has its expected reaction (counted, stale, latched), and is recovered from."""
-    value, answer = bench.rig.faults[fault]
-    bench.changed = True
-    lease = _begin(bench)
+    value, answer = context.rig.faults[fault]
+    context.changed = True
+    lease = _begin(context)
     if answer in ("transient", "unseen"):
-        _is_survived(bench, lease, fault, value, counted=answer == "transient")
+        _is_tolerated(context, lease, fault, value, counted=answer == "transient")
     elif answer == "stale":
-        _is_called_stale(bench, fault, value)
+        _becomes_stale(context, fault, value)
     else:
-        _is_latched(bench, lease, fault, value)
+        _is_latched(context, lease, fault, value)
 
 
 @check("truth", of_faults=_counted)
-def budget_for_transient_faults_ends(bench: Bench, fault: str) -> None:
+def budget_for_transient_faults_ends(context: ConformanceContext, fault: str) -> None:
     """A transient fault that does not end leads to FAULTED with its cause, or to no sample at all."""
-    bench.changed = True
-    lease = _begin(bench)
-    bench.begin(fault, _BEYOND_ANY_BUDGET)
-    bench.reach_faulted(_NOTICED_S, lease)
-    assert isinstance(bench.device.fault, DeviceError)
-    assert bench.device.fault.device == bench.device.name
+    context.changed = True
+    lease = _begin(context)
+    context.begin(fault, _BEYOND_ANY_BUDGET)
+    context.reach_faulted(_NOTICED_S, lease)
+    assert isinstance(context.device.fault, DeviceError)
+    assert context.device.fault.device == context.device.name
 
 
 @check("truth", "process")
-def vanished_device_is_a_fault_and_can_return(bench: Bench) -> None:
+def vanished_device_is_a_fault_and_can_return(context: ConformanceContext) -> None:
     """kill -9 of the device: FAULTED, ``disconnect`` does not raise, and after its restart everything works again."""
-    bench.spoiled = True
-    lease = _begin(bench)
-    bench.seat.vanish()
-    bench.reach_faulted(_NOTICED_S, lease)
-    bench.device.disconnect()
-    assert bench.device.state is Lifecycle.DISCONNECTED
+    context.spoiled = True
+    lease = _begin(context)
+    context.under_test.vanish()
+    context.reach_faulted(_NOTICED_S, lease)
+    context.device.disconnect()
+    assert context.device.state is Lifecycle.DISCONNECTED
     with pytest.raises(DeviceError):
-        bench.device.connect()
-    assert bench.device.state is Lifecycle.DISCONNECTED
-    assert bench.emulator
-    bench.reconnect()
+        context.device.connect()
+    assert context.device.state is Lifecycle.DISCONNECTED
+    assert context.emulator
+    context.reconnect()
 
 
-def _begin(bench: Bench) -> Lease | None:
+def _begin(context: ConformanceContext) -> Lease | None:
     """Bring the device to ACTIVE and use it."""
-    bench.active()
-    if TwistSink not in bench.rig.spec.capabilities.provides:
-        bench.until(lambda: _reads(bench), 2.0, "first sample")
+    context.active()
+    if TwistSink not in context.rig.spec.capabilities.provides:
+        context.until(lambda: _reads(context), 2.0, "first sample")
         return None
-    lease = bench.arm.acquire(OWNER)
-    bench.stream(lease, bench.twist(bench.axis(), speed=_SLOW_M_S), _CALM_S)
+    lease = context.arm.acquire(OWNER)
+    context.stream(lease, context.twist(context.axis(), speed=_SLOW_M_S), _CALM_S)
     return lease
 
 
-def _use(bench: Bench, lease: Lease | None, seconds: float) -> list[Any]:
+def _use(context: ConformanceContext, lease: Lease | None, seconds: float) -> list[Any]:
     """Use the device as a task does; return the samples that it gave."""
     samples = []
-    end_ns = bench.clock.now_ns() + round(seconds * 1e9)
-    while bench.clock.now_ns() < end_ns:
+    end_ns = context.clock.now_ns() + round(seconds * 1e9)
+    while context.clock.now_ns() < end_ns:
         if lease is not None:
             with suppress(StaleData):
-                bench.arm.send_twist(bench.command(bench.twist(bench.axis(), speed=_SLOW_M_S)), lease)
+                context.arm.send_twist(context.command(context.twist(context.axis(), speed=_SLOW_M_S)), lease)
         with suppress(DeviceError):
-            samples.append(bench.read())
-        bench.sleep(0.01)
+            samples.append(context.read())
+        context.sleep(0.01)
     return samples
 
 
-def _is_survived(bench: Bench, lease: Lease | None, fault: str, value: Any, *, counted: bool) -> None:
-    before = bench.counters()
-    _use(bench, lease, _CALM_S)
-    calm = bench.counters()
-    bench.begin(fault, value)
-    samples = _use(bench, lease, 2 * _CALM_S)
-    assert bench.device.state is Lifecycle.ACTIVE, bench.device.fault
-    after = bench.counters()
+def _is_tolerated(context: ConformanceContext, lease: Lease | None, fault: str, value: Any, *, counted: bool) -> None:
+    before = context.counters()
+    _use(context, lease, _CALM_S)
+    calm = context.counters()
+    context.begin(fault, value)
+    samples = _use(context, lease, 2 * _CALM_S)
+    assert context.device.state is Lifecycle.ACTIVE, context.device.fault
+    after = context.counters()
     assert len({sample.seq for sample in samples}) > 2
     stamps = [sample.t_ns for sample in samples]
     assert stamps == sorted(stamps)
@@ -117,72 +117,72 @@ def _is_survived(bench: Bench, lease: Lease | None, fault: str, value: Any, *, c
     assert any(after[name] > calm.get(name, 0) for name in rare), f"counted nowhere in health: {after}"
 
 
-def _is_called_stale(bench: Bench, fault: str, value: Any) -> None:
-    bench.begin(fault, value)
-    limit_s = 2.0 / (bench.rig.state_rate_hz or bench.rig.spec.capabilities.state_rate_hz)
-    bench.until(lambda: _is_stale(bench, limit_s), _NOTICED_S, "StaleData")
-    assert bench.device.state is not Lifecycle.FAULTED
-    bench.end(fault)
-    bench.until(lambda: not _is_stale(bench, 10.0 * limit_s), _NOTICED_S, "fresh samples")
+def _becomes_stale(context: ConformanceContext, fault: str, value: Any) -> None:
+    context.begin(fault, value)
+    limit_s = 2.0 / (context.rig.state_rate_hz or context.rig.spec.capabilities.state_rate_hz)
+    context.until(lambda: _is_stale(context, limit_s), _NOTICED_S, "StaleData")
+    assert context.device.state is not Lifecycle.FAULTED
+    context.end(fault)
+    context.until(lambda: not _is_stale(context, 10.0 * limit_s), _NOTICED_S, "fresh samples")
 
 
-def _is_stale(bench: Bench, limit_s: float) -> bool:
+def _is_stale(context: ConformanceContext, limit_s: float) -> bool:
     try:
-        bench.read(limit_s)
+        context.read(limit_s)
     except StaleData:
         return True
     return False
 
 
-def _is_latched(bench: Bench, lease: Lease | None, fault: str, value: Any) -> None:
-    bench.begin(fault, value)
-    bench.reach_faulted(_NOTICED_S, lease)
-    first = bench.device.fault
+def _is_latched(context: ConformanceContext, lease: Lease | None, fault: str, value: Any) -> None:
+    context.begin(fault, value)
+    context.reach_faulted(_NOTICED_S, lease)
+    first = context.device.fault
     assert isinstance(first, DeviceError)
-    assert first.device == bench.device.name
+    assert first.device == context.device.name
     with pytest.raises(LifecycleError):
-        bench.device.activate()
+        context.device.activate()
     if lease is not None:
         with pytest.raises(CommandRejected):
-            bench.arm.send_twist(bench.command(bench.twist(bench.axis(), speed=_SLOW_M_S)), lease)
-        if not bench.rig.spec.capabilities.falls_on_power_loss:
-            bench.settle(3.0)
-    bench.sleep(0.1)
-    assert bench.device.state is Lifecycle.FAULTED
-    assert bench.device.fault is first, "the first fault is the one to report"
+            context.arm.send_twist(context.command(context.twist(context.axis(), speed=_SLOW_M_S)), lease)
+        if not context.rig.spec.capabilities.falls_on_power_loss:
+            context.settle(3.0)
+    context.sleep(0.1)
+    assert context.device.state is Lifecycle.FAULTED
+    assert context.device.fault is first, "the first fault is the one to report"
     if fault in _LASTING:
         with pytest.raises(DeviceError):
-            bench.device.recover(bench.token)
-        assert bench.device.state is Lifecycle.FAULTED
-    bench.end(fault)
-    _serves_again(bench)
+            context.device.recover(context.token)
+        assert context.device.state is Lifecycle.FAULTED
+    context.end(fault)
+    _serves_again(context)
     if lease is not None:
         with pytest.raises(CommandRejected):
-            bench.arm.send_twist(bench.command(bench.twist(bench.axis(), speed=_SLOW_M_S)), lease)
+            context.arm.send_twist(context.command(context.twist(context.axis(), speed=_SLOW_M_S)), lease)
 
 
-def _serves_again(bench: Bench) -> None:
+def _serves_again(context: ConformanceContext) -> None:
     """``recover`` leads to READY, never to ACTIVE; if it cannot, reconnecting does."""
-    deadline_ns = bench.clock.now_ns() + round(_RECOVERED_S * 1e9)
-    while bench.is_in(Lifecycle.FAULTED) and bench.clock.now_ns() < deadline_ns:
+    deadline_ns = context.clock.now_ns() + round(_RECOVERED_S * 1e9)
+    while context.is_in(Lifecycle.FAULTED) and context.clock.now_ns() < deadline_ns:
         with suppress(DeviceError):
-            bench.device.recover(bench.token)
-            assert bench.is_in(Lifecycle.READY)
-            assert bench.device.fault is None
-        bench.sleep(0.05)
-    if bench.is_in(Lifecycle.READY):
+            context.device.recover(context.token)
+            assert context.is_in(Lifecycle.READY)
+            assert context.device.fault is None
+        context.sleep(0.05)
+    if context.is_in(Lifecycle.READY):
         with suppress(DeviceError):
-            bench.device.activate()
-    if not bench.is_in(Lifecycle.ACTIVE):
-        if bench.rig.spec.capabilities.falls_on_power_loss:
+            context.device.activate()
+    if not context.is_in(Lifecycle.ACTIVE):
+        if context.rig.spec.capabilities.falls_on_power_loss:
             # It fell; it has to be lifted.
-            bench.device.disconnect()
-            bench.restore()
-        bench.reconnect(_RECONNECTED_S)
+            context.device.disconnect()
+            context.restore()
+        context.reconnect(_RECONNECTED_S)
 
 
-def _reads(bench: Bench) -> bool:
+def _reads(context: ConformanceContext) -> bool:
     with suppress(DeviceError):
-        bench.read()
+        context.read()
         return True
     return False

@@ -9,39 +9,39 @@ import pytest
 from touchcell.drivers.core.errors import DeviceError, TransportTimeout
 from touchcell.drivers.core.protocols import FrameSource
 from touchcell.testing.conformance.check import check
-from touchcell.testing.conformance.context import Bench
+from touchcell.testing.conformance.context import ConformanceContext
 
 _UNREAD_PERIODS = 8
 
 
-@check(FrameSource, on_bench=True)
-def next_waits_and_gives_up(bench: Bench) -> None:
+@check(FrameSource, on_hardware=True)
+def next_waits_and_times_out(context: ConformanceContext) -> None:
     """``next`` returns a frame beyond the known number, and raises TransportTimeout if none arrives in time."""
-    bench.active()
-    first = bench.camera.next(-1, 2.0)
-    assert bench.camera.next(first.seq, 2.0).seq > first.seq
-    ahead = round(bench.rig.state_rate_hz or bench.rig.spec.capabilities.state_rate_hz)
-    start_ns = bench.clock.now_ns()
+    context.active()
+    first = context.camera.next(-1, 2.0)
+    assert context.camera.next(first.seq, 2.0).seq > first.seq
+    ahead = round(context.rig.state_rate_hz or context.rig.spec.capabilities.state_rate_hz)
+    start_ns = context.clock.now_ns()
     with pytest.raises(TransportTimeout) as caught:
-        bench.camera.next(first.seq + ahead, 0.1)
+        context.camera.next(first.seq + ahead, 0.1)
     assert caught.value.timeout_s == pytest.approx(0.1)
-    assert (bench.clock.now_ns() - start_ns) * 1e-9 >= 0.099
+    assert (context.clock.now_ns() - start_ns) * 1e-9 >= 0.099
 
 
-@check(FrameSource, on_bench=True)
-def latest_never_goes_back(bench: Bench) -> None:
+@check(FrameSource, on_hardware=True)
+def latest_never_goes_back(context: ConformanceContext) -> None:
     """``latest`` repeats the newest frame until a newer one arrives, and skips unread ones."""
-    rate_hz = bench.rig.state_rate_hz or bench.rig.spec.capabilities.state_rate_hz
-    bench.active()
-    first = bench.camera.next(-1, 2.0)
-    bench.sleep(_UNREAD_PERIODS / rate_hz)
-    newest = bench.camera.latest()
+    rate_hz = context.rig.state_rate_hz or context.rig.spec.capabilities.state_rate_hz
+    context.active()
+    first = context.camera.next(-1, 2.0)
+    context.sleep(_UNREAD_PERIODS / rate_hz)
+    newest = context.camera.latest()
     assert newest.seq >= first.seq + _UNREAD_PERIODS // 2
-    assert bench.camera.latest().seq >= newest.seq
+    assert context.camera.latest().seq >= newest.seq
 
 
 @check(FrameSource)
-def frames_that_nobody_reads_are_not_decoded(bench: Bench) -> None:
+def unread_frames_are_not_decoded(context: ConformanceContext) -> None:
     """While frames pass unread OpenCV decodes none of them; a read decodes one."""
     import cv2
 
@@ -53,32 +53,32 @@ def frames_that_nobody_reads_are_not_decoded(bench: Bench) -> None:
         decoded += 1
         return original(*arguments)
 
-    rate_hz = bench.rig.state_rate_hz or bench.rig.spec.capabilities.state_rate_hz
-    bench.active()
-    first = bench.camera.next(-1, 2.0)
+    rate_hz = context.rig.state_rate_hz or context.rig.spec.capabilities.state_rate_hz
+    context.active()
+    first = context.camera.next(-1, 2.0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cv2, "imdecode", counting)
-        bench.sleep(_UNREAD_PERIODS / rate_hz)
+        context.sleep(_UNREAD_PERIODS / rate_hz)
         assert decoded == 0
-        assert bench.camera.latest().seq > first.seq
-        bench.camera.latest()
+        assert context.camera.latest().seq > first.seq
+        context.camera.latest()
     if decoded == 0:
         pytest.skip("does not decode with OpenCV: not observable")
     assert decoded <= 2
 
 
 @check(FrameSource, "truth")
-def lost_frames_leave_a_gap(bench: Bench) -> None:
+def lost_frames_leave_a_gap(context: ConformanceContext) -> None:
     """Frames lost in transport leave gaps in the sequence numbers."""
-    if "drop" not in bench.rig.faults:
+    if "drop" not in context.rig.faults:
         pytest.skip("its emulator drops no frames")
-    bench.active()
-    seq = bench.camera.next(-1, 2.0).seq
-    bench.begin("drop", 3)
+    context.active()
+    seq = context.camera.next(-1, 2.0).seq
+    context.begin("drop", 3)
     widest = 0
     for _ in range(12):
         try:
-            frame = bench.camera.next(seq, 1.0)
+            frame = context.camera.next(seq, 1.0)
         except DeviceError:
             continue
         widest = max(widest, frame.seq - seq)

@@ -13,7 +13,7 @@ from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, DeviceError, LifecycleError, Rejection
 from touchcell.drivers.core.protocols import HealthSource, NativeWatchdog, StopCategory, Stoppable, TwistSink
 from touchcell.testing.conformance.check import check
-from touchcell.testing.conformance.context import Bench
+from touchcell.testing.conformance.context import ConformanceContext
 
 # ServoArm, which only combines others, is not declared by drivers.
 _PROTOCOLS = frozenset(
@@ -25,10 +25,10 @@ _WARM_UP_CYCLES = 2
 _CYCLES = 10
 
 
-@check(on_bench=True)
-def lifecycle_in_order_only(bench: Bench) -> None:
+@check(on_hardware=True)
+def lifecycle_in_order_only(context: ConformanceContext) -> None:
     """Every operation is refused outside its state, and does not change the state."""
-    device = bench.device
+    device = context.device
     allowed = {
         "connect": (Lifecycle.DISCONNECTED,),
         "configure": (Lifecycle.PASSIVE,),
@@ -42,67 +42,67 @@ def lifecycle_in_order_only(bench: Bench) -> None:
                 with pytest.raises(LifecycleError):
                     getattr(device, operation)()
         with pytest.raises(LifecycleError):
-            device.recover(bench.token)
+            device.recover(context.token)
         assert device.state is before
         getattr(device, step)()
-    assert bench.is_in(Lifecycle.READY)
+    assert context.is_in(Lifecycle.READY)
     device.disconnect()
     device.disconnect()
-    assert bench.is_in(Lifecycle.DISCONNECTED)
+    assert context.is_in(Lifecycle.DISCONNECTED)
 
 
 @check("truth")
-def connect_never_energises(bench: Bench) -> None:
+def connect_never_energises(context: ConformanceContext) -> None:
     """Until ``activate`` no message that changes power, mode or zero is sent, and nothing moves."""
-    before = bench.energised()
-    start = None if bench.rig.position is None else bench.truth()[bench.rig.position]
-    bench.ready()
-    bench.sleep(0.2)
-    assert bench.energised() == before
+    before = context.energised()
+    start = None if context.rig.position is None else context.truth()[context.rig.position]
+    context.ready()
+    context.sleep(0.2)
+    assert context.energised() == before
     if start is not None:
-        np.testing.assert_allclose(bench.truth()[bench.rig.position or ""], start, atol=1e-4)
-    bench.device.disconnect()
-    assert bench.energised() == before
+        np.testing.assert_allclose(context.truth()[context.rig.position or ""], start, atol=1e-4)
+    context.device.disconnect()
+    assert context.energised() == before
 
 
 @check("truth", "process")
-def failed_connect_can_be_retried(bench: Bench) -> None:
+def failed_connect_can_be_retried(context: ConformanceContext) -> None:
     """Without a device ``connect`` raises within 15 s, leaves DISCONNECTED, and works once the device is there."""
-    bench.seat.clear()
-    start_ns = bench.clock.now_ns()
+    context.under_test.clear()
+    start_ns = context.clock.now_ns()
     with pytest.raises(DeviceError):
-        bench.device.connect()
-    assert (bench.clock.now_ns() - start_ns) * 1e-9 < 15.0
-    assert bench.is_in(Lifecycle.DISCONNECTED)
-    assert bench.emulator
-    bench.active()
-    assert bench.is_in(Lifecycle.ACTIVE)
+        context.device.connect()
+    assert (context.clock.now_ns() - start_ns) * 1e-9 < 15.0
+    assert context.is_in(Lifecycle.DISCONNECTED)
+    assert context.emulator
+    context.active()
+    assert context.is_in(Lifecycle.ACTIVE)
 
 
-@check(on_bench=True)
-def disconnect_from_every_state(bench: Bench) -> None:
+@check(on_hardware=True)
+def disconnect_from_every_state(context: ConformanceContext) -> None:
     """``disconnect`` works from PASSIVE, READY and ACTIVE, and the device can be used again."""
     steps = ("connect", "configure", "activate")
     for length in range(1, len(steps) + 1):
         for step in steps[:length]:
-            getattr(bench.device, step)()
-        bench.device.disconnect()
-        assert bench.device.state is Lifecycle.DISCONNECTED
-        if bench.rig.spec.capabilities.falls_on_power_loss:
+            getattr(context.device, step)()
+        context.device.disconnect()
+        assert context.device.state is Lifecycle.DISCONNECTED
+        if context.rig.spec.capabilities.falls_on_power_loss:
             break
 
 
-@check(on_bench=True)
-def protocols_are_those_of_the_record(bench: Bench) -> None:
+@check(on_hardware=True)
+def protocols_are_those_of_the_record(context: ConformanceContext) -> None:
     """Every protocol that is declared is provided, and every one of ours that is provided is declared."""
-    declared = bench.rig.spec.capabilities.provides
-    assert {protocol for protocol in declared | _PROTOCOLS if isinstance(bench.device, protocol)} == declared
+    declared = context.rig.spec.capabilities.provides
+    assert {protocol for protocol in declared | _PROTOCOLS if isinstance(context.device, protocol)} == declared
 
 
-@check(HealthSource, on_bench=True)
-def health_is_told_by_name(bench: Bench) -> None:
+@check(HealthSource, on_hardware=True)
+def health_has_named_readings(context: ConformanceContext) -> None:
     """``health`` returns named numbers and texts while connected; no number is NaN."""
-    device = bench.ready()
+    device = context.ready()
     assert isinstance(device, HealthSource)
     health = device.health()
     assert health
@@ -111,110 +111,110 @@ def health_is_told_by_name(bench: Bench) -> None:
         assert reading == reading, name
 
 
-@check(NativeWatchdog, on_bench=True)
-def watchdog_is_read_back(bench: Bench) -> None:
+@check(NativeWatchdog, on_hardware=True)
+def watchdog_is_read_back(context: ConformanceContext) -> None:
     """An active device reports a watchdog no longer than declared."""
-    device = bench.active()
-    longest_s = bench.rig.spec.capabilities.max_watchdog_s
+    device = context.active()
+    longest_s = context.rig.spec.capabilities.max_watchdog_s
     assert isinstance(device, NativeWatchdog)
     assert longest_s is not None
     assert 0.0 < device.watchdog_s() <= longest_s
 
 
-@check("arm", on_bench=True)
-def record_of_the_watchdog_is_consistent(bench: Bench) -> None:
+@check("arm", on_hardware=True)
+def record_of_the_watchdog_is_consistent(context: ConformanceContext) -> None:
     """``max_watchdog_s`` is declared exactly by devices that have a watchdog."""
-    capabilities = bench.rig.spec.capabilities
+    capabilities = context.rig.spec.capabilities
     assert (capabilities.max_watchdog_s is not None) == (NativeWatchdog in capabilities.provides)
 
 
 @check(Stoppable)
-def stop_categories_are_those_of_the_record(bench: Bench) -> None:
+def stop_categories_are_those_of_the_record(context: ConformanceContext) -> None:
     """Supported categories stop a moving arm in the promised state; the others are refused."""
-    offered = bench.rig.spec.capabilities.stop_categories
+    offered = context.rig.spec.capabilities.stop_categories
     assert StopCategory.STOP_AND_HOLD in offered
-    lease = bench.leased()
+    lease = context.leased()
     for category in sorted(StopCategory, reverse=True):
         if category not in offered:
             with pytest.raises(LifecycleError):
-                bench.arm.stop(category)
-            assert bench.device.state is Lifecycle.ACTIVE
+                context.arm.stop(category)
+            assert context.device.state is Lifecycle.ACTIVE
             continue
-        bench.stream(lease, bench.twist(bench.axis()), 0.3)
-        bench.arm.stop(category)
+        context.stream(lease, context.twist(context.axis()), 0.3)
+        context.arm.stop(category)
         if category is StopCategory.STOP_AND_HOLD:
-            bench.settle()
-            bench.until(bench.arm.at_rest, 1.0, "at_rest")
-            assert bench.device.state is Lifecycle.ACTIVE
+            context.settle()
+            context.until(context.arm.at_rest, 1.0, "at_rest")
+            assert context.device.state is Lifecycle.ACTIVE
             continue
-        assert bench.device.state is Lifecycle.READY
-        if bench.rig.spec.capabilities.has_brakes:
-            bench.settle()
-        if "energised" in bench.truth():
-            bench.until(lambda: not bench.truth()["energised"], 3.0, "power off")
-        bench.until(lambda: _activates(bench), 10.0, "ACTIVE after a stop that removes power")
-        lease = bench.arm.acquire("after the stop")
+        assert context.device.state is Lifecycle.READY
+        if context.rig.spec.capabilities.has_brakes:
+            context.settle()
+        if "energised" in context.truth():
+            context.until(lambda: not context.truth()["energised"], 3.0, "power off")
+        context.until(lambda: _activates(context), 10.0, "ACTIVE after a stop that removes power")
+        lease = context.arm.acquire("after the stop")
 
 
-def _activates(bench: Bench) -> bool:
+def _activates(context: ConformanceContext) -> bool:
     try:
-        bench.device.activate()
+        context.device.activate()
     except DeviceError:
         return False
     return True
 
 
 @check(TwistSink)
-def deactivation_rests_and_voids_the_lease(bench: Bench) -> None:
+def deactivation_stops_and_voids_the_lease(context: ConformanceContext) -> None:
     """``deactivate`` of a moving arm ends at rest in READY; the lease is invalid afterwards."""
-    lease = bench.leased()
-    bench.stream(lease, bench.twist(bench.axis()), 0.3)
-    bench.device.deactivate(DeactivatePolicy.HOLD)
-    assert bench.device.state is Lifecycle.READY
-    before = bench.position()
-    bench.sleep(0.2)
-    assert np.linalg.norm(bench.position() - before) < 1e-3
-    bench.device.activate()
+    lease = context.leased()
+    context.stream(lease, context.twist(context.axis()), 0.3)
+    context.device.deactivate(DeactivatePolicy.HOLD)
+    assert context.device.state is Lifecycle.READY
+    before = context.position()
+    context.sleep(0.2)
+    assert np.linalg.norm(context.position() - before) < 1e-3
+    context.device.activate()
     with pytest.raises(CommandRejected) as caught:
-        bench.arm.send_twist(bench.command(bench.twist(bench.axis())), lease)
+        context.arm.send_twist(context.command(context.twist(context.axis())), lease)
     assert caught.value.reason is Rejection.LEASE
 
 
 @check(TwistSink)
-def deactivation_policies_are_obeyed_or_refused(bench: Bench) -> None:
+def deactivation_policies_are_applied_or_refused(context: ConformanceContext) -> None:
     """Each policy ends in READY, or raises LifecycleError and keeps the arm held; power is really off."""
-    bench.ready()
+    context.ready()
     for policy in DeactivatePolicy:
-        bench.until(lambda: _activates(bench), 10.0, f"ACTIVE before {policy.value}")
+        context.until(lambda: _activates(context), 10.0, f"ACTIVE before {policy.value}")
         try:
-            bench.device.deactivate(policy)
+            context.device.deactivate(policy)
         except LifecycleError:
             assert policy is not DeactivatePolicy.HOLD
-            assert bench.device.state is Lifecycle.ACTIVE
-            assert bench.truth().get("energised", True)
-            bench.device.deactivate(DeactivatePolicy.HOLD)
+            assert context.device.state is Lifecycle.ACTIVE
+            assert context.truth().get("energised", True)
+            context.device.deactivate(DeactivatePolicy.HOLD)
             continue
-        assert bench.device.state is Lifecycle.READY
-        if policy in (DeactivatePolicy.OFF, DeactivatePolicy.PARK_THEN_OFF) and bench.rig.process:
-            assert not bench.truth().get("energised", False)
+        assert context.device.state is Lifecycle.READY
+        if policy in (DeactivatePolicy.OFF, DeactivatePolicy.PARK_THEN_OFF) and context.rig.process:
+            assert not context.truth().get("energised", False)
 
 
 @check("truth")
-def ten_cycles_leak_nothing(bench: Bench) -> None:
+def ten_cycles_leak_nothing(context: ConformanceContext) -> None:
     """Ten more lifecycles leave no more threads and open files than before."""
     for _ in range(_WARM_UP_CYCLES):
-        _cycle(bench)
+        _cycle(context)
     before = _threads(), _files()
     for _ in range(_CYCLES):
-        _cycle(bench)
-    bench.until(lambda: _threads() <= before[0] and _files() <= before[1], 2.0, "threads and files as before")
+        _cycle(context)
+    context.until(lambda: _threads() <= before[0] and _files() <= before[1], 2.0, "threads and files as before")
 
 
-def _cycle(bench: Bench) -> None:
-    bench.active()
-    bench.device.disconnect()
-    if bench.rig.spec.capabilities.falls_on_power_loss:
-        bench.restore()
+def _cycle(context: ConformanceContext) -> None:
+    context.active()
+    context.device.disconnect()
+    if context.rig.spec.capabilities.falls_on_power_loss:
+        context.restore()
 
 
 def _threads() -> int:

@@ -25,33 +25,33 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.fixture(scope="class")
-def conformance_seat(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def conformance_device(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """Provide the device fixture of a suite's class and its emulator."""
     from touchcell.testing.conformance.context import DeviceUnderTest
 
     suite: Any = request.cls
     folder = tmp_path_factory.mktemp(suite.driver)
-    seat = DeviceUnderTest(suite.rig_function, folder, _address(request.config))
-    yield seat
-    seat.clear()
+    under_test = DeviceUnderTest(suite.rig_function, folder, _address(request.config))
+    yield under_test
+    under_test.clear()
 
 
 @pytest.fixture
-def conformance_bench(request: pytest.FixtureRequest, conformance_seat: Any) -> Iterator[Any]:
+def conformance_context(request: pytest.FixtureRequest, conformance_device: Any) -> Iterator[Any]:
     """Provide the context of a check."""
-    from touchcell.testing.conformance.context import Bench
+    from touchcell.testing.conformance.context import ConformanceContext
 
     needs: Any = getattr(request.function, "conformance", None)
-    reason = needs.missing(conformance_seat.rig) if needs is not None else None
+    reason = needs.missing(conformance_device.rig) if needs is not None else None
     if reason is not None:
         pytest.skip(reason)
-    if known := conformance_seat.rig.known.get(request.node.name.removeprefix("test_")):
+    if known := conformance_device.rig.known.get(request.node.name.removeprefix("test_")):
         request.applymarker(pytest.mark.xfail(reason=known, strict=True))
-    bench = Bench(conformance_seat)
-    yield bench
+    context = ConformanceContext(conformance_device)
+    yield context
     report = request.node.stash.get(_FAILED, None)
-    bench.spoiled = bench.spoiled or report is not None
-    bench.close()
+    context.spoiled = context.spoiled or report is not None
+    context.close()
 
 
 _FAILED = pytest.StashKey[bool]()

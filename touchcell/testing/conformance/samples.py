@@ -12,23 +12,23 @@ import pytest
 from touchcell.drivers.core.errors import DeviceError, StaleData
 from touchcell.drivers.core.protocols import JointSource, TcpSource, WrenchSource
 from touchcell.testing.conformance.check import check
-from touchcell.testing.conformance.context import Bench
+from touchcell.testing.conformance.context import ConformanceContext
 
 _WINDOW_S = 0.5
 _FROZEN_S = 0.3
 
 
-@check(TcpSource, on_bench=True)
-def states_are_stamped_and_numbered(bench: Bench) -> None:
+@check(TcpSource, on_hardware=True)
+def states_are_stamped_and_numbered(context: ConformanceContext) -> None:
     """Timestamps are on the injected clock and advance; numbers rise; values are finite rigid poses."""
-    before_ns = bench.clock.now_ns()
-    bench.ready()
+    before_ns = context.clock.now_ns()
+    context.ready()
     samples = []
-    end_ns = bench.clock.now_ns() + round(_WINDOW_S * 1e9)
-    while bench.clock.now_ns() < end_ns:
-        samples.append(bench.arm.tcp())
-        assert samples[-1].t_ns <= bench.clock.now_ns()
-        bench.sleep(0.002)
+    end_ns = context.clock.now_ns() + round(_WINDOW_S * 1e9)
+    while context.clock.now_ns() < end_ns:
+        samples.append(context.arm.tcp())
+        assert samples[-1].t_ns <= context.clock.now_ns()
+        context.sleep(0.002)
     # A sample in progress before the connection may be a little older than it.
     assert samples[0].t_ns > before_ns - round(0.1e9)
     for older, newer in pairwise(samples):
@@ -42,54 +42,54 @@ def states_are_stamped_and_numbered(bench: Bench) -> None:
         assert sample.value.twist.shape == (6,)
         assert np.isfinite(T).all()
         assert np.isfinite(sample.value.twist).all()
-    _agrees_with_rate(bench, samples)
+    _agrees_with_rate(context, samples)
 
 
-@check("camera", on_bench=True)
-def frames_are_stamped_and_numbered(bench: Bench) -> None:
+@check("camera", on_hardware=True)
+def frames_are_stamped_and_numbered(context: ConformanceContext) -> None:
     """Timestamps are on the injected clock and rise with the numbers, by about a period each."""
-    before_ns = bench.clock.now_ns()
-    bench.active()
-    frames = [bench.camera.next(-1, 2.0)]
-    end_ns = bench.clock.now_ns() + round(_WINDOW_S * 1e9)
-    while bench.clock.now_ns() < end_ns:
-        frames.append(bench.camera.next(frames[-1].seq, 1.0))
-        assert frames[-1].t_ns <= bench.clock.now_ns()
+    before_ns = context.clock.now_ns()
+    context.active()
+    frames = [context.camera.next(-1, 2.0)]
+    end_ns = context.clock.now_ns() + round(_WINDOW_S * 1e9)
+    while context.clock.now_ns() < end_ns:
+        frames.append(context.camera.next(frames[-1].seq, 1.0))
+        assert frames[-1].t_ns <= context.clock.now_ns()
     assert frames[0].t_ns >= before_ns - round(0.1e9)
     for older, newer in pairwise(frames):
         assert newer.seq > older.seq
         assert newer.t_ns > older.t_ns
         assert newer.value.image.dtype == np.uint8
         assert newer.value.image.shape == older.value.image.shape
-    _agrees_with_rate(bench, frames)
+    _agrees_with_rate(context, frames)
 
 
-def _agrees_with_rate(bench: Bench, samples: list[Any]) -> None:
+def _agrees_with_rate(context: ConformanceContext, samples: list[Any]) -> None:
     """Check that numbers rise at no less than half the declared rate, as machines are busy; samples arrive at no more
     than 2.5 times it, as some drivers read more often at rest.
     """
-    declared_hz = bench.rig.state_rate_hz or bench.rig.spec.capabilities.state_rate_hz
+    declared_hz = context.rig.state_rate_hz or context.rig.spec.capabilities.state_rate_hz
     first, last = samples[0], samples[-1]
     passed_s = (last.t_ns - first.t_ns) * 1e-9
     assert last.seq - first.seq >= 0.5 * declared_hz * passed_s
     assert len({sample.seq for sample in samples}) - 1 <= 2.5 * declared_hz * passed_s
 
 
-@check(on_bench=True)
-def too_old_is_stale(bench: Bench) -> None:
+@check(on_hardware=True)
+def old_samples_are_stale(context: ConformanceContext) -> None:
     """A sample older than the caller accepts is rejected with its age, limit and number."""
-    bench.active()
-    bench.until(lambda: _newest_is_there(bench), 2.0, "first sample")
+    context.active()
+    context.until(lambda: _newest_is_there(context), 2.0, "first sample")
     with pytest.raises(StaleData) as caught:
-        bench.read(max_age_s=-1.0)
+        context.read(max_age_s=-1.0)
     assert caught.value.limit_s == -1.0
     assert caught.value.age_s > -1.0
 
 
-@check(JointSource, on_bench=True)
-def joints_are_finite_and_fresh(bench: Bench) -> None:
+@check(JointSource, on_hardware=True)
+def joints_are_finite_and_fresh(context: ConformanceContext) -> None:
     """Joint angles and velocities have one length, are finite, and no older than requested."""
-    device = bench.ready()
+    device = context.ready()
     assert isinstance(device, JointSource)
     sample = device.joints(max_age_s=0.5)
     assert sample.value.q.shape == sample.value.dq.shape
@@ -97,10 +97,10 @@ def joints_are_finite_and_fresh(bench: Bench) -> None:
     assert np.isfinite(sample.value.dq).all()
 
 
-@check(WrenchSource, on_bench=True)
-def wrench_is_finite_and_fresh(bench: Bench) -> None:
+@check(WrenchSource, on_hardware=True)
+def wrench_is_finite_and_fresh(context: ConformanceContext) -> None:
     """The wrench is (6,) finite numbers, no older than requested."""
-    device = bench.ready()
+    device = context.ready()
     assert isinstance(device, WrenchSource)
     wrench = device.wrench(max_age_s=0.5).value
     assert wrench.shape == (6,)
@@ -108,24 +108,24 @@ def wrench_is_finite_and_fresh(bench: Bench) -> None:
 
 
 @check("truth", "process")
-def frozen_device_never_looks_fresh(bench: Bench) -> None:
+def frozen_device_never_looks_fresh(context: ConformanceContext) -> None:
     """While the device hangs, no earlier sample is returned with a younger timestamp, nor within a short max_age."""
-    bench.spoiled = True
-    bench.active()
-    bench.until(lambda: _newest_is_there(bench), 2.0, "first sample")
-    bench.emulator.freeze()
-    frozen_ns = bench.clock.now_ns()
-    bench.sleep(_FROZEN_S)
+    context.spoiled = True
+    context.active()
+    context.until(lambda: _newest_is_there(context), 2.0, "first sample")
+    context.emulator.freeze()
+    frozen_ns = context.clock.now_ns()
+    context.sleep(_FROZEN_S)
     with pytest.raises(DeviceError):
-        bench.read(max_age_s=_FROZEN_S / 2)
+        context.read(max_age_s=_FROZEN_S / 2)
     # Raising every time is correct too.
     with suppress(DeviceError):
-        assert bench.read().t_ns <= frozen_ns + round(0.05e9)
+        assert context.read().t_ns <= frozen_ns + round(0.05e9)
 
 
-def _newest_is_there(bench: Bench) -> bool:
+def _newest_is_there(context: ConformanceContext) -> bool:
     try:
-        bench.read()
+        context.read()
     except StaleData:
         return False
     return True

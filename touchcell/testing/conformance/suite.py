@@ -41,15 +41,15 @@ def _checks() -> Iterator[Any]:
 
 
 def _method(function: Any) -> Any:
-    def method(self: object, conformance_bench: Any) -> None:
-        function(conformance_bench)
+    def method(self: object, conformance_context: Any) -> None:
+        function(conformance_context)
 
     return _named(method, function)
 
 
 def _fault_method(function: Any) -> Any:
-    def method(self: object, conformance_bench: Any, fault: str) -> None:
-        function(conformance_bench, fault)
+    def method(self: object, conformance_context: Any, fault: str) -> None:
+        function(conformance_context, fault)
 
     return _named(method, function)
 

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import sys
 
+from touchcell.errors import TouchcellError
 from touchcell.testing.emulation.launcher import main
 
-sys.exit(main(sys.argv[1:]))
+try:
+    sys.exit(main(sys.argv[1:]))
+except TouchcellError as error:
+    sys.exit(f"touchcell emulate: {error}")

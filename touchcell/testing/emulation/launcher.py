@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Protocol, runtime_checkable
 
+from touchcell.errors import ConfigError, suggest
 from touchcell.registry import Registry
 from touchcell.testing.emulation.base import Emulator, read_fault_script, serve
 
@@ -33,11 +34,17 @@ EMULATORS: Final = Registry("touchcell.emulators", "emulator", EmulatorModule)
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the emulator named first in ``arguments`` until it is stopped; return the exit code."""
+    """Run the emulator named first in ``arguments`` until it is asked to end; return the exit code.
+
+    Raises:
+        ConfigError: there is no such emulator, its arguments are wrong, or its address cannot be used.
+    """
     names = EMULATORS.names()
     parser = argparse.ArgumentParser("touchcell emulate", description="Emulate a device at its interface.")
     parsers = parser.add_subparsers(dest="name", required=True, metavar=" | ".join(names))
     wanted = arguments[0] if arguments else ""
+    if wanted and not wanted.startswith("-") and wanted not in names:
+        raise ConfigError(f"unknown emulator {wanted!r}", hint=suggest(wanted, names, otherwise="known emulators"))
     for name in names:
         child = parsers.add_parser(name)
         child.add_argument("--control", type=Path, help="UNIX socket of the control channel")
@@ -48,5 +55,11 @@ def main(arguments: Sequence[str]) -> int:
     options = parser.parse_args(arguments)
     script = read_fault_script(options.fault_script) if options.fault_script else ()
     emulator = EMULATORS.load(options.name).build(options)
-    asyncio.run(serve(emulator, options.control, script, lifeline=options.lifeline))
+    try:
+        asyncio.run(serve(emulator, options.control, script, lifeline=options.lifeline))
+    except OSError as error:
+        raise ConfigError(
+            f"the emulator {options.name!r} cannot open its wire: {error.strerror or error}",
+            hint="an address must be one of this machine, such as 127.0.0.2, and free",
+        ) from None
     return 0

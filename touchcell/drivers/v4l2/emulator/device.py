@@ -243,11 +243,11 @@ class CameraModel:
         reply.timeperframe = codec.Fraction(1, self.rate_hz)
 
     def _set_parameters(self, handle: Handle, body: bytearray) -> None:
-        asked = codec.StreamParameters.from_buffer_copy(body)
-        if asked.type == codec.VIDEO_CAPTURE:
+        request_body = codec.StreamParameters.from_buffer_copy(body)
+        if request_body.type == codec.VIDEO_CAPTURE:
             if self.streaming:
                 raise Refused(errno.EBUSY)
-            period = asked.timeperframe
+            period = request_body.timeperframe
             if period.numerator and period.denominator:
                 wanted_hz = period.denominator / period.numerator
                 self.rate_hz = min(RATES_HZ, key=lambda rate_hz: abs(rate_hz - wanted_hz))
@@ -278,23 +278,25 @@ class CameraModel:
         handle.priority = wanted
 
     def _request_buffers(self, handle: Handle, body: bytearray) -> None:
-        asked = codec.RequestBuffers.from_buffer_copy(body)
-        if asked.type != codec.VIDEO_CAPTURE or asked.memory != codec.MEMORY_MMAP:
+        request_body = codec.RequestBuffers.from_buffer_copy(body)
+        if request_body.type != codec.VIDEO_CAPTURE or request_body.memory != codec.MEMORY_MMAP:
             raise Refused(errno.EINVAL)
         if self.owner not in (None, handle) or self.streaming:
             raise Refused(errno.EBUSY)
         reply = _fresh(codec.RequestBuffers, body, "type", "memory")
-        reply.count = self.buffers = min(asked.count, codec.MAX_BUFFERS)
+        reply.count = self.buffers = min(request_body.count, codec.MAX_BUFFERS)
         reply.capabilities = _BUFFERS_MMAP | _BUFFERS_ORPHANED
         self.owner = handle if self.buffers else None
         self.queued.clear()
 
     def _query_buffer(self, handle: Handle, body: bytearray) -> None:
-        asked = codec.Buffer.from_buffer_copy(body)
-        if asked.type != codec.VIDEO_CAPTURE or asked.index >= self.buffers:
+        request_body = codec.Buffer.from_buffer_copy(body)
+        if request_body.type != codec.VIDEO_CAPTURE or request_body.index >= self.buffers:
             raise Refused(errno.EINVAL)
-        reply = self._buffer(asked.index)
-        reply.flags = codec.BUF_MAPPED | self.stamp_flags | (codec.BUF_QUEUED if asked.index in self.queued else 0)
+        reply = self._buffer(request_body.index)
+        reply.flags = (
+            codec.BUF_MAPPED | self.stamp_flags | (codec.BUF_QUEUED if request_body.index in self.queued else 0)
+        )
         body[:] = bytes(reply)
 
     def _queue_buffer(self, handle: Handle, body: bytearray) -> None:
@@ -409,9 +411,9 @@ class CameraModel:
             self.energising += 1
         if not self.stuck_controls:
             control.value = control.nearest(value)
-            self._tell(handle, identity, _EVENT_VALUE)
+            self._notify_others(handle, identity, _EVENT_VALUE)
             if identity == codec.CID_EXPOSURE_AUTO:
-                self._tell(handle, codec.CID_EXPOSURE_ABSOLUTE, _EVENT_FLAGS)
+                self._notify_others(handle, codec.CID_EXPOSURE_ABSOLUTE, _EVENT_FLAGS)
         return control.value
 
     def _get_extended(self, handle: Handle, body: bytearray) -> None:
@@ -480,7 +482,7 @@ class CameraModel:
         event.pending = len(handle.events)
         body[:] = bytes(event)
 
-    def _tell(self, setter: Handle, identity: int, changes: int) -> None:
+    def _notify_others(self, setter: Handle, identity: int, changes: int) -> None:
         for handle in self.handles:
             flags = handle.subscribed.get(identity)
             if flags is not None and (handle is not setter or flags & _EVENT_ALLOW_FEEDBACK):
@@ -510,19 +512,19 @@ class CameraModel:
 
 def _fresh(layout: type[S], body: bytearray, *kept: str) -> S:
     # The kernel zeroes every field that a driver does not fill, so only ``kept`` fields of the caller may survive.
-    asked = layout.from_buffer_copy(body)
+    request_body = layout.from_buffer_copy(body)
     body[:] = bytes(ctypes.sizeof(layout))
     reply = layout.from_buffer(body)
     for name in kept:
-        setattr(reply, name, getattr(asked, name))
+        setattr(reply, name, getattr(request_body, name))
     return reply
 
 
 def _nearest_format(body: bytearray) -> tuple[str, int, int]:
     pix = codec.Format.from_buffer_copy(body).pix
-    asked = codec.fourcc_text(pix.pixelformat)
+    request_body = codec.fourcc_text(pix.pixelformat)
     width, height = min(SIZES, key=lambda size: abs(size[0] - pix.width) + abs(size[1] - pix.height))
-    return asked if asked in FORMATS else "YUYV", width, height
+    return request_body if request_body in FORMATS else "YUYV", width, height
 
 
 def _low_word(item: codec.ExtendedControl) -> int:

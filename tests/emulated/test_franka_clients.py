@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from tests.helpers.franka_bench import DEADLINE_S, eventually, fresh_host
+from tests.helpers.franka_harness import DEADLINE_S, eventually, fresh_host
 from touchcell.drivers.franka.emulator.arm import JOINT_MAX_RAD, JOINT_MIN_RAD, READY_POSE_RAD, flange_pose
 from touchcell.drivers.franka.errors import ERRORS
 from touchcell.testing.emulation.process import EmulatorProcess

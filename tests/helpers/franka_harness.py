@@ -38,7 +38,7 @@ def eventually(true: Callable[[], bool]) -> None:
         time.sleep(0.002)
 
 
-class Bench:
+class FrankaHarness:
     """One emulator, one driver, and the calls of a task."""
 
     def __init__(self, **config: Any) -> None:

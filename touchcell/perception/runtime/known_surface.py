@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from touchcell.drivers.core.protocols import FrameSource
@@ -10,6 +12,7 @@ from touchcell.geometry import se3
 from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.perception.runtime.estimator_spec import EstimatorConfig, EstimatorContext, EstimatorSpec
 
 # An arm repeats to about a tenth of a millimetre and of a degree.
 _COVARIANCE = np.diag([1e-8] * 3 + [3e-6] * 3)
@@ -51,3 +54,20 @@ class KnownSurfaceSource:
         T_s_f = se3.compose(se3.inverse(self._T_base_s), self._T_base_f)
         touches = bool(se3.inverse(T_s_f)[2, 3] > 0.0)
         return ContactEstimate(touches, PoseGaussian(T_s_f, _COVARIANCE), self.frame.t_ns, self.frame.seq, now_ns)
+
+
+class KnownSurface(EstimatorConfig):
+    """The contact from the arm's pose above a surface at a given pose, for collecting labels.
+
+    ``surface_mm_deg`` is the pose of the sensor frame in the arm's base when it just touches the surface, upright.
+    """
+
+    kind: Literal["known_surface"]
+    surface_mm_deg: tuple[float, float, float, float, float, float]
+
+    def build(self, context: EstimatorContext) -> KnownSurfaceSource:
+        """Return the source."""
+        return KnownSurfaceSource(context.camera, se3.from_euler_mm_deg(np.array(self.surface_mm_deg)))
+
+
+KNOWN_SURFACE = EstimatorSpec("known_surface", "contact from the arm's pose above a known surface", KnownSurface)

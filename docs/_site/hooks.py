@@ -1,0 +1,43 @@
+"""Hooks of the site: the reference of the command line is what the parsers themselves print."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+from typing import Any
+
+PLACE = "<!-- generated: command line -->"
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Fill the place of generated text on a page."""
+    return markdown.replace(PLACE, command_line()) if PLACE in markdown else markdown
+
+
+def command_line() -> str:
+    """Return the help of touchcell and of each of its commands, as Markdown."""
+    overview = _help()
+    names = re.findall(r"^ {4}([a-z][a-z-]*)(?: |$)", overview, re.MULTILINE)
+    sections = [f"```text\n{overview}```"]
+    for name in dict.fromkeys(names):
+        if name != "emulate":  # Its options are those of the emulators that are installed.
+            sections.append(f"## touchcell {name}\n\n```text\n{_help(name)}```")
+    return "\n\n".join(sections)
+
+
+def _help(*words: str) -> str:
+    from touchcell.cell.cli.main import main
+
+    printed = io.StringIO()
+    columns, os.environ["COLUMNS"] = os.environ.get("COLUMNS"), "100"
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+            main([*words, "--help"])
+    finally:
+        if columns is None:
+            del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = columns
+    return printed.getvalue()

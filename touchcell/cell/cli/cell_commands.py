@@ -1,0 +1,60 @@
+"""``run`` and ``check``: cell files."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from touchcell.cell.cli.arguments import Subparsers, add_cell, add_command
+from touchcell.cell.cli.exit_codes import EXIT_OK
+from touchcell.cell.config.find import find_cell
+
+
+def add_parser(commands: Subparsers) -> None:
+    """Declare the commands."""
+    run = add_command(commands, "run", _run, "run a cell's task and report on it")
+    add_cell(run)
+    run.add_argument("--data", type=Path, metavar="DIR", help="data set folder for drivers that replay or collect one")
+    run.add_argument("--model", metavar="FILE", help="model file in place of the one that the cell names")
+    run.add_argument("--out", type=Path, metavar="FOLDER", help="run folder (default: runs/NAME-TIME)")
+    run.add_argument("--animate", action="store_true", help="also write animation.gif, of a simulated run")
+    run.add_argument("--quiet", action="store_true", help="show no live progress line")
+
+    check = add_command(commands, "check", _check, "validate a cell file without connecting anything")
+    add_cell(check)
+    check.add_argument("--data", type=Path, metavar="DIR", help="data set folder that the run will be given")
+
+
+def _run(options: argparse.Namespace) -> int:
+    from touchcell.cell.cli.run import run_cell
+
+    return run_cell(
+        find_cell(options.cell),
+        data=options.data,
+        model=options.model,
+        out=options.out,
+        live=not options.quiet and sys.stdout.isatty(),
+        moving=options.animate,
+    )
+
+
+def _check(options: argparse.Namespace) -> int:
+    from touchcell.cell.config.schema import plan_cell
+
+    plan = plan_cell(find_cell(options.cell), {} if options.data is None else {"data": options.data})
+    print(f"{options.cell}: {plan.cell.name} is valid")
+    print(f"  task     {plan.task.name}: {plan.task.summary}")
+    for device in plan.built.values():
+        print(f"  {device.spec.capabilities.kind:<8} {device.name}: {device.spec.name}, {device.spec.summary}")
+    for name, interlock in plan.cell.interlocks.items():
+        way = plan.stopping_distances.get(name)
+        print(f"  interlock {name}: {interlock.kind}" + (f"; beyond its limit, {way}" if way else ""))
+    if plan.cell.processes == "separate":
+        from touchcell.cell.runtime.process_watchdog import process_lines
+
+        for line in process_lines(plan):
+            print(f"  process  {line}")
+    if plan.skipped:
+        print(f"  not needed by this task and not built: {', '.join(plan.skipped)}")
+    return EXIT_OK

@@ -1,0 +1,31 @@
+"""``devices`` and ``probe``: what is plugged in, and whether it answers."""
+
+from __future__ import annotations
+
+import argparse
+
+from touchcell.cell.cli.arguments import Subparsers, add_cell, add_command
+from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_OK
+from touchcell.cell.config.find import find_cell
+
+
+def add_parser(commands: Subparsers) -> None:
+    """Declare the commands."""
+    add_command(commands, "devices", _devices, "list cameras, serial ports and CAN interfaces, and what they need")
+    probe = add_command(commands, "probe", _probe, "connect a cell's devices without energising any; print their state")
+    add_cell(probe)
+
+
+def _devices(options: argparse.Namespace) -> int:
+    from touchcell.cell.cli.devices import print_devices
+
+    print_devices()
+    return EXIT_OK
+
+
+def _probe(options: argparse.Namespace) -> int:
+    from touchcell.cell.cli.devices import print_probes, probe_cell
+
+    probes = probe_cell(find_cell(options.cell))
+    print_probes(probes)
+    return EXIT_DEVICE_LOST if any(probe.error for probe in probes) else EXIT_OK

@@ -1,0 +1,207 @@
+"""``train``, ``train-sim``, ``calibrate``, ``calibrate-sim``, ``adapt``, ``evaluate``: estimators and their sensors."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from touchcell.cell.cli.arguments import Subparsers, add_command, positive, whole
+from touchcell.cell.cli.exit_codes import EXIT_OK
+from touchcell.cell.config.find import find_cell
+
+_KINDS = ("gdn", "cnn", "markers")
+
+
+def add_parser(commands: Subparsers) -> None:
+    """Declare the commands."""
+    _add_training(commands)
+    _add_calibration(commands)
+    evaluate = add_command(commands, "evaluate", _evaluate, "measure error, likelihood and latency on labelled images")
+    _add_data(evaluate, "data set folder with train/, val/ or test/")
+    evaluate.add_argument("--split", choices=("train", "val", "test"), default="val", help="(default: %(default)s)")
+    evaluate.add_argument("--model", type=Path, required=True, metavar="FILE", help="model file")
+    evaluate.add_argument("--calibration", type=Path, metavar="FILE", help="file of `touchcell calibrate`")
+    evaluate.add_argument("--deeper-than", type=float, metavar="MM", help="leave out shallower contacts")
+    evaluate.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
+
+
+def _add_training(commands: Subparsers) -> None:
+    train = add_command(commands, "train", _train, "train an estimator on labelled images")
+    _add_data(train, "data set folder with train/ and val/")
+    _add_out(train, "model file to write (.safetensors)")
+    train.add_argument(
+        "--kind",
+        choices=_KINDS,
+        default="gdn",
+        help="Gaussian-density network, regression or marker estimator (default: %(default)s)",
+    )
+    train.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
+    train.add_argument("--networks", type=positive, help="of a marker estimator, whose mixture it gives (default: 2)")
+    train.add_argument(
+        "--short-side",
+        type=positive,
+        metavar="PX",
+        help="least pixels of what a gdn or cnn sees, made by averaging whole ones (default: 100; 70 is twice as fast)",
+    )
+    _add_seed(train)
+    train.add_argument("--fresh", action="store_true", help="start again instead of resuming")
+
+    train_sim = add_command(commands, "train-sim", _train_sim, "train the estimator that ships, on simulated images")
+    _add_out(train_sim, "model file to write (.safetensors)")
+    train_sim.add_argument("--samples", type=positive, default=12_000, help="simulated images (default: %(default)s)")
+    train_sim.add_argument("--kind", choices=_KINDS, default="gdn", help="as of `train` (default: %(default)s)")
+    train_sim.add_argument("--tip", metavar="TIP", help="tip file of `calibrate-sim`, or the name of one that ships")
+    train_sim.add_argument("--processed", action="store_true", help="for images as the public data have them")
+    train_sim.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
+    _add_seed(train_sim)
+
+
+def _add_calibration(commands: Subparsers) -> None:
+    calibrate_sim = add_command(commands, "calibrate-sim", _calibrate_sim, "make the simulated tip like a real one")
+    _add_data(calibrate_sim, "data set folder with train/, better also val/")
+    _add_out(calibrate_sim, "tip file to write (.yaml)")
+    calibrate_sim.add_argument(
+        "--frames", type=positive, default=20, help="labelled images to fit to (default: %(default)s)"
+    )
+    calibrate_sim.add_argument(
+        "--images", type=positive, default=600, help="images that teach the matching, unlabelled (default: %(default)s)"
+    )
+    calibrate_sim.add_argument(
+        "--rings", type=positive, default=10, help="of the marker lattice (default: %(default)s)"
+    )
+    _add_seed(calibrate_sim)
+
+    calibrate = add_command(
+        commands, "calibrate", _calibrate, "find zoom, turn and shift of a camera from images out of contact"
+    )
+    calibrate.add_argument("--model", type=Path, required=True, metavar="FILE", help="model file")
+    _add_out(calibrate, "calibration file to write (.yaml)")
+    source = calibrate.add_mutually_exclusive_group(required=True)
+    source.add_argument("--frames", type=Path, metavar="DIR", help="folder with PNG images of the tip out of contact")
+    source.add_argument("--cell", type=Path, metavar="CELL", help="cell file whose sensor takes them now")
+    calibrate.add_argument("--sensor", metavar="NAME", help="which sensor of the cell (default: its only one)")
+    calibrate.add_argument(
+        "--count", type=positive, default=20, help="images that the cell's sensor takes (default: %(default)s)"
+    )
+    calibrate.add_argument(
+        "--reference", type=Path, metavar="DIR", help="such images of the sensor that the model knows"
+    )
+
+    adapt = add_command(
+        commands, "adapt", _adapt, "bring a marker estimator to another sensor by a few labelled images"
+    )
+    adapt.add_argument("--model", type=Path, required=True, metavar="FILE", help="model file of a marker estimator")
+    _add_data(adapt, "data set folder with train/ of the new sensor")
+    adapt.add_argument("--frames", type=positive, help="so many of its images, evenly chosen (default: all)")
+    _add_out(adapt, "model file to write (.safetensors)")
+
+
+def _add_data(parser: argparse.ArgumentParser, text: str) -> None:
+    parser.add_argument("--data", type=Path, required=True, metavar="DIR", help=text)
+
+
+def _add_out(parser: argparse.ArgumentParser, text: str) -> None:
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=text)
+
+
+def _add_seed(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seed", type=whole, default=0, help="of everything random (default: %(default)s)")
+
+
+def _train(options: argparse.Namespace) -> int:
+    from touchcell.perception.networks.training import train
+
+    train(
+        options.data,
+        options.out,
+        kind=options.kind,
+        epochs=options.epochs,
+        networks=options.networks,
+        short_side_px=options.short_side,
+        seed=options.seed,
+        resume=not options.fresh,
+    )
+    return EXIT_OK
+
+
+def _train_sim(options: argparse.Namespace) -> int:
+    from touchcell.cell.cli.train_sim import train_on_simulation
+
+    train_on_simulation(
+        options.out,
+        samples=options.samples,
+        kind=options.kind,
+        tip=options.tip,
+        processed=options.processed,
+        epochs=options.epochs,
+        seed=options.seed,
+    )
+    return EXIT_OK
+
+
+def _calibrate_sim(options: argparse.Namespace) -> int:
+    from touchcell.cell.cli.calibrate_sim import calibrate_sim
+
+    calibrate_sim(
+        options.data,
+        options.out,
+        frames=options.frames,
+        images=options.images,
+        rings=options.rings,
+        seed=options.seed,
+    )
+    return EXIT_OK
+
+
+def _calibrate(options: argparse.Namespace) -> int:
+    from touchcell.cell.cli.calibrate import calibrate
+
+    change = calibrate(
+        options.model,
+        options.out,
+        frames=options.frames,
+        cell=None if options.cell is None else find_cell(options.cell),
+        sensor=options.sensor,
+        count=options.count,
+        taught=options.reference,
+    )
+    u, v = change.shift_px
+    print(
+        f"zoom {change.zoom:.4f}, turn {change.turn_deg:.2f} deg, shift {u:.2f} {v:.2f} px, {change.rms_px:.2f} px left"
+    )
+    print(f"{change.frames} images; wrote {options.out}")
+    return EXIT_OK
+
+
+def _adapt(options: argparse.Namespace) -> int:
+    from touchcell.perception.calibration.adaptation import adapt
+
+    model = adapt(options.model, options.data, options.out, frames=options.frames)
+    told, camera = model.header.training, model.header.camera
+    assert camera is not None
+    print(f"{told['adapted_images_matched']} of {told['adapted_images']} images matched and learned from")
+    print(f"camera: zoom {camera.zoom:.4f}, turn {camera.turn_deg:.1f} deg; labels' axes:", end=" ")
+    print(f"{model.header.label_turn_deg:.1f} deg; wrote {options.out}")
+    return EXIT_OK
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    from rich.progress import Progress
+
+    from touchcell.perception.networks.evaluate import evaluate, print_table
+
+    with Progress(transient=True, disable=not sys.stdout.isatty()) as bar:
+        images = bar.add_task("images", total=None)
+        result = evaluate(
+            options.data,
+            options.split,
+            options.model,
+            calibration=options.calibration,
+            deeper_than_mm=options.deeper_than,
+            progress=lambda done, total: bar.update(images, completed=done, total=total),
+        )
+    print_table(result)
+    if options.json is not None:
+        result.write(options.json)
+    return EXIT_OK

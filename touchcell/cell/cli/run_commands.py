@@ -1,0 +1,116 @@
+"""``why``, ``report``, ``view``: what runs left behind; ``stop``, ``reset``, ``resume``: runs that are in progress."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from touchcell.cell.cli.arguments import RUNS, Subparsers, add_command, add_run_folder, port
+from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED
+from touchcell.errors import ConfigError
+
+
+def add_parser(commands: Subparsers) -> None:
+    """Declare the commands."""
+    why = add_command(commands, "why", _why, "explain why a run tripped or failed")
+    add_run_folder(why)
+
+    report = add_command(commands, "report", _report, "make a run's summary and plots again from its recording")
+    add_run_folder(report)
+    report.add_argument("--animate", action="store_true", help="also write animation.gif")
+
+    view = add_command(commands, "view", _view, "show in a browser what a run's sensors feel, live or recorded")
+    add_run_folder(view)
+    view.add_argument("--port", type=port, default=8177, help="of the page on this machine (default: %(default)s)")
+
+    stop = add_command(commands, "stop", _stop, "stop a run from another shell")
+    add_run_folder(stop, "every run in progress below runs/")
+    stop.add_argument("--now", action="store_true", help="at once, without withdrawing first")
+
+    for word, text in (
+        ("reset", "reset a run that has tripped and waits, once the cause has gone; nothing moves by it"),
+        ("resume", "let a run that has been reset start its task again"),
+    ):
+        asking = add_command(commands, word, _ask, text)
+        add_run_folder(asking, "the one run below runs/ that waits")
+        asking.set_defaults(ask=word)
+
+
+def latest_run(runs: Path = RUNS) -> Path:
+    """The run folder whose recording is newest.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    from touchcell.cell.recording.mcap import RECORDING
+
+    recordings = sorted(runs.glob(f"*/{RECORDING}"), key=lambda file: (file.stat().st_mtime_ns, file))
+    if not recordings:
+        raise ConfigError(f"there is no run below {runs}/", key="FOLDER", hint="name the folder of a run")
+    return recordings[-1].parent
+
+
+def _folder(options: argparse.Namespace) -> Path:
+    if options.folder is not None:
+        return Path(options.folder)
+    folder = latest_run()
+    print(f"{folder}:")
+    return folder
+
+
+def _report(options: argparse.Namespace) -> int:
+    from touchcell.cell.analysis.report import write_report
+
+    folder = _folder(options)
+    print(write_report(folder))
+    if options.animate:
+        from touchcell.cell.experiments.animation import animate
+
+        print(animate(folder))
+    return EXIT_OK
+
+
+def _view(options: argparse.Namespace) -> int:
+    from touchcell.cell.analysis.web_viewer import view_run
+
+    try:
+        view_run(_folder(options), options.port)
+    except OSError as error:
+        raise ConfigError(
+            f"cannot serve a page: {error.strerror}", key="--port", value=options.port, hint="--port 0 takes a free one"
+        ) from None
+    return EXIT_OK
+
+
+def _why(options: argparse.Namespace) -> int:
+    from touchcell.cell.analysis.trip_report import explain
+
+    print(explain(_folder(options)))
+    return EXIT_OK
+
+
+def _stop(options: argparse.Namespace) -> int:
+    from touchcell.cell.runtime.operator_input import NoSuchRun, ask_to_stop, await_end, running
+
+    folders = [options.folder] if options.folder else running(RUNS)
+    if not folders:
+        raise NoSuchRun(RUNS, "no run is in progress here")
+    for folder in folders:
+        ask_to_stop(folder, at_once=options.now)
+    ended = {folder: await_end(folder) for folder in folders}
+    for folder, done in ended.items():
+        print(f"{folder}: {'stopped' if done else 'asked, and still in progress'}")
+    return EXIT_OK if all(ended.values()) else EXIT_TASK_FAILED
+
+
+def _ask(options: argparse.Namespace) -> int:
+    from touchcell.cell.runtime.operator_channel import OperatorRequest, ask_run, is_waiting, operator_name
+    from touchcell.cell.runtime.operator_input import NoSuchRun, running
+
+    folders = [options.folder] if options.folder else [run for run in running(RUNS) if is_waiting(run)]
+    if len(folders) != 1 or not is_waiting(folders[0]):
+        where = folders[0] if len(folders) == 1 else RUNS
+        raise NoSuchRun(where, "several runs wait: name one" if len(folders) > 1 else "no run waits for a reset here")
+    done, answer = ask_run(folders[0], OperatorRequest(options.ask), operator_name())
+    print(f"{folders[0]}: {answer}")
+    return EXIT_OK if done else EXIT_TASK_FAILED

@@ -1,0 +1,75 @@
+"""Contacts from camera images by a trained model, a contact gate and a filter."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
+
+from pydantic import PositiveFloat
+
+from touchcell.errors import ConfigError
+from touchcell.paths import MODELS
+from touchcell.perception.runtime.estimator_spec import EstimatorConfig, EstimatorContext, EstimatorSpec
+from touchcell.perception.runtime.filter_spec import FilterSection
+from touchcell.plugin_section import Section
+
+if TYPE_CHECKING:
+    from touchcell.perception.runtime.pipeline import ContactPipeline
+
+BUILTIN: Final = "builtin:"
+
+
+class GateConfig(Section):
+    """The contact gate: mean change of the marker image, in per cent, that begins and ends a contact."""
+
+    touch_percent: PositiveFloat
+    release_percent: PositiveFloat
+
+
+class NetworkEstimator(EstimatorConfig):
+    """Image -> network -> filter. ``calibration`` is a file of ``touchcell calibrate``."""
+
+    kind: Literal["network"]
+    model: str
+    calibration: str | None = None
+    gate: GateConfig | None = None
+    filter: FilterSection | None = None
+
+    def build(self, context: EstimatorContext) -> ContactPipeline:
+        """Return the pipeline.
+
+        Raises:
+            ModelError: the model file cannot be used.
+            ConfigError: a contact gate is configured for a model without an image out of contact.
+        """
+        import cv2
+
+        from touchcell.perception.runtime.contact_gate import ContactGate
+        from touchcell.perception.runtime.estimators import load_estimator
+        from touchcell.perception.runtime.pipeline import ContactPipeline
+
+        # A second thread gains nothing on images of this size, and takes a core from other sensors.
+        cv2.setNumThreads(1)
+        calibration = None if self.calibration is None else Path(self.calibration)
+        model = load_estimator(model_path(self.model), calibration)
+        contact_gate = None
+        if self.gate is not None:
+            if model.reference is None:
+                raise ConfigError(
+                    f"model {self.model} holds no image out of contact, which a contact gate compares with",
+                    key=f"sensors.{context.sensor}.estimator.gate",
+                    value=self.model,
+                    hint="leave out `gate:`, so that every frame goes through the network",
+                )
+            enter, leave = self.gate.touch_percent / 100, self.gate.release_percent / 100
+            contact_gate = ContactGate(model.reference, enter=enter, leave=leave)
+        pose_filter = None if self.filter is None else self.filter.build()
+        return ContactPipeline(context.camera, model, contact_gate=contact_gate, pose_filter=pose_filter)
+
+
+def model_path(name: str) -> Path:
+    """Return the file behind a cell file's ``model:``: a path, or ``builtin:NAME`` for one that ships."""
+    return MODELS / f"{name.removeprefix(BUILTIN)}.safetensors" if name.startswith(BUILTIN) else Path(name)
+
+
+NETWORK = EstimatorSpec("network", "trained model, contact gate and filter on the sensor's images", NetworkEstimator)
