@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from touchcell.drivers.core.clock import MonotonicClock
+from tests.helpers.bus_arms import CLOCK, TOKEN, UP, activate, faulted, position, running, wait
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
-from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
+from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle
 from touchcell.drivers.core.errors import (
     CommandRejected,
     ConnectError,
@@ -35,10 +35,6 @@ from touchcell.drivers.damiao.rig import config, rig
 from touchcell.errors import ConfigError
 from touchcell.testing.emulation.process import EmulatorProcess
 
-CLOCK = MonotonicClock()
-TOKEN = OperatorToken("test", 0)
-UP = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0])
-
 
 @pytest.fixture(scope="module")
 def channel(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -47,9 +43,7 @@ def channel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def process(channel: Path) -> Iterator[EmulatorProcess]:
-    process = rig(channel.parent, 1).start()
-    yield process
-    process.stop()
+    yield from running(rig(channel.parent, 1))
 
 
 @pytest.fixture
@@ -65,20 +59,6 @@ def arm(channel: Path, emulator: EmulatorProcess) -> Iterator[DamiaoCanArm]:
     arm.disconnect()
 
 
-def wait(condition: Callable[[], Any], timeout_s: float = 10.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.005)
-
-
-def activate(arm: DamiaoCanArm) -> Lease:
-    arm.connect()
-    arm.configure()
-    arm.activate()
-    return arm.acquire("test")
-
-
 def stream(arm: DamiaoCanArm, lease: Lease, twist: np.ndarray, seconds: float) -> np.ndarray:
     """Sends the twist for so long; returns the measured ones."""
     measured = []
@@ -88,14 +68,6 @@ def stream(arm: DamiaoCanArm, lease: Lease, twist: np.ndarray, seconds: float) -
         measured.append(arm.tcp().value.twist)
         time.sleep(0.01)
     return np.array(measured)
-
-
-def position(state: dict[str, Any]) -> np.ndarray:
-    return np.array(state["position_m"])
-
-
-def faulted(arm: DamiaoCanArm) -> bool:
-    return arm.state is Lifecycle.FAULTED
 
 
 def test_it_is_registered_and_declares_that_it_falls() -> None:
@@ -135,7 +107,7 @@ def test_a_twist_moves_the_tool_and_its_expiry_stops_it(arm: DamiaoCanArm, emula
     lease = activate(arm)
     start = position(emulator.state())
     measured = stream(arm, lease, UP, 0.8)
-    # A starved loop moves the setpoint more slowly than asked for, never faster.
+    # A starved loop moves the setpoint more slowly than commanded, never faster.
     speed = np.median(measured, axis=0)
     assert 0.01 < speed[2] < 0.06
     np.testing.assert_allclose(speed[:2], 0.0, atol=0.01)

@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from touchcell.drivers.core.clock import MonotonicClock
+from tests.helpers.bus_arms import CLOCK, TOKEN, UP, activate, faulted, position, running, wait
 from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
-from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
+from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle
 from touchcell.drivers.core.errors import (
     CommandRejected,
     ConnectError,
@@ -37,9 +37,6 @@ from touchcell.drivers.feetech.rig import DIRECTION, PARK_DEG, ZERO_TICKS, confi
 from touchcell.errors import ConfigError
 from touchcell.testing.emulation.process import EmulatorProcess
 
-CLOCK = MonotonicClock()
-TOKEN = OperatorToken("test", 0)
-UP = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0])
 TICK_RAD = 2 * np.pi / 4096
 
 
@@ -50,9 +47,7 @@ def port(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def process(port: Path) -> Iterator[EmulatorProcess]:
-    process = rig(port.parent, 1).start()
-    yield process
-    process.stop()
+    yield from running(rig(port.parent, 1))
 
 
 @pytest.fixture
@@ -68,20 +63,6 @@ def arm(port: Path, servos: EmulatorProcess) -> Iterator[FeetechSerialArm]:
     arm.disconnect()
 
 
-def wait(condition: Callable[[], Any], timeout_s: float = 20.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.005)
-
-
-def activate(arm: FeetechSerialArm) -> Lease:
-    arm.connect()
-    arm.configure()
-    arm.activate()
-    return arm.acquire("test")
-
-
 def send(arm: FeetechSerialArm, lease: Lease, twist: np.ndarray) -> Sent[TwistCommand]:
     return arm.send_twist(TwistCommand(twist, TwistFrame.BASE, CLOCK.now_ns(), 0.2), lease)
 
@@ -91,14 +72,6 @@ def stream(arm: FeetechSerialArm, lease: Lease, twist: np.ndarray, seconds: floa
     while time.monotonic() < until:
         send(arm, lease, twist)
         time.sleep(0.01)
-
-
-def position(state: dict[str, Any]) -> np.ndarray:
-    return np.array(state["position_m"])
-
-
-def faulted(arm: FeetechSerialArm) -> bool:
-    return arm.state is Lifecycle.FAULTED
 
 
 def test_it_is_registered_and_declares_its_limitations() -> None:

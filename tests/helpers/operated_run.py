@@ -90,7 +90,7 @@ class OperatedRun:
 
 
 def tripped(folder: Path, **changes: Any) -> OperatedRun:
-    """A run whose arm stopped telling its state in the middle of its work."""
+    """A run whose arm stopped publishing its state in the middle of its task."""
     run = OperatedRun(folder, waiting_cell(**changes))
     run.until("run")
     run.go(20)

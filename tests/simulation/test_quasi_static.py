@@ -230,7 +230,7 @@ def test_a_snapshot_brings_object_and_contact_back():
 
 @pytest.mark.parametrize("shape", [SQUARE, HEXAGON, ROUND])
 def test_on_a_face_the_normal_is_the_faces(shape):
-    """Where skin is dragged along, the anchor is on the surface but for rounding."""
+    """The anchor of dragged skin is on the surface but for rounding."""
     body = shape_of(ObjectConfig(shape=shape, mass_g=1.0).build(TableConfig()).solid)
     for y in np.linspace(-0.015, 0.015, 61):
         on = body.nearest(np.array([-0.1, y, 0.02])).point

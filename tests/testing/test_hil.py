@@ -1,4 +1,4 @@
-"""Tests on a bench ask a person; without one there is one clear line."""
+"""Tests on real hardware ask the operator; without a terminal there is one clear line."""
 
 from __future__ import annotations
 

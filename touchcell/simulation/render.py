@@ -17,7 +17,7 @@ from touchcell.simulation import _plain_paint
 
 
 class _Kernels(Protocol):
-    """What the compiled and the plain module offer."""
+    """Interface of the compiled and the plain module."""
 
     def paint(self, image: ImageArray, centres: Array, stamps: ImageArray, /) -> None: ...
     def expose(

@@ -11,12 +11,10 @@ from pydantic import NonNegativeFloat, PositiveFloat, model_validator
 
 from touchcell.control.alignment import Aim, AlignmentGains, TargetAlignment
 from touchcell.control.path import Point
-from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig, Six, SixGains
-from touchcell.tasks.interface import TaskContext, TaskSpec
+from touchcell.tasks.contact_servo import ContactServoConfig, Six, SixGains
 from touchcell.tasks.push_path import Obstacle, plan
-from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
+from touchcell.tasks.servoing import ServoConfig, one_arm_task
 
 Mm = tuple[float, float]
 
@@ -159,17 +157,10 @@ class Push:
         }
 
 
-def build(config: SingleArmPushingConfig, context: TaskContext) -> ServoTask:
-    """Build the task for a cell that has ``arm`` and ``sensor``."""
-    servo = ContactServo(ARM, SENSOR, config, config.reference_mm_deg, Push(config), context)
-    return ServoTask("single_arm_pushing", config, context, servo)
-
-
-SPEC = TaskSpec(
-    name="single_arm_pushing",
-    summary="push an object over a table to a target, steering it by touch",
-    config=SingleArmPushingConfig,
-    arms={ARM: SERVO_ARM},
-    sensors=frozenset({SENSOR}),
-    build=build,
+SPEC = one_arm_task(
+    "single_arm_pushing",
+    "push an object over a table to a target, steering it by touch",
+    SingleArmPushingConfig,
+    Push,
+    lambda config: config.reference_mm_deg,
 )

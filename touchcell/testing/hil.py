@@ -119,7 +119,7 @@ def _ask(config: pytest.Config, device: str) -> None:
         try:
             answer = input()
         except (EOFError, OSError):
-            # Standard input is no terminal, or a worker's.
+            # Standard input is not a terminal, or belongs to a worker.
             answer = None
     if answer is None:
         pytest.exit(

@@ -1,4 +1,4 @@
-"""What the gate refuses, in which order, and that what it lets through is its own: finite, limited and read-only."""
+"""Rejections of the gate and their order; accepted commands are copies: finite, limited and read-only."""
 
 from __future__ import annotations
 
@@ -229,7 +229,7 @@ def test_anything_but_an_array_of_numbers_is_refused(harness: GateHarness, kind:
 
 
 class Hostile:
-    """Raises what no one expects when NumPy asks for its numbers."""
+    """Raises an unexpected error on conversion by NumPy."""
 
     def __array__(self, *_: Any, **__: Any) -> Any:
         raise RuntimeError("no")
@@ -329,7 +329,7 @@ def test_a_twist_changed_by_a_driver_is_checked_again(made: Array, reason: Rejec
 
 
 class Overshooting(DifferentialIk):
-    """Kinematics that answer with a larger twist than they were asked for."""
+    """Kinematics that return a larger twist than the requested one."""
 
     def at(self, q: Array) -> Any:
         local = super().at(q)
@@ -374,7 +374,7 @@ def test_from_rest_every_command_obeys_acceleration_whatever_its_time_to_live(
     before = np.zeros(6)
     for k in range(5):
         sent = harness.send(ttl_s=ttl_s, after_s=1.0 / rate_hz)
-        # After the end of its time the arm stands, and what counts is the step from rest.
+        # After the end of its time the arm is at rest, so the step is limited from rest.
         before = before if ttl_s >= 1.0 / rate_hz else np.zeros(6)
         step_s = FIRST_STEP_S if k == 0 or ttl_s < 1.0 / rate_hz else 1.0 / rate_hz
         assert np.linalg.norm(sent.command.twist - before) <= 0.5 * step_s * (1 + 1e-9)
@@ -389,7 +389,7 @@ def test_a_reset_makes_the_next_command_the_first(harness: GateHarness) -> None:
 
 
 def test_the_scale_is_the_smaller_of_both_parts() -> None:
-    """Also where the linear part asks for less and comes first."""
+    """Also where the linear part requires a smaller scale and comes first."""
     harness = GateHarness(NO_JERK)
     requested = np.array([0.4, 0, 0, 1.0, 0, 0])
     sent = harness.cruise(requested)

@@ -44,14 +44,8 @@ _EXTRAS: Final = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code, whatever becomes of the output; see ``exit_codes``."""
-    try:
-        return _command(list(sys.argv[1:] if arguments is None else arguments))
-    finally:
-        flush_output()
-
-
-def _command(words: list[str]) -> int:
+    """Run one command and return its exit code; see ``exit_codes``."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
     passed_on: list[str] = []
     if "bench" in words[:2] and "--" in words:
         # argparse hands the dashes on to the subcommand's parser, which then claims the words behind them.
@@ -64,8 +58,11 @@ def _command(words: list[str]) -> int:
     options = parser.parse_args(words)
     options.passed_on = passed_on
     options.parser = parser
-    with log_to_terminal(options.verbose):
-        return _run(options)
+    try:
+        with log_to_terminal(options.verbose):
+            return _run(options)
+    finally:
+        flush_output()
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -112,7 +109,7 @@ def _run(options: argparse.Namespace) -> int:
         remedy = f"pip install '{_EXTRAS[error.name]}'"
         return _fail(f"`{options.command}` needs {error.name}, which is not installed ({remedy})", EXIT_BAD_INPUT)
     except BrokenPipeError:
-        # The reader of our output, `head` perhaps, is done.
+        # The reader of the output, `head` perhaps, has seen enough.
         return EXIT_OK
     except KeyboardInterrupt:
         return _fail("interrupted", EXIT_INTERRUPTED)

@@ -32,7 +32,7 @@ from touchcell.drivers.core.errors import DeviceError
 from touchcell.errors import TouchcellError
 from touchcell.logs import log_to_file
 
-_logger = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 LOG = "run.log"
 """Name of the log file in a run folder."""
@@ -124,7 +124,7 @@ def run_plan(plan: CellPlan, *, out: Path | None = None, live: bool = False) -> 
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "cell.yaml").write_text(plan.text())
     with log_to_file(folder / LOG):
-        _logger.info("%s: task %s of %s, in %s", plan.cell.name, plan.task.name, plan.file, folder)
+        logger.info("%s: task %s of %s, in %s", plan.cell.name, plan.task.name, plan.file, folder)
         try:
             result, leaving = _run(cell, folder, live)
         except FolderInUse:
@@ -133,7 +133,7 @@ def run_plan(plan: CellPlan, *, out: Path | None = None, live: bool = False) -> 
             _write_result(folder, _not_started_json(plan, error))
             raise
         ended = f"{result.outcome.value} after {result.duration_s:.2f} s"
-        _logger.info("%s: %s%s", plan.cell.name, ended, f" ({result.reason})" if result.reason else "")
+        logger.info("%s: %s%s", plan.cell.name, ended, f" ({result.reason})" if result.reason else "")
     return FinishedRun(result, folder, _report(folder), leaving)
 
 
@@ -155,7 +155,7 @@ def _run(cell: Cell, folder: Path, live: bool) -> tuple[RunResult, Exception | N
     except Exception as error:
         if result is None:
             raise
-        _logger.exception("after the run")
+        logger.exception("after the run")
         warn(f"after the run: {error}")
         _write_result(folder, {**_result_json(cell.plan, result), "after_the_run": str(error)})
         return result, error
@@ -216,7 +216,7 @@ def _dump(box: BlackBox, folder: Path, cell: Cell, result: RunResult) -> None:
         }
         box.dump(folder, result, about)
     except Exception as error:
-        _logger.exception("no black box")
+        logger.exception("no black box")
         # What happened is reported all the same.
         warn(f"no black box: {error}")
 

@@ -48,7 +48,16 @@ _SHORTEST_TTL_S = 1e-3
 
 
 class LimitsConfig(DriverConfig):
-    """The ``limits:`` of an arm in the cell file: speeds, accelerations and jerks of the tool centre point."""
+    """The ``limits:`` of an arm in the cell file: speeds, accelerations and jerks of the tool centre point.
+
+    Attributes:
+        tcp_speed_m_s: largest linear speed.
+        tcp_accel_m_s2: largest linear acceleration.
+        tcp_rot_speed_rad_s: largest angular speed.
+        tcp_rot_accel_rad_s2: largest angular acceleration.
+        tcp_jerk_m_s3: largest linear jerk.
+        tcp_rot_jerk_rad_s3: largest angular jerk.
+    """
 
     tcp_speed_m_s: float = Field(default=0.10, gt=0.0, le=1.0)
     tcp_accel_m_s2: float = Field(default=0.5, gt=0.0, le=10.0)
@@ -313,7 +322,14 @@ class Arm(Device):
 
 
 class JointLimitsConfig(DriverConfig):
-    """The ``joint_limits:`` of an arm in the cell file; ranges, speeds and accelerations are in its chain file."""
+    """The ``joint_limits:`` of an arm in the cell file; ranges, speeds and accelerations are in its chain file.
+
+    Attributes:
+        margin_deg: distance to the end of a joint's range within which outward speed falls to zero.
+        characteristic_length_mm: length that makes a radian comparable to a distance, about half the arm's reach.
+        singular_value_mm: singular value of the Jacobian below which its direction is damped.
+        singular_floor_mm: smallest singular value; motion that would reduce it further is refused.
+    """
 
     margin_deg: float = Field(default=5.0, gt=0.0, le=45.0)
     characteristic_length_mm: float = Field(default=250.0, gt=0.0, le=2000.0)

@@ -32,7 +32,7 @@ class TwistCommand:
     """Move the tool centre point at a velocity for at most ``ttl_s``, then stop.
 
     A command is a value: it keeps a read-only copy of an array of numbers, so that nothing that sees it on its way to
-    the arm can change it. What is no such array is left as it is, for the gate to judge.
+    the arm can change it. Anything else is left unchanged, for the gate to reject.
 
     Attributes:
         twist: (6,) [vx vy vz wx wy wz], m/s and rad/s: linear velocity of the tool centre point, angular velocity.

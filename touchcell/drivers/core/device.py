@@ -94,6 +94,7 @@ class Device(ABC):
             self._close()
             self._forget_state()
             raise
+        _logger.info("%s: connected", self.name)
 
     @final
     def configure(self) -> None:
@@ -184,11 +185,12 @@ class Device(ABC):
     def _to_faulted(self, error: DeviceError) -> DeviceError:
         """Latch the first fault; returns it so that callers can raise it."""
         with self._state_lock:
-            if self._state is not Lifecycle.FAULTED:
-                # The error first: who reads the state from another thread finds it.
-                self._fault_error = error
-                self._state = Lifecycle.FAULTED
-                _logger.error("faulted: %s", error)
+            if self._state is Lifecycle.FAULTED:
+                return error
+            # The error first: who reads the state from another thread finds it.
+            self._fault_error = error
+            self._state = Lifecycle.FAULTED
+        _logger.error("faulted: %s", error)
         return error
 
     def _attempt(self, step: Callable[[], None]) -> None:

@@ -178,4 +178,4 @@ def require_protocols(protocols: Iterable[object]) -> None:
     """Check a declaration. Raises TypeError for anything that ``isinstance`` cannot hold against a device."""
     for each in protocols:
         if not (isinstance(each, type) and getattr(each, "_is_runtime_protocol", False)):
-            raise TypeError(f"{each!r} is no runtime-checkable Protocol class")
+            raise TypeError(f"{each!r} is not a runtime-checkable Protocol class")

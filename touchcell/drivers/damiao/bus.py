@@ -15,10 +15,11 @@ from __future__ import annotations
 import errno
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from touchcell.drivers.core import can_errors
+from touchcell.drivers.core.bus_reply import BusCounters, Reply
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import (
     CodecError,
@@ -46,29 +47,11 @@ class Address:
     mst_id: int
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """State of a motor, stamped when it was requested (its age is at most the time since)."""
-
-    feedback: Feedback
-    t_ns: int
-
-
 @dataclass(slots=True)
-class Counters:
-    """Message statistics since the bus was opened."""
+class Counters(BusCounters):
+    """Message statistics, with the error frames of the CAN controller."""
 
-    sent: int = 0
-    answered: int = 0
-    missed: int = 0
-    corrupt: int = 0
-    unexpected: int = 0
-    not_sent: int = 0
     error_frames: int = 0
-
-    def as_dict(self) -> dict[str, int]:
-        """Return the counters by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 @dataclass(slots=True, eq=False)
@@ -122,7 +105,7 @@ class MotorBus:
         n = len(self._addresses)
         self._ranges: list[Ranges | None] = [None] * n
         self._pending: list[deque[_Pending]] = [deque() for _ in range(n)]
-        self._newest: list[Answer | None] = [None] * n
+        self._newest: list[Reply[Feedback] | None] = [None] * n
         self._wanted_register: tuple[int, int, bool] | None = None
         self._replies: list[codec.RegisterReply] = []
         self._bus_off = False
@@ -190,10 +173,10 @@ class MotorBus:
             while (answer := self._newest[index]) is None and self._receive(until_ns):
                 pass
             if answer is not None:
-                return answer.feedback
+                return answer.state
         raise self._no_answer(index)
 
-    def exchange(self, data: Sequence[bytes | None], until_ns: int) -> list[Answer | None]:
+    def exchange(self, data: Sequence[bytes | None], until_ns: int) -> list[Reply[Feedback] | None]:
         """Send every motor its frame, or a request for its state if None, and collect the replies.
 
         Returns as soon as all have replied to this very request, and at ``until_ns`` at the latest, with the newest
@@ -377,7 +360,7 @@ class MotorBus:
             self.counters.unexpected += 1
             return
         self.counters.answered += 1
-        self._newest[index] = Answer(feedback, queue.popleft().t_ns)
+        self._newest[index] = Reply(feedback, queue.popleft().t_ns)
 
     def _note_error(self, arbitration_id: int) -> None:
         self.counters.error_frames += 1

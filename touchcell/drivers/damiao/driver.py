@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from touchcell.drivers.core.bus_arm import BusArm, BusArmConfig
+from touchcell.drivers.core.bus_reply import Reply
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
@@ -41,8 +42,8 @@ from touchcell.drivers.core.protocols import (
 from touchcell.drivers.core.samples import JointState, Stamped
 from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.damiao import codec
-from touchcell.drivers.damiao.bus import Address, Answer, MotorBus
-from touchcell.drivers.damiao.codec import MitCommand, Register
+from touchcell.drivers.damiao.bus import Address, MotorBus
+from touchcell.drivers.damiao.codec import Feedback, MitCommand, Register
 from touchcell.drivers.kinematics.chain import GRAVITY_M_S2, ChainDescription, SerialChain, Vector3
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
@@ -59,7 +60,16 @@ _DISABLED_ITSELF = codec.StatusCode(
 
 
 class MotorConfig(BaseModel):
-    """Configuration of one joint's motor: joint angle = ``direction`` times motor angle, plus ``offset_deg``."""
+    """Configuration of one joint's motor: joint angle = ``direction`` times motor angle, plus ``offset_deg``.
+
+    Attributes:
+        esc_id: CAN id that the motor listens to.
+        mst_id: CAN id that it answers with.
+        direction: sign of joint angle against motor angle.
+        offset_deg: joint angle at the motor's zero.
+        kp_n_m_rad: stiffness of its position loop, N m/rad.
+        kd_n_m_s_rad: damping of its position loop, N m s/rad.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -76,6 +86,17 @@ class DamiaoCanConfig(BusArmConfig):
 
     ``interface``, ``channel`` and ``bus_options`` go to python-can; the bit rates are those set by the adapter or by
     ``ip link``.
+
+    Attributes:
+        interface: of python-can.
+        channel: of python-can, such as can0.
+        bus_options: further options of python-can.
+        fd: whether the bus is CAN FD.
+        bitrate: bit/s, as set by the adapter or by ``ip link``.
+        data_bitrate: bit/s of the data phase of CAN FD.
+        gravity_m_s2: gravity along the axes of the arm's base, for compensation.
+        motors: one for each joint, from the base.
+        watchdog_s: silence after which a motor lets go by itself: the arm sinks.
     """
 
     interface: str = "socketcan"
@@ -156,7 +177,7 @@ class DamiaoCanArm(BusArm):
 
     def _reset_state(self) -> None:
         super()._reset_state()
-        self._answers: list[Answer | None] = [None] * len(self._config.motors)
+        self._answers: list[Reply[Feedback] | None] = [None] * len(self._config.motors)
 
     def watchdog_s(self) -> float:
         """Return the timeout after which the motors disable themselves, as read back; the longest of them."""
@@ -176,9 +197,9 @@ class DamiaoCanArm(BusArm):
         readings |= super().health()
         for joint, answer in zip(self._chain.joint_names, self._answers, strict=True):
             if answer is not None:
-                readings[f"{joint}_status"] = answer.feedback.status
-                readings[f"{joint}_mos_c"] = answer.feedback.mos_c
-                readings[f"{joint}_rotor_c"] = answer.feedback.rotor_c
+                readings[f"{joint}_status"] = answer.state.status
+                readings[f"{joint}_mos_c"] = answer.state.mos_c
+                readings[f"{joint}_rotor_c"] = answer.state.rotor_c
         return readings
 
     def _open_bus(self) -> None:
@@ -229,7 +250,7 @@ class DamiaoCanArm(BusArm):
         with self._lock:
             answers = [self._fresh_answer(index) for index in range(len(self._enabled))]
             for index, motor in enumerate(self._config.motors):
-                status = answers[index].feedback.status
+                status = answers[index].state.status
                 if codec.fault(status) is not None:
                     status = self._bus.command(index, codec.CLEAR_ERROR).status
                 if (code := codec.fault(status)) is not None:
@@ -239,7 +260,7 @@ class DamiaoCanArm(BusArm):
             self._missed.clear()
             self._latched_fault = None
 
-    def _fresh_answer(self, index: int) -> Answer:
+    def _fresh_answer(self, index: int) -> Reply[Feedback]:
         """Return the loop's newest reply. Waiting for a silent motor here would let the others' timeouts expire."""
         answer, limit_s = self._answers[index], self._config.max_silence_s
         if answer is None or (self._clock.now_ns() - answer.t_ns) * 1e-9 > limit_s:
@@ -343,12 +364,12 @@ class DamiaoCanArm(BusArm):
             for i, motor in enumerate(self._config.motors)
         ]
 
-    def _take(self, answers: list[Answer | None]) -> None:
+    def _take(self, answers: list[Reply[Feedback] | None]) -> None:
         good = [self._plausible(index, answer) for index, answer in enumerate(answers)]
         for index, answer in enumerate(good):
             if answer is not None:
                 self._answers[index] = answer
-                self._check_status(index, answer.feedback.status)
+                self._check_status(index, answer.state.status)
         known = [answer for answer in self._answers if answer is not None]
         if len(known) == len(good) and all(answer is not None for answer in good):
             self._publish(known)
@@ -358,20 +379,20 @@ class DamiaoCanArm(BusArm):
         if self._joints is not None:
             self._check_tracking(self._joints.value.q, self._setpoint.q)
 
-    def _plausible(self, index: int, answer: Answer | None) -> Answer | None:
+    def _plausible(self, index: int, answer: Reply[Feedback] | None) -> Reply[Feedback] | None:
         """Return the reply, or None if the motor cannot have turned that far since the last one."""
         before = self._answers[index]
         if answer is None or before is None:
             return answer
         elapsed_s = max(answer.t_ns - before.t_ns, 0) * 1e-9
         reach = self._bus.ranges(index).velocity_rad_s * elapsed_s + _PLAUSIBLE_JUMP_RAD
-        if abs(answer.feedback.q - before.feedback.q) <= reach:
+        if abs(answer.state.q - before.state.q) <= reach:
             return answer
         self._implausible += 1
         return None
 
-    def _publish(self, answers: list[Answer]) -> None:
-        feedback = np.array([(a.feedback.q, a.feedback.dq, a.feedback.tau) for a in answers])
+    def _publish(self, answers: list[Reply[Feedback]]) -> None:
+        feedback = np.array([(a.state.q, a.state.dq, a.state.tau) for a in answers])
         state = JointState(
             self._direction * feedback[:, 0] + self._offset,
             self._direction * feedback[:, 1],

@@ -12,9 +12,10 @@ from __future__ import annotations
 import select
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
+from touchcell.drivers.core.bus_reply import BusCounters, Reply
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import CodecError, ConnectError, CorruptMessage, DeviceGone, TransportTimeout
 from touchcell.drivers.feetech import codec
@@ -27,29 +28,11 @@ _LONGEST_NOISE_S = 0.2
 _READ_SIZE = 4096
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """State of a servo, stamped when it was requested (its age is at most the time since)."""
-
-    state: ServoState
-    t_ns: int
-
-
 @dataclass(slots=True)
-class Counters:
-    """Message statistics since the line was opened."""
+class Counters(BusCounters):
+    """Message statistics, with the replies that arrived cycles too late."""
 
-    sent: int = 0
-    answered: int = 0
-    missed: int = 0
-    corrupt: int = 0
     late: int = 0
-    unexpected: int = 0
-    not_sent: int = 0
-
-    def as_dict(self) -> dict[str, int]:
-        """Return the counters by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 class ServoBus:
@@ -139,7 +122,7 @@ class ServoBus:
         with self._lock:
             self._send(codec.sync_write(Register.GOAL_POSITION, data))
 
-    def read_states(self, until_ns: int) -> list[Answer | None]:
+    def read_states(self, until_ns: int) -> list[Reply[ServoState] | None]:
         """Request the state of all servos; return when all have replied, and at ``until_ns`` at the latest.
 
         Raises:
@@ -151,7 +134,7 @@ class ServoBus:
             length = codec.state_length(start)
             self._drain()
             requested_ns = self._clock.now_ns()
-            answers: dict[int, Answer] = {}
+            answers: dict[int, Reply[ServoState]] = {}
             if self._send(codec.sync_read(self._ids, start, length)):
                 while len(answers) < len(self._ids):
                     packets = self._receive(until_ns, codec.state_length(codec.STATE_STARTS[0]))
@@ -163,7 +146,9 @@ class ServoBus:
             self.counters.missed += len(self._ids) - len(answers)
             return [answers.get(servo) for servo in self._ids]
 
-    def _take_state(self, packet: Packet, length: int, requested_ns: int, answers: dict[int, Answer]) -> None:
+    def _take_state(
+        self, packet: Packet, length: int, requested_ns: int, answers: dict[int, Reply[ServoState]]
+    ) -> None:
         if packet.servo in self._ids and len(packet.data) != length:
             self.counters.late += 1
             return
@@ -171,7 +156,7 @@ class ServoBus:
             self.counters.unexpected += 1
             return
         try:
-            answers[packet.servo] = Answer(codec.decode_state(packet.data), requested_ns)
+            answers[packet.servo] = Reply(codec.decode_state(packet.data), requested_ns)
         except CodecError:
             self.counters.corrupt += 1
 

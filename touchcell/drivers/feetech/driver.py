@@ -24,6 +24,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from touchcell.drivers.core.bus_arm import BusArm, BusArmConfig
+from touchcell.drivers.core.bus_reply import Reply
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import OperatorToken
 from touchcell.drivers.core.errors import (
@@ -39,7 +40,7 @@ from touchcell.drivers.core.protocols import SERVO_ARM, HealthSource, JointGoal,
 from touchcell.drivers.core.samples import JointState, Quality, Stamped
 from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.feetech import codec
-from touchcell.drivers.feetech.bus import Answer, ServoBus
+from touchcell.drivers.feetech.bus import ServoBus
 from touchcell.drivers.feetech.codec import FaultBit, Register, ServoState
 from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain
@@ -66,6 +67,14 @@ class ServoConfig(BaseModel):
 
     ``min_ticks`` and ``max_ticks`` limit the joint's range, within one turn: a servo turns the long way round between
     4095 and 0. ``homing_offset_ticks`` is the value stored in the servo when it was calibrated.
+
+    Attributes:
+        id: of the servo on the line.
+        zero_ticks: reading at joint angle zero.
+        direction: sign of joint angle against ticks.
+        min_ticks: lowest reading of the joint's range.
+        max_ticks: highest reading of the joint's range.
+        homing_offset_ticks: value stored in the servo when it was calibrated.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -98,7 +107,15 @@ class ServoConfig(BaseModel):
 
 class FeetechSerialConfig(BusArmConfig):
     """Configuration of a Feetech arm. ``servos`` are in the order of the joints; the chain's joint ranges are narrowed
-    to the calibrated ones."""
+    to the calibrated ones.
+
+    Attributes:
+        port: serial port; a name under /dev/serial/by-id stays with the adapter.
+        baudrate: bit/s of the line.
+        echo: whether the adapter echoes what is sent.
+        servos: one for each joint, from the base.
+        torque_limit_percent: largest torque, of the servo's own maximum.
+    """
 
     port: str
     baudrate: int = Field(default=1_000_000, gt=0)
@@ -179,7 +196,7 @@ class FeetechSerialArm(BusArm):
 
     def _reset_state(self) -> None:
         super()._reset_state()
-        self._answers: list[Answer | None] = [None] * len(self._config.servos)
+        self._answers: list[Reply[ServoState] | None] = [None] * len(self._config.servos)
         # A servo holds its goal by itself: goals are sent only between activation and rest.
         self._driving = False
         self._unanswered = [0] * len(self._config.servos)
@@ -357,7 +374,7 @@ class FeetechSerialArm(BusArm):
             self._bus.write(self._ids[index], Register.TORQUE_ENABLE, bytes([codec.TORQUE_OFF]))
             self._enabled[index] = False
 
-    def _fresh_answers(self) -> list[tuple[int, Answer]]:
+    def _fresh_answers(self) -> list[tuple[int, Reply[ServoState]]]:
         """Request the state of every servo now; return servo ids and states. Raises TransportTimeout."""
         silent = list(self._ids)
         for _ in range(_TRIES):
@@ -386,7 +403,7 @@ class FeetechSerialArm(BusArm):
             )
         self._take(self._bus.read_states(until_ns), due)
 
-    def _take(self, answers: list[Answer | None], due: Array) -> None:
+    def _take(self, answers: list[Reply[ServoState] | None], due: Array) -> None:
         good = [self._plausible(index, answer) for index, answer in enumerate(answers)]
         for index, answer in enumerate(good):
             self._unanswered[index] += 1
@@ -403,7 +420,7 @@ class FeetechSerialArm(BusArm):
             if self._driving:
                 self._check_tracking(q, due)
 
-    def _plausible(self, index: int, answer: Answer | None) -> Answer | None:
+    def _plausible(self, index: int, answer: Reply[ServoState] | None) -> Reply[ServoState] | None:
         """Return the reply, or None if the servo cannot have turned that far since the last one."""
         before = self._answers[index]
         if answer is None or before is None:
@@ -415,7 +432,7 @@ class FeetechSerialArm(BusArm):
         self._implausible += 1
         return None
 
-    def _publish(self, answers: list[Answer]) -> Array:
+    def _publish(self, answers: list[Reply[ServoState]]) -> Array:
         q = np.array([self._angle(index, answer.state.position) for index, answer in enumerate(answers)])
         units = [self._bus.identity(servo).speed_unit_ticks_s for servo in self._ids]
         dq = np.array(

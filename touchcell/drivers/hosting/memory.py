@@ -74,7 +74,7 @@ class _Mapped:
         self._stride = -(-self.capacity // _WORD) + _SLOT_WORDS
 
     def _slot(self, number: int) -> int:
-        """Return the index of the first word of the slot of record ``number``."""
+        """Return the index of the first 64-bit entry of the slot of record ``number``."""
         return _HEADER_WORDS + (number % SLOTS) * self._stride
 
     def close(self) -> None:

@@ -208,10 +208,12 @@ class RemoteArm(RemoteDevice):
             DeviceFault: the host has died or is silent; the arm is FAULTED.
         """
         link = self._check_host()
-        # The gate would say the same, but the block has no room for anything else.
+        # Same check as in the gate, because the block has no room for anything else.
         command = checked_twist_command(self.name, command)
         if abs(command.t_ns) >= 2**62:
-            raise CommandRejected(self.name, Rejection.EXPIRED, "its time stamp is no time", value=command.t_ns)
+            raise CommandRejected(
+                self.name, Rejection.EXPIRED, "its timestamp is not an integer in nanoseconds", value=command.t_ns
+            )
         value = self._commands.value
         value["number"] = self._next()
         value["lease"] = lease.epoch if self._lease is not None and lease is self._lease else 0

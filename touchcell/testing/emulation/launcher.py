@@ -34,7 +34,7 @@ EMULATORS: Final = Registry("touchcell.emulators", "emulator", EmulatorModule)
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the emulator named first in ``arguments`` until it is asked to end; return the exit code.
+    """Run the emulator named first in ``arguments`` until it is stopped; return the exit code.
 
     Raises:
         ConfigError: there is no such emulator, its arguments are wrong, or its address cannot be used.
