@@ -180,7 +180,7 @@ def _judged(case: ArmCase, fault: ProcessFault, longest_s: float) -> list[str]:
 
 
 def _arm_case(name: str, before: Any, record: Any, fault_ns: int) -> ArmCase:
-    commanded = [int(record[key]) for key in ("asked_ns", "stop_ns") if record[key] > fault_ns]
+    commanded = [int(record[key]) for key in ("requested_ns", "stop_ns") if record[key] > fault_ns]
     rested_ns = int(record["moved_ns"]) if record["at_rest"] else None
     detected_ns = min(commanded, default=None)
     return ArmCase(
