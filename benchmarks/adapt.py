@@ -166,7 +166,7 @@ def _real(data: Path, path: Path, held_out: int) -> Case:
     model = load_model(path)
     architecture = model.header.architecture
     if not isinstance(architecture, MarkerArchitecture):
-        raise SystemExit(f"{path} is no marker model")
+        raise SystemExit(f"{path} is not a marker model")
     sets, unchanged = {}, None
     for name, wanted in (("train", COUNTS[-1]), ("val", held_out)):
         split = read_split(data, name)
@@ -191,7 +191,7 @@ def _simulated(path: Path, tip: str, held_out: int) -> Case:
     model = load_model(path)
     architecture = model.header.architecture
     if not isinstance(architecture, MarkerArchitecture):
-        raise SystemExit(f"{path} is no marker model")
+        raise SystemExit(f"{path} is not a marker model")
     sensor = load_tip(tip)
     other_tip, other_rig = second_sensor(sensor.tip, sensor.rig)
     few = _drawn(other_tip, other_rig, COUNTS[-1], 11, model)

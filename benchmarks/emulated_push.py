@@ -171,12 +171,12 @@ def simulated(
     with compose(plan_cell(folder / "cell.yaml")) as built, Recorder(folder / RECORDING) as recorder:
         result = RunLoop(built, recorder).run()
     run = RunFolder(folder)
-    told = object_poses(run)[_OBJECT]
+    poses = object_poses(run)[_OBJECT]
     series, contacts = true_contacts(run, _SENSORS[LEADER])
     t_s = scene_time(run, series)
     T_f_s = np.asarray(se3.from_euler_mm_deg(np.nan_to_num(contacts)))
     T_world_f = se3.compose(sensor_poses(run, _SENSORS[LEADER]).at(t_s), se3.inverse(T_f_s))
-    truth = _Truth(t_s, told.at(t_s), T_world_f)
+    truth = _Truth(t_s, poses.at(t_s), T_world_f)
     return _push(run, f"{result.outcome.value}: {result.reason}", truth)
 
 
@@ -237,20 +237,20 @@ def _sensing_s(run: RunFolder, role: str) -> float:
 
 def _obeying_s(run: RunFolder, role: str) -> float:
     """Return the delay by which the integrated commands best fit the tool's motion."""
-    series, told = run.recording.series(f"/arms/{role}/command"), run.recording.series(f"/arms/{role}/tcp")
+    series, tcp = run.recording.series(f"/arms/{role}/command"), run.recording.series(f"/arms/{role}/tcp")
     assert series is not None
-    assert told is not None
-    inside = np.searchsorted(told.t_s, series.t_s, side="right") - 1
-    T_base_tcp = tip_points(told)[np.clip(inside, 0, None)]
+    assert tcp is not None
+    inside = np.searchsorted(tcp.t_s, series.t_s, side="right") - 1
+    T_base_tcp = tip_points(tcp)[np.clip(inside, 0, None)]
     velocity = np.array([row["twist"][:3] for row in series.rows])
     in_tool = np.array([row["frame"] != "base" for row in series.rows])
     velocity[in_tool] = np.einsum("nij,nj->ni", T_base_tcp[in_tool, :3, :3], velocity[in_tool])
     way = np.concatenate([np.zeros((1, 3)), np.cumsum(velocity[:-1] * np.diff(series.t_s)[:, None], axis=0)])
-    moved = tip_points(told)[:, :3, 3]
-    within = (told.t_s > series.t_s[0] + _DELAYS_S[-1]) & (told.t_s < series.t_s[-1])
+    moved = tip_points(tcp)[:, :3, 3]
+    within = (tcp.t_s > series.t_s[0] + _DELAYS_S[-1]) & (tcp.t_s < series.t_s[-1])
 
     def misfit(delay_s: float) -> float:
-        expected = np.stack([np.interp(told.t_s[within] - delay_s, series.t_s, axis) for axis in way.T], axis=1)
+        expected = np.stack([np.interp(tcp.t_s[within] - delay_s, series.t_s, axis) for axis in way.T], axis=1)
         off = moved[within] - expected
         return float(np.sum((off - off.mean(axis=0)) ** 2))
 
@@ -394,7 +394,7 @@ def _plot(pushes: Mapping[str, Push], path_mm: Array, path: Path) -> None:
         above.plot(push.object_mm_deg[:, 0], push.object_mm_deg[:, 1], **style)
         then, _ = differences_mm(push, path_mm)
         away.plot(push.t_s[: len(then)], then, **style)
-    above.set(xlabel="x (mm)", ylabel="y (mm)", title="object's middle, from above")
+    above.set(xlabel="x (mm)", ylabel="y (mm)", title="object's centre, top view")
     away.set(xlabel="time since the push began (s)", ylabel="mm", title="from the emulated median at the same time")
     above.legend(fontsize=8)
     for axis in (above, away):

@@ -81,11 +81,11 @@ def checks() -> list[Check]:
 def _deflection() -> Check:
     script = [((0, 0, 10, 0, 0, 0), 0.45), (_STILL, 0.1), ((10, 0, 0, 0, 0, 0), 0.4), ((0, 0, 0, 0, 0, 10), 0.3)]
     script += [((0, 0, 0, 20, 0, 0), 0.4), ((0, -20, 0, 0, 0, 0), 0.4), (_STILL, 0.2)]
-    felt = []
+    deflections = []
     for step_ms in (1.0, 0.1):
         tip = CommandedTip({**_FLOOR, "physics_step_ms": step_ms}, _ABOVE)
-        felt.append([tip.move(twist, 0.02).T_f_s[:2, 3] for twist, s in script for _ in range(round(s / 0.02))])
-    worst_mm = 1e3 * float(np.abs(np.array(felt[0]) - np.array(felt[1])).max())
+        deflections.append([tip.move(twist, 0.02).T_f_s[:2, 3] for twist, s in script for _ in range(round(s / 0.02))])
+    worst_mm = 1e3 * float(np.abs(np.array(deflections[0]) - np.array(deflections[1])).max())
     return Check("tip deflection at 1 ms against 0.1 ms", f"{worst_mm:.3f} mm", "<= 0.1 mm", worst_mm <= 0.1)
 
 

@@ -131,9 +131,9 @@ def perform(script: Script, physics: str, physics_step_ms: float = 1.0, *, joint
             for tip, hand in hands.items():
                 hand.follow(twists.get(tip, _STILL))
             clock.advance_s(_CYCLE_S)
-            felt = [scene.contact(tip).value for tip in hands]
-            shears.append([1e3 * state.T_f_s[:2, 3] for state in felt])
-            forces.append([state.normal_force_n for state in felt])
+            contacts = [scene.contact(tip).value for tip in hands]
+            shears.append([1e3 * state.T_f_s[:2, 3] for state in contacts])
+            forces.append([state.normal_force_n for state in contacts])
     cpu_s = time.process_time() - started
     duration_s = (clock.now_ns() - start_ns) * 1e-9
     return Trace(np.array(shears), np.array(forces), dict(scene.objects().value), duration_s, cpu_s)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
 from pydantic.json_schema import JsonSchemaValue
@@ -13,6 +13,9 @@ from pydantic_core import CoreSchema, PydanticCustomError, PydanticKnownError, c
 
 from touchcell.errors import ConfigError
 from touchcell.registry import Registry
+
+PLUGIN: Final = "x-plugin"
+"""Keyword of a JSON Schema that says which kind of plug-in a section belongs to."""
 
 
 class Section(BaseModel):
@@ -78,4 +81,5 @@ class PluginSection:
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         models = [self.registry.load(name).config for name in self.registry.names()]
-        return handler(core_schema.union_schema([model.__pydantic_core_schema__ for model in models]))
+        union = handler(core_schema.union_schema([model.__pydantic_core_schema__ for model in models]))
+        return union | {PLUGIN: self.registry.noun}

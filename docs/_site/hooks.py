@@ -21,9 +21,9 @@ def command_line() -> str:
     overview = _help()
     names = re.findall(r"^ {4}([a-z][a-z-]*)(?: |$)", overview, re.MULTILINE)
     sections = [f"```text\n{overview}```"]
-    for name in dict.fromkeys(names):
-        if name != "emulate":  # Its options are those of the emulators that are installed.
-            sections.append(f"## touchcell {name}\n\n```text\n{_help(name)}```")
+    # The options of emulate are those of the emulators that are installed.
+    named = [name for name in dict.fromkeys(names) if name != "emulate"]
+    sections += [f"## touchcell {name}\n\n```text\n{_help(name)}```" for name in named]
     return "\n\n".join(sections)
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import touchcell as tc
-from touchcell.api.recordings import unit_of
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.settings import with_settings
 from touchcell.cell.config.yaml_file import load
+from touchcell.units import unit_of
 
 
 @pytest.fixture(scope="module")

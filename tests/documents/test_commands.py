@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.__main__ import BENCHMARKS
 from tests.documents.pages import PAGES, Block, all_blocks, spans
-from touchcell.cell.bench.catalog import benchmarks
+from touchcell.cell.bench.catalog import benchmark_names
 from touchcell.cell.cli.main import main
 from touchcell.paths import CHECKOUT, CONFIGS
 
@@ -69,7 +69,7 @@ def test_touchcell_accepts_the_command(command: Command, monkeypatch: pytest.Mon
     words = command.words[1:]
     _parses(words, monkeypatch)
     if words[0] == "bench" and len(words) > 1:
-        assert words[1] == "NAME" or words[1] in benchmarks()
+        assert words[1] == "NAME" or words[1] in benchmark_names()
 
 
 @pytest.mark.parametrize(

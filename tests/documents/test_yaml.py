@@ -17,6 +17,7 @@ import yaml
 from tests.documents.pages import FOLLOWED, Block, all_blocks
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.schema import ArmSection, SensorSection, plan_cell
+from touchcell.drivers.core.spec import DRIVERS
 from touchcell.paths import CONFIGS
 
 BLOCKS = [block for block in all_blocks("yaml", "yml") if block.page not in FOLLOWED]
@@ -58,13 +59,12 @@ def test_yaml_is_accepted(block: Block, tmp_path: Path) -> None:
 
 
 def _holds(device: dict[str, Any], section: type[ArmSection] | type[SensorSection]) -> None:
-    from touchcell.drivers.core import spec as drivers
-
     own = {key: value for key, value in device.items() if key not in section.model_fields}
-    drivers.spec(device["driver"]).config.model_validate(own)
+    DRIVERS.load(device["driver"]).config.model_validate(own)
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize("block", [block for block in BLOCKS if block.note.endswith(", run")], ids=str)
 def test_yaml_that_is_said_to_run_ends_as_done(
     block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

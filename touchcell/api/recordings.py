@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -17,26 +16,7 @@ from touchcell.cell.analysis.run_data import Series, load_run
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.errors import suggest
 from touchcell.geometry.types import Array
-
-_UNITS = {
-    "mm": "mm",
-    "m": "m",
-    "deg": "deg",
-    "rad": "rad",
-    "s": "s",
-    "ms": "ms",
-    "us": "us",
-    "ns": "ns",
-    "n": "N",
-    "mm_s": "mm/s",
-    "deg_s": "deg/s",
-    "m_s": "m/s",
-    "rad_s": "rad/s",
-    "hz": "Hz",
-    "percent": "%",
-}
-_SUFFIX = re.compile(r"_(" + "|".join(sorted(_UNITS, key=len, reverse=True)) + r")$")
-_TWIST_UNIT = "m/s, rad/s"
+from touchcell.units import unit_of
 
 
 @dataclass(frozen=True)
@@ -125,14 +105,6 @@ def read_run(folder: str | PathLike[str]) -> RunRecording:
         tuple({"t_s": (event.t_ns - run.start_ns) * 1e-9, **event.data} for event in run.events),
         json.loads(result_file.read_text()) if result_file.exists() else {},
     )
-
-
-def unit_of(column: str) -> str:
-    """The unit that a column's name ends in; "" for a column without one."""
-    if column == "twist":
-        return _TWIST_UNIT
-    found = _SUFFIX.search(column)
-    return _UNITS[found[1]] if found else ""
 
 
 def _topic(name: str, series: Series) -> Topic:

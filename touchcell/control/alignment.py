@@ -112,14 +112,14 @@ class TargetAlignment:
         length = math.hypot(normal[0], normal[1])
         nx, ny = float(normal[0]) / length, float(normal[1]) / length
         tip = float(T_base_sensor[0, 3]), float(T_base_sensor[1, 3])
-        middle = tip[0] + self._gains.lead_m * nx, tip[1] + self._gains.lead_m * ny
+        centre = tip[0] + self._gains.lead_m * nx, tip[1] + self._gains.lead_m * ny
         heading = math.atan2(ny, nx)
         if self._path is None:
-            self._path = Path([middle, *self._route(middle, heading)])
-        place = self._path.place(middle, self._along_m, self._gains.look_ahead_m)
+            self._path = Path([centre, *self._route(centre, heading)])
+        place = self._path.place(centre, self._along_m, self._gains.look_ahead_m)
         self._along_m = max(self._along_m, place.along_m)
         ahead = self._path.point(place.along_m + self._gains.look_ahead_m)
-        dx, dy = ahead[0] - middle[0], ahead[1] - middle[1]
+        dx, dy = ahead[0] - centre[0], ahead[1] - centre[1]
         theta = math.atan2(nx * dy - ny * dx, nx * dx + ny * dy)
         target = self._path.end
         target_aside = nx * (target[1] - tip[1]) - ny * (target[0] - tip[0])

@@ -13,53 +13,10 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.plugin_section import Section
 from touchcell.simulation.shape_spec import ObjectShapeConfig, ObjectShapeSection, ObjectSpec, PoseMmDeg
+from touchcell.simulation.shapes import Ball, Prism, Solid, Turned
 
 TABLES: dict[str, float] = {"mdf": 0.3, "foam": 0.6}
 """Coefficients of sliding friction of the paper's two tables, chosen within literature values."""
-
-
-@dataclass(frozen=True, slots=True)
-class Prism:
-    """A convex outline extruded along z; the origin is in the middle of its bottom.
-
-    Attributes:
-        outline_m: (n, 2) corners, anticlockwise.
-        height_m: along z.
-    """
-
-    outline_m: Array
-    height_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class Turned:
-    """A solid of revolution about z, made of stacked cylinders; the origin is in the middle of its bottom.
-
-    Attributes:
-        sections_m: (height, radius) of each, from the bottom up. One section is a plain cylinder.
-    """
-
-    sections_m: tuple[tuple[float, float], ...]
-
-    @property
-    def height_m(self) -> float:
-        """Height along z."""
-        return sum(height for height, _ in self.sections_m)
-
-
-@dataclass(frozen=True, slots=True)
-class Ball:
-    """A ball about its origin."""
-
-    radius_m: float
-
-    @property
-    def height_m(self) -> float:
-        """Diameter of the ball."""
-        return 2.0 * self.radius_m
-
-
-Solid = Prism | Turned | Ball
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +37,11 @@ class FreeObject:
 
 
 class BoxShape(ObjectShapeConfig):
-    """A box, its sides along the object's axes."""
+    """A box, its sides along the object's axes.
+
+    Attributes:
+        size_mm: lengths of its sides.
+    """
 
     kind: Literal["box"]
     size_mm: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
@@ -92,7 +53,11 @@ class BoxShape(ObjectShapeConfig):
 
 
 class HexagonShape(ObjectShapeConfig):
-    """A hexagonal prism, two of its faces across the object's x axis."""
+    """A hexagonal prism, two of its faces across the object's x axis.
+
+    Attributes:
+        height_mm: height.
+    """
 
     kind: Literal["hexagon"]
     width_mm: PositiveFloat = Field(description="across flats")
@@ -106,7 +71,12 @@ class HexagonShape(ObjectShapeConfig):
 
 
 class CylinderShape(ObjectShapeConfig):
-    """An upright cylinder."""
+    """An upright cylinder.
+
+    Attributes:
+        diameter_mm: diameter.
+        height_mm: height.
+    """
 
     kind: Literal["cylinder"]
     diameter_mm: PositiveFloat
@@ -118,7 +88,11 @@ class CylinderShape(ObjectShapeConfig):
 
 
 class BottleShape(ObjectShapeConfig):
-    """Stacked cylinders: [height, diameter] of each, from the bottom up."""
+    """Stacked cylinders: [height, diameter] of each, from the bottom up.
+
+    Attributes:
+        sections_mm: height and diameter of each cylinder, from the bottom up.
+    """
 
     kind: Literal["bottle"]
     sections_mm: tuple[tuple[PositiveFloat, PositiveFloat], ...] = Field(min_length=1)
@@ -129,7 +103,11 @@ class BottleShape(ObjectShapeConfig):
 
 
 class BallShape(ObjectShapeConfig):
-    """A ball; its frame is at its centre."""
+    """A ball; its frame is at its centre.
+
+    Attributes:
+        diameter_mm: diameter.
+    """
 
     kind: Literal["ball"]
     diameter_mm: PositiveFloat
@@ -140,7 +118,13 @@ class BallShape(ObjectShapeConfig):
 
 
 class ObjectConfig(Section):
-    """One free object of the ``scene:`` section. ``pose_mm_deg`` is in the world frame, its z above the table's top."""
+    """One free object of the ``scene:`` section. ``pose_mm_deg`` is in the world frame, its z above the table's top.
+
+    Attributes:
+        shape: its shape.
+        mass_g: its mass.
+        pose_mm_deg: initial pose in the world frame, z above the table's top.
+    """
 
     shape: ObjectShapeSection
     mass_g: PositiveFloat
@@ -154,7 +138,12 @@ class ObjectConfig(Section):
 
 
 class TableConfig(Section):
-    """The table under the objects: a level plane."""
+    """The table under the objects: a level plane.
+
+    Attributes:
+        height_mm: height of its top in the world.
+        friction: coefficient of sliding friction, or the name of one of the paper's tables.
+    """
 
     height_mm: float = 0.0
     friction: Literal["mdf", "foam"] | Annotated[float, Field(gt=0.0, le=2.0)] = "mdf"

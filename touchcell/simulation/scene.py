@@ -226,7 +226,12 @@ class PlaneConfig(SurfaceConfig):
 
 
 class RampConfig(SurfaceConfig):
-    """Flat, then bent over an arc to an incline along the pose's +x; see ``surfaces.Ramp``."""
+    """Flat, then bent over an arc to an incline along the pose's +x; see ``surfaces.Ramp``.
+
+    Attributes:
+        bend_radius_mm: radius of the arc.
+        incline_deg: slope at its end, negative downwards.
+    """
 
     kind: Literal["ramp"]
     bend_radius_mm: float = Field(gt=0.0)
@@ -238,7 +243,11 @@ class RampConfig(SurfaceConfig):
 
 
 class DomeConfig(SurfaceConfig):
-    """A hemisphere on a plane, its centre at the pose's origin, rising towards +z."""
+    """A hemisphere on a plane, its centre at the pose's origin, rising towards +z.
+
+    Attributes:
+        radius_mm: radius of the hemisphere.
+    """
 
     kind: Literal["dome"]
     radius_mm: float = Field(gt=0.0)
@@ -249,7 +258,11 @@ class DomeConfig(SurfaceConfig):
 
 
 class SphereConfig(SurfaceConfig):
-    """A ball about the pose's origin."""
+    """A ball about the pose's origin.
+
+    Attributes:
+        radius_mm: radius of the ball.
+    """
 
     kind: Literal["sphere"]
     radius_mm: float = Field(gt=0.0)
@@ -260,7 +273,12 @@ class SphereConfig(SurfaceConfig):
 
 
 class TipLawConfig(Section):
-    """Contact law of every simulated tip of the scene; see ``contact.ContactLaw``."""
+    """Contact law of every simulated tip of the scene; see ``contact.ContactLaw``.
+
+    Attributes:
+        radius_mm: radius of the tip.
+        stiffness_n_mm: normal stiffness, N/mm.
+    """
 
     radius_mm: float = Field(default=20.0, gt=0.0)
     stiffness_n_mm: float = Field(default=1.5, gt=0.0)
@@ -277,6 +295,15 @@ class SceneConfig(Section, SceneSection):
     unaffected by contact. ``quasi_static``: in addition, objects slide on the table where tips push them, without
     inertia and always upright. ``dynamic``: MuJoCo moves free objects and soft tips, at steps of ``physics_step_ms``
     within ``step_ms``, the grid on which arms move and contacts are stored.
+
+    Attributes:
+        physics: fidelity, see above.
+        surfaces: surfaces, by a name of one's own.
+        objects: free objects, by a name of one's own.
+        table: the table under the objects.
+        tip: contact law of the simulated tips.
+        step_ms: grid on which arms move and contacts are stored.
+        physics_step_ms: step of the dynamics, a divisor of ``step_ms``.
     """
 
     physics: Literal["kinematic", "quasi_static", "dynamic"] = "kinematic"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
+from typing import Annotated, Final, Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -13,10 +13,8 @@ from touchcell.geometry.types import Array
 from touchcell.plugin_section import PluginSection, Section
 from touchcell.registry import Registry
 from touchcell.simulation.motions import Glide, Motion, Periodic, Still
+from touchcell.simulation.shapes import Solid
 from touchcell.simulation.surfaces import Shape, Surface
-
-if TYPE_CHECKING:
-    from touchcell.simulation.objects import Solid
 
 PoseMmDeg = tuple[float, float, float, float, float, float]
 
@@ -25,7 +23,13 @@ _SI = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
 
 
 class GlideConfig(Section):
-    """One smooth move: translations along and at most one rotation about the start frame's axes."""
+    """One smooth move: translations along and at most one rotation about the start frame's axes.
+
+    Attributes:
+        displacement_mm_deg: translation along and rotation about the start frame's axes; about one axis at most.
+        start_s: when it begins.
+        duration_s: how long it takes.
+    """
 
     kind: Literal["glide"]
     displacement_mm_deg: PoseMmDeg
@@ -44,7 +48,14 @@ class GlideConfig(Section):
 
 
 class PeriodicConfig(Section):
-    """Sines in all pose components of the start frame, with a gentle start; see ``motions.Periodic``."""
+    """Sines in all pose components of the start frame, with a gentle start; see ``motions.Periodic``.
+
+    Attributes:
+        amplitude_mm_deg: amplitude of each component.
+        shift_deg: phase of each component.
+        period_s: period of all components.
+        ramp_s: time in which the amplitude grows at the start.
+    """
 
     kind: Literal["periodic"]
     amplitude_mm_deg: PoseMmDeg
@@ -67,6 +78,11 @@ class SurfaceConfig(Section):
     """Base of the section of a surface.
 
     ``pose_mm_deg`` is the pose of the shape's frame in the world, where its ``motion`` starts.
+
+    Attributes:
+        kind: which surface.
+        pose_mm_deg: pose of the shape's frame in the world, where its motion starts.
+        motion: how it moves; none for a surface that stands still.
     """
 
     kind: str
@@ -84,7 +100,11 @@ class SurfaceConfig(Section):
 
 
 class ObjectShapeConfig(Section):
-    """Base of the ``shape:`` section of a free object."""
+    """Base of the ``shape:`` section of a free object.
+
+    Attributes:
+        kind: which shape.
+    """
 
     kind: str
 

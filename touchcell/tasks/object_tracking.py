@@ -7,11 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 from pydantic import PositiveFloat
 
-from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import ContactServo, SixGains
-from touchcell.tasks.interface import TaskContext, TaskSpec
-from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
+from touchcell.tasks.contact_servo import SixGains
+from touchcell.tasks.servoing import ServoConfig, one_arm_task
 
 
 class ObjectTrackingConfig(ServoConfig):
@@ -57,18 +55,10 @@ class Track:
         return {}
 
 
-def build(config: ObjectTrackingConfig, context: TaskContext) -> ServoTask:
-    """Build the task for a cell that has ``arm`` and ``sensor``."""
-    reference = (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0)
-    servo = ContactServo(ARM, SENSOR, config, reference, Track(config), context)
-    return ServoTask("object_tracking", config, context, servo)
-
-
-SPEC = TaskSpec(
-    name="object_tracking",
-    summary="keep contact with an object and follow its motion in all six components",
-    config=ObjectTrackingConfig,
-    arms={ARM: SERVO_ARM},
-    sensors=frozenset({SENSOR}),
-    build=build,
+SPEC = one_arm_task(
+    "object_tracking",
+    "keep contact with an object and follow its motion in all six components",
+    ObjectTrackingConfig,
+    Track,
+    lambda config: (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0),
 )

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from enum import Enum, auto
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
+from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig
-from touchcell.tasks.interface import Action, Observation, TaskContext, TransitionRecord
+from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Six
+from touchcell.tasks.interface import Action, Observation, TaskContext, TaskSpec, TransitionRecord
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
 from touchcell.tasks.state_machine_task import MachineTask
 
@@ -285,3 +286,30 @@ class ServoTask(MachineTask):
             values = servo.telemetry(observation, servoing=servoing)
             telemetry |= {f"{prefix}{name}": value for name, value in values.items()}
         return telemetry
+
+
+ServoConfigT = TypeVar("ServoConfigT", bound=ServoConfig)
+
+
+def one_arm_task(
+    name: str,
+    summary: str,
+    config: type[ServoConfigT],
+    behavior: Callable[[ServoConfigT], Behavior],
+    reference_mm_deg: Callable[[ServoConfigT], Six],
+) -> TaskSpec[ServoConfigT]:
+    """Return the spec of a task in which ``arm`` holds a contact with ``sensor`` and runs one behavior.
+
+    Args:
+        name: of the task.
+        summary: one line for ``touchcell list``.
+        config: pydantic model of its parameters.
+        behavior: creates the behavior from the parameters.
+        reference_mm_deg: returns the contact to hold, Euler components of ``T_f_s``.
+    """
+
+    def build(config: ServoConfigT, context: TaskContext) -> ServoTask:
+        servo = ContactServo(ARM, SENSOR, config, reference_mm_deg(config), behavior(config), context)
+        return ServoTask(name, config, context, servo)
+
+    return TaskSpec(name, summary, config, {ARM: SERVO_ARM}, frozenset({SENSOR}), build)

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, model_validator
 
 from touchcell.control.alignment import Aim, AlignmentGains, TargetAlignment
 from touchcell.control.path import Point
-from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig, Six, SixGains
-from touchcell.tasks.interface import TaskContext, TaskSpec
+from touchcell.tasks.contact_servo import ContactServoConfig, Six, SixGains
 from touchcell.tasks.push_path import Obstacle, plan
-from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
+from touchcell.tasks.servoing import ServoConfig, one_arm_task
 
 Mm = tuple[float, float]
 
@@ -47,6 +45,8 @@ class PushConfig(ContactServoConfig):
         align_max_mm_s: largest lateral speed.
         push_timeout_s: longest duration of the push.
     """
+
+    renamed_keys: ClassVar[Mapping[str, str]] = {"middle_mm": "object_center_offset_mm"}
 
     reference_mm_deg: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     kp_per_s: SixGains = (0.0, 0.0, 0.0, 8.0, 0.0, 0.0)
@@ -157,17 +157,10 @@ class Push:
         }
 
 
-def build(config: SingleArmPushingConfig, context: TaskContext) -> ServoTask:
-    """Build the task for a cell that has ``arm`` and ``sensor``."""
-    servo = ContactServo(ARM, SENSOR, config, config.reference_mm_deg, Push(config), context)
-    return ServoTask("single_arm_pushing", config, context, servo)
-
-
-SPEC = TaskSpec(
-    name="single_arm_pushing",
-    summary="push an object over a table to a target, steering it by touch",
-    config=SingleArmPushingConfig,
-    arms={ARM: SERVO_ARM},
-    sensors=frozenset({SENSOR}),
-    build=build,
+SPEC = one_arm_task(
+    "single_arm_pushing",
+    "push an object over a table to a target, steering it by touch",
+    SingleArmPushingConfig,
+    Push,
+    lambda config: config.reference_mm_deg,
 )

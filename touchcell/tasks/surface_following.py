@@ -7,11 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 from pydantic import PositiveFloat
 
-from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import ContactServo, SixGains
-from touchcell.tasks.interface import TaskContext, TaskSpec
-from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
+from touchcell.tasks.contact_servo import SixGains
+from touchcell.tasks.servoing import ServoConfig, one_arm_task
 
 
 class SurfaceFollowingConfig(ServoConfig):
@@ -65,18 +63,10 @@ class Follow:
         return {}
 
 
-def build(config: SurfaceFollowingConfig, context: TaskContext) -> ServoTask:
-    """Build the task for a cell that has ``arm`` and ``sensor``."""
-    reference = (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0)
-    servo = ContactServo(ARM, SENSOR, config, reference, Follow(config), context)
-    return ServoTask("surface_following", config, context, servo)
-
-
-SPEC = TaskSpec(
-    name="surface_following",
-    summary="slide over an unknown surface at constant depth and normal to it",
-    config=SurfaceFollowingConfig,
-    arms={ARM: SERVO_ARM},
-    sensors=frozenset({SENSOR}),
-    build=build,
+SPEC = one_arm_task(
+    "surface_following",
+    "slide over an unknown surface at constant depth and normal to it",
+    SurfaceFollowingConfig,
+    Follow,
+    lambda config: (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0),
 )

@@ -58,14 +58,14 @@ def test_a_trip_is_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert stop["distance_m"] == pytest.approx(0.4e-3, rel=0.5)
 
     assert main(["why", str(folder)]) == EXIT_OK
-    told = capsys.readouterr().out
-    assert "first cause" in told
-    assert "workspace (trip): arm: x = -71." in told
-    assert "limit -72 mm" in told
-    assert "settle -> run" in told
-    assert "mm deep, frames up to" in told
-    assert "stopped by category 2 from 2" in told
-    assert "at rest after 0.0" in told
+    output = capsys.readouterr().out
+    assert "first cause" in output
+    assert "workspace (trip): arm: x = -71." in output
+    assert "limit -72 mm" in output
+    assert "settle -> run" in output
+    assert "mm deep, frames up to" in output
+    assert "stopped by category 2 from 2" in output
+    assert "at rest after 0.0" in output
     assert (folder / "why.png").stat().st_size > 10_000
 
 
@@ -110,7 +110,9 @@ def test_an_arm_that_ignores_every_command_still_leaves_a_black_box(
     assert main(["run", str(cell), "--out", str(folder), "--quiet"]) == EXIT_TRIPPED
     capsys.readouterr()
     assert main(["why", str(folder)]) == EXIT_OK
-    told = capsys.readouterr().out
-    assert "never seen at rest: does not come to rest by any means that its driver has: use the emergency stop" in told
-    assert "then " in told
-    assert "stop (fault): arm: not seen at rest" in told
+    output = capsys.readouterr().out
+    assert (
+        "never seen at rest: does not come to rest by any means that its driver has: use the emergency stop" in output
+    )
+    assert "then " in output
+    assert "stop (fault): arm: not seen at rest" in output

@@ -237,3 +237,19 @@ def _problems(path: Path) -> tuple[ConfigError, ...]:
     with pytest.raises(InvalidCell) as caught:
         plan_cell(path)
     return caught.value.problems
+
+
+def test_a_key_that_was_renamed_is_answered_with_its_new_name(tmp_path: Path) -> None:
+    text = (CONFIGS / "single_push_sim.yaml").read_text()
+    assert "\ntask:\n" in text
+    path = tmp_path / "cell.yaml"
+    path.write_text(text.replace("\ntask:\n", "\ntask:\n  middle_mm: 60\n"))
+    error = refused(path)
+    assert (error.key, error.reason) == ("task.middle_mm", "was renamed")
+    assert error.hint == "write `object_center_offset_mm:`"
+
+
+def test_a_name_belongs_to_one_device(tmp_path: Path) -> None:
+    path = written(tmp_path, ("interlocks:\n", "devices:\n  arm: {driver: replay_camera, data: .}\n\ninterlocks:\n"))
+    error = refused(path)
+    assert (error.key, error.reason) == ("devices.arm", "another device has this name")

@@ -152,3 +152,8 @@ def test_every_trial_of_every_experiment_is_a_valid_cell(name, tmp_path):
 def test_unknown_experiment_gets_a_suggestion(tmp_path, capsys):
     assert main(["experiment", "surface_folowing", "--out", str(tmp_path)]) == 2
     assert "surface_following" in capsys.readouterr().err
+
+
+def test_an_unknown_executor_is_answered_with_a_suggestion(tmp_path):
+    with pytest.raises(ConfigError, match="did you mean 'local'"):
+        perform_all(Perform(duration, tmp_path), TWO, executor="locl")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ import pytest
 import yaml
 
 from tests.helpers.pushing_cell import cell_file
+from touchcell.cell.cli import run as run_command
+from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_TASK_FAILED, EXIT_TRIPPED
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import Recorder
@@ -18,7 +21,7 @@ from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
-from touchcell.cell.runtime.run_result import Outcome
+from touchcell.cell.runtime.run_result import Outcome, Progress
 from touchcell.cell.runtime.run_states import RunState
 from touchcell.drivers.core.errors import DeviceFault, DeviceGone
 from touchcell.drivers.core.protocols import StopCategory
@@ -161,6 +164,33 @@ def test_an_exception_stops_every_arm_in_the_same_moment(
             if (place, role) != ("a driver's release", "leader"):
                 assert arm.owner is None
         fault.armed = False
+
+
+@pytest.mark.parametrize("kind", ["ValueError", "DeviceGone"])
+@pytest.mark.parametrize("place", [place for place in PLACES if place not in HARMLESS])
+def test_the_command_leaves_a_result_a_black_box_and_the_right_exit_code(
+    tmp_path: Path, cell_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, kind: str
+) -> None:
+    class Armed(RunLoop):
+        def __init__(self, cell: Cell, recorder: Any, *, box: Any = None, on_cycle: Any = None, **more: Any) -> None:
+            fault = PLACES[place](cell, recorder, box, EXCEPTIONS[kind]())
+
+            def after_cycle(progress: Progress) -> None:
+                on_cycle(progress)
+                fault.armed = progress.t_s > 0.2
+
+            super().__init__(cell, recorder, box=box, on_cycle=after_cycle, **more)
+
+    monkeypatch.setattr(run_command, "RunLoop", Armed)
+    code = run_command.run_cell(cell_path, out=tmp_path / "run", live=False)
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    box = json.loads((tmp_path / "run" / "blackbox.json").read_text())
+    # An arm that cannot be read is not seen at rest, which is a trip of its own.
+    trips = place in ("an interlock", "a driver's state")
+    assert result["outcome"] == box["outcome"] == ("tripped" if trips else "error")
+    assert result["reason"] == box["reason"] != ""
+    lost = kind == "DeviceGone" and place != "an interlock" and place != "the recorder"
+    assert code == (EXIT_DEVICE_LOST if lost else EXIT_TRIPPED if trips else EXIT_TASK_FAILED)
 
 
 def _raise(error: Exception) -> None:

@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_TASK_FAI
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
-from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest, Request, ask_run, is_waiting
+from touchcell.cell.runtime.operator_channel import OperatorRequest, is_waiting
 from touchcell.cell.runtime.run_result import Outcome
 from touchcell.cell.runtime.watchdog import NullWatchdog
 from touchcell.control.latch import LatchState
@@ -331,40 +330,6 @@ def test_a_pair_of_what_is_not_there_is_refused(tmp_path: Path, pair: dict[str, 
     with pytest.raises(InvalidCell) as caught:
         plan_cell(path)
     assert caught.value.problems[0].key.startswith("pairs.0")
-
-
-def test_requests_come_from_keys_and_files_in_order_and_are_answered(tmp_path: Path) -> None:
-    desk = OperatorChannel(tmp_path)
-    desk.ask(OperatorRequest.RESET, "ada")
-    assert desk.take() is None
-    desk.open()
-    assert is_waiting(tmp_path)
-    told: list[tuple[bool, str]] = []
-    other = threading.Thread(target=lambda: told.append(ask_run(tmp_path, OperatorRequest.RESUME, "bob", DEADLINE_S)))
-    other.start()
-    desk.ask(OperatorRequest.RESET, "ada")
-    taken: list[Request] = []
-    deadline_s = time.monotonic() + DEADLINE_S
-    while len(taken) < 2:
-        assert time.monotonic() < deadline_s
-        if (request := desk.take()) is not None:
-            taken.append(request)
-            desk.answer(request, request.ask is OperatorRequest.RESUME, f"to {request.operator}")
-    other.join()
-    assert told == [(True, "to bob")]
-    assert {(request.ask, request.operator) for request in taken} == {
-        (OperatorRequest.RESET, "ada"),
-        (OperatorRequest.RESUME, "bob"),
-    }
-    desk.close()
-    assert not is_waiting(tmp_path)
-
-
-def test_a_run_that_does_not_answer_is_told(tmp_path: Path) -> None:
-    done, words = ask_run(tmp_path, OperatorRequest.RESET, "ada", wait_s=0.0)
-    assert not done
-    assert "no answer" in words
-    assert not (tmp_path / "request.json").exists()
 
 
 def test_reset_without_a_run_that_waits(

@@ -359,3 +359,42 @@ def test_a_joint_goal_is_refused_in_the_order_of_a_twist_and_returned_as_numbers
     np.testing.assert_array_equal(arm._admitted_joint_goal([1] * 6, lease, 1.0, -1.0, 1.0, 6), np.ones(6))
     arm._state = Lifecycle.READY
     assert reason([0.0] * 6) is Rejection.MODE
+
+
+def test_a_stop_that_removes_power_does_not_overwrite_a_fault(arm: NotedArm, monkeypatch: pytest.MonkeyPatch) -> None:
+    fault = DeviceFault("arm", "brake")
+    begin_stop = arm._begin_stop
+
+    def faulting(category: StopCategory) -> None:
+        begin_stop(category)
+        arm._to_faulted(fault)
+
+    monkeypatch.setattr(arm, "_begin_stop", faulting)
+    arm.stop(StopCategory.STOP_THEN_REMOVE_POWER)
+    assert arm.state is Lifecycle.FAULTED
+    assert arm.fault is fault
+
+
+def test_a_twist_that_meets_a_fault_is_followed_by_a_stop(
+    clock: VirtualClock, arm: NotedArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lease = arm.acquire("task")
+    happened: list[str] = []
+    begin_stop = arm._begin_stop
+
+    def streamed(twist_base: np.ndarray, ttl_s: float, now_ns: int) -> None:
+        # A thread of the driver latches a fault, and its stop reaches the arm before this twist does.
+        arm._to_faulted(DeviceFault("arm", "hot"))
+        happened.append("twist")
+
+    def stopped(category: StopCategory) -> None:
+        begin_stop(category)
+        happened.append("stop")
+
+    monkeypatch.setattr(arm, "_stream_twist", streamed)
+    monkeypatch.setattr(arm, "_begin_stop", stopped)
+    with pytest.raises(CommandRejected) as caught:
+        arm.send_twist(command(clock), lease)
+    assert caught.value.reason is Rejection.MODE
+    assert happened == ["stop", "twist", "stop"]
+    assert arm.state is Lifecycle.FAULTED

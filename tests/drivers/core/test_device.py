@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 
 from touchcell.drivers.core.clock import VirtualClock
@@ -75,3 +77,52 @@ def test_a_rejected_command_is_not_a_fault_but_a_lost_device_is(gadget: Gadget) 
     with pytest.raises(DeviceGone):
         gadget.attempt(DeviceGone("gadget", "cable"))
     assert gadget.state is Lifecycle.FAULTED
+
+
+def test_a_fault_latched_while_connecting_leaves_the_device_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
+    gadget = Gadget()
+    monkeypatch.setattr(gadget, "_open", lambda: gadget._to_faulted(DeviceFault("gadget", "hot")))
+    with pytest.raises(DeviceFault, match="hot"):
+        gadget.connect()
+    assert gadget.state is Lifecycle.DISCONNECTED
+    assert gadget.fault is None
+
+
+def test_a_connection_that_fails_with_a_fault_leaves_the_device_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
+    gadget = Gadget()
+    monkeypatch.setattr(gadget, "_open", lambda: gadget.attempt(DeviceGone("gadget", "cable")))
+    with pytest.raises(DeviceGone):
+        gadget.connect()
+    assert gadget.state is Lifecycle.DISCONNECTED
+    assert gadget.fault is None
+
+
+class Interrupted:
+    """A lock that lets another thread latch a fault in the last moment before it is taken."""
+
+    def __init__(self, device: Device, fault: DeviceError) -> None:
+        self._lock, self._device, self._fault = device._state_lock, device, fault
+        self._pending = True
+
+    def __enter__(self) -> None:
+        if self._pending:
+            self._pending = False
+            thread = threading.Thread(target=self._device._to_faulted, args=(self._fault,))
+            thread.start()
+            thread.join()
+        self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+
+@pytest.mark.parametrize("transition", ["activate", "deactivate"])
+def test_no_transition_overwrites_a_fault_of_the_last_moment(gadget: Gadget, transition: str) -> None:
+    if transition == "deactivate":
+        gadget.activate()
+    fault = DeviceFault("gadget", "hot")
+    gadget._state_lock = Interrupted(gadget, fault)  # type: ignore[assignment]
+    with pytest.raises(DeviceFault, match="hot"):
+        getattr(gadget, transition)()
+    assert gadget.state is Lifecycle.FAULTED
+    assert gadget.fault is fault

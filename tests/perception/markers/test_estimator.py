@@ -68,7 +68,7 @@ def trained(data: Path) -> Path:
     recorder = Recorder()
     train_markers(data, out, settings=QUICK, cache=data / "cache", observer=recorder)
     assert recorder.calls["train"] == (160, 160)
-    assert recorder.calls["matched"][0] == recorder.told["matched"][1]
+    assert recorder.calls["matched"][0] == recorder.calls["matched"][1]
     assert len(recorder.records) == 8
     # Ten batches hold all images once.
     assert recorder.batches >= 16

@@ -261,7 +261,7 @@ def _cost_lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         )
     yield "again: the same frame once more, CPU; start: from a fresh process to its first estimate, wall and CPU;"
     yield "apart: largest difference from the xi of the estimator's first runtime, m or rad;"
-    yield "training: CPU time of all epochs, where the model file tells it; decoding and matching come on top"
+    yield "training: CPU time of all epochs, where the model file has it; decoding and matching come on top"
 
 
 def _stage_lines(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:

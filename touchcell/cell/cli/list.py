@@ -8,6 +8,7 @@ from typing import Any
 from touchcell import compiled
 from touchcell.cell.bench.catalog import benchmark_names
 from touchcell.cell.experiments.runner import EXPERIMENTS
+from touchcell.cell.experiments.trials import EXECUTORS
 from touchcell.control.interlocks.spec import INTERLOCKS
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.errors import ConfigError
@@ -36,6 +37,7 @@ def listing() -> dict[str, list[tuple[str, str]]]:
         "objects": _rows(OBJECTS),
         "emulators": [(name, "") for name in EMULATORS.names()],
         "experiments": _rows(EXPERIMENTS),
+        "executors": _rows(EXECUTORS),
         "benchmarks": [(name, "") for name in benchmark_names()],
         "cells that ship": [(f"configs/{path.name}", _first_comment(path)) for path in _shipped()],
     } | ({"missing": [(line, "") for line in lines]} if (lines := compiled.missing()) else {})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from typing import Final
@@ -20,6 +19,7 @@ from touchcell.cell.cli import (
 )
 from touchcell.cell.cli.arguments import Subparsers
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_DEVICE_LOST, EXIT_INTERRUPTED, EXIT_OK, MEANING
+from touchcell.cell.cli.output import flush_output, warn
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.errors import TouchcellError, suggest
 from touchcell.logs import log_to_terminal
@@ -58,8 +58,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(words)
     options.passed_on = passed_on
     options.parser = parser
-    with log_to_terminal(options.verbose):
-        return _run(options)
+    try:
+        with log_to_terminal(options.verbose):
+            return _run(options)
+    finally:
+        flush_output()
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -106,13 +109,12 @@ def _run(options: argparse.Namespace) -> int:
         remedy = f"pip install '{_EXTRAS[error.name]}'"
         return _fail(f"`{options.command}` needs {error.name}, which is not installed ({remedy})", EXIT_BAD_INPUT)
     except BrokenPipeError:
-        # The reader of our output, `head` perhaps, is done; Python would complain again when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # The reader of the output, `head` perhaps, has seen enough.
         return EXIT_OK
     except KeyboardInterrupt:
         return _fail("interrupted", EXIT_INTERRUPTED)
 
 
 def _fail(message: str, code: int) -> int:
-    print(f"touchcell: {message}", file=sys.stderr)
+    warn(message)
     return code

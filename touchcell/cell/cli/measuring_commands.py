@@ -34,6 +34,9 @@ def add_parser(commands: Subparsers) -> None:
         help="folder with one for each (default: %(default)s)",
     )
     experiment.add_argument("--jobs", type=positive, help="trials at a time (default: one for each core)")
+    experiment.add_argument(
+        "--executor", default="local", metavar="NAME", help="what runs the trials (default: %(default)s)"
+    )
     experiment.add_argument("--trials", type=positive, help="repetitions of each row (default: the experiment's own)")
     experiment.add_argument("--quick", action="store_true", help="the least that still shows every kind of row")
 
@@ -60,7 +63,8 @@ def _experiment(options: argparse.Namespace) -> int:
     for experiment in experiments:
         folder = options.out / experiment.name
         try:
-            tables.append(run_experiment(experiment, folder, scale, jobs=jobs, live=sys.stdout.isatty()))
+            live = sys.stdout.isatty()
+            tables.append(run_experiment(experiment, folder, scale, jobs=jobs, executor=options.executor, live=live))
         except KeyboardInterrupt:
             print(f"touchcell: what has finished is kept in {folder}; the same command goes on", file=sys.stderr)
             raise

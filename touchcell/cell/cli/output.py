@@ -36,6 +36,8 @@ def flush_output() -> None:
 def _silence(stream: TextIO, error: Exception) -> None:
     """Let ``stream`` lead nowhere: what it still holds would otherwise fail again when Python exits."""
     logger.info("output ends: %s", error)
+    if stream is not sys.stderr and not isinstance(error, BrokenPipeError):
+        warn(f"no more output: {error}")
     try:
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())

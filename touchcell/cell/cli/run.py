@@ -8,15 +8,15 @@ import json
 import logging
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from touchcell.cell.analysis.report import write_report
-from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
+from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
+from touchcell.cell.cli.output import say, warn
 from touchcell.cell.config.schema import CellPlan, plan_cell
-from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import RECORDING, Recorder
 from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, stop_record
 from touchcell.cell.runtime.cell import Cell
@@ -24,13 +24,15 @@ from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.heap import trim_heap
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.operator_channel import OperatorChannel
-from touchcell.cell.runtime.operator_input import reachable, stop_on_keys, stop_on_signals
+from touchcell.cell.runtime.operator_input import FolderInUse, reachable, stop_on_keys, stop_on_signals
 from touchcell.cell.runtime.run_result import Outcome, Progress, RunResult
 from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.drivers.core.clock import VirtualClock
+from touchcell.drivers.core.errors import DeviceError
+from touchcell.errors import TouchcellError
 from touchcell.logs import log_to_file
 
-_logger = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 LOG = "run.log"
 """Name of the log file in a run folder."""
@@ -51,12 +53,22 @@ class FinishedRun:
     Attributes:
         result: how it ended.
         folder: its run folder.
-        summary: the text of its report.
+        summary: the text of its report; empty where none could be written.
+        leaving: what was raised after the run, while its devices were given back or its recording was closed.
     """
 
     result: RunResult
     folder: Path
     summary: str
+    leaving: Exception | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of ``touchcell run``."""
+        if self.result.lost or isinstance(self.leaving, DeviceError):
+            return EXIT_DEVICE_LOST
+        code = _EXIT[self.result.outcome]
+        return EXIT_TASK_FAILED if code == EXIT_OK and self.leaving is not None else code
 
 
 def run_cell(
@@ -82,14 +94,17 @@ def run_cell(
         ConfigError, ModelError, ConnectError: before anything moves.
     """
     run = run_plan(plan_cell(path, {} if data is None else {"data": data}, model=model), out=out, live=live)
-    print(run.summary)
+    if run.summary:
+        say(run.summary)
     if moving:
         from touchcell.cell.experiments.animation import animate
 
-        print(f"  {animate(run.folder).name}")
-    if run.result.outcome in (Outcome.TRIPPED, Outcome.ERROR):
-        print(f"`touchcell why {run.folder}` explains")
-    return _EXIT[run.result.outcome]
+        say(f"  {animate(run.folder).name}")
+    if run.result.outcome is not Outcome.DONE:
+        say(f"{run.result.outcome.value}: {run.result.reason or 'no reason was given'}")
+    if run.result.outcome not in (Outcome.DONE, Outcome.STOPPED):
+        say(f"`touchcell why {run.folder}` explains")
+    return run.exit_code
 
 
 def run_plan(plan: CellPlan, *, out: Path | None = None, live: bool = False) -> FinishedRun:
@@ -109,15 +124,47 @@ def run_plan(plan: CellPlan, *, out: Path | None = None, live: bool = False) -> 
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "cell.yaml").write_text(plan.text())
     with log_to_file(folder / LOG):
-        _logger.info("%s: task %s of %s, in %s", plan.cell.name, plan.task.name, plan.file, folder)
-        result = _run(cell, folder, live)
+        logger.info("%s: task %s of %s, in %s", plan.cell.name, plan.task.name, plan.file, folder)
+        try:
+            result, leaving = _run(cell, folder, live)
+        except FolderInUse:
+            raise
+        except Exception as error:
+            _write_result(folder, _not_started_json(plan, error))
+            raise
         ended = f"{result.outcome.value} after {result.duration_s:.2f} s"
-        _logger.info("%s: %s%s", plan.cell.name, ended, f" ({result.reason})" if result.reason else "")
-    (folder / "result.json").write_text(json.dumps(_result_json(plan, result), indent=1) + "\n")
-    return FinishedRun(result, folder, write_report(folder))
+        logger.info("%s: %s%s", plan.cell.name, ended, f" ({result.reason})" if result.reason else "")
+    return FinishedRun(result, folder, _report(folder), leaving)
 
 
-def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
+def _report(folder: Path) -> str:
+    """Write the report; without room for it, or with a recording that is damaged, there is none."""
+    try:
+        return write_report(folder)
+    except (OSError, TouchcellError) as error:
+        warn(f"no report: {error}; `touchcell report {folder}` makes it later")
+        return ""
+
+
+def _run(cell: Cell, folder: Path, live: bool) -> tuple[RunResult, Exception | None]:
+    """Run to the end; returns how it ended, and what was raised when the devices were given back."""
+    result = None
+    try:
+        with _running(cell, folder, live) as run:
+            result = run()
+    except Exception as error:
+        if result is None:
+            raise
+        logger.exception("after the run")
+        warn(f"after the run: {error}")
+        _write_result(folder, {**_result_json(cell.plan, result), "after_the_run": str(error)})
+        return result, error
+    return result, None
+
+
+@contextlib.contextmanager
+def _running(cell: Cell, folder: Path, live: bool) -> Iterator[Callable[[], RunResult]]:
+    """Within reach of the operator, with everything open and all devices active; yields what runs the task."""
     stop, channel = StopRequest(), OperatorChannel(folder)
     box = BlackBox()
     with (
@@ -130,7 +177,7 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
     ):
         cell.watchdog.note_to(folder)
         if live:
-            print("\n".join(cell.watchdog.describe()))
+            say("\n".join(cell.watchdog.describe()))
 
         def after_cycle(progress: Progress) -> None:
             look_at_keys()
@@ -143,29 +190,42 @@ def _run(cell: Cell, folder: Path, live: bool) -> RunResult:
         def tripped(so_far: RunResult) -> None:
             keep_earlier(folder)
             _dump(box, folder, cell, so_far)
-            print(f"tripped: {so_far.reason}\n`touchcell why {folder}` explains; `touchcell reset {folder}` or r, when")
-            print("it is safe, then `touchcell resume` or g; `touchcell stop` or q ends the run")
+            say(f"tripped: {so_far.reason}\n`touchcell why {folder}` explains; `touchcell reset {folder}` or r, when")
+            say("it is safe, then `touchcell resume` or g; `touchcell stop` or q ends the run")
 
         loop = RunLoop(cell, recorder, box=box, stop=stop, on_cycle=after_cycle, channel=channel, on_trip=tripped)
-        result = loop.run()
-        # Before the devices are given back, which an arm that obeys nothing may not survive.
-        if result.outcome in (Outcome.TRIPPED, Outcome.ERROR) and not loop.has_waited:
-            _dump(box, folder, cell, result)
-    return result
+
+        def run() -> RunResult:
+            result = loop.run()
+            # Before the devices are given back, which an arm that obeys nothing may not survive.
+            _write_result(folder, _result_json(cell.plan, result))
+            if result.outcome is not Outcome.DONE and not loop.has_waited:
+                _dump(box, folder, cell, result)
+            return result
+
+        yield run
 
 
 def _dump(box: BlackBox, folder: Path, cell: Cell, result: RunResult) -> None:
-    about = {
-        "cell": cell.plan.cell.name,
-        "cell_file": "cell.yaml",
-        "cell_sha256": hashlib.sha256((folder / "cell.yaml").read_bytes()).hexdigest(),
-        "start_ns": cell.start_ns,
-    }
     try:
+        about = {
+            "cell": cell.plan.cell.name,
+            "cell_file": "cell.yaml",
+            "cell_sha256": hashlib.sha256((folder / "cell.yaml").read_bytes()).hexdigest(),
+            "start_ns": cell.start_ns,
+        }
         box.dump(folder, result, about)
-    except RecordingError as error:
-        # What happened is told all the same.
-        print(f"touchcell: no black box: {error}", file=sys.stderr)
+    except Exception as error:
+        logger.exception("no black box")
+        # What happened is reported all the same.
+        warn(f"no black box: {error}")
+
+
+def _write_result(folder: Path, result: Mapping[str, Any]) -> None:
+    try:
+        (folder / "result.json").write_text(json.dumps(result, indent=1) + "\n")
+    except OSError as error:
+        warn(f"no result.json: {error}")
 
 
 @contextlib.contextmanager
@@ -177,7 +237,9 @@ def _live_line(plan: CellPlan, live: bool) -> Iterator[Any]:
     from rich.text import Text
 
     started = time.monotonic()
-    with Live(Text("starting"), refresh_per_second=8, transient=True) as display:
+    display = Live(Text("starting"), refresh_per_second=8, transient=True)
+    try:
+        display.start()
 
         def show(progress: Progress) -> None:
             wall_s = time.monotonic() - started
@@ -193,6 +255,10 @@ def _live_line(plan: CellPlan, live: bool) -> Iterator[Any]:
             display.update(Text("  ".join(parts)))
 
         yield show
+    finally:
+        # A terminal that is gone needs no last line.
+        with contextlib.suppress(OSError, ValueError):
+            display.stop()
 
 
 def _result_json(plan: CellPlan, result: RunResult) -> dict[str, Any]:
@@ -212,6 +278,11 @@ def _result_json(plan: CellPlan, result: RunResult) -> dict[str, Any]:
         "skipped": list(plan.skipped),
         "stages_us": {stage: _quantiles_us(rows) for stage, rows in result.times.rows.items()},
     }
+
+
+def _not_started_json(plan: CellPlan, error: Exception) -> dict[str, Any]:
+    """The result of a run whose task never started."""
+    return {"cell": plan.cell.name, "task": plan.task.name, "outcome": Outcome.ERROR.value, "reason": str(error)}
 
 
 def _quantiles_us(rows: Iterable[int]) -> dict[str, float]:

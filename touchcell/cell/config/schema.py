@@ -55,6 +55,12 @@ class CapsuleSection(_Section):
 
     ``from_base_mm`` in place of ``from_mm`` is a place in the base's frame: for the forearm of an arm that tells only
     where its tool is.
+
+    Attributes:
+        from_mm: start of the segment in the tool's frame.
+        from_base_mm: start of the segment in the base's frame, in place of ``from_mm``.
+        to_mm: end of the segment in the tool's frame.
+        radius_mm: radius of the capsule.
     """
 
     from_mm: Three | None = None
@@ -70,7 +76,12 @@ class CapsuleSection(_Section):
 
 
 class BoxSection(_Section):
-    """Something that stands still: the pose of its centre in the world, and the lengths of its sides."""
+    """Something that stands still: the pose of its centre in the world, and the lengths of its sides.
+
+    Attributes:
+        pose_mm_deg: pose of its centre in the world frame.
+        size_mm: lengths of its sides.
+    """
 
     pose_mm_deg: Six
     size_mm: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
@@ -82,6 +93,14 @@ class ArmSection(_OpenSection):
 
     ``stop_category`` is by IEC 60204-1: 2 stops and holds with power, 1 stops and then removes it. ``base_pose_mm_deg``
     is in the world; ``body`` adds capsules to those of the arm's chain, for ``clearance``.
+
+    Attributes:
+        driver: name of the driver, as ``touchcell list`` shows it.
+        deactivate: what the arm does when it is deactivated at the end of a run, once it stands.
+        stop_category: how it stops when something is wrong, by IEC 60204-1: 2 stops and holds with power, 1 stops and
+            then removes it.
+        base_pose_mm_deg: pose of its base in the world frame.
+        body: capsules in addition to those of the arm's chain, for ``clearance``.
     """
 
     driver: str
@@ -97,7 +116,14 @@ class ArmSection(_OpenSection):
 
 
 class SensorSection(_OpenSection):
-    """A tactile sensor: its camera's driver, where it sits, and how frames become contacts."""
+    """A tactile sensor: its camera's driver, where it sits, and how frames become contacts.
+
+    Attributes:
+        driver: name of the camera's driver, as ``touchcell list`` shows it.
+        mounted_on: name of the arm that carries it; none where nothing moves it.
+        tcp_to_sensor_mm_deg: pose of the sensor in the tool frame of that arm.
+        estimator: how frames become contacts.
+    """
 
     driver: str
     mounted_on: str | None = None
@@ -113,6 +139,11 @@ class SensorSection(_OpenSection):
 class DeviceSection(_OpenSection):
     """A device that is neither an arm nor a tactile sensor, as a force-torque sensor or a gripper: its driver, the arm
     that carries it, what happens when it is deactivated, and the driver's own keys.
+
+    Attributes:
+        driver: name of the driver, as ``touchcell list`` shows it.
+        mounted_on: name of the arm that carries it; none where nothing moves it.
+        deactivate: what it does when it is deactivated.
     """
 
     driver: str
@@ -124,6 +155,12 @@ class TaskSection(_OpenSection):
     """The task, which arms, sensors and devices play its roles, and the task's own keys.
 
     ``steps:`` alone names the task too.
+
+    Attributes:
+        name: name of the task, as ``touchcell list`` shows it.
+        arms: name of the arm that plays each role; a role that is left out goes to the arm of its name.
+        sensors: name of the sensor that plays each role, likewise.
+        devices: name of the device that plays each role, likewise.
     """
 
     name: str
@@ -138,7 +175,11 @@ class TaskSection(_OpenSection):
 
 
 class RecordingSection(_Section):
-    """What is kept of a run besides numbers."""
+    """What is kept of a run besides numbers.
+
+    Attributes:
+        frames: whether camera images are recorded, and how they are compressed.
+    """
 
     frames: Literal["none", "jpeg", "png"] = "none"
 
@@ -148,6 +189,12 @@ class PairSection(_Section):
 
     All arms of a cell stop together. With ``on_stop: hold`` the follower then keeps its power, and so what it holds,
     whatever its ``stop_category`` says, unless it is itself what is wrong; with ``same`` it stops as that says.
+
+    Attributes:
+        leader: name of the arm that pushes.
+        follower: name of the arm that gives way and holds.
+        on_stop: what the follower does when all arms stop: ``hold`` keeps its power, ``same`` obeys its
+            ``stop_category``.
     """
 
     leader: str
@@ -156,7 +203,12 @@ class PairSection(_Section):
 
 
 class CollectSection(_Section):
-    """Where labelled frames go, and in which proportion to which split."""
+    """Where labelled frames go, and in which proportion to which split.
+
+    Attributes:
+        data: folder of the data set, made or continued.
+        shares: proportion of the frames that go to each split.
+    """
 
     data: Path
     shares: dict[Literal["train", "val", "test"], Annotated[int, Field(ge=1)]] = Field(
@@ -170,6 +222,28 @@ class CellFile(_Section):
     ``on_trip: end`` ends a run that has tripped; ``wait_for_reset`` keeps it up, with the arms stopped and watched,
     until a person has reset it and lets the task start again. ``emulated_scene`` is what `touchcell emulate cell` puts
     around the cell's arms and cameras; nothing else looks at it.
+
+    Attributes:
+        schema_: version of the format; 1.
+        name: name of the cell, which names its run folders.
+        time: ``simulated`` runs as fast as it can on a virtual clock, ``real`` in real time.
+        rate_hz: control cycles per second.
+        processes: ``separate`` runs devices in processes of their own with a watchdog, in real time only.
+        seed: of everything random.
+        max_duration_s: longest run; it is stopped then.
+        scene: what is simulated around the arms, for simulated devices.
+        emulated_scene: what ``touchcell emulate cell`` puts around the cell's arms and cameras; nothing else reads it.
+        obstacles: what stands still around the arms, by a name of one's own, for ``clearance``.
+        arms: the arms, by a name of one's own.
+        sensors: the tactile sensors, by a name of one's own.
+        devices: other devices, by a name of one's own.
+        pairs: arms that hold something between them.
+        interlocks: the rules that stop or slow the arms, by a name of one's own.
+        on_trip: what happens after a trip: ``end`` ends the run; ``wait_for_reset`` keeps the arms stopped and watched
+            until a person has reset it.
+        task: what the cell does.
+        recording: what is recorded of a run besides numbers.
+        collect: where a task that labels frames puts them.
     """
 
     schema_: Literal[1] = Field(alias="schema")

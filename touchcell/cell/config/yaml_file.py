@@ -92,8 +92,7 @@ class YamlFile:
         kind = detail["type"]
         context = detail.get("ctx", {})
         if kind == "extra_forbidden":
-            known = _fields_at(model, location[:-1], data)
-            return self.problem(path, "unknown key", value=value, hint=suggest(str(location[-1]), known))
+            return self._unknown_key(path, str(location[-1]), _models_at(model, location[:-1], data), value)
         if kind == "missing":
             written = "schema: 1" if location == ("schema",) else f"{location[-1]}:"
             return self.problem((*path, location[-1]), "is missing", hint=f"add `{written}`")
@@ -123,6 +122,13 @@ class YamlFile:
         shown = "" if isinstance(value, dict | list) else f", not {_short(value)}"
         hint = "write it in quotes" if kind == "string_type" and isinstance(value, int | float | bool) else ""
         return self.problem(path, reason[:1].lower() + reason[1:] + shown, value=value, hint=hint)
+
+    def _unknown_key(self, path: KeyPath, key: str, models: Sequence[type[BaseModel]], value: Any) -> ConfigError:
+        for each in models:
+            if (new := getattr(each, "renamed_keys", {}).get(key)) is not None:
+                return self.problem(path, "was renamed", value=value, hint=f"write `{new}:`")
+        known = {field.alias or name for each in models for name, field in each.model_fields.items()}
+        return self.problem(path, "unknown key", value=value, hint=suggest(key, known))
 
     def _written(self, at: KeyPath, location: KeyPath) -> KeyPath:
         """``location`` as far as it stands in the file: without the union tags that pydantic puts in."""
@@ -173,8 +179,8 @@ def _merged(details: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return list(found.values())
 
 
-def _fields_at(model: type[BaseModel], location: KeyPath, data: Any) -> list[str]:
-    """Field names of the model that ``location`` leads to in ``data``, through fields, indices, tags and plug-ins."""
+def _models_at(model: type[BaseModel], location: KeyPath, data: Any) -> list[type[BaseModel]]:
+    """Models that ``location`` leads to in ``data``, through fields, indices, tags and plug-ins."""
     candidates: list[type[BaseModel] | PluginSection] = [model]
     for part in location:
         models = _resolved(candidates, data)
@@ -185,8 +191,7 @@ def _fields_at(model: type[BaseModel], location: KeyPath, data: Any) -> list[str
         elif tagged:
             candidates = [*tagged]
         data = _child(data, part)
-    models = _resolved(candidates, data)
-    return sorted({field.alias or name for each in models for name, field in each.model_fields.items()})
+    return _resolved(candidates, data)
 
 
 def _resolved(candidates: Sequence[type[BaseModel] | PluginSection], data: Any) -> list[type[BaseModel]]:

@@ -45,9 +45,9 @@ def measure(trial: RunFolder) -> Mapping[str, float]:
     task = trial.recording.series("/task")
     assert task is not None
     found = {"samples": float(len(labels)), "seconds_each": float(np.ptp(task.t_s)) / len(labels)}
-    asked, felt = _grabbed(trial)
-    slipped = np.linalg.norm(asked[:, :2] - felt[:, :2], axis=1)
-    deep = felt[:, 2] > _DEEP_MM
+    commanded, actual = _grabbed(trial)
+    slipped = np.linalg.norm(commanded[:, :2] - actual[:, :2], axis=1)
+    deep = actual[:, 2] > _DEEP_MM
     found |= {"slip_mm": float(slipped[~deep].mean()), "slip_deep_mm": float(slipped[deep].mean())}
     return found | _learned(trial.path, data)
 
@@ -67,11 +67,11 @@ def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
 def _grabbed(trial: RunFolder) -> tuple[Array, Array]:
     """Return contacts (n, 6) commanded and true at the end of each grab."""
     asked = trial.recording.series(f"/sensors/{SENSOR}/contact")
-    series, felt = true_contacts(trial, SENSOR)
+    series, actual = true_contacts(trial, SENSOR)
     assert asked is not None
     grabs = trial.recording.during(series.t_s, "grab")
     last = np.flatnonzero(grabs[:-1] & ~grabs[1:])
-    return asked.poses()[: len(felt)][last], felt[last]
+    return asked.poses()[: len(actual)][last], actual[last]
 
 
 def _learned(folder: Path, data: Path) -> dict[str, float]:

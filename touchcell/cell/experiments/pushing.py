@@ -207,10 +207,10 @@ def push_measures(run: RunFolder) -> dict[str, float]:
     sensors = run.plan.sensor_roles
     pushing = TWO_ARMS.sensors[0] if TWO_ARMS.sensors[0] in sensors else next(iter(sensors))
     target = target_mm(run)
-    middle = 1e3 * object_poses(run)[OBJECT].at(np.array([end_s]))[0, :2, 3]
+    centre = 1e3 * object_poses(run)[OBJECT].at(np.array([end_s]))[0, :2, 3]
     return found | {
         "error_mm": off_normal_mm(_surface_pose(run, pushing, end_s), target),
-        "object_center_offset_mm": float(np.linalg.norm(target - middle)),
+        "object_center_offset_mm": float(np.linalg.norm(target - centre)),
     }
 
 
@@ -218,5 +218,5 @@ def _surface_pose(run: RunFolder, sensor: str, t_s: float) -> Array:
     """Return T_world_f (4, 4) of the true contact."""
     T_world_s = sensor_poses(run, sensor).at(np.array([t_s]))[0]
     series, contacts = true_contacts(run, sensor)
-    felt = Poses(scene_time(run, series), np.asarray(se3.from_euler_mm_deg(np.nan_to_num(contacts))))
-    return se3.compose(T_world_s, se3.inverse(felt.at(np.array([t_s]))[0]))
+    contact = Poses(scene_time(run, series), np.asarray(se3.from_euler_mm_deg(np.nan_to_num(contacts))))
+    return se3.compose(T_world_s, se3.inverse(contact.at(np.array([t_s]))[0]))

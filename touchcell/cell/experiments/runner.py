@@ -68,7 +68,15 @@ EXPERIMENTS: Final = Registry("touchcell.experiments", "experiment", ExperimentS
 """All installed experiments."""
 
 
-def run_experiment(experiment: ExperimentSpec, folder: Path, scale: Scale, *, jobs: int = 1, live: bool = False) -> str:
+def run_experiment(
+    experiment: ExperimentSpec,
+    folder: Path,
+    scale: Scale,
+    *,
+    jobs: int = 1,
+    executor: str = "local",
+    live: bool = False,
+) -> str:
     """Run missing trials, then write table and figures into ``folder``; return the table.
 
     Args:
@@ -76,6 +84,7 @@ def run_experiment(experiment: ExperimentSpec, folder: Path, scale: Scale, *, jo
         folder: for ``trials/``, ``summary.txt``, ``summary.json`` and the figures.
         scale: amount of it.
         jobs: number of parallel trials, each in its own process; 1 runs in this process.
+        executor: name of what runs the trials.
         live: show progress.
 
     Raises:
@@ -84,7 +93,9 @@ def run_experiment(experiment: ExperimentSpec, folder: Path, scale: Scale, *, jo
     """
     folder.mkdir(parents=True, exist_ok=True)
     perform = Perform(experiment.measure, folder / "trials")
-    finished = perform_all(perform, experiment.trials(scale), jobs=jobs, live=live, title=experiment.name)
+    finished = perform_all(
+        perform, experiment.trials(scale), jobs=jobs, executor=executor, live=live, title=experiment.name
+    )
     rows = _rows(finished)
     text = table(f"{experiment.name}: {experiment.summary}", rows, experiment.columns, experiment.paper)
     pictures = experiment.draw(finished, folder)

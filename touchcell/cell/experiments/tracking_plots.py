@@ -44,9 +44,9 @@ def plot_all_six(trial: RunFolder, path: Path) -> Path:
     """Plot the paths of plate and sensor with their frames, in top and side view, and all errors over time."""
     figure, axes = plt.subplots(1, 3, figsize=(18, 6), layout="constrained")
     poses, T_world_plate, error = tracking(trial)
-    felt = np.isfinite(error[:, 0])
-    sensor = Poses(poses.t_s[felt], poses.T_world[felt])
-    plate = Poses(poses.t_s[felt], T_world_plate[felt])
+    in_contact = np.isfinite(error[:, 0])
+    sensor = Poses(poses.t_s[in_contact], poses.T_world[in_contact])
+    plate = Poses(poses.t_s[in_contact], T_world_plate[in_contact])
     for axis, view, title in ((axes[0], (0, 1), "from above"), (axes[1], (0, 2), "from the side")):
         path_2d(axis, plate, view, color="black", lw=1.2, label="plate")
         path_2d(axis, sensor, view, color=ORANGE, lw=1.2, ls="--", label="sensor")

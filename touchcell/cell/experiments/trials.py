@@ -6,16 +6,12 @@ import copy
 import hashlib
 import json
 import math
-import multiprocessing
 import os
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Protocol
 
 import yaml
 
@@ -28,6 +24,7 @@ from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.run_result import Outcome
 from touchcell.errors import ConfigError, suggest
 from touchcell.paths import CONFIGS
+from touchcell.registry import Registry
 
 COLLECTED = "data"
 """Subfolder of a trial's folder for collected frames."""
@@ -140,8 +137,44 @@ class Perform:
         return _finished(trial, RunFolder(folder), record) if record["settings"] == _digest(trial.cell_data()) else None
 
 
+class Executor(Protocol):
+    """Runs trials somewhere: in processes of this machine, or on others."""
+
+    def __call__(self, perform: Perform, trials: Sequence[Trial], jobs: int, /) -> Iterator[Finished]:
+        """Run every trial by ``perform(trial)``, at most ``jobs`` at a time; yield each as it finishes, in any order.
+
+        Closing the iterator, or an interrupt, ends what runs.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class ExecutorSpec:
+    """Entry point of an executor (group ``touchcell.executors``).
+
+    Attributes:
+        name: value of ``--executor`` on the command line.
+        summary: one line for ``touchcell list``.
+        run: the executor.
+    """
+
+    name: str
+    summary: str
+    run: Executor
+
+
+EXECUTORS: Final = Registry("touchcell.executors", "executor", ExecutorSpec)
+"""All installed executors."""
+
+
 def perform_all(
-    perform: Perform, trials: Sequence[Trial], *, jobs: int = 1, live: bool = False, title: str = ""
+    perform: Perform,
+    trials: Sequence[Trial],
+    *,
+    jobs: int = 1,
+    executor: str = "local",
+    live: bool = False,
+    title: str = "",
 ) -> list[Finished]:
     """Run the missing ones of ``trials``; return all of them in order.
 
@@ -149,6 +182,7 @@ def perform_all(
         perform: runs one.
         trials: all trials.
         jobs: number in parallel; 1 runs them in this process.
+        executor: name of what runs them.
         live: show a progress bar.
         title: on it.
 
@@ -162,43 +196,10 @@ def perform_all(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, transient=True, disable=not live) as progress:
         bar = progress.add_task(title, total=len(trials), completed=len(found))
-        for finished in _each(perform, missing, jobs):
+        for finished in EXECUTORS.load(executor).run(perform, missing, jobs):
             found[finished.trial.name] = finished
             progress.update(bar, advance=1, description=f"{title}: {finished.trial.name} {finished.outcome}")
     return [found[trial.name] for trial in trials]
-
-
-def _each(perform: Perform, trials: Sequence[Trial], jobs: int) -> Iterator[Finished]:
-    if jobs == 1 or len(trials) < 2:
-        for trial in trials:
-            yield perform(trial)
-        return
-    # Spawned processes: a fork would inherit locks of library threads that do not survive it.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(trials)), context, initializer=_belong_to_parent) as executor:
-        running = [executor.submit(perform, trial) for trial in trials]
-        try:
-            for future in as_completed(running):
-                yield future.result()
-        except BaseException:
-            executor.shutdown(wait=False, cancel_futures=True)
-            for child in multiprocessing.active_children():
-                child.terminate()
-            raise
-
-
-def _belong_to_parent() -> None:
-    # A terminal's Ctrl-C reaches every process of the group.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # A worker whose parent was killed would wait for work forever.
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _finished(trial: Trial, folder: RunFolder, record: Mapping[str, Any]) -> Finished:

@@ -16,13 +16,7 @@ WALL_CLOCK_TOPICS: Final = frozenset({"/timing"})
 
 @dataclass(frozen=True, slots=True)
 class TopicComparison:
-    """What the two recordings have of one topic.
-
-    Attributes:
-        topic: name of the topic.
-        counts: messages in each recording.
-        difference: where they differ first, for people; empty when they are identical.
-    """
+    """Comparison of one topic in two recordings."""
 
     topic: str
     counts: tuple[int, int]
@@ -30,7 +24,7 @@ class TopicComparison:
 
     @property
     def identical(self) -> bool:
-        """Whether every message is the same."""
+        """True if every message is identical."""
         return not self.difference
 
 
@@ -101,5 +95,5 @@ def _differences(where: str, first: Any, second: Any) -> Iterator[str]:
 
 
 def _bits(value: Any) -> Any:
-    """What is compared of a value: of a float its bits, and of everything its type too."""
+    """Return the compared representation of a value: a float's bits, and the type of everything."""
     return type(value), value.hex() if isinstance(value, float) else value

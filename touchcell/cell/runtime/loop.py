@@ -360,6 +360,8 @@ class RunLoop:
         error = self._error or self._record.error
         if (trip := cell.supervisor.latch.first_cause) is not None:
             outcome, reason = Outcome.TRIPPED, f"{trip.interlock}: {trip.subject}: {trip.reason}"
+            if error is not None:
+                reason += f"; error: {error}"
         elif error is not None:
             outcome, reason = Outcome.ERROR, str(error)
         elif stop is not None and stop.event == FINISHED:

@@ -1,26 +1,36 @@
-"""Where a person asks a run that has tripped to reset and to go on, by a key or from another shell, and is answered.
+"""Operator requests to a run that has tripped: reset and resume, by a key or from another shell, and their answers.
 
-From another shell a request is a file in the run folder and the answer another; each is replaced as a whole. Requests
-are taken only while the run waits: what was asked before counts for nothing.
+Another shell connects to a UNIX socket in the run folder, which is there only while the run waits. Its mode lets only
+this user connect, and the peer's credentials are checked besides. A message is one packet of bounded size, nothing
+blocks the loop, and what is malformed is logged and dropped. Requests made before the run waits do not count.
 """
 
 from __future__ import annotations
 
 import contextlib
+import getpass
 import json
+import logging
 import os
-import time
+import socket
+import struct
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any, Final
 
-_WAITING: Final = "waiting"
-_REQUEST: Final = "request.json"
-_ANSWER: Final = "answer.json"
+SOCKET: Final = "operator.socket"
+MAX_BYTES: Final = 1024
+"""Longest message in either direction."""
+
 _WAIT_S: Final = 10.0
-_POLL_S: Final = 0.02
+_MOST_CLIENTS: Final = 8
+_LONGEST_NAME: Final = 64
+_CREDENTIALS: Final = struct.Struct("3i")
+
+logger = logging.getLogger(__name__)
 
 
 class OperatorRequest(Enum):
@@ -37,16 +47,16 @@ class Request:
     Attributes:
         ask: for what.
         operator: who asks.
-        number: by which another shell knows its answer; None for a key.
+        client: connection to another shell; None for a key.
     """
 
     ask: OperatorRequest
     operator: str
-    number: int | None = None
+    client: socket.socket | None = None
 
 
 class OperatorChannel:
-    """Takes requests while it is open.
+    """Takes requests while it is open; nothing that a client, a terminal or a file system does is raised.
 
     Args:
         folder: the run folder, for requests from other shells; None takes only those of ``ask``.
@@ -56,24 +66,32 @@ class OperatorChannel:
         self._folder = folder
         self._asked: deque[Request] = deque()
         self._open = False
+        self._server: socket.socket | None = None
+        self._clients: deque[socket.socket] = deque()
         self.last_reply = ""
 
     def open(self) -> None:
-        """The run waits from now on. Whatever was asked before is forgotten."""
+        """The run waits from now on. Earlier requests are forgotten."""
         self._asked.clear()
         self.last_reply = ""
         self._open = True
         if self._folder is not None:
-            (self._folder / _REQUEST).unlink(missing_ok=True)
-            with contextlib.suppress(OSError):
-                (self._folder / _WAITING).touch()
+            try:
+                self._server = _serve(self._folder)
+            except OSError as error:
+                logger.warning("%s: no requests from other shells: %s", self._folder, error)
 
     def close(self) -> None:
         """The run waits no longer."""
         self._open = False
-        if self._folder is not None:
-            for name in (_WAITING, _REQUEST):
-                (self._folder / name).unlink(missing_ok=True)
+        for client in self._clients:
+            client.close()
+        self._clients.clear()
+        if self._server is not None and self._folder is not None:
+            self._server.close()
+            self._server = None
+            with contextlib.suppress(OSError):
+                (self._folder / SOCKET).unlink()
 
     def ask(self, ask: OperatorRequest, operator: str) -> None:
         """Ask from within this process."""
@@ -82,48 +100,140 @@ class OperatorChannel:
 
     def take(self) -> Request | None:
         """The next request, or None."""
-        if self._open and self._folder is not None and (data := _read(self._folder / _REQUEST)) is not None:
-            (self._folder / _REQUEST).unlink(missing_ok=True)
-            with contextlib.suppress(KeyError, ValueError, TypeError):
-                self._asked.append(Request(OperatorRequest(data["ask"]), str(data["operator"]), int(data["number"])))
+        if self._server is not None:
+            self._accept(self._server)
+            for client in tuple(self._clients):
+                if (request := self._received(client)) is not None:
+                    self._asked.append(request)
         return self._asked.popleft() if self._asked else None
 
-    def answer(self, request: Request, done: bool, words: str) -> None:
-        """Tell whoever asked what became of it."""
-        self.last_reply = words
-        if request.number is not None and self._folder is not None:
+    def answer(self, request: Request, done: bool, reply: str) -> None:
+        """Send the outcome of a request to its operator."""
+        self.last_reply = reply
+        if request.client is not None:
             with contextlib.suppress(OSError):
-                _write(self._folder / _ANSWER, {"number": request.number, "done": done, "words": words})
+                request.client.send(json.dumps({"done": done, "reply": reply}).encode()[:MAX_BYTES])
+            request.client.close()
+
+    def _accept(self, server: socket.socket) -> None:
+        for _ in range(_MOST_CLIENTS):
+            try:
+                client, _ = server.accept()
+            except OSError:
+                # Nobody is there, or went away in the meantime.
+                return
+            if (uid := _peer_uid(client)) not in (os.getuid(), 0):
+                logger.warning("a request of user %d was refused", uid)
+                client.close()
+                continue
+            client.setblocking(False)
+            self._clients.append(client)
+            if len(self._clients) > _MOST_CLIENTS:
+                self._clients.popleft().close()
+
+    def _received(self, client: socket.socket) -> Request | None:
+        try:
+            data, _, flags, _ = client.recvmsg(MAX_BYTES)
+        except BlockingIOError:
+            return None
+        except OSError:
+            data, flags = b"", 0
+        self._clients.remove(client)
+        request = _parsed(data, client) if data and not flags & socket.MSG_TRUNC and _stays(client) else None
+        if request is None:
+            if data:
+                logger.warning("a request that is malformed, or whose sender has gone, was dropped")
+            client.close()
+        return request
+
+
+def operator_name() -> str:
+    """Name of the user of this process, or the number of one without a name."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError, ImportError):
+        return f"uid {os.getuid()}"
 
 
 def is_waiting(folder: Path) -> bool:
-    """Whether the run in ``folder`` has tripped and waits for a person."""
-    return (folder / _WAITING).exists()
+    """Whether the run in ``folder`` has tripped and waits for its operator."""
+    try:
+        with _connected(folder, _WAIT_S):
+            return True
+    except OSError:
+        return False
 
 
 def ask_run(folder: Path, ask: OperatorRequest, operator: str, wait_s: float = _WAIT_S) -> tuple[bool, str]:
-    """Ask the waiting run in ``folder``; returns whether it was done, and in words what became of it."""
-    number = time.monotonic_ns()
-    _write(folder / _REQUEST, {"ask": ask.value, "operator": operator, "number": number})
-    deadline_s = time.monotonic() + wait_s
-    while time.monotonic() < deadline_s:
-        answer = _read(folder / _ANSWER)
-        if answer is not None and answer.get("number") == number:
-            return bool(answer["done"]), str(answer["words"])
-        time.sleep(_POLL_S)
-    (folder / _REQUEST).unlink(missing_ok=True)
-    return False, "no answer: does the run still go on?"
-
-
-def _read(file: Path) -> dict[str, Any] | None:
+    """Ask the waiting run in ``folder``; returns whether it was done, and the run's reply."""
     try:
-        data = json.loads(file.read_text())
-    except (OSError, ValueError):
+        with _connected(folder, wait_s) as client:
+            client.send(json.dumps({"ask": ask.value, "operator": operator}).encode())
+            answer = json.loads(client.recv(MAX_BYTES))
+            return bool(answer["done"]), str(answer["reply"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return False, "no answer: does the run still wait?"
+
+
+def _serve(folder: Path) -> socket.socket:
+    """A listening socket in ``folder`` that only this user may connect to. Raises OSError."""
+    server = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        with _address(folder) as address:
+            with contextlib.suppress(FileNotFoundError):
+                (folder / SOCKET).unlink()
+            server.bind(address)
+            # Nobody can connect before it listens.
+            (folder / SOCKET).chmod(0o600)
+        server.setblocking(False)
+        server.listen(_MOST_CLIENTS)
+    except OSError:
+        server.close()
+        raise
+    return server
+
+
+@contextlib.contextmanager
+def _connected(folder: Path, wait_s: float) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client, _address(folder) as address:
+        client.settimeout(max(wait_s, 1e-3))
+        client.connect(address)
+        if _peer_uid(client) not in (os.getuid(), 0) and os.getuid() != 0:
+            raise PermissionError(f"{folder}: the run belongs to another user")
+        yield client
+
+
+@contextlib.contextmanager
+def _address(folder: Path) -> Iterator[str]:
+    """The socket's address by way of a descriptor: a path in an address has 107 bytes at most."""
+    fd = os.open(folder, os.O_PATH | os.O_DIRECTORY)
+    try:
+        yield f"/proc/self/fd/{fd}/{SOCKET}"
+    finally:
+        os.close(fd)
+
+
+def _peer_uid(connection: socket.socket) -> int:
+    _, uid, _ = _CREDENTIALS.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
+    return int(uid)
+
+
+def _stays(client: socket.socket) -> bool:
+    """Whether a client still waits for its answer: what it has given up must not be done."""
+    try:
+        return client.recv(1, socket.MSG_PEEK) != b""
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+
+
+def _parsed(data: bytes, client: socket.socket) -> Request | None:
+    try:
+        message: Any = json.loads(data)
+        ask, operator = OperatorRequest(message["ask"]), message["operator"]
+    except (ValueError, KeyError, TypeError, RecursionError):
         return None
-    return data if isinstance(data, dict) else None
-
-
-def _write(file: Path, data: dict[str, Any]) -> None:
-    whole = file.with_name(f"{file.name}.{os.getpid()}")
-    whole.write_text(json.dumps(data))
-    whole.replace(file)
+    if not isinstance(operator, str) or not operator.isprintable() or not 0 < len(operator) <= _LONGEST_NAME:
+        return None
+    return Request(ask, operator, client)

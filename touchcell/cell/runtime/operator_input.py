@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import getpass
 import os
 import select
 import signal
@@ -18,7 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Final
 
-from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest
+from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest, operator_name
 from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.errors import TouchcellError
 
@@ -88,8 +87,13 @@ def stop_on_keys(
     import termios
     import tty
 
-    before = termios.tcgetattr(fd)
-    tty.setcbreak(fd)
+    try:
+        before = termios.tcgetattr(fd)
+        tty.setcbreak(fd)
+    except (termios.error, OSError):
+        # It has gone in the meantime, which its hang-up signal reports.
+        yield lambda: None
+        return
     try:
         yield lambda: _look(fd, stop, channel)
     finally:
@@ -107,11 +111,11 @@ def _terminal(stream: IO[str]) -> int | None:
 
 
 def _look(fd: int, stop: StopRequest, channel: OperatorChannel | None) -> None:
-    if not select.select([fd], [], [], 0.0)[0]:
-        return
     try:
+        if not select.select([fd], [], [], 0.0)[0]:
+            return
         keys = os.read(fd, 64)
-    except OSError:
+    except (OSError, ValueError):
         keys = b""
     if not keys or any(key in AT_ONCE_KEYS for key in keys):
         stop.ask_at_once()
@@ -120,7 +124,7 @@ def _look(fd: int, stop: StopRequest, channel: OperatorChannel | None) -> None:
     elif channel is not None:
         for key in dict.fromkeys(keys.lower()):
             if key in ASK_KEYS:
-                channel.ask(ASK_KEYS[key], getpass.getuser())
+                channel.ask(ASK_KEYS[key], operator_name())
 
 
 @contextlib.contextmanager
@@ -141,7 +145,9 @@ def reachable(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            (folder / PID_FILE).unlink(missing_ok=True)
+            # A folder that has vanished needs no tidying.
+            with contextlib.suppress(OSError):
+                (folder / PID_FILE).unlink()
 
 
 def running(runs: Path) -> list[Path]:

@@ -32,7 +32,7 @@ _SINCE: Final = ""
 class Overrun:
     """The time between two control cycles stays below the limit.
 
-    A loop that hung finds everything fresh when it resumes: ages alone do not show that nobody was watching.
+    After a hang all data is fresh again when the loop resumes: age limits alone do not reveal the gap.
     """
 
     name: str

@@ -238,6 +238,13 @@ class WorkspaceConfig(GradedSettings):
     """Box for a sensor, or for the tool centre point of an arm without one, along the axes of the arm's base.
 
     ``margin_mm`` is the free space around the box: a cell whose stopping distance may exceed it is refused.
+
+    Attributes:
+        arm: role of the arm.
+        sensor: role of the sensor whose tip stays inside; none for the tool centre point.
+        min_mm: lower corner of the box in the arm's base frame.
+        max_mm: upper corner of the box.
+        margin_mm: free space around the box: a cell whose stopping distance may exceed it is refused.
     """
 
     kind: Literal["workspace"]
@@ -279,7 +286,14 @@ def _guarded(name: str, sensor: str | None, T_tcp_sensor: Mapping[str, Array]) -
 
 
 class TiltConfig(GradedSettings):
-    """Cone for the z axis of a sensor, or of the tool of an arm without one; ``direction`` is along base axes."""
+    """Cone for the z axis of a sensor, or of the tool of an arm without one; ``direction`` is along base axes.
+
+    Attributes:
+        arm: role of the arm.
+        sensor: role of the sensor whose axis is meant; none for the tool's.
+        direction: axis of the cone, along the axes of the arm's base.
+        limit_deg: half of the cone's opening.
+    """
 
     kind: Literal["tilt"]
     arm: str
@@ -301,7 +315,12 @@ class TiltConfig(GradedSettings):
 
 
 class TcpSpeedConfig(InterlockSettings):
-    """Largest speeds of any tool centre point."""
+    """Largest speeds of any tool centre point.
+
+    Attributes:
+        limit_m_s: largest linear speed, commanded and measured.
+        limit_rad_s: largest angular speed, likewise.
+    """
 
     kind: Literal["tcp_speed"]
     limit_m_s: PositiveFloat
@@ -313,7 +332,11 @@ class TcpSpeedConfig(InterlockSettings):
 
 
 class DepthConfig(GradedSettings):
-    """Largest indentation of any sensor."""
+    """Largest indentation of any sensor.
+
+    Attributes:
+        limit_mm: largest indentation.
+    """
 
     kind: Literal["depth"]
     limit_mm: PositiveFloat
@@ -324,7 +347,11 @@ class DepthConfig(GradedSettings):
 
 
 class FrameAgeConfig(InterlockSettings):
-    """Largest age of a tactile frame."""
+    """Largest age of a tactile frame.
+
+    Attributes:
+        limit_ms: oldest tactile frame that is accepted.
+    """
 
     kind: Literal["frame_age"]
     limit_ms: PositiveFloat
@@ -335,7 +362,11 @@ class FrameAgeConfig(InterlockSettings):
 
 
 class ArmStateAgeConfig(InterlockSettings):
-    """Largest age of an arm state."""
+    """Largest age of an arm state.
+
+    Attributes:
+        limit_ms: oldest state of an arm that is accepted.
+    """
 
     kind: Literal["arm_state_age"]
     limit_ms: PositiveFloat

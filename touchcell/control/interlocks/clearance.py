@@ -74,6 +74,10 @@ class ClearanceConfig(SpatialInterlockConfig):
     """Smallest distance of every arm to the others, to the cell's ``obstacles:`` and to itself.
 
     Nearer than ``slow_mm``, approaching motion is slowed to a quarter for as long as it continues.
+
+    Attributes:
+        limit_mm: smallest distance.
+        slow_mm: distance below which approaching motion is slowed to a quarter.
     """
 
     kind: Literal["clearance"]

@@ -49,7 +49,7 @@ class Standstill:
             if not mark.values and view.now_ns - mark.since_ns >= round(1e9 * self.settle_s):
                 mark = TimerState(mark.since_ns, values=tuple(position.tolist()))
             drift_m = math.dist(position, mark.values) if mark.values else 0.0
-            # The position is taken anew after a violation, or the latch could never be reset.
+            # The reference is reset after a violation, or the latch could never be reset.
             marks[role] = TimerState(view.now_ns) if drift_m > self.limit_m else mark
             if found is None and drift_m > self.limit_m:
                 reason = f"drifted by {1e3 * drift_m:.2f} mm while commanded to stop, limit {1e3 * self.limit_m:g} mm"
@@ -75,7 +75,12 @@ def _limited(view: CellView) -> Mapping[str, str]:
 
 
 class StandstillConfig(InterlockSettings):
-    """Largest drift of an arm that is commanded to stop, and the time that it may take to come to rest."""
+    """Largest drift of an arm that is commanded to stop, and the time that it may take to come to rest.
+
+    Attributes:
+        limit_mm: largest drift.
+        settle_ms: time to come to rest after a stop.
+    """
 
     kind: Literal["standstill"]
     limit_mm: PositiveFloat
@@ -87,7 +92,13 @@ class StandstillConfig(InterlockSettings):
 
 
 class TrackingConfig(InterlockSettings):
-    """Largest difference between commanded and measured velocity, and how long it may be exceeded."""
+    """Largest difference between commanded and measured velocity, and how long it may be exceeded.
+
+    Attributes:
+        limit_mm_s: largest difference of the velocities.
+        leave_mm_s: difference below which the time starts anew; none for a share of the limit.
+        hold_ms: how long it may be exceeded.
+    """
 
     kind: Literal["tracking"]
     limit_mm_s: PositiveFloat
@@ -103,7 +114,11 @@ class TrackingConfig(InterlockSettings):
 
 
 class LimitedConfig(InterlockSettings):
-    """Longest time for which an arm's gate may limit the task's commands."""
+    """Longest time for which an arm's gate may limit the task's commands.
+
+    Attributes:
+        limit_ms: longest time.
+    """
 
     kind: Literal["limited"]
     limit_ms: PositiveFloat

@@ -212,6 +212,15 @@ def _taken_elsewhere(view: CellView) -> tuple[Reading, ...]:
 
 
 class _PairSettings(SpatialInterlockConfig):
+    """Settings of an interlock on a pair of arms.
+
+    Attributes:
+        severity: as of every interlock.
+        leader_sensor: role of the leader's sensor.
+        follower_sensor: role of the follower's sensor.
+        states: states of the task in which it is judged; none for all.
+    """
+
     severity: Literal["limit", "trip", "fault"] = "trip"  # type: ignore[assignment]
     leader_sensor: str = "leader_sensor"
     follower_sensor: str = "follower_sensor"
@@ -219,7 +228,15 @@ class _PairSettings(SpatialInterlockConfig):
 
 
 class OutOfStepConfig(_PairSettings):
-    """Largest rate at which the tips of leader and follower close or part, and largest difference of their depths."""
+    """Largest rate at which the tips of leader and follower close or part, and largest difference of their depths.
+
+    Attributes:
+        leader: role of the arm that carries the leader's sensor.
+        follower: role of the arm that carries the follower's sensor.
+        limit_mm_s: largest rate at which the tips close or part.
+        limit_mm: largest difference of the depths.
+        hold_ms: how long either may be exceeded.
+    """
 
     kind: Literal["out_of_step"]
     leader: str = "leader"
@@ -249,7 +266,11 @@ class OutOfStepConfig(_PairSettings):
 
 
 class ObjectLostConfig(_PairSettings):
-    """Longest time without contact at either sensor once both have touched the object."""
+    """Longest time without contact at either sensor once both have touched the object.
+
+    Attributes:
+        limit_ms: longest time without contact.
+    """
 
     kind: Literal["object_lost"]
     severity: Literal["trip", "fault"] = "trip"
@@ -269,6 +290,15 @@ class TopplingConfig(SpatialInterlockConfig):
     """Largest tilt and tilt rate of the touched object, and largest vertical shear; how long each may be exceeded.
 
     ``sensors`` are the pushing one, or the pushing and the counter-pushing one, with the ``arms`` that carry them.
+
+    Attributes:
+        sensors: roles of the pushing sensor, and of the counter-pushing one.
+        arms: roles of the arms that carry them.
+        limit_deg: largest tilt of the object.
+        limit_deg_s: largest tilt rate.
+        limit_mm: largest vertical shear.
+        hold_ms: how long each may be exceeded.
+        states: states of the task in which it is judged; none for all.
     """
 
     kind: Literal["toppling"]

@@ -38,7 +38,11 @@ class ReadingAge:
 
 
 class ReadingAgeConfig(InterlockSettings):
-    """Largest age of the reading of any device under ``devices:``."""
+    """Largest age of the reading of any device under ``devices:``.
+
+    Attributes:
+        limit_ms: oldest reading that is accepted.
+    """
 
     kind: Literal["reading_age"]
     limit_ms: PositiveFloat

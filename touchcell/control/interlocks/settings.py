@@ -16,7 +16,12 @@ if TYPE_CHECKING:
 
 
 class InterlockSettings(BaseModel):
-    """Base of the settings: unknown keys are refused, no limit has a default."""
+    """Base of the settings: unknown keys are refused, no limit has a default.
+
+    Attributes:
+        kind: which interlock.
+        severity: ``limit`` slows the motion first, ``trip`` stops it, ``fault`` stops it and distrusts the device.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 

@@ -159,7 +159,11 @@ def _out_of_range(view: CellView) -> Mapping[str, str]:
 
 
 class FrameFrozenConfig(InterlockSettings):
-    """Longest time that a sensor's image may stay identical, noise included."""
+    """Longest time that a sensor's image may stay identical, noise included.
+
+    Attributes:
+        limit_ms: longest time with the same image.
+    """
 
     kind: Literal["frame_frozen"]
     limit_ms: PositiveFloat
@@ -170,7 +174,11 @@ class FrameFrozenConfig(InterlockSettings):
 
 
 class ExposureConfig(InterlockSettings):
-    """Largest change of a sensor's brightness."""
+    """Largest change of a sensor's brightness.
+
+    Attributes:
+        limit_percent: largest change of the mean grey level.
+    """
 
     kind: Literal["exposure"]
     limit_percent: PositiveFloat
@@ -181,7 +189,12 @@ class ExposureConfig(InterlockSettings):
 
 
 class ContactLostConfig(InterlockSettings):
-    """Longest time without an established contact while the task is in one of ``states``."""
+    """Longest time without an established contact while the task is in one of ``states``.
+
+    Attributes:
+        limit_ms: longest time without contact.
+        states: states of the task in which it is judged.
+    """
 
     kind: Literal["contact_lost"]
     limit_ms: PositiveFloat
@@ -193,7 +206,13 @@ class ContactLostConfig(InterlockSettings):
 
 
 class UncertainConfig(GradedSettings):
-    """Largest standard deviation of the estimated depth, and how long it may be exceeded."""
+    """Largest standard deviation of the estimated depth, and how long it may be exceeded.
+
+    Attributes:
+        limit_mm: largest standard deviation of the depth.
+        leave_mm: deviation below which the time starts anew; none for a share of the limit.
+        hold_ms: how long it may be exceeded.
+    """
 
     kind: Literal["uncertain"]
     limit_mm: PositiveFloat
@@ -208,7 +227,11 @@ class UncertainConfig(GradedSettings):
 
 
 class OutOfRangeConfig(GradedSettings):
-    """Longest time outside the range that the network was trained on."""
+    """Longest time outside the range that the network was trained on.
+
+    Attributes:
+        limit_ms: longest time outside the range.
+    """
 
     kind: Literal["out_of_range"]
     limit_ms: PositiveFloat
@@ -222,6 +245,11 @@ class InconsistentConfig(GradedSettings):
     """Largest normalised innovation squared of the filter, and in how many consecutive frames it may be exceeded.
 
     A consistent filter with six degrees of freedom exceeds 22.5 in one frame of a thousand.
+
+    Attributes:
+        limit_nis: largest normalised innovation squared, six degrees of freedom.
+        leave_nis: value below which the count of frames ends; none for a share of the limit.
+        frames: consecutive frames that may exceed it.
     """
 
     kind: Literal["inconsistent"]
@@ -237,7 +265,13 @@ class InconsistentConfig(GradedSettings):
 
 
 class ShearConfig(GradedSettings):
-    """Largest tangential shear of any contact: beyond it the skin saturates or slips."""
+    """Largest tangential shear of any contact: beyond it the skin saturates or slips.
+
+    Attributes:
+        limit_mm: largest tangential shear.
+        leave_mm: shear below which the time starts anew; none for a share of the limit.
+        hold_ms: how long it may be exceeded.
+    """
 
     kind: Literal["shear"]
     limit_mm: PositiveFloat
@@ -251,7 +285,13 @@ class ShearConfig(GradedSettings):
 
 
 class TorsionConfig(GradedSettings):
-    """Largest rotation of any contact about the surface normal."""
+    """Largest rotation of any contact about the surface normal.
+
+    Attributes:
+        limit_deg: largest rotation about the surface normal.
+        leave_deg: rotation below which the time starts anew; none for a share of the limit.
+        hold_ms: how long it may be exceeded.
+    """
 
     kind: Literal["torsion"]
     limit_deg: PositiveFloat
@@ -269,6 +309,13 @@ class SlipConfig(GradedSettings):
 
     On real images, estimates of shear fall behind the motion once shear exceeds depth: there the skin begins to
     slide. Contacts shallower than ``min_depth_mm`` are not judged.
+
+    Attributes:
+        limit_ratio: largest ratio of shear to depth.
+        leave_ratio: ratio below which the time starts anew; none for a share of the limit.
+        hold_ms: how long it may be exceeded.
+        min_depth_mm: contacts shallower than this are not judged.
+        states: states of the task in which it is judged; none for all.
     """
 
     kind: Literal["slip"]
@@ -289,6 +336,11 @@ class MarkersLostConfig(InterlockSettings):
     """Largest fraction of the markers expected in view that may be missing, and in how many consecutive frames.
 
     Only estimators that detect markers report it; for others it never trips.
+
+    Attributes:
+        limit_percent: largest share of missing markers.
+        leave_percent: share below which the count of frames ends; none for a share of the limit.
+        frames: consecutive frames that may exceed it.
     """
 
     kind: Literal["markers_lost"]

@@ -48,7 +48,16 @@ _SHORTEST_TTL_S = 1e-3
 
 
 class LimitsConfig(DriverConfig):
-    """The ``limits:`` of an arm in the cell file: speeds, accelerations and jerks of the tool centre point."""
+    """The ``limits:`` of an arm in the cell file: speeds, accelerations and jerks of the tool centre point.
+
+    Attributes:
+        tcp_speed_m_s: largest linear speed.
+        tcp_accel_m_s2: largest linear acceleration.
+        tcp_rot_speed_rad_s: largest angular speed.
+        tcp_rot_accel_rad_s2: largest angular acceleration.
+        tcp_jerk_m_s3: largest linear jerk.
+        tcp_rot_jerk_rad_s3: largest angular jerk.
+    """
 
     tcp_speed_m_s: float = Field(default=0.10, gt=0.0, le=1.0)
     tcp_accel_m_s2: float = Field(default=0.5, gt=0.0, le=10.0)
@@ -152,7 +161,7 @@ class Arm(Device):
         admitted = sent.command
         left_s = admitted.ttl_s - (sent.t_ns - admitted.t_ns) * 1e-9
         self._stream_twist(admitted.twist, max(left_s, _SHORTEST_TTL_S), sent.t_ns)
-        if self._stop_count != stop_count:
+        if self._stop_count != stop_count or self.state is not Lifecycle.ACTIVE:
             # Another thread has stopped or faulted the arm since; the twist may have reached it after that stop.
             self._gate.reset()
             if self.state in (Lifecycle.ACTIVE, Lifecycle.FAULTED):
@@ -177,14 +186,15 @@ class Arm(Device):
             )
         if self.state not in (Lifecycle.ACTIVE, Lifecycle.FAULTED):
             return
-        self._stop_count += 1
+        self._count_stop()
         self._gate.reset()
         removes_power = category is not StopCategory.STOP_AND_HOLD
         if removes_power:
             self._desk.revoke()
         self._begin_stop(category)
-        if removes_power and self.state is Lifecycle.ACTIVE:
-            self._state = Lifecycle.READY
+        if removes_power:
+            # Not over a fault that a thread of the driver has latched since.
+            self._change_state(Lifecycle.ACTIVE, Lifecycle.READY)
 
     @abstractmethod
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
@@ -241,8 +251,9 @@ class Arm(Device):
 
     @final
     def _to_faulted(self, error: DeviceError) -> DeviceError:
-        was_active = self.state is Lifecycle.ACTIVE
-        latched = super()._to_faulted(error)
+        with self._state_lock:
+            was_active = self.state is Lifecycle.ACTIVE
+            latched = super()._to_faulted(error)
         if was_active:
             self._give_up_command()
             # The device may be gone; the first fault is the one to report.
@@ -250,8 +261,12 @@ class Arm(Device):
                 self._begin_stop(StopCategory.STOP_AND_HOLD)
         return latched
 
+    def _count_stop(self) -> None:
+        with self._state_lock:
+            self._stop_count += 1
+
     def _give_up_command(self) -> None:
-        self._stop_count += 1
+        self._count_stop()
         self._desk.revoke()
         self._gate.reset()
 
@@ -307,7 +322,14 @@ class Arm(Device):
 
 
 class JointLimitsConfig(DriverConfig):
-    """The ``joint_limits:`` of an arm in the cell file; ranges, speeds and accelerations are in its chain file."""
+    """The ``joint_limits:`` of an arm in the cell file; ranges, speeds and accelerations are in its chain file.
+
+    Attributes:
+        margin_deg: distance to the end of a joint's range within which outward speed falls to zero.
+        characteristic_length_mm: length that makes a radian comparable to a distance, about half the arm's reach.
+        singular_value_mm: singular value of the Jacobian below which its direction is damped.
+        singular_floor_mm: smallest singular value; motion that would reduce it further is refused.
+    """
 
     margin_deg: float = Field(default=5.0, gt=0.0, le=45.0)
     characteristic_length_mm: float = Field(default=250.0, gt=0.0, le=2000.0)

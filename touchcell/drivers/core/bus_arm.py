@@ -54,6 +54,19 @@ class BusArmConfig(DriverConfig):
 
     A joint that deviates by ``tracking_error_deg`` from its setpoint, a reply older than ``max_silence_s``, or more
     than ``max_missed_fraction`` of the cycles without all replies is a fault.
+
+    Attributes:
+        chain: name of a chain description that ships, or path of a YAML file.
+        tool: tool on the flange.
+        rate_hz: cycles of the bus per second.
+        max_silence_s: oldest reply of a motor; an older one is a fault.
+        max_missed_fraction: share of cycles without all replies; more is a fault.
+        tracking_error_deg: largest deviation of a joint from its setpoint; more is a fault.
+        limits: limits of the tool centre point.
+        joint_limits: how joints are kept within their ranges.
+        park_deg: joint angles at which the arm may be switched off; none where it has no such pose.
+        park_tolerance_deg: how near to that pose counts as parked.
+        on_disconnect: what an energised arm does when it is disconnected.
     """
 
     chain: str

@@ -9,6 +9,7 @@ PASSIVE only reads: nothing that changes power, mode or zero has been sent. ``ac
 from __future__ import annotations
 
 import logging
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
@@ -64,6 +65,8 @@ class Device(ABC):
     def __init__(self, name: str, clock: Clock) -> None:
         self.name = name
         self._clock = clock
+        # Threads of a driver latch faults while the loop's thread makes transitions: state and fault change together.
+        self._state_lock = threading.RLock()
         self._state = Lifecycle.DISCONNECTED
         self._fault_error: DeviceError | None = None
 
@@ -86,10 +89,11 @@ class Device(ABC):
         self._require("connect", Lifecycle.DISCONNECTED)
         try:
             self._open()
+            self._enter(Lifecycle.PASSIVE)
         except BaseException:
             self._close()
+            self._forget_state()
             raise
-        self._state = Lifecycle.PASSIVE
         _logger.info("%s: connected", self.name)
 
     @final
@@ -120,8 +124,10 @@ class Device(ABC):
         """FAULTED -> READY, on a person's request; never on to ACTIVE. Raises if the cause is still there."""
         self._require("recover", Lifecycle.FAULTED)
         self._recover(token)
-        self._fault_error = None
-        self._state = Lifecycle.READY
+        with self._state_lock:
+            self._require("recover", Lifecycle.FAULTED)
+            self._fault_error = None
+            self._state = Lifecycle.READY
         _logger.info("%s: recovered on request of %s", self.name, token.operator)
 
     @final
@@ -135,8 +141,7 @@ class Device(ABC):
                 with suppress(TransportError):
                     self._deactivate(self._disconnect_policy())
         finally:
-            self._state = Lifecycle.DISCONNECTED
-            self._fault_error = None
+            self._forget_state()
             self._close()
             _logger.info("%s: disconnected", self.name)
 
@@ -157,18 +162,35 @@ class Device(ABC):
 
     def _enter(self, state: Lifecycle) -> None:
         """Enter ``state``, unless a thread of the driver has latched a fault on the way: then raise that."""
-        if self._fault_error is not None:
-            raise self._fault_error
-        self._state = state
+        with self._state_lock:
+            if self._fault_error is not None:
+                raise self._fault_error
+            self._state = state
         _logger.info("%s: %s", self.name, state.value)
+
+    def _change_state(self, expected: Lifecycle, state: Lifecycle) -> bool:
+        """Compare and set: enter ``state`` if the device is in ``expected``; returns whether it was."""
+        with self._state_lock:
+            if self._state is not expected:
+                return False
+            self._state = state
+            return True
+
+    def _forget_state(self) -> None:
+        """Be DISCONNECTED, without a fault."""
+        with self._state_lock:
+            self._state = Lifecycle.DISCONNECTED
+            self._fault_error = None
 
     def _to_faulted(self, error: DeviceError) -> DeviceError:
         """Latch the first fault; returns it so that callers can raise it."""
-        if self._state is not Lifecycle.FAULTED:
+        with self._state_lock:
+            if self._state is Lifecycle.FAULTED:
+                return error
             # The error first: who reads the state from another thread finds it.
             self._fault_error = error
             self._state = Lifecycle.FAULTED
-            _logger.error("faulted: %s", error)
+        _logger.error("faulted: %s", error)
         return error
 
     def _attempt(self, step: Callable[[], None]) -> None:

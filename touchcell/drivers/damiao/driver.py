@@ -60,7 +60,16 @@ _DISABLED_ITSELF = codec.StatusCode(
 
 
 class MotorConfig(BaseModel):
-    """Configuration of one joint's motor: joint angle = ``direction`` times motor angle, plus ``offset_deg``."""
+    """Configuration of one joint's motor: joint angle = ``direction`` times motor angle, plus ``offset_deg``.
+
+    Attributes:
+        esc_id: CAN id that the motor listens to.
+        mst_id: CAN id that it answers with.
+        direction: sign of joint angle against motor angle.
+        offset_deg: joint angle at the motor's zero.
+        kp_n_m_rad: stiffness of its position loop, N m/rad.
+        kd_n_m_s_rad: damping of its position loop, N m s/rad.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -77,6 +86,17 @@ class DamiaoCanConfig(BusArmConfig):
 
     ``interface``, ``channel`` and ``bus_options`` go to python-can; the bit rates are those set by the adapter or by
     ``ip link``.
+
+    Attributes:
+        interface: of python-can.
+        channel: of python-can, such as can0.
+        bus_options: further options of python-can.
+        fd: whether the bus is CAN FD.
+        bitrate: bit/s, as set by the adapter or by ``ip link``.
+        data_bitrate: bit/s of the data phase of CAN FD.
+        gravity_m_s2: gravity along the axes of the arm's base, for compensation.
+        motors: one for each joint, from the base.
+        watchdog_s: silence after which a motor lets go by itself: the arm sinks.
     """
 
     interface: str = "socketcan"

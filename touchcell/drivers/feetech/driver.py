@@ -67,6 +67,14 @@ class ServoConfig(BaseModel):
 
     ``min_ticks`` and ``max_ticks`` limit the joint's range, within one turn: a servo turns the long way round between
     4095 and 0. ``homing_offset_ticks`` is the value stored in the servo when it was calibrated.
+
+    Attributes:
+        id: of the servo on the line.
+        zero_ticks: reading at joint angle zero.
+        direction: sign of joint angle against ticks.
+        min_ticks: lowest reading of the joint's range.
+        max_ticks: highest reading of the joint's range.
+        homing_offset_ticks: value stored in the servo when it was calibrated.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -99,7 +107,15 @@ class ServoConfig(BaseModel):
 
 class FeetechSerialConfig(BusArmConfig):
     """Configuration of a Feetech arm. ``servos`` are in the order of the joints; the chain's joint ranges are narrowed
-    to the calibrated ones."""
+    to the calibrated ones.
+
+    Attributes:
+        port: serial port; a name under /dev/serial/by-id stays with the adapter.
+        baudrate: bit/s of the line.
+        echo: whether the adapter echoes what is sent.
+        servos: one for each joint, from the base.
+        torque_limit_percent: largest torque, of the servo's own maximum.
+    """
 
     port: str
     baudrate: int = Field(default=1_000_000, gt=0)

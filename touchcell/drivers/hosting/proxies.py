@@ -271,10 +271,11 @@ class RemoteArm(RemoteDevice):
             raise LifecycleError(self.name, "read its pose", self._state.value, ["passive"])
         # A stop that removes power ends in READY, and a driver may fault on its own.
         found = LIFECYCLES[int(record["lifecycle"])]
-        if found is Lifecycle.FAULTED and self._state is not Lifecycle.FAULTED and note:
-            self._fault_error = _device_error(note, self.name)
-        if found in (Lifecycle.READY, Lifecycle.FAULTED) and self._state is Lifecycle.ACTIVE:
-            self._state = found
+        with self._state_lock:
+            if found is Lifecycle.FAULTED and self._state is not Lifecycle.FAULTED and note:
+                self._fault_error = _device_error(note, self.name)
+            if found in (Lifecycle.READY, Lifecycle.FAULTED):
+                self._change_state(Lifecycle.ACTIVE, found)
         return record, note
 
     def _open(self) -> None:

@@ -90,7 +90,14 @@ class Joint(Placement):
 
 
 class Tool(Placement):
-    """Tool on the flange: pose of the tool centre point, and mass and centre of mass in the flange frame."""
+    """Tool on the flange: pose of the tool centre point, and mass and centre of mass in the flange frame.
+
+    Attributes:
+        origin_mm: position of the tool centre point in the flange frame.
+        rotation_deg: its orientation there, extrinsic xyz.
+        mass_kg: mass of the tool.
+        com_mm: centre of mass in the flange frame.
+    """
 
     mass_kg: NotNegative = 0.0
     com_mm: Vector3 = (0.0, 0.0, 0.0)

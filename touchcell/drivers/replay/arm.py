@@ -20,7 +20,13 @@ from touchcell.geometry.types import Array
 
 
 class ReplayArmConfig(DriverConfig):
-    """Data set and rate; equal to those of the replay camera."""
+    """Data set and rate; equal to those of the replay camera.
+
+    Attributes:
+        data: root of a data set in the public layout.
+        split: train, val or test.
+        rate_hz: images per second.
+    """
 
     data: Path
     split: str

@@ -265,8 +265,7 @@ class UrArm(Arm):
         if keeper is not None:
             keeper.join(_KEEPER_JOIN_S)
         # The thread may have latched a fault while the state was already DISCONNECTED.
-        self._state = Lifecycle.DISCONNECTED
-        self._fault_error = None
+        self._forget_state()
         self._drop_program()
         if self._power_off_by is not None:
             with suppress(DeviceError), dashboard(self.name, self._config.host) as client:

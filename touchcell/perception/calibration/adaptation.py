@@ -261,13 +261,13 @@ def _refined(
     would bias depth.
     """
     some = np.linspace(0, len(xi) - 1, min(_REFINED_WITH, len(xi))).round().astype(int)
-    middle = old_lattice.mean(axis=0)
+    centre = old_lattice.mean(axis=0)
     labels = old.header.labels
     moved = displacements[some].astype(np.float64).reshape(len(some), -1, 2)
 
     def residuals(x: Array) -> Array:
         linear = np.exp(x[0]) * np.array([[np.cos(x[1]), -np.sin(x[1])], [np.sin(x[1]), np.cos(x[1])]])
-        seen = (old_lattice + moved - middle) @ linear.T + middle + x[2:4] - old_lattice
+        seen = (old_lattice + moved - centre) @ linear.T + centre + x[2:4] - old_lattice
         mean, _ = outputs_of(layers, (x[5] * seen).reshape(len(some), -1).astype(np.float32), labels)
         aim = labels.targets(about_z(turn + x[4], xi[some]))
         flat: Array = (mean + x[6:] - aim).ravel() / _TYPICAL_ERROR

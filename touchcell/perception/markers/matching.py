@@ -259,20 +259,20 @@ class MarkerMatcher:
         off = self._off(guess, centres)
         if off < _NEAR * self._spacing_px:
             yield guess, self._guess_sd
-        alike = self._alike(density)
-        offs = [self._off(start, centres) for start in alike]
+        similar = self._most_similar(density)
+        offs = [self._off(start, centres) for start in similar]
         order = np.argsort(offs)[:_MOST_STARTS]
         if _NEAR * self._spacing_px <= off <= offs[order[0]]:
             yield guess, self._guess_sd
         for i in order:
-            yield alike[i], 0.4 * self.model.sd
+            yield similar[i], 0.4 * self.model.sd
 
     def _off(self, coefficients: Array, centres: Array) -> float:
         """Return the median distance px of the predicted markers from their nearest discs."""
         _, square, _ = kernels.pair(self.model.positions(coefficients), centres)
         return math.sqrt(float(np.median(square)))
 
-    def _alike(self, density: NDArray[np.float32]) -> Array:
+    def _most_similar(self, density: NDArray[np.float32]) -> Array:
         """Return (s, k) coefficients of the learned contacts whose disc density is most similar to this image's."""
         apart = kernels.bytes_apart(self._bank_density, _in_bytes(density))
         return self._bank[np.argsort(apart)[:_ALIKE]]
@@ -305,11 +305,11 @@ class MarkerMatcher:
         predicted = self.model.positions(coefficients)
         partner, paired = pair(predicted, centres, self._reach)
         off = np.where(paired[:, None], centres[partner] - predicted, 0.0)
-        nobody = np.zeros((1, 2))
+        missing = np.zeros((1, 2))
         for _ in range(_RINGS_GROWN):
             near_by = np.append(paired, False)[self._neighbours].sum(axis=1)
             expected: Array = (
-                np.concatenate([off, nobody])[self._neighbours].sum(axis=1) / np.maximum(near_by, 1.0)[:, None]
+                np.concatenate([off, missing])[self._neighbours].sum(axis=1) / np.maximum(near_by, 1.0)[:, None]
             )
             corrected = predicted + np.where(paired[:, None], off, _ONWARD * expected)
             before = int(paired.sum())

@@ -80,12 +80,12 @@ def fit_lattice(discs: Discs, rings: int) -> tuple[Array, float]:
     radius = ring_numbers(rings) / rings
     z = (flat[:, 0] + 1j * flat[:, 1]) / rings
     terms = np.column_stack([np.ones(len(z)), z, z * radius**2, z * radius**4])
-    middle = np.median(centres, axis=0)
-    reach = np.percentile(np.linalg.norm(centres - middle, axis=1), 85) / np.percentile(np.abs(z), 85)
+    centre = np.median(centres, axis=0)
+    reach = np.percentile(np.linalg.norm(centres - centre, axis=1), 85) / np.percentile(np.abs(z), 85)
     seen_at = centres[:, 0] + 1j * centres[:, 1]
     best: tuple[float, Array, float] = (-np.inf, flat, np.inf)
     for turn in np.arange(12) * np.pi / 36:
-        placed = complex(*middle) + reach * np.exp(1j * turn) * z
+        placed = complex(*centre) + reach * np.exp(1j * turn) * z
         for step in range(16):
             points = np.column_stack([placed.real, placed.imag])
             partner, paired = pair(points, centres, (0.8 if step < 6 else 0.4) * reach / rings)
@@ -123,7 +123,7 @@ def find_reference(frames: Sequence[Discs], rings: int) -> Array:
 
 @runtime_checkable
 class DisplacementPrior(Protocol):
-    """Where learning begins before any image has been matched."""
+    """Source of the initial displacements, before any image has been matched."""
 
     def __call__(self, lattice: Array, rings: int, seed: int, /) -> Array:
         """Return (n, m, 2) px displacements of markers in random contacts, from a lattice (m, 2) px and its rings."""
@@ -306,8 +306,8 @@ def _spread(
     for i, field in enumerate(fields):
         if not _surely(field) and len(frames[i]):
             apart = ((density[sure] - density[i]) ** 2).sum(axis=1)
-            alike = sure[np.argsort(apart)[:_ALIKE]]
-            again = matcher.match_from(frames[i], [fields[j].coefficients for j in alike])
+            similar = sure[np.argsort(apart)[:_ALIKE]]
+            again = matcher.match_from(frames[i], [fields[j].coefficients for j in similar])
             fields[i] = max(field, again, key=quality)
 
 

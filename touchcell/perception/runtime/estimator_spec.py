@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class EstimatorContext:
-    """What an estimator may need besides its own section.
+    """Inputs of an estimator besides its own section.
 
     Attributes:
         sensor: name of the sensor in the cell file.
@@ -33,6 +33,7 @@ class EstimatorConfig(Section):
 
     Attributes:
         needs_truth: True if it can only be built where the true contact is known, as in a simulated scene.
+        kind: which estimator.
     """
 
     needs_truth: ClassVar[bool] = False

@@ -1,4 +1,4 @@
-"""The contact as arm and surface tell it: for collecting labels, when there is no model yet that could look."""
+"""Contact from the poses of arm and surface: for collecting labels before a model exists."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _COVARIANCE = np.diag([1e-8] * 3 + [3e-6] * 3)
 
 
 class KnownSurfaceSource:
-    """A ``ContactSource`` that reads the camera, but takes the contact from the arm's pose.
+    """A ``ContactSource`` that reads the camera, but computes the contact from the arm's pose.
 
-    What slips on the surface is not seen: the contact is the one that was asked for, as in the public data.
+    Slip is not observed: the contact is the commanded one, as in the public data.
 
     Args:
         camera: an opened frame source.
-        T_base_f: (4, 4) surface frame in the arm's base: where the sensor frame is when it just touches, upright.
+        T_base_f: (4, 4) surface frame in the arm's base: the sensor frame at first touch, upright.
     """
 
     ended = False
@@ -41,11 +41,11 @@ class KnownSurfaceSource:
         self._camera.latest()
 
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
-        """Tell where the sensor is."""
+        """Record the sensor's pose."""
         self._T_base_s = T_base_sensor
 
     def update(self, now_ns: int) -> ContactEstimate | None:
-        """The contact now, in contact or not, stamped with the newest frame. Raises DeviceError from the camera."""
+        """Return the current contact, stamped with the newest frame. Raises DeviceError from the camera."""
         frame = self._camera.latest()
         if self.frame is None or frame.seq != self.frame.seq:
             self.frame = frame
@@ -60,6 +60,9 @@ class KnownSurface(EstimatorConfig):
     """The contact from the arm's pose above a surface at a given pose, for collecting labels.
 
     ``surface_mm_deg`` is the pose of the sensor frame in the arm's base when it just touches the surface, upright.
+
+    Attributes:
+        surface_mm_deg: pose of the sensor frame in the arm's base when it just touches the surface, upright.
     """
 
     kind: Literal["known_surface"]

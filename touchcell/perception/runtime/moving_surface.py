@@ -37,8 +37,8 @@ from pydantic import PositiveFloat
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.gaussian import NotPositiveDefinite, PoseGaussian
 from touchcell.geometry.types import Array
-from touchcell.perception.runtime.filter import FilterState, isotropic_noise, require_noise_density, require_pose
-from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec
+from touchcell.perception.runtime.filter import isotropic_noise, require_noise_density, require_pose
+from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec, FilterState
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +193,14 @@ class MovingSurfaceConfig(FilterConfig):
 
     ``speed_*`` is the standard deviation of the surface's velocity when it is first touched, ``accel_*`` the growth of
     the velocity's uncertainty.
+
+    Attributes:
+        drift_mm_per_sqrt_s: growth of the position's standard deviation between frames.
+        drift_deg_per_sqrt_s: growth of the orientation's standard deviation between frames.
+        speed_mm_s: standard deviation of the surface's linear velocity when it is first touched.
+        speed_deg_s: standard deviation of its angular velocity then.
+        accel_mm_s_per_sqrt_s: growth of the linear velocity's standard deviation.
+        accel_deg_s_per_sqrt_s: growth of the angular velocity's standard deviation.
     """
 
     model: Literal["moving_surface"]

@@ -20,14 +20,26 @@ BUILTIN: Final = "builtin:"
 
 
 class GateConfig(Section):
-    """The contact gate: mean change of the marker image, in per cent, that begins and ends a contact."""
+    """The contact gate: mean change of the marker image, in per cent, that begins and ends a contact.
+
+    Attributes:
+        touch_percent: change of the image above which a contact begins.
+        release_percent: change of the image below which it ends.
+    """
 
     touch_percent: PositiveFloat
     release_percent: PositiveFloat
 
 
 class NetworkEstimator(EstimatorConfig):
-    """Image -> network -> filter. ``calibration`` is a file of ``touchcell calibrate``."""
+    """Image -> network -> filter. ``calibration`` is a file of ``touchcell calibrate``.
+
+    Attributes:
+        model: model file, or ``builtin:NAME`` for one that ships.
+        calibration: file of ``touchcell calibrate``, where another camera taught the model.
+        gate: decides about contact without the network; without it every frame goes through the network.
+        filter: fuses the estimates over time; without it each frame stands by itself.
+    """
 
     kind: Literal["network"]
     model: str

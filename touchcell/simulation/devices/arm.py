@@ -39,7 +39,15 @@ _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE, Lifecycle.FAU
 
 
 class SimArmConfig(DriverConfig):
-    """Base pose, start pose, limits and latency of the arm; the latency delays twists, not stops."""
+    """Base pose, start pose, limits and latency of the arm; the latency delays twists, not stops.
+
+    Attributes:
+        start_pose_mm_deg: initial pose of the tool centre point in the base frame.
+        base_pose_mm_deg: pose of the base in the world frame.
+        limits: limits of the tool centre point.
+        latency_ms: delay of twists; stops are not delayed.
+        max_ttl_s: longest time-to-live of a command that is accepted.
+    """
 
     start_pose_mm_deg: tuple[float, float, float, float, float, float]
     base_pose_mm_deg: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -58,7 +58,18 @@ _REST_SPEED_RAD_S = 1e-3
 
 
 class SimJointArmConfig(DriverConfig):
-    """Model, base pose, start pose, tool and limits of the arm."""
+    """Model, base pose, start pose, tool and limits of the arm.
+
+    Attributes:
+        model: which arm.
+        start_pose_mm_deg: initial pose of the tool centre point in the base frame.
+        base_pose_mm_deg: pose of the base in the world frame.
+        tool: tool on the flange, by name or by its pose and mass.
+        limits: limits of the tool centre point.
+        joint_limits: how joints are kept within their ranges.
+        max_ttl_s: longest time-to-live of a command that is accepted.
+        physics_step_ms: step of the dynamics.
+    """
 
     model: Literal["panda", "ur5e"]
     start_pose_mm_deg: tuple[float, float, float, float, float, float]

@@ -39,6 +39,18 @@ class SimTactipConfig(DriverConfig):
     ``exposure`` is a factor on grey levels, ``blur_px`` the standard deviation of a Gaussian, ``dropped`` the fraction
     of frames lost, ``tip`` a tip file (``touchcell calibrate-sim``) or the name of one that ships. Exposure, blur and
     noise apply to ``output: raw``; processed images are black and white.
+
+    Attributes:
+        mounted_on: name of the arm that carries it.
+        tcp_to_sensor_mm_deg: pose of the sensor in the tool frame of that arm.
+        rate_hz: frames per second.
+        latency_ms: time from exposure to delivery.
+        noise: standard deviation of the grey levels, of 255.
+        exposure: factor on grey levels.
+        blur_px: standard deviation of a Gaussian blur.
+        dropped: share of frames that are lost.
+        tip: tip file of ``touchcell calibrate-sim``, or the name of one that ships.
+        output: ``raw`` camera frames, or ``processed`` binary images as in the public data.
     """
 
     mounted_on: str

@@ -14,11 +14,14 @@ from pydantic import (
     BeforeValidator,
     Discriminator,
     Field,
+    GetJsonSchemaHandler,
     NonNegativeFloat,
     PositiveFloat,
     PositiveInt,
     model_validator,
 )
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 from touchcell.errors import suggest
 from touchcell.tasks.contact_servo import ContactServoConfig, Six, SixGains
@@ -52,7 +55,7 @@ class Until(TaskConfig):
         return self
 
     @property
-    def feels(self) -> bool:
+    def needs_touch(self) -> bool:
         """True if a condition needs the tactile sensor."""
         return self.contact is not None or self.depth_mm is not None
 
@@ -215,8 +218,24 @@ def _numbers(value: Any) -> bool:
     return isinstance(value, list) and all(isinstance(each, int | float) for each in value)
 
 
+class _OneKey:
+    """Describes a step to editors as ``_by_kind`` reads it: a mapping with one key."""
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        steps = dict(zip(KINDS, handler(schema)["oneOf"], strict=True))
+        return {
+            "type": "object",
+            "properties": steps,
+            "minProperties": 1,
+            "maxProperties": 1,
+            "additionalProperties": False,
+        }
+
+
 Step = Annotated[
-    Annotated[Move | Servo | Hold | Retract | Record | Repeat, Discriminator("kind")], BeforeValidator(_by_kind)
+    Annotated[Move | Servo | Hold | Retract | Record | Repeat, Discriminator("kind")],
+    BeforeValidator(_by_kind),
+    _OneKey(),
 ]
 Repeat.model_rebuild()
 

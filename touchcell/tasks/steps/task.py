@@ -177,7 +177,7 @@ class StepsTask(MachineTask):
         elif self._goal is not None and is_there(
             self._T_base_tcp(), self._goal, 1e-3 * step.tolerance_mm, float(np.radians(step.tolerance_deg))
         ):
-            if step.until is not None and step.until.feels:
+            if step.until is not None and step.until.needs_touch:
                 wanted = "contact" if step.until.contact is not None else f"depth of {step.until.depth_mm:g} mm"
                 self._post("unmet", f"arrived without the {wanted} that {state_name(self._machine.state)} waits for")
             else:

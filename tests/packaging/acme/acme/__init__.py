@@ -1,0 +1,1 @@
+"""Plug-ins of a package outside touchcell, one module each."""
