@@ -20,11 +20,11 @@ def command_line() -> str:
     """Return the help of touchcell and of each of its commands, as Markdown."""
     overview = _help()
     names = re.findall(r"^ {4}([a-z][a-z-]*)(?: |$)", overview, re.MULTILINE)
-    sections = [f"```text\n{overview}```"]
-    for name in dict.fromkeys(names):
-        if name != "emulate":  # Its options are those of the emulators that are installed.
-            sections.append(f"## touchcell {name}\n\n```text\n{_help(name)}```")
-    return "\n\n".join(sections)
+    # The options of `emulate` are those of the emulators that are installed.
+    commands = [
+        f"## touchcell {name}\n\n```text\n{_help(name)}```" for name in dict.fromkeys(names) if name != "emulate"
+    ]
+    return "\n\n".join([f"```text\n{overview}```", *commands])
 
 
 def _help(*words: str) -> str:
