@@ -12,7 +12,8 @@ import numpy as np
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array
-from touchcell.perception.runtime.filter import FilterState, PoseFilter
+from touchcell.perception.runtime.filter import PoseFilter
+from touchcell.perception.runtime.filter_spec import FilterState
 
 
 def gauss_newton(prior: PoseGaussian, observation: PoseGaussian) -> PoseGaussian:

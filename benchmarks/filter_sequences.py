@@ -18,7 +18,8 @@ from touchcell.perception.contact_poses import random_poses
 from touchcell.perception.models.labels import CONTACT_NAMES, XI_UNITS, contact_from_xi
 from touchcell.perception.models.prediction import Prediction
 from touchcell.perception.runtime.estimators import load_estimator
-from touchcell.perception.runtime.filter import FilterState, PoseFilter
+from touchcell.perception.runtime.filter import PoseFilter
+from touchcell.perception.runtime.filter_spec import FilterState
 
 STEP_NS = 1_000_000_000
 """Time between two contacts, so that a noise density per second is one per contact."""

@@ -13,7 +13,8 @@ from benchmarks import filter_rivals
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.gaussian import PoseGaussian, mahalanobis_squared
 from touchcell.geometry.types import Array
-from touchcell.perception.runtime.filter import ContactFilter, PoseFilter, isotropic_noise
+from touchcell.perception.runtime.filter import PoseFilter, isotropic_noise
+from touchcell.perception.runtime.filter_spec import ContactFilter
 from touchcell.perception.runtime.moving_surface import MovingSurfaceFilter
 
 SIGMAS_RAD = (0.02, 0.05, 0.1, 0.2, 0.35)

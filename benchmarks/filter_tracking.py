@@ -23,8 +23,7 @@ from touchcell.geometry import gaussian, se3
 from touchcell.geometry.types import Array
 from touchcell.perception.models.labels import XI_UNITS
 from touchcell.perception.runtime.estimate import ContactEstimate
-from touchcell.perception.runtime.filter import ContactFilter
-from touchcell.perception.runtime.filter_spec import FilterSection
+from touchcell.perception.runtime.filter_spec import ContactFilter, FilterSection
 from touchcell.perception.runtime.motion import PoseHistory
 from touchcell.perception.runtime.pipeline import ContactSource
 

@@ -20,11 +20,11 @@ def command_line() -> str:
     """Return the help of touchcell and of each of its commands, as Markdown."""
     overview = _help()
     names = re.findall(r"^ {4}([a-z][a-z-]*)(?: |$)", overview, re.MULTILINE)
-    # The options of `emulate` are those of the emulators that are installed.
-    commands = [
-        f"## touchcell {name}\n\n```text\n{_help(name)}```" for name in dict.fromkeys(names) if name != "emulate"
-    ]
-    return "\n\n".join([f"```text\n{overview}```", *commands])
+    sections = [f"```text\n{overview}```"]
+    # The options of emulate are those of the emulators that are installed.
+    named = [name for name in dict.fromkeys(names) if name != "emulate"]
+    sections += [f"## touchcell {name}\n\n```text\n{_help(name)}```" for name in named]
+    return "\n\n".join(sections)
 
 
 def _help(*words: str) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from touchcell.geometry import se3
 from touchcell.geometry.gaussian import PoseGaussian, mahalanobis_squared
 from touchcell.geometry.types import Array
-from touchcell.perception.runtime.filter import ContactFilter
+from touchcell.perception.runtime.filter_spec import ContactFilter
 
 STEP_NS = 10_000_000
 BLOCK = 10_000

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from touchcell.simulation.objects import Ball, ObjectConfig, Prism, TableConfig, Turned
+from touchcell.simulation.objects import ObjectConfig, TableConfig
+from touchcell.simulation.shapes import Ball, Prism, Turned
 
 
 def built(shape: dict, table: TableConfig | None = None):

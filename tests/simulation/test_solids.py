@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from touchcell.simulation import solids
-from touchcell.simulation.objects import Ball, BoxShape, HexagonShape, Prism, Solid, Turned
+from touchcell.simulation.objects import BoxShape, HexagonShape
+from touchcell.simulation.shapes import Ball, Prism, Solid, Turned
 from touchcell.simulation.solids import friction_radius_m, mass_properties, plain_shape_of, shape_of
 
 SQUARE = BoxShape(kind="box", size_mm=(80, 80, 60)).build()

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from touchcell.simulation.objects import Prism
+from touchcell.simulation.shapes import Prism
 from touchcell.simulation.solids import friction_radius_m
 from touchcell.tasks.push_path import STEP_M, NoPathFound, Obstacle, length_m, min_turning_radius_m, plan
 

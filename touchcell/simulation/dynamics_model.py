@@ -14,7 +14,8 @@ import mujoco
 import numpy as np
 
 from touchcell.geometry.types import Array
-from touchcell.simulation.objects import Ball, FreeObject, Prism, Solid, Turned
+from touchcell.simulation.objects import FreeObject
+from touchcell.simulation.shapes import Ball, Prism, Solid, Turned
 from touchcell.simulation.solids import friction_radius_m, mass_properties
 
 FEET = 8

@@ -13,53 +13,10 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.plugin_section import Section
 from touchcell.simulation.shape_spec import ObjectShapeConfig, ObjectShapeSection, ObjectSpec, PoseMmDeg
+from touchcell.simulation.shapes import Ball, Prism, Solid, Turned
 
 TABLES: dict[str, float] = {"mdf": 0.3, "foam": 0.6}
 """Coefficients of sliding friction of the paper's two tables, chosen within literature values."""
-
-
-@dataclass(frozen=True, slots=True)
-class Prism:
-    """A convex outline extruded along z; the origin is in the middle of its bottom.
-
-    Attributes:
-        outline_m: (n, 2) corners, anticlockwise.
-        height_m: along z.
-    """
-
-    outline_m: Array
-    height_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class Turned:
-    """A solid of revolution about z, made of stacked cylinders; the origin is in the middle of its bottom.
-
-    Attributes:
-        sections_m: (height, radius) of each, from the bottom up. One section is a plain cylinder.
-    """
-
-    sections_m: tuple[tuple[float, float], ...]
-
-    @property
-    def height_m(self) -> float:
-        """Height along z."""
-        return sum(height for height, _ in self.sections_m)
-
-
-@dataclass(frozen=True, slots=True)
-class Ball:
-    """A ball about its origin."""
-
-    radius_m: float
-
-    @property
-    def height_m(self) -> float:
-        """Diameter of the ball."""
-        return 2.0 * self.radius_m
-
-
-Solid = Prism | Turned | Ball
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from touchcell.geometry.types import Array
-from touchcell.simulation.objects import Ball, Prism, Solid
+from touchcell.simulation.shapes import Ball, Prism, Solid
 from touchcell.simulation.surfaces import Surface
 
 View = tuple[int, int]

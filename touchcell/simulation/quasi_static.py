@@ -22,7 +22,8 @@ from touchcell.drivers.core.scene import ContactState
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 from touchcell.simulation.contact import ContactLaw, ContactModel
-from touchcell.simulation.objects import Ball, FreeObject
+from touchcell.simulation.objects import FreeObject
+from touchcell.simulation.shapes import Ball
 from touchcell.simulation.solids import friction_radius_m, plain_shape_of
 from touchcell.simulation.surfaces import Surface
 from touchcell.simulation.timeline import Restore

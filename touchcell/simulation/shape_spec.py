@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
+from typing import Annotated, Final, Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -13,10 +13,8 @@ from touchcell.geometry.types import Array
 from touchcell.plugin_section import PluginSection, Section
 from touchcell.registry import Registry
 from touchcell.simulation.motions import Glide, Motion, Periodic, Still
+from touchcell.simulation.shapes import Solid
 from touchcell.simulation.surfaces import Shape, Surface
-
-if TYPE_CHECKING:
-    from touchcell.simulation.objects import Solid
 
 PoseMmDeg = tuple[float, float, float, float, float, float]
 

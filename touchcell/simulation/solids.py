@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from touchcell.geometry.types import Array
-from touchcell.simulation.objects import Ball, Prism, Solid, Turned
+from touchcell.simulation.shapes import Ball, Prism, Solid, Turned
 from touchcell.simulation.surfaces import Shape, Sphere, SurfacePoint
 
 

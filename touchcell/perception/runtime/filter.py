@@ -7,8 +7,7 @@ of two Gaussians on the manifold. Training poses are drawn uniformly, so dividin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from pydantic import PositiveFloat
@@ -16,33 +15,7 @@ from pydantic import PositiveFloat
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array
-from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec
-
-
-@dataclass(frozen=True, slots=True)
-class FilterState:
-    """Estimate, with its sensor pose and time, and its consistency with the last frame."""
-
-    belief: PoseGaussian
-    T_base_sensor: Array
-    t_ns: int
-    nis: float | None = None
-
-
-class ContactFilter(Protocol):
-    """Interface of the filters ``PoseFilter`` and ``moving_surface.MovingSurfaceFilter``."""
-
-    def reset(self) -> None:
-        """Clear the state: the next observation starts a new contact."""
-        ...
-
-    def predict(self, T_base_sensor: Array, t_ns: int) -> PoseGaussian:
-        """Predict the estimate for the sensor at ``T_base_sensor`` at ``t_ns``; the state is unchanged."""
-        ...
-
-    def update(self, observation: PoseGaussian, T_base_sensor: Array, t_ns: int) -> FilterState:
-        """Fuse an observation made at ``t_ns`` with the sensor at ``T_base_sensor``; returns the new state."""
-        ...
+from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec, FilterState
 
 
 class PoseFilter:

@@ -37,8 +37,8 @@ from pydantic import PositiveFloat
 from touchcell.geometry import gaussian, se3
 from touchcell.geometry.gaussian import NotPositiveDefinite, PoseGaussian
 from touchcell.geometry.types import Array
-from touchcell.perception.runtime.filter import FilterState, isotropic_noise, require_noise_density, require_pose
-from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec
+from touchcell.perception.runtime.filter import isotropic_noise, require_noise_density, require_pose
+from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec, FilterState
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from touchcell.perception.models.prediction import ContactEstimator
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.runtime.contact_gate import ContactGate
 from touchcell.perception.runtime.estimate import ContactEstimate
-from touchcell.perception.runtime.filter import ContactFilter
+from touchcell.perception.runtime.filter_spec import ContactFilter
 from touchcell.perception.runtime.motion import PoseHistory
 
 Timer = Callable[[], int]

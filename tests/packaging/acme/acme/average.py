@@ -7,8 +7,7 @@ from pydantic import Field
 from touchcell.geometry import se3
 from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array
-from touchcell.perception.runtime.filter import FilterState
-from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec
+from touchcell.perception.runtime.filter_spec import FilterConfig, FilterSpec, FilterState
 
 
 class Average:

@@ -7,8 +7,7 @@ from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.perception.runtime.estimator_spec import EstimatorConfig, EstimatorContext, EstimatorSpec
-from touchcell.perception.runtime.filter import ContactFilter
-from touchcell.perception.runtime.filter_spec import FilterSection
+from touchcell.perception.runtime.filter_spec import ContactFilter, FilterSection
 from touchcell.perception.runtime.pipeline import ContactSource
 
 
