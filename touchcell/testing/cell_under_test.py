@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from os import PathLike
@@ -32,12 +33,18 @@ class Message:
     Attributes:
         topic: e.g. "/arms/arm/command".
         t_ns: time on the cell's clock.
-        data: content, units in the keys.
+        encoded: content as JSON.
     """
 
     topic: str
     t_ns: int
-    data: Mapping[str, Any]
+    encoded: bytes
+
+    @property
+    def data(self) -> Mapping[str, Any]:
+        """Content, units in the keys."""
+        content: Mapping[str, Any] = json.loads(self.encoded)
+        return content
 
 
 class CellUnderTest:
@@ -96,7 +103,7 @@ class CellUnderTest:
     def __repr__(self) -> str:
         return f"<CellUnderTest {self.plan.cell.name!r}: {self.state} after {self.t_s:.3f} s>"
 
-    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
+    def add(self, topic: str, t_ns: int, data: bytes) -> None:
         """Keep one message; called by the run loop."""
         self.messages.append(Message(topic, t_ns, data))
 
@@ -153,7 +160,8 @@ class CellUnderTest:
 
     def values(self, topic: str, key: str) -> list[Any]:
         """Recorded values of one key of one topic, in order."""
-        return [each.data[key] for each in self.messages if each.topic == topic and key in each.data]
+        found = (each.data for each in self.messages if each.topic == topic)
+        return [data[key] for data in found if key in data]
 
     # What the test does.
 
