@@ -234,8 +234,8 @@ def plan_anew(path: Path) -> CellPlan:
     """Return its plan; a task that collects starts again, in a folder beside the file."""
     collected = path.with_suffix(".collected")
     shutil.rmtree(collected, ignore_errors=True)
-    # Only a collecting cell has something to override.
-    return plan_cell(path, {"data": collected})
+    collects = "collect" in yaml.safe_load(path.read_text())
+    return plan_cell(path, {"data": collected} if collects else {})
 
 
 def run_case(path: Path, fault: Fault, device: str, state: str) -> Case:

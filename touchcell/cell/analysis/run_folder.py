@@ -24,7 +24,7 @@ class RunFolder:
     @cached_property
     def plan(self) -> CellPlan:
         """Its cell. Raises ConfigError."""
-        return plan_cell(self.path / "cell.yaml")
+        return plan_cell(self.path / "cell.yaml", to_run=False)
 
     @cached_property
     def recording(self) -> Run:

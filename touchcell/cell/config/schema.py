@@ -6,16 +6,19 @@ task fit, and says which devices the task does not need, so that they are not ev
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
+from touchcell.cell.config.feasibility import unfeasible
+from touchcell.cell.config.input_files import with_input_files
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
 from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile
@@ -32,12 +35,26 @@ from touchcell.drivers.core.spec import DRIVERS, AnyDriver, DriverConfig
 from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.input_file import BUILTIN
 from touchcell.perception.runtime.estimator_spec import EstimatorSection
 from touchcell.tasks.interface import TASKS, AnyTask, TaskConfig
 
 M = TypeVar("M", bound=BaseModel)
 Three = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]
+
+
+_LONGEST_NAME: Final = 100
+
+
+def _folder_name(name: str) -> str:
+    """A cell's name, which names its run folders too."""
+    if not re.fullmatch(r"\w[\w .+-]*", name) or len(name.encode()) > _LONGEST_NAME:
+        raise ValueError(
+            "names run folders: it may have letters, digits, spaces, `.`, `_`, `+` and `-`, begins with a letter or "
+            f"digit, and has at most {_LONGEST_NAME} bytes"
+        )
+    return name
 
 
 class _Section(BaseModel):
@@ -247,7 +264,7 @@ class CellFile(_Section):
     """
 
     schema_: Literal[1] = Field(alias="schema")
-    name: str
+    name: Annotated[str, AfterValidator(_folder_name)]
     time: Literal["simulated", "real"]
     rate_hz: Annotated[float, Field(gt=0, le=1000)]
     processes: Literal["one", "separate"] = "one"
@@ -334,6 +351,7 @@ def plan_cell(
     *,
     model: str | None = None,
     settings: Mapping[str, Any] | None = None,
+    to_run: bool = True,
 ) -> CellPlan:
     """Read and check a cell file without connecting anything.
 
@@ -341,23 +359,33 @@ def plan_cell(
         path: the YAML file.
         overrides: driver keys set from the command line (``--data``), for every device whose driver has such a key.
         model: network model in place of the one that the file names.
+        to_run: False for the cell of a run that has been: its files may be gone, and its limits are not judged again.
         settings: values in place of the file's own, by dotted key ("task.speed_mm_s", "arms.arm.limits").
 
     Raises:
         ConfigError: with file, line, key, value and remedy; InvalidCell for several at once.
     """
     file = load_layers(Path(path), settings)
+    if model is not None and not model.startswith(BUILTIN):
+        # Paths of the command line are relative to the working directory, those of the file to the file.
+        model = str(Path(model).absolute())
+    overrides = dict(overrides or {})
+    if isinstance(data := overrides.get("data"), Path):
+        overrides["data"] = data.absolute()
     if model is not None and isinstance(sensors := file.data.get("sensors"), dict):
         for sensor in sensors.values():
             estimator = sensor.get("estimator") if isinstance(sensor, dict) else None
             if isinstance(estimator, dict) and estimator.get("kind") == "network":
                 estimator["model"] = model
-    return _Planner(file, overrides or {}, settings or {}).plan()
+    return _Planner(file, overrides, settings or {}, to_run=to_run).plan()
 
 
 class _Planner:
-    def __init__(self, file: YamlFile, overrides: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+    def __init__(
+        self, file: YamlFile, overrides: Mapping[str, Any], settings: Mapping[str, Any], *, to_run: bool
+    ) -> None:
         self._file = file
+        self._to_run = to_run
         self._overrides = overrides
         self._settings = settings
         self._problems: list[ConfigError] = []
@@ -366,7 +394,7 @@ class _Planner:
         file = self._file
         if "data" in self._overrides and isinstance(collect := file.data.get("collect"), dict):
             collect["data"] = self._overrides["data"]
-        cell = file.validate(CellFile, file.data)
+        cell = self._with_input_files(file.validate(CellFile, file.data), ())
         self._require_scene_fits(cell)
         task, task_config = self._task(cell)
         arm_roles = self._roles(cell, "arms", task.arms, cell.arms) if task else {}
@@ -397,13 +425,14 @@ class _Planner:
             self._require_data_is_used(cell, {**arms, **sensors})
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
         self._require_pairs(cell)
+        self._require_use_of_data(cell, devices)
         stopping_distances = self._require_margins(cell, arm_roles, sensor_roles, arms)
         if self._problems:
             raise InvalidCell(self._problems)
         assert task is not None
         assert task_config is not None
         skipped = sorted({*cell.arms, *cell.sensors, *cell.devices} - {*arms, *sensors, *auxiliaries})
-        return CellPlan(
+        planned = CellPlan(
             file.path,
             cell,
             arms,
@@ -419,6 +448,9 @@ class _Planner:
             auxiliaries,
             auxiliary_roles,
         )
+        if self._to_run and (problems := unfeasible(file, planned)):
+            raise InvalidCell(problems)
+        return planned
 
     def _require_scene_fits(self, cell: CellFile) -> None:
         if cell.scene is not None:
@@ -530,7 +562,7 @@ class _Planner:
         fields = spec.config.model_fields
         settings = {key: value for key, value in {**shared, **self._overrides}.items() if key in fields}
         config = self._validated(spec.config, {**(section.model_extra or {}), **settings}, at)
-        return DevicePlan(at[1], spec, config) if config is not None else None
+        return DevicePlan(at[1], spec, self._with_input_files(config, at)) if config is not None else None
 
     def _require_interlocks(self, cell: CellFile, task: AnyTask) -> None:
         """What moves must be bounded; limits have no defaults, so the file has to name them."""
@@ -688,6 +720,18 @@ class _Planner:
                     value=devices[name].spec.name,
                     hint="choose another driver; `touchcell list` names all",
                 )
+
+    def _require_use_of_data(self, cell: CellFile, devices: Mapping[str, DevicePlan]) -> None:
+        reads = any("data" in device.spec.config.model_fields for device in devices.values())
+        if "data" in self._overrides and not reads and cell.collect is None:
+            self._add((), "--data names a data set that no device reads and no task collects", hint="leave it out")
+
+    def _with_input_files(self, config: M, at: KeyPath) -> M:
+        if not self._to_run:
+            return config
+        found, problems = with_input_files(self._file, config, at)
+        self._problems.extend(problems)
+        return found
 
     def _validated(self, model: type[M], data: Any, at: KeyPath) -> M | None:
         try:
