@@ -62,14 +62,14 @@ def test_a_refused_command_is_logged_once_until_one_is_accepted(caplog: pytest.L
 
 
 def test_a_run_writes_its_log(tmp_path: Path) -> None:
-    cell = tc.load_cell("surface_follow_sim", set={"interlocks.indentation.limit_mm": 1.0})
+    cell = tc.load_cell("surface_follow_sim", set={"interlocks.uncertain.limit_mm": 0.01})
     run = tc.run(cell, out=tmp_path / "run")
     assert run.outcome == "tripped"
     log = (run.folder / LOG).read_text()
     for line in (
         "INFO    touchcell.drivers.core.device: arm: active",
         "INFO    touchcell.tasks.state_machine: surface_following: prepare -> approach by ",
-        "WARNING touchcell.control.latch: trip: indentation: sensor: ",
+        "WARNING touchcell.control.latch: trip: uncertain: sensor: ",
         "INFO    touchcell.cell.cli.run: surface_follow_sim: tripped after ",
     ):
         assert line in log
