@@ -163,7 +163,7 @@ def run_fault(folder: Path, fault: ProcessFault, rate_hz: float, what: str = "sw
                 continue
             if not record["at_rest"]:
                 problems.append(f"{name} moved afterwards")
-            if record["obeyed_ns"] > record["stop_ns"] > fault_ns or (
+            if record["executed_ns"] > record["stop_ns"] > fault_ns or (
                 name in at_rest and record["obeyed"] != at_rest[name]["obeyed"]
             ):
                 problems.append(f"{name} obeyed a command after the stop")
