@@ -15,6 +15,7 @@ PAGES: tuple[Path, ...] = tuple(sorted([*CHECKOUT.glob("*.md"), *DOCS.rglob("*.m
 
 FOLLOWED: tuple[Path, ...] = (
     DOCS / "tutorials" / "first-run.md",
+    DOCS / "tutorials" / "test-a-cell.md",
     DOCS / "how-to" / "write-a-task.md",
     DOCS / "how-to" / "write-a-driver.md",
     DOCS / "how-to" / "write-an-interlock.md",
@@ -22,7 +23,7 @@ FOLLOWED: tuple[Path, ...] = (
 """Pages that a test follows from top to bottom."""
 
 _FENCE = re.compile(r"^(?P<indent> *)```(?P<info>[^\n`]*)\n(?P<text>.*?)^(?P=indent)```", re.MULTILINE | re.DOTALL)
-_COMMENT = re.compile(r"<!--\s*(.*?)\s*-->\s*\Z", re.DOTALL)
+_COMMENT = re.compile(r"<!--\s*((?:(?!-->).)*?)\s*-->\s*\Z", re.DOTALL)
 _TITLE = re.compile(r'title="([^"]*)"')
 _LINK = re.compile(r"!?\[(?:[^\[\]]|\[[^\]]*\])*\]\(([^()\s]+)\)")
 _HEADING = re.compile(r"^#{1,6} +(.+?) *$", re.MULTILINE)

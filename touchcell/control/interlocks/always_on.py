@@ -32,7 +32,7 @@ _SINCE: Final = ""
 class Overrun:
     """The time between two control cycles stays below the limit.
 
-    After a hang all data is fresh again when the loop resumes, so age limits do not reveal the gap in supervision.
+    After a hang all data is fresh again when the loop resumes: age limits alone do not reveal the gap.
     """
 
     name: str
