@@ -238,7 +238,7 @@ def _dump(box: BlackBox, folder: Path, cell: Cell, result: RunResult) -> bool:
     try:
         box.dump(folder, result, cell.start_ns)
     except Exception as error:
-        logger.exception("no black box but its ring")
+        logger.info("no black box but its ring", exc_info=True)
         # What happened is reported all the same.
         warn(f"the black box stays in its ring: {error}")
         return False
