@@ -1,4 +1,4 @@
-"""Hooks of the site: the reference of the command line is what the parsers themselves print."""
+"""Hooks of the site: the references of command line and cell files are made by what they describe."""
 
 from __future__ import annotations
 
@@ -6,9 +6,25 @@ import contextlib
 import io
 import os
 import re
+import tempfile
+from pathlib import Path
 from typing import Any
 
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
 PLACE = "<!-- generated: command line -->"
+
+
+def on_files(files: Files, *, config: MkDocsConfig) -> Files:
+    """Add a page of keys for each kind of thing that a cell file may name."""
+    from touchcell.cell.cli.reference import write_reference
+
+    with tempfile.TemporaryDirectory() as folder:
+        for page in write_reference(Path(folder)):
+            content = page.read_text(encoding="utf-8")
+            files.append(File.generated(config, f"reference/{page.name}", content=content))
+    return files
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
