@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     )
     from touchcell.api.estimators import load_estimator
     from touchcell.api.recordings import RunRecording, Topic, read_run
-    from touchcell.cell.config.schema import CellPlan
+    from touchcell.cell.config.cell_plan import CellPlan
     from touchcell.cell.runtime.cell import Cell
     from touchcell.cell.runtime.compose import compose
     from touchcell.drivers.core.errors import CommandRejected, DeviceError
@@ -73,7 +73,7 @@ _MODULES = {
     ),
     "touchcell.api.estimators": ("load_estimator",),
     "touchcell.api.recordings": ("RunRecording", "Topic", "read_run"),
-    "touchcell.cell.config.schema": ("CellPlan",),
+    "touchcell.cell.config.cell_plan": ("CellPlan",),
     "touchcell.cell.runtime.cell": ("Cell",),
     "touchcell.cell.runtime.compose": ("compose",),
     "touchcell.drivers.core.errors": ("CommandRejected", "DeviceError"),

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError, PydanticKnownError, core_schema
 
@@ -54,7 +53,7 @@ class PluginSection:
         spec: HasConfig = self.registry.load(str(section.get(self.tag, self.default)))
         return spec.config
 
-    def _validate(self, value: Any, info: ValidationInfo) -> BaseModel:
+    def _validate(self, value: Any) -> BaseModel:
         if isinstance(value, BaseModel):
             return value
         if not isinstance(value, Mapping):
@@ -68,13 +67,10 @@ class PluginSection:
         except ConfigError as error:
             context = {"tag": self.tag, "reason": error.reason, "hint": error.hint, "value": error.value}
             raise PydanticCustomError("plugin", "{reason} ({hint})", context) from error
-        if info.mode == "json":
-            # What was read as JSON is held to the strict rules for JSON, which validation in Python does not know.
-            return model.model_validate_json(json.dumps(value), strict=True)
         return model.model_validate(value)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.with_info_plain_validator_function(
+        return core_schema.no_info_plain_validator_function(
             self._validate,
             serialization=core_schema.plain_serializer_function_ser_schema(BaseModel.model_dump),
         )

@@ -15,6 +15,7 @@ PAGES: tuple[Path, ...] = tuple(sorted([*CHECKOUT.glob("*.md"), *DOCS.rglob("*.m
 
 FOLLOWED: tuple[Path, ...] = (
     DOCS / "tutorials" / "first-run.md",
+    DOCS / "tutorials" / "test-a-cell.md",
     DOCS / "how-to" / "write-a-task.md",
     DOCS / "how-to" / "write-a-driver.md",
     DOCS / "how-to" / "write-an-interlock.md",

@@ -98,4 +98,6 @@ def test_every_python_block_compiles() -> None:
 
 @pytest.mark.parametrize("page", [page for page in sorted(DOCS.rglob("*.md")) if page not in FOLLOWED], ids=_names)
 def test_pages_that_are_not_followed_have_no_python_that_nobody_runs(page: Path) -> None:
-    assert [str(block) for block in blocks(page) if block.language == "python"] == []
+    # Code of the package that tests/packaging/test_plugins.py installs is held to it there.
+    python = [block for block in blocks(page) if block.language == "python" and not block.text.startswith("# acme/")]
+    assert [str(block) for block in python] == []

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -371,7 +371,7 @@ class Topics:
     def __init__(self) -> None:
         self.told: set[str] = set()
 
-    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
+    def add(self, topic: str, t_ns: int, data: bytes) -> None:
         self.told.add(topic)
 
 

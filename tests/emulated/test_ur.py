@@ -709,7 +709,7 @@ def test_a_protective_stop_cannot_be_released_at_once(address: int) -> None:
         arm.configure()
         emulator.fault("protective_stop")
         wait_faulted(arm)
-        with pytest.raises(DeviceFault, match="stays"):
+        with pytest.raises(DeviceFault, match="remains"):
             arm.recover(TOKEN)
         assert arm.state is Lifecycle.FAULTED
 

@@ -579,5 +579,5 @@ def test_an_unknown_fault_is_a_typed_error(emulator: EmulatorProcess) -> None:
 
 
 def test_a_folder_without_images_is_a_typed_error(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="holds no images"):
+    with pytest.raises(ConfigError, match="contains no images"):
         picture.files(tmp_path)

@@ -20,7 +20,8 @@ import yaml
 
 from tests.fault_injection.emulated_cells import FAULT_ROLES, arm_cell, camera_cell, sensor_of, sensors_of
 from tests.fault_injection.sent_commands import SentCommands
-from touchcell.cell.config.schema import CellPlan, plan_cell
+from touchcell.cell.config.cell_plan import CellPlan
+from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop

@@ -15,8 +15,9 @@ import numpy as np
 import yaml
 
 from tests.fault_injection.sent_commands import SentCommands
+from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.find import find_cell
-from touchcell.cell.config.schema import CellPlan, plan_cell
+from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
@@ -233,8 +234,8 @@ def plan_anew(path: Path) -> CellPlan:
     """Return its plan; a task that collects starts again, in a folder beside the file."""
     collected = path.with_suffix(".collected")
     shutil.rmtree(collected, ignore_errors=True)
-    # Only a collecting cell has something to override.
-    return plan_cell(path, {"data": collected})
+    collects = "collect" in yaml.safe_load(path.read_text())
+    return plan_cell(path, {"data": collected} if collects else {})
 
 
 def run_case(path: Path, fault: Fault, device: str, state: str) -> Case:

@@ -163,7 +163,7 @@ def run_fault(folder: Path, fault: ProcessFault, rate_hz: float, what: str = "sw
                 continue
             if not record["at_rest"]:
                 problems.append(f"{name} moved afterwards")
-            if record["obeyed_ns"] > record["stop_ns"] > fault_ns or (
+            if record["executed_ns"] > record["stop_ns"] > fault_ns or (
                 name in at_rest and record["obeyed"] != at_rest[name]["obeyed"]
             ):
                 problems.append(f"{name} obeyed a command after the stop")
@@ -180,7 +180,7 @@ def _judged(case: ArmCase, fault: ProcessFault, longest_s: float) -> list[str]:
 
 
 def _arm_case(name: str, before: Any, record: Any, fault_ns: int) -> ArmCase:
-    commanded = [int(record[key]) for key in ("asked_ns", "stop_ns") if record[key] > fault_ns]
+    commanded = [int(record[key]) for key in ("requested_ns", "stop_ns") if record[key] > fault_ns]
     rested_ns = int(record["moved_ns"]) if record["at_rest"] else None
     detected_ns = min(commanded, default=None)
     return ArmCase(

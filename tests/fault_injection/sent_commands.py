@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from touchcell.cell.runtime.run_record import Box
 
 
@@ -19,8 +16,8 @@ class SentCommands:
         self._box = box
         self._last_ns: int | None = None
 
-    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
-        """Record one message."""
+    def add(self, topic: str, t_ns: int, data: bytes) -> None:
+        """Take in one message."""
         if topic.endswith("/command"):
             self._last_ns = t_ns
         if self._box is not None:

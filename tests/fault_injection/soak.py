@@ -91,12 +91,12 @@ def lap(path: Path, folder: Path, rng: np.random.Generator, before_s: float = 0.
         rng: selects fault and time.
         before_s: cell time of earlier runs.
     """
-    cell, stop, box = compose(plan_anew(path)), StopRequest(), BlackBox()
+    cell, stop, box = compose(plan_anew(path)), StopRequest(), BlackBox(about={"cell": path.name})
     sent = SentCommands(box)
     places = [(fault, device) for fault in FAULTS for device in _targets(fault, cell)]
     fault, device = places[rng.integers(len(places))] if places and rng.random() < 0.75 else (None, "")
     after = int(rng.integers(1, 1500))
-    with Recorder(folder / "run.mcap") as recorder, cell:
+    with Recorder(folder / "run.mcap") as recorder, box, cell:
         loop = RunLoop(cell, recorder, box=sent, stop=stop)
         loop.begin()
         cycles = 0
@@ -107,7 +107,7 @@ def lap(path: Path, folder: Path, rng: np.random.Generator, before_s: float = 0.
         result = loop.end()
         stands = all(arm.at_rest() for arm in cell.arms.values())
         if result.outcome is Outcome.TRIPPED:
-            box.dump(folder, result, {"cell": path.name})
+            box.dump(folder, result)
     problem = "" if stands else "an arm is not at rest"
     if result.causes and sent.since(result.causes[0].t_ns):
         problem = "a command was sent after the trip"

@@ -186,6 +186,7 @@ class SafetyWalk(RuleBasedStateMachine):
             for arm in self.arms.values():
                 arm.faults = replace(arm.faults, ignores_stops=False, ignores_expiry=False, drift_m_s=0.0)
             self.cell.__exit__(None, None, None)
+            self.box.close()
         self.folder.cleanup()
 
 

@@ -12,8 +12,9 @@ from typing import Final
 import numpy as np
 import yaml
 
+from touchcell.cell.config.cell_plan import CellFile, CellPlan, DevicePlan
 from touchcell.cell.config.find import find_cell
-from touchcell.cell.config.schema import CellFile, CellPlan, DevicePlan, plan_cell
+from touchcell.cell.config.schema import plan_cell
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.drivers.core.spec import DRIVERS

@@ -8,8 +8,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.find import find_cell
-from touchcell.cell.config.schema import CellPlan, plan_cell
+from touchcell.cell.config.schema import plan_cell
 
 
 @dataclass(frozen=True)

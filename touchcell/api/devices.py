@@ -12,7 +12,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from touchcell.api.cells import load_cell
-from touchcell.cell.config.schema import CellPlan
+from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.yaml_file import KeyPath, YamlFile
 from touchcell.cell.runtime.devices import build_devices
 from touchcell.control.reach import Reach, is_there

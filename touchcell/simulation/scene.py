@@ -329,6 +329,10 @@ class SceneConfig(Section, SceneSection):
         """Build the scene; its motions start now."""
         return Scene(self._world(), clock, self.step_ms * 1e-3)
 
+    def modules(self) -> Mapping[str, str]:
+        """Return MuJoCo for dynamic scenes."""
+        return {"mujoco": "physics"} if self.physics == "dynamic" else {}
+
     def _world(self) -> World:
         surfaces = {name: config.build() for name, config in self.surfaces.items()}
         if self.physics == "kinematic":

@@ -22,7 +22,16 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.perception.contact_poses import PUBLIC_DEPTH_MM, random_poses
 from touchcell.perception.runtime.estimate import ContactEstimate
-from touchcell.tasks.interface import Action, Observation, TaskConfig, TaskContext, TaskSpec, TransitionRecord
+from touchcell.tasks.interface import (
+    DEPTH,
+    SPEED,
+    Action,
+    Observation,
+    TaskConfig,
+    TaskContext,
+    TaskSpec,
+    TransitionRecord,
+)
 from touchcell.tasks.servoing import ARM, SENSOR
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef
 from touchcell.tasks.state_machine_task import MachineTask
@@ -54,13 +63,13 @@ class DataCollectionConfig(TaskConfig):
 
     samples: PositiveInt = 1000
     seed: NonNegativeInt = 0
-    depth_mm: tuple[PositiveFloat, PositiveFloat] = PUBLIC_DEPTH_MM
+    depth_mm: Annotated[tuple[PositiveFloat, PositiveFloat], DEPTH] = PUBLIC_DEPTH_MM
     tilt_deg: Annotated[float, Field(ge=0.0, le=45.0)] = 25.0
     shear_mm: NonNegativeFloat = 5.0
     torsion_deg: NonNegativeFloat = 5.0
     clearance_mm: PositiveFloat = 3.0
-    speed_mm_s: PositiveFloat = 40.0
-    press_speed_mm_s: PositiveFloat = 15.0
+    speed_mm_s: Annotated[PositiveFloat, SPEED] = 40.0
+    press_speed_mm_s: Annotated[PositiveFloat, SPEED] = 15.0
     turn_deg_s: PositiveFloat = 60.0
     settle_ms: NonNegativeFloat = 50.0
     move_timeout_s: PositiveFloat = 10.0

@@ -6,7 +6,7 @@ The leader pushes and steers; the follower holds the far side and moves along, w
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from pydantic import PositiveFloat
@@ -14,7 +14,7 @@ from pydantic import PositiveFloat
 from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig, Six, SixGains
-from touchcell.tasks.interface import TaskContext, TaskSpec
+from touchcell.tasks.interface import CONTACT_DEPTH, TaskContext, TaskSpec
 from touchcell.tasks.servoing import ServoConfig, ServoTask
 from touchcell.tasks.single_arm_pushing import Push, PushConfig
 
@@ -38,7 +38,7 @@ class FollowerConfig(ContactServoConfig):
 
     active: bool = False
     turn_deg_per_mm: PositiveFloat = 0.9
-    reference_mm_deg: Six = (0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
+    reference_mm_deg: Annotated[Six, CONTACT_DEPTH] = (0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
     kp_per_s: SixGains = (0.0, 10.0, 10.0, 10.0, 0.0, 0.0)
     ki_per_s2: SixGains = (0.0, 25.0, 25.0, 25.0, 0.0, 0.0)
     integral_zone_mm: PositiveFloat = 5.0

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
+from typing import Any, Final, Generic, Literal, Protocol, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
@@ -18,6 +18,26 @@ from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.registry import Registry
+
+
+@dataclass(frozen=True, slots=True)
+class Demand:
+    """Annotation of a parameter that asks the same of every run, so that `touchcell check` holds it against the limits.
+
+    Attributes:
+        quantity: an indentation in mm, a speed of an arm in mm/s, or a distance to go in mm.
+        item: which number of a list it is; None for a single number, or the largest of a list.
+    """
+
+    quantity: Literal["depth", "speed", "distance"]
+    item: int | None = None
+
+
+DEPTH: Final = Demand("depth")
+CONTACT_DEPTH: Final = Demand("depth", item=2)
+"""Of a contact x, y, z, alpha, beta, gamma."""
+SPEED: Final = Demand("speed")
+DISTANCE: Final = Demand("distance")
 
 
 class TaskConfig(BaseModel):

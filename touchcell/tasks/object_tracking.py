@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import numpy as np
 from pydantic import PositiveFloat
 
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import SixGains
+from touchcell.tasks.interface import DEPTH
 from touchcell.tasks.servoing import ServoConfig, one_arm_task
 
 
@@ -20,7 +22,7 @@ class ObjectTrackingConfig(ServoConfig):
         duration_s: duration of the tracking.
     """
 
-    depth_mm: PositiveFloat = 6.0
+    depth_mm: Annotated[PositiveFloat, DEPTH] = 6.0
     settle_tolerance_mm: PositiveFloat = 1.0
     settle_tolerance_deg: PositiveFloat = 3.0
     kp_per_s: SixGains = (10.0, 10.0, 10.0, 8.0, 8.0, 8.0)

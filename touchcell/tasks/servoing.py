@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from enum import Enum, auto
-from typing import Final, TypeVar
+from typing import Annotated, Final, TypeVar
 
 import numpy as np
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
@@ -14,7 +14,7 @@ from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Six
-from touchcell.tasks.interface import Action, Observation, TaskContext, TaskSpec, TransitionRecord
+from touchcell.tasks.interface import SPEED, Action, Observation, TaskContext, TaskSpec, TransitionRecord
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
 from touchcell.tasks.state_machine_task import MachineTask
 
@@ -39,12 +39,12 @@ class ServoConfig(ContactServoConfig):
         prepare_timeout_s: longest wait for the first frame and arm state.
     """
 
-    approach_speed_mm_s: PositiveFloat = 10.0
+    approach_speed_mm_s: Annotated[PositiveFloat, SPEED] = 10.0
     approach_distance_mm: PositiveFloat = 50.0
     settle_time_s: NonNegativeFloat = 0.3
     settle_timeout_s: PositiveFloat = 10.0
     retract_mm: PositiveFloat = 20.0
-    retract_speed_mm_s: PositiveFloat = 20.0
+    retract_speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
     max_reapproach: NonNegativeInt = 2
     stale_timeout_s: PositiveFloat = 0.5
     prepare_timeout_s: PositiveFloat = 5.0

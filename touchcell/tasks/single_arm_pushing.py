@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Self
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, model_validator
@@ -13,6 +13,7 @@ from touchcell.control.alignment import Aim, AlignmentGains, TargetAlignment
 from touchcell.control.path import Point
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import ContactServoConfig, Six, SixGains
+from touchcell.tasks.interface import SPEED
 from touchcell.tasks.push_path import Obstacle, plan
 from touchcell.tasks.servoing import ServoConfig, one_arm_task
 
@@ -57,7 +58,7 @@ class PushConfig(ContactServoConfig):
     obstacles_mm: tuple[tuple[float, float, PositiveFloat], ...] = ()
     clearance_mm: PositiveFloat = 60.0
     turning_radius_mm: PositiveFloat = 120.0
-    push_speed_mm_s: PositiveFloat = 20.0
+    push_speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
     object_center_offset_mm: PositiveFloat = 60.0
     look_ahead_mm: PositiveFloat = 60.0
     align_kp_mm_s_per_deg: PositiveFloat = 5.0

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import numpy as np
 from pydantic import PositiveFloat
 
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import SixGains
+from touchcell.tasks.interface import DEPTH, DISTANCE, SPEED
 from touchcell.tasks.servoing import ServoConfig, one_arm_task
 
 
@@ -22,12 +24,12 @@ class SurfaceFollowingConfig(ServoConfig):
         distance_mm: distance that the sensor travels.
     """
 
-    depth_mm: PositiveFloat = 3.0
+    depth_mm: Annotated[PositiveFloat, DEPTH] = 3.0
     kp_per_s: SixGains = (0.0, 0.0, 8.0, 8.0, 8.0, 0.0)
     ki_per_s2: SixGains = (0.0, 0.0, 16.0, 16.0, 16.0, 0.0)
-    speed_mm_s: PositiveFloat = 20.0
+    speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
     direction_deg: float = 0.0
-    distance_mm: PositiveFloat = 100.0
+    distance_mm: Annotated[PositiveFloat, DISTANCE] = 100.0
 
 
 class Follow:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from touchcell.cell.config.schema import CellPlan, DevicePlan
+    from touchcell.cell.config.cell_plan import CellPlan, DevicePlan
     from touchcell.testing.emulation.rig import DeviceFixture, FixtureFactory
 
 _CONFIRMED = pytest.StashKey[set[str]]()

@@ -13,7 +13,7 @@ import yaml
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_TRIPPED
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.true_contact import put_on_true_contact
-from touchcell.cell.recording.mcap import read
+from touchcell.cell.recording.mcap import encode, read
 from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.paths import CONFIGS
 from touchcell.simulation.devices.arm import SimArm
@@ -35,11 +35,11 @@ def run_into_the_wall(folder: Path, **arm: Any) -> Path:
 
 
 def test_the_ring_keeps_ten_seconds() -> None:
-    box = BlackBox()
-    for k in range(3000):
-        box.add("/task", k * 10_000_000, {"k": k})
-    # Both ends included.
-    assert len(box) == 1001
+    with BlackBox() as box:
+        for k in range(3000):
+            box.add("/task", k * 10_000_000, encode({"k": k}))
+        # Both ends included.
+        assert [message.data["k"] for message in box.messages()] == list(range(1999, 3000))
 
 
 def test_a_trip_is_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -88,9 +88,9 @@ def test_the_stop_category_of_the_cell_file_is_used(tmp_path: Path) -> None:
     assert json.loads((folder / "blackbox.json").read_text())["stops"]["arm"]["category"] == 1
 
 
-def test_a_run_without_a_black_box(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_without_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["why", str(tmp_path)]) == EXIT_BAD_INPUT
-    assert "holds no black box" in capsys.readouterr().err
+    assert "holds nothing of a run" in capsys.readouterr().err
 
 
 def test_an_arm_that_ignores_every_command_still_leaves_a_black_box(
@@ -111,9 +111,21 @@ def test_an_arm_that_ignores_every_command_still_leaves_a_black_box(
     assert main(["run", str(cell), "--out", str(folder), "--quiet"]) == EXIT_TRIPPED
     capsys.readouterr()
     assert main(["why", str(folder)]) == EXIT_OK
-    output = capsys.readouterr().out
-    assert (
-        "never seen at rest: does not come to rest by any means that its driver has: use the emergency stop" in output
-    )
-    assert "then " in output
-    assert "stop (fault): arm: not seen at rest" in output
+    told = capsys.readouterr().out
+    assert "never seen at rest: does not come to rest by any means that its driver has: use the emergency stop" in told
+    assert "then " in told
+    assert "stop (fault): arm: not seen at rest" in told
+
+
+def test_limited_tells_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = yaml.safe_load(SHIPPED.read_text())
+    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    data["arms"]["arm"]["limits"] |= {"tcp_rot_accel_rad_s2": 0.01}
+    cell, folder = tmp_path / "cell.yaml", tmp_path / "run"
+    cell.write_text(yaml.safe_dump(data))
+    assert main(["run", str(cell), "--out", str(folder), "--quiet"]) == EXIT_TRIPPED
+    capsys.readouterr()
+    assert main(["why", str(folder)]) == EXIT_OK
+    told = capsys.readouterr().out
+    assert "limited (trip): arm: limited by its gate" in told
+    assert "what to do: lower the task's gains" in told

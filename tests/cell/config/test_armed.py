@@ -13,7 +13,8 @@ import pytest
 import yaml
 
 from touchcell.cell.config.armed import cell_facts, proof_table, prove_cell, require_armed
-from touchcell.cell.config.schema import CellPlan, plan_cell
+from touchcell.cell.config.cell_plan import CellPlan
+from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.yaml_file import InvalidCell
 from touchcell.control.interlocks.config import build_interlocks
 from touchcell.control.interlocks.planning_scene import PlanningScene
@@ -21,7 +22,8 @@ from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
 
 Data = dict[str, Any]
-SHIPPED = sorted(path.stem for path in CONFIGS.glob("*.yaml"))
+# The model of the other is what a user trains first.
+SHIPPED = sorted(path.stem for path in CONFIGS.glob("*.yaml") if path.stem != "replay_real")
 PAIR = {
     "in_step": {"kind": "out_of_step", "limit_mm_s": 30, "limit_mm": 4, "hold_ms": 100, "states": ["settle", "run"]},
     "held": {"kind": "object_lost", "limit_ms": 200, "states": ["settle", "run"]},
@@ -123,7 +125,7 @@ DISARMED: dict[str, tuple[Callable[[Data], Any], str, str]] = {
     "no box for the follower": (lambda d: drop(d, "follower_box"), "interlocks", "'follower'"),
     "no box for the leader": (lambda d: drop(d, "leader_box"), "interlocks", "'leader'"),
     "two boxes for one arm": (
-        lambda d: interlock(d, "follower_box", arm="leader", sensor="leader_sensor"),
+        lambda d: interlock(d, "follower_box", **d["interlocks"]["leader_box"]),
         "interlocks",
         "'follower'",
     ),
@@ -464,6 +466,7 @@ def test_at_activation_the_interlocks_in_use_are_proven_once_more(tmp_path: Path
 
 def test_nothing_is_required_of_a_task_that_moves_nothing(tmp_path: Path) -> None:
     data = yaml.safe_load((CONFIGS / "replay_real.yaml").read_text())
+    data["sensors"]["sensor"]["estimator"]["model"] = "builtin:sim_gdn"
     plan = planned(data, tmp_path)
     assert plan.proofs == ()
     assert proof_table(plan) == []

@@ -40,7 +40,8 @@ def line_of(path: Path, words: str) -> int:
 
 @pytest.mark.parametrize("path", sorted(SHIPPED.parent.glob("*.yaml")), ids=lambda path: path.name)
 def test_every_cell_that_ships_is_valid(path: Path) -> None:
-    plan = plan_cell(path, {"data": path.parent} if "replay" in path.name else {})
+    replays = path.name == "replay_real.yaml"
+    plan = plan_cell(path, {"data": path.parent} if replays else {}, model="builtin:sim_gdn" if replays else None)
     assert plan.task.name == plan.cell.task.name
 
 
@@ -136,7 +137,8 @@ def test_a_slower_arm_needs_less_margin(tmp_path: Path) -> None:
 
 def test_the_length_of_the_sensor_swings_further(tmp_path: Path) -> None:
     long = ("mounted_on: arm", "mounted_on: arm\n    tcp_to_sensor_mm_deg: [0, 0, 100, 0, 0, 0]")
-    plan = plan_cell(written(tmp_path, long, ("margin_mm: 15", "margin_mm: 30")))
+    deep = ("min_mm: [-150, -50, 10]", "min_mm: [-150, -50, -90]")
+    plan = plan_cell(written(tmp_path, long, deep, ("margin_mm: 15", "margin_mm: 30")))
     way = plan.stopping_distances["workspace"]
     assert way.speed_m_s == pytest.approx(0.1 + 0.5 * 0.1)
     assert way.braking_m == pytest.approx(0.01 + 0.5 * 0.05 * 0.5 / 2.5)

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.fault_injection.fuzz_recordings import lz4_bomb, original, try_mutants
 from touchcell.cell.errors import RecordingError
-from touchcell.cell.recording.mcap import CHUNK_BYTES, Recorder, read
+from touchcell.cell.recording.mcap import CHUNK_BYTES, Damage, Recorder, follow, read
 
 
 def test_round_trip(tmp_path: Path) -> None:
@@ -76,6 +77,9 @@ class _FullDisk(io.BytesIO):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return super().write(data)  # type: ignore[arg-type]
 
+    def close(self) -> None:
+        """Keep what was written, to be read by the test."""
+
 
 def test_full_disk_is_a_typed_error_and_keeps_what_was_written(tmp_path: Path) -> None:
     disk = _FullDisk()
@@ -100,3 +104,66 @@ def test_refuses_files_that_are_not_recordings(tmp_path: Path) -> None:
         list(read(tmp_path / "x"))
     with pytest.raises(RecordingError, match="cannot be read"):
         list(read(tmp_path / "missing"))
+
+
+def damaged(path: Path) -> tuple[list[int], list[Damage]]:
+    """Numbers of the messages that are read, and what is named as damaged."""
+    damage: list[Damage] = []
+    return [message.data["i"] for message in read(path, damage)], damage
+
+
+def test_a_flipped_bit_is_never_read_as_another_value(tmp_path: Path) -> None:
+    whole = original()
+    path = tmp_path / "run.mcap"
+    path.write_bytes(whole)
+    numbers, none = damaged(path)
+    assert none == []
+    for at in range(100, len(whole) // 2, len(whole) // 40):
+        rotten = bytearray(whole)
+        rotten[at] ^= 0x10
+        path.write_bytes(rotten)
+        kept, named = damaged(path)
+        assert set(kept) <= set(numbers)
+        assert len(kept) >= 0.6 * len(numbers)
+        assert len(kept) == len(numbers) or named
+
+
+def test_channels_are_found_at_the_end_when_the_chunk_that_describes_them_is_damaged(tmp_path: Path) -> None:
+    rotten = bytearray(original())
+    rotten[200] ^= 0xFF
+    path = tmp_path / "run.mcap"
+    path.write_bytes(rotten)
+    kept, (first, *_) = damaged(path)
+    assert len(kept) > 100
+    assert "checksum" in first.reason or "decompressed" in first.reason
+
+
+def test_the_next_chunk_is_found_behind_a_damaged_length(tmp_path: Path) -> None:
+    whole = original()
+    at = whole.index(b"\x03\x00\x00\x00lz4", len(whole) // 4) - 32
+    rotten = bytearray(whole)
+    rotten[at] = 0xFF
+    path = tmp_path / "run.mcap"
+    path.write_bytes(rotten)
+    kept, (first, *_) = damaged(path)
+    assert "bytes are damaged" in first.reason
+    assert kept[-1] == 999
+
+
+def test_a_cut_recording_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(original()[:-5000])
+    assert "cut off" in damaged(path)[1][-1].reason
+
+
+def test_a_chunk_that_would_fill_the_memory_is_not_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(lz4_bomb(megabytes=300))
+    damage: list[Damage] = []
+    assert list(read(path, damage)) == []
+    assert "claims to hold" in damage[0].reason
+    assert list(follow(path, lambda: False)) == []
+
+
+def test_no_mutant_of_a_recording_raises_anything_else_or_is_read_as_something_else(tmp_path: Path) -> None:
+    assert [tried for tried in try_mutants(150, seed=3, folder=tmp_path) if tried.problem] == []

@@ -140,7 +140,7 @@ class Watched:
         self.run.arm._body.follow = followed  # type: ignore[method-assign]
         self.run.arm.stop = stopped  # type: ignore[method-assign]
 
-    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
+    def add(self, topic: str, t_ns: int, data: bytes) -> None:
         if self.state() is STOPPING and self.while_stopping is not None:
             stimulus, self.while_stopping = self.while_stopping, None
             stimulus()

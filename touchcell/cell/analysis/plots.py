@@ -55,7 +55,7 @@ def plot_contact(run: Run, sensor: str, path: Path, *, last_s: float | None = No
     axes.flat[0].legend(loc="best", fontsize=9)
     for axis in axes[-1]:
         axis.set_xlabel("time (s)")
-        if last_s is not None:
+        if last_s is not None and len(contact.t_s):
             axis.set_xlim(contact.t_s[-1] - last_s, contact.t_s[-1])
     figure.suptitle(f"{sensor}: contact pose and shear of the sensor in the surface frame")
     figure.savefig(path, dpi=100)

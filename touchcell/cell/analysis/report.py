@@ -173,6 +173,8 @@ def _text(folder: Path, result: dict[str, Any], summary: dict[str, Any], picture
         lines += [
             f"  {stage:<18}{row['median']:11.1f}{row['p99']:11.1f}{row['count']:9d}" for stage, row in stages.items()
         ]
+    if run.damage:
+        lines.append(f"the recording is damaged in {len(run.damage)} places, first {run.damage[0]}")
     lines += compiled.missing()
     lines.append(f"run folder: {folder}")
     lines += [f"  {picture.name}" for picture in pictures]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from touchcell.cell.recording.mcap import Message, read
+from touchcell.cell.recording.mcap import Damage, Message, read
 from touchcell.cell.recording.messages import COMPONENTS
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
@@ -49,11 +50,12 @@ class Series:
 
 @dataclass(frozen=True)
 class Run:
-    """A recording, by topic, with the task's states."""
+    """A recording, by topic, with the task's states, and what could not be read of it."""
 
     topics: dict[str, Series]
     events: tuple[Message, ...]
     start_ns: int
+    damage: tuple[Damage, ...] = ()
 
     def series(self, topic: str) -> Series | None:
         """Return the topic's series, or None where nothing was recorded."""
@@ -76,21 +78,27 @@ class Run:
 
 
 def load_run(path: Path) -> Run:
-    """Read a recording without its images. Raises RecordingError."""
+    """Read a recording; images are left out. Raises RecordingError."""
+    damage: list[Damage] = []
+    messages = [message for message in read(path, damage) if not message.topic.endswith("/image")]
+    return run_of(messages, damage)
+
+
+def run_of(messages: Iterable[Message], damage: Iterable[Damage] = ()) -> Run:
+    """Messages as a run."""
     grouped: dict[str, list[Message]] = {}
-    for message in read(path):
-        if not message.topic.endswith("/image"):
-            grouped.setdefault(message.topic, []).append(message)
+    for message in messages:
+        grouped.setdefault(message.topic, []).append(message)
     events = tuple(grouped.pop("/events", []))
-    start_ns = min((messages[0].t_ns for messages in grouped.values()), default=0)
+    start_ns = min((found[0].t_ns for found in grouped.values()), default=0)
     topics = {
         topic: Series(
-            np.array([(message.t_ns - start_ns) * 1e-9 for message in messages]),
-            tuple(message.data for message in messages),
+            np.array([(message.t_ns - start_ns) * 1e-9 for message in found]),
+            tuple(message.data for message in found),
         )
-        for topic, messages in grouped.items()
+        for topic, found in grouped.items()
     }
-    return Run(topics, events, start_ns)
+    return Run(topics, events, start_ns, tuple(damage))
 
 
 def tip_points(series: Series) -> Array:
@@ -99,4 +107,7 @@ def tip_points(series: Series) -> Array:
 
 
 def _number(value: Any) -> float:
-    return float(value) if isinstance(value, int | float) else float("nan")
+    try:
+        return float(value) if isinstance(value, int | float) else float("nan")
+    except OverflowError:
+        return float("nan")

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.cell.analysis.run_data import Run, Series, load_run, tip_points
-from touchcell.cell.config.schema import CellPlan, plan_cell
+from touchcell.cell.config.cell_plan import CellPlan
+from touchcell.cell.config.schema import plan_cell
 from touchcell.geometry.types import Array
 
 
@@ -24,7 +25,7 @@ class RunFolder:
     @cached_property
     def plan(self) -> CellPlan:
         """Its cell. Raises ConfigError."""
-        return plan_cell(self.path / "cell.yaml")
+        return plan_cell(self.path / "cell.yaml", to_run=False)
 
     @cached_property
     def recording(self) -> Run:

@@ -12,8 +12,8 @@ from touchcell.cell.analysis.run_data import Run
 _BEFORE_S, _AFTER_S = 1.0, 0.5
 
 
-def plot_trip(run: Run, trip_s: float, cause: dict[str, Any] | None, path: Path) -> Path:
-    """Plot commanded and measured speed, depth, and frame age, from a second before the trip until after the stop."""
+def plot_trip(run: Run, trip_s: float, cause: dict[str, Any] | None, path: Path, moment: str = "trip") -> Path:
+    """Speed sent and measured, depth, and the age of frames, from a second before the moment until after the stop."""
     figure = Figure(figsize=(11, 8), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True)
     speed, depth, age = axes
@@ -48,7 +48,7 @@ def plot_trip(run: Run, trip_s: float, cause: dict[str, Any] | None, path: Path)
         axis.grid(alpha=0.3)
         if axis.get_legend_handles_labels()[0]:
             axis.legend(fontsize=9, loc="upper left")
-    axes[-1].set_xlabel("time from the trip (s)")
+    axes[-1].set_xlabel(f"time from the {moment} (s)")
     if cause is not None:
         figure.suptitle(f"{cause['interlock']}: {cause['subject']}: {cause['reason']}")
     figure.savefig(path, dpi=110)

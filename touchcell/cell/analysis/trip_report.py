@@ -1,71 +1,142 @@
-"""``touchcell why``: explains why a run tripped, from its black box, with a plot around the moment."""
+"""``touchcell why``: explains why a run did not end as done, with a plot around the moment."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from touchcell.cell.analysis.run_data import Run, Series, load_run
+from touchcell.cell.analysis.run_data import Run, Series, load_run, run_of
+from touchcell.cell.config.yaml_file import load
 from touchcell.cell.errors import RecordingError
-from touchcell.cell.runtime.black_box import ABOUT, MESSAGES
+from touchcell.cell.recording.mcap import RECORDING
+from touchcell.cell.runtime.black_box import ABOUT, CRASH, MESSAGES, RING, read_left_ring
+from touchcell.cell.runtime.operator_input import is_running
 from touchcell.cell.runtime.watchdog import NOTES
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 
+RESULT: Final = "result.json"
 BEFORE_S: Final = 1.0
-"""Time before the trip that is reported, s."""
+"""How much of the time before the trip is shown."""
+_EVENTS: Final = 5
+
+
+@dataclass(frozen=True, slots=True)
+class _Evidence:
+    """What a run has left: a record of how it ended, as far as there is one, and its last messages."""
+
+    about: dict[str, Any]
+    run: Run
+    source: str
 
 
 def explain(folder: Path) -> str:
-    """Return what tripped the run in ``folder``, what happened in the second before, and how the arms came to rest.
+    """Why the run in ``folder`` did not end as done, what happened in the second before, and how the arms came to rest.
 
-    Also draws ``why.png`` beside it. A run whose process died has the watchdog's note only.
+    Also draws ``why.png`` beside it. Evidence is taken, in this order, from the ring of a run whose process did not end
+    by itself, from its black box, and from its result and recording.
 
     Raises:
-        RecordingError: the folder holds no black box.
+        RecordingError: the folder holds nothing of a run.
     """
-    if not (folder / ABOUT).exists() and (folder / NOTES).exists():
-        return _from_watchdog(folder / NOTES)
-    about = _about(folder)
-    run = load_run(folder / MESSAGES)
-    lines = [f"{about['cell']}: {about['outcome']}, cell file sha256 {about['cell_sha256'][:12]}"]
-    causes = about["causes"]
-    t_ns = causes[0]["t_ns"] if causes else _last_ns(run)
+    goes_on = is_running(folder)
+    evidence = None if goes_on and not (folder / ABOUT).exists() else _evidence(folder)
+    if evidence is None:
+        if goes_on:
+            return f"{folder}: the run goes on, and nothing has stopped it"
+        if (folder / NOTES).exists():
+            return "\n".join([_DIED, *_watchdog_note(folder / NOTES)])
+        raise RecordingError(folder, "holds nothing of a run", hint="name the folder of a run")
+    about, run = evidence.about, evidence.run
+    outcome = str(about.get("outcome", "ended without a result"))
+    sha256 = str(about.get("cell_sha256", ""))[:12]
+    lines = [f"{about.get('cell', folder.name)}: {outcome}" + (f", cell file sha256 {sha256}" if sha256 else "")]
+    causes = about.get("causes") or []
+    start_ns = int(about.get("start_ns", run.start_ns))
+    t_ns = int(causes[0]["t_ns"]) if causes else _last_ns(run)
     if causes:
-        lines.append(f"first cause, {(t_ns - about['start_ns']) * 1e-9:.3f} s after the start:")
+        lines.append(f"first cause, {(t_ns - start_ns) * 1e-9:.3f} s after the start:")
         lines.append(f"  {_cause(causes[0])}")
+        if remedy := _remedy(folder, causes[0]):
+            lines.append(f"  what to do: {remedy}")
         lines += [f"  then {1e-6 * (cause['t_ns'] - t_ns):.0f} ms later: {_cause(cause)}" for cause in causes[1:]]
+    elif about.get("outcome") == "done":
+        lines.append("  the task reached its end; there is nothing to explain")
+    elif "outcome" in about:
+        lines.append(f"  {about.get('reason') or 'no reason was given'}")
     else:
-        lines.append(f"  {about['reason']}")
-    trip_s = (t_ns - run.start_ns) * 1e-9
-    lines.append(f"in the {BEFORE_S:g} s before:")
-    lines += [f"  {line}" for line in _before(run, trip_s)]
-    lines.append("after:")
-    lines += [f"  {role}: {_stop(stop)}" for role, stop in about["stops"].items()]
-    from touchcell.cell.analysis.trip_plot import plot_trip
+        lines.append(f"  {_DIED}")
+        lines += [f"  {line}" for line in _crash(folder / CRASH)]
+        lines += _watchdog_note(folder / NOTES) if (folder / NOTES).exists() else []
+    end_s = (t_ns - run.start_ns) * 1e-9
+    if events := _events(run, t_ns):
+        lines.append("what happened:")
+        lines += [f"  {line}" for line in events]
+    if before := _before(run, end_s):
+        lines.append(f"in the {BEFORE_S:g} s before:")
+        lines += [f"  {line}" for line in before]
+    if stops := about.get("stops"):
+        lines.append("after:")
+        lines += [f"  {role}: {_stop(stop)}" for role, stop in stops.items()]
+    lines.append(f"evidence: {evidence.source}")
+    lines += [f"  damaged {damage}" for damage in run.damage]
+    if run.topics:
+        from touchcell.cell.analysis.trip_plot import plot_trip
 
-    lines.append(f"plot: {plot_trip(run, trip_s, causes[0] if causes else None, folder / 'why.png')}")
+        moment = "trip" if causes else "end"
+        try:
+            lines.append(f"plot: {plot_trip(run, end_s, causes[0] if causes else None, folder / 'why.png', moment)}")
+        except OSError as error:
+            lines.append(f"no plot: {error.strerror}")
     return "\n".join(lines)
 
 
-def _about(folder: Path) -> dict[str, Any]:
+_DIED: Final = "the run's process ended without a result: it was killed, crashed, or there was no memory left"
+
+
+def _evidence(folder: Path) -> _Evidence | None:
+    if (folder / RING).exists():
+        about, messages = read_left_ring(folder)
+        return _Evidence(about, run_of(messages), RING)
+    if (folder / ABOUT).exists():
+        return _Evidence(_record(folder / ABOUT), load_run(folder / MESSAGES), MESSAGES)
+    about = _record(folder / RESULT) if (folder / RESULT).exists() else {}
+    if (folder / RECORDING).exists():
+        return _Evidence(about, load_run(folder / RECORDING), RECORDING)
+    return _Evidence(about, run_of([]), RESULT) if about else None
+
+
+def _record(file: Path) -> dict[str, Any]:
     try:
-        about: dict[str, Any] = json.loads((folder / ABOUT).read_text())
-    except OSError:
-        raise RecordingError(folder, "holds no black box", hint="a run leaves one when it trips or fails") from None
-    except ValueError:
-        raise RecordingError(folder / ABOUT, "is damaged") from None
+        about = json.loads(file.read_text())
+    except OSError as error:
+        raise RecordingError(file, f"cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError):
+        raise RecordingError(file, "is damaged") from None
+    if not isinstance(about, dict):
+        raise RecordingError(file, "is damaged")
     return about
 
 
-def _from_watchdog(file: Path) -> str:
+def _crash(file: Path) -> list[str]:
+    """The signal and the innermost frames that the interpreter noted."""
+    try:
+        lines = [line.strip() for line in file.read_text(errors="replace").splitlines() if line.strip()]
+    except OSError:
+        return []
+    return [line for line in lines if not line.startswith("Extension modules")][:6]
+
+
+def _watchdog_note(file: Path) -> list[str]:
     try:
         note = json.loads(file.read_text())
     except (OSError, ValueError):
         raise RecordingError(file, "is damaged") from None
-    lines = ["the run's own process left no black box; the watchdog noted:", f"  {note['words']}"]
+    lines = ["the watchdog noted:", f"  {note['words']}"]
     if note["limit_s"]:
         lines[-1] += f"  [value {note['value_s']:.4g}, limit {note['limit_s']:.4g} s]"
     for name, arm in note["arms"].items():
@@ -74,7 +145,7 @@ def _from_watchdog(file: Path) -> str:
             f"  {name}: commanded to stop at {1e3 * arm['speed_m_s']:.1f} mm/s; {rest} and "
             f"{1e3 * arm['distance_m']:.2f} mm" + (", by the strongest category it offers" if arm["escalated"] else "")
         )
-    return "\n".join(lines)
+    return lines
 
 
 def _cause(cause: dict[str, Any]) -> str:
@@ -82,6 +153,29 @@ def _cause(cause: dict[str, Any]) -> str:
     if cause["value"] is not None and cause["limit"] is not None:
         text += f"  [value {cause['value']:.4g}, limit {cause['limit']:.4g} {cause['unit']}]"
     return text + (f", tactile frame {cause['frame_seq']}" if cause["frame_seq"] is not None else "")
+
+
+_REMEDIES: Final = {
+    "limited": "lower the task's gains or speeds, raise that limit of the arm if it can do more, or, where the "
+    "estimate itself jumps, train the estimator on more images",
+    "workspace": "if the task was right to go there, make the box larger; if not, look at its start and its target",
+    "depth": "lower the task's depth or gains, or approach more slowly",
+    "out_of_range": "press less deep and less slanted, or train the estimator on the contacts that occur",
+    "frame_age": "find what delays the camera or the cycle (budget.png); raise the limit only if the arm is slow",
+    "arm_state_age": "find what delays the arm's states or the cycle (budget.png)",
+    "tcp_speed": "lower the task's speeds or gains; the limit is for the tool, with the turn about it",
+    "tracking": "the arm does not follow: look at its load, its own speed limits and what it touches",
+    "contact_lost": "lower the speed, raise the depth, or let the task search again more often",
+}
+
+
+def _remedy(folder: Path, cause: dict[str, Any]) -> str:
+    """What to do about a trip, by the kind of its interlock in the run's cell file."""
+    try:
+        entry = load(folder / "cell.yaml").data.get("interlocks", {}).get(cause["interlock"], {})
+    except (ConfigError, AttributeError):
+        return ""
+    return _REMEDIES.get(str(entry.get("kind")), "") if isinstance(entry, dict) else ""
 
 
 def _stop(stop: dict[str, Any]) -> str:
@@ -107,8 +201,8 @@ def _before(run: Run, trip_s: float) -> list[str]:
     for role in run.roles("arms", "tcp"):
         tcp = _window(run.series(f"/arms/{role}/tcp"), trip_s)
         if tcp is not None:
-            path_mm = _path_length(tcp.poses()[:, :3])
-            lines.append(f"{role}: moved {path_mm:.1f} mm, at most at {np.nanmax(_finite(tcp, 'speed_mm_s')):.1f} mm/s")
+            way_mm = _path_length(tcp.poses()[:, :3])
+            lines.append(f"{role}: moved {way_mm:.1f} mm, at most at {_finite(tcp, 'speed_mm_s').max():.1f} mm/s")
         commands = _window(run.series(f"/arms/{role}/command"), trip_s)
         if commands is not None:
             held = [row for row in commands.rows if row["limited_by"]]
@@ -123,6 +217,17 @@ def _before(run: Run, trip_s: float) -> list[str]:
             change = f"{depth[0]:.2f} -> {depth[-1]:.2f} mm deep" if finite else "no contact"
             lines.append(f"{role}: {change}, frames up to {max(ages_ms):.0f} ms old")
     return lines
+
+
+def _events(run: Run, t_ns: int) -> list[str]:
+    """The latest events that have a reason, with their times before or after the moment."""
+    lines = []
+    for event in run.events:
+        words = [str(event.data.get(key) or "") for key in ("event", "to", "reason")]
+        if words[2]:
+            change = f"{words[0]} -> {words[1]}" if words[1] else words[0]
+            lines.append(f"{(event.t_ns - t_ns) * 1e-9:+.3f} s: {change}: {words[2]}")
+    return lines[-_EVENTS:]
 
 
 def _rows(series: Series) -> list[tuple[float, dict[str, Any]]]:
@@ -149,4 +254,6 @@ def _window(series: Series | None, trip_s: float) -> Series | None:
 
 
 def _last_ns(run: Run) -> int:
-    return run.events[-1].t_ns if run.events else run.start_ns
+    """When the last message was recorded."""
+    newest_s = max((float(series.t_s[-1]) for series in run.topics.values() if len(series.t_s)), default=0.0)
+    return max(run.start_ns + round(1e9 * newest_s), run.events[-1].t_ns if run.events else 0)

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from pydantic import BaseModel
 
-from touchcell.cell.config import schema
+from touchcell.cell.config import cell_plan
 from touchcell.cell.config.json_schema import WithMeanings
 from touchcell.cell.config.meanings import summary
 from touchcell.control.interlocks.spec import INTERLOCKS
@@ -36,15 +36,15 @@ _REGISTRIES: Final[Mapping[str, Registry[Any]]] = {
     "object": OBJECTS,
 }
 _SECTIONS: Final[Mapping[str, type[BaseModel]]] = {
-    "file": schema.CellFile,
-    "arm": schema.ArmSection,
-    "sensor": schema.SensorSection,
-    "device": schema.DeviceSection,
-    "task": schema.TaskSection,
-    "obstacle": schema.BoxSection,
-    "pair": schema.PairSection,
-    "recording": schema.RecordingSection,
-    "collect": schema.CollectSection,
+    "file": cell_plan.CellFile,
+    "arm": cell_plan.ArmSection,
+    "sensor": cell_plan.SensorSection,
+    "device": cell_plan.DeviceSection,
+    "task": cell_plan.TaskSection,
+    "obstacle": cell_plan.BoxSection,
+    "pair": cell_plan.PairSection,
+    "recording": cell_plan.RecordingSection,
+    "collect": cell_plan.CollectSection,
 }
 SECTION: Final = "section"
 KINDS: Final = (SECTION, *_REGISTRIES)

@@ -11,7 +11,8 @@ import numpy as np
 from touchcell import compiled
 from touchcell.cell.cli import discovery
 from touchcell.cell.cli.discovery import Found
-from touchcell.cell.config.schema import CellPlan, plan_cell
+from touchcell.cell.config.cell_plan import CellPlan
+from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.runtime.devices import build_devices
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.errors import DeviceError, LifecycleError

@@ -22,8 +22,9 @@ from typing import Any
 
 import numpy as np
 
+from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.find import find_cell
-from touchcell.cell.config.schema import CellPlan, plan_cell
+from touchcell.cell.config.schema import plan_cell
 from touchcell.drivers.core.clock import MonotonicClock
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.franka.emulator import arm as franka_arm

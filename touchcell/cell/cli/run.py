@@ -16,15 +16,18 @@ from typing import Any
 from touchcell.cell.analysis.report import write_report
 from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
 from touchcell.cell.cli.output import say, warn
-from touchcell.cell.config.schema import CellPlan, plan_cell
+from touchcell.cell.config.cell_plan import CellPlan
+from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.recording.mcap import RECORDING, Recorder
-from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, stop_record
+from touchcell.cell.recording.reserved_file import ReservedFile
+from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, note_crashes, stop_record
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.heap import trim_heap
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.operator_channel import OperatorChannel
-from touchcell.cell.runtime.operator_input import FolderInUse, reachable, stop_on_keys, stop_on_signals
+from touchcell.cell.runtime.operator_input import stop_on_keys, stop_on_signals
+from touchcell.cell.runtime.run_directory import RunFolderError, run_directory
 from touchcell.cell.runtime.run_result import Outcome, Progress, RunResult
 from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.drivers.core.clock import VirtualClock
@@ -86,12 +89,12 @@ def run_cell(
         path: the cell file.
         data: for drivers that replay a data set.
         model: estimator model in place of the file's own.
-        out: run folder.
+        out: run folder, made for this run or empty.
         live: show a progress line.
         moving: also make the animation of a simulated run.
 
     Raises:
-        ConfigError, ModelError, ConnectError: before anything moves.
+        ConfigError, ModelError, RunFolderError, ConnectError: before anything moves.
     """
     run = run_plan(plan_cell(path, {} if data is None else {"data": data}, model=model), out=out, live=live)
     if run.summary:
@@ -112,29 +115,39 @@ def run_plan(plan: CellPlan, *, out: Path | None = None, live: bool = False) -> 
 
     Args:
         plan: the cell.
-        out: run folder; None for ``runs/NAME-TIME``.
+        out: run folder, made for this run or empty; None for ``runs/NAME-TIME``.
         live: show a progress line.
 
     Raises:
-        ConfigError, ModelError, ConnectError: before anything moves.
+        ConfigError, ModelError, RunFolderError, ConnectError: before anything moves.
     """
     cell = compose(plan)
     trim_heap()
-    folder = out or Path("runs") / f"{plan.cell.name}-{time.strftime('%Y%m%d-%H%M%S')}"
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "cell.yaml").write_text(plan.text())
-    with log_to_file(folder / LOG):
+    with run_directory(plan.cell.name, out) as folder, _log_and_result(folder, plan) as result_file:
         logger.info("%s: task %s of %s, in %s", plan.cell.name, plan.task.name, plan.file, folder)
         try:
-            result, leaving = _run(cell, folder, live)
-        except FolderInUse:
-            raise
+            result, leaving = _run(cell, folder, live, result_file)
         except Exception as error:
-            _write_result(folder, _not_started_json(plan, error))
+            _write_result(result_file, _not_started_json(plan, error))
             raise
         ended = f"{result.outcome.value} after {result.duration_s:.2f} s"
         logger.info("%s: %s%s", plan.cell.name, ended, f" ({result.reason})" if result.reason else "")
     return FinishedRun(result, folder, _report(folder), leaving)
+
+
+@contextlib.contextmanager
+def _log_and_result(folder: Path, plan: CellPlan) -> Iterator[ReservedFile]:
+    """Put the cell file and a log into the run folder, and take the room for ``result.json``."""
+    try:
+        (folder / "cell.yaml").write_text(plan.text())
+        result_file = ReservedFile(folder / "result.json")
+    except OSError as error:
+        raise RunFolderError(folder, f"cannot be written: {error.strerror}") from None
+    with log_to_file(folder / LOG):
+        try:
+            yield result_file
+        finally:
+            result_file.discard()
 
 
 def _report(folder: Path) -> str:
@@ -146,29 +159,30 @@ def _report(folder: Path) -> str:
         return ""
 
 
-def _run(cell: Cell, folder: Path, live: bool) -> tuple[RunResult, Exception | None]:
+def _run(cell: Cell, folder: Path, live: bool, result_file: ReservedFile) -> tuple[RunResult, Exception | None]:
     """Run to the end; returns how it ended, and what was raised when the devices were given back."""
     result = None
     try:
-        with _running(cell, folder, live) as run:
+        with _running(cell, folder, live, result_file) as run:
             result = run()
     except Exception as error:
         if result is None:
             raise
         logger.exception("after the run")
         warn(f"after the run: {error}")
-        _write_result(folder, {**_result_json(cell.plan, result), "after_the_run": str(error)})
+        _write_result(result_file, {**_result_json(cell.plan, result), "after_the_run": str(error)})
         return result, error
     return result, None
 
 
 @contextlib.contextmanager
-def _running(cell: Cell, folder: Path, live: bool) -> Iterator[Callable[[], RunResult]]:
+def _running(cell: Cell, folder: Path, live: bool, result_file: ReservedFile) -> Iterator[Callable[[], RunResult]]:
     """Within reach of the operator, with everything open and all devices active; yields what runs the task."""
     stop, channel = StopRequest(), OperatorChannel(folder)
-    box = BlackBox()
+    explained = False
     with (
-        reachable(folder),
+        note_crashes(folder),
+        BlackBox(folder, _about(cell, folder)) as box,
         Recorder(folder / RECORDING) as recorder,
         cell,
         stop_on_signals(stop),
@@ -189,6 +203,7 @@ def _running(cell: Cell, folder: Path, live: bool) -> Iterator[Callable[[], RunR
 
         def tripped(so_far: RunResult) -> None:
             keep_earlier(folder)
+            recorder.sync()
             _dump(box, folder, cell, so_far)
             say(f"tripped: {so_far.reason}\n`touchcell why {folder}` explains; `touchcell reset {folder}` or r, when")
             say("it is safe, then `touchcell resume` or g; `touchcell stop` or q ends the run")
@@ -198,32 +213,42 @@ def _running(cell: Cell, folder: Path, live: bool) -> Iterator[Callable[[], RunR
         def run() -> RunResult:
             result = loop.run()
             # Before the devices are given back, which an arm that obeys nothing may not survive.
-            _write_result(folder, _result_json(cell.plan, result))
-            if result.outcome is not Outcome.DONE and not loop.has_waited:
-                _dump(box, folder, cell, result)
+            _write_result(result_file, _result_json(cell.plan, result))
+            nonlocal explained
+            explained = result.outcome is Outcome.DONE or loop.has_waited or _dump(box, folder, cell, result)
+            if result.outcome is Outcome.TRIPPED:
+                recorder.sync()
             return result
 
         yield run
+    if explained:
+        box.discard()
 
 
-def _dump(box: BlackBox, folder: Path, cell: Cell, result: RunResult) -> None:
+def _about(cell: Cell, folder: Path) -> dict[str, Any]:
+    return {
+        "cell": cell.plan.cell.name,
+        "cell_file": "cell.yaml",
+        "cell_sha256": hashlib.sha256((folder / "cell.yaml").read_bytes()).hexdigest(),
+        "start_ns": cell.clock.now_ns(),
+    }
+
+
+def _dump(box: BlackBox, folder: Path, cell: Cell, result: RunResult) -> bool:
+    """Write the black box; returns whether that succeeded. Its ring has everything where it did not."""
     try:
-        about = {
-            "cell": cell.plan.cell.name,
-            "cell_file": "cell.yaml",
-            "cell_sha256": hashlib.sha256((folder / "cell.yaml").read_bytes()).hexdigest(),
-            "start_ns": cell.start_ns,
-        }
-        box.dump(folder, result, about)
+        box.dump(folder, result, cell.start_ns)
     except Exception as error:
-        logger.exception("no black box")
+        logger.info("no black box but its ring", exc_info=True)
         # What happened is reported all the same.
-        warn(f"no black box: {error}")
+        warn(f"the black box stays in its ring: {error}")
+        return False
+    return True
 
 
-def _write_result(folder: Path, result: Mapping[str, Any]) -> None:
+def _write_result(result_file: ReservedFile, result: Mapping[str, Any]) -> None:
     try:
-        (folder / "result.json").write_text(json.dumps(result, indent=1) + "\n")
+        result_file.write(json.dumps(result, indent=1) + "\n")
     except OSError as error:
         warn(f"no result.json: {error}")
 

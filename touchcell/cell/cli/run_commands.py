@@ -104,15 +104,13 @@ def _stop(options: argparse.Namespace) -> int:
 
 
 def _ask(options: argparse.Namespace) -> int:
-    import getpass
-
-    from touchcell.cell.runtime.operator_channel import OperatorRequest, ask_run, is_waiting
+    from touchcell.cell.runtime.operator_channel import OperatorRequest, ask_run, is_waiting, operator_name
     from touchcell.cell.runtime.operator_input import NoSuchRun, running
 
     folders = [options.folder] if options.folder else [run for run in running(RUNS) if is_waiting(run)]
     if len(folders) != 1 or not is_waiting(folders[0]):
         where = folders[0] if len(folders) == 1 else RUNS
         raise NoSuchRun(where, "several runs wait: name one" if len(folders) > 1 else "no run waits for a reset here")
-    done, answer = ask_run(folders[0], OperatorRequest(options.ask), getpass.getuser())
+    done, answer = ask_run(folders[0], OperatorRequest(options.ask), operator_name())
     print(f"{folders[0]}: {answer}")
     return EXIT_OK if done else EXIT_TASK_FAILED

@@ -26,7 +26,7 @@ from touchcell.geometry import se3
 from touchcell.tasks.interface import TaskContext
 
 if TYPE_CHECKING:
-    from touchcell.cell.config.schema import CellPlan
+    from touchcell.cell.config.cell_plan import CellPlan
     from touchcell.perception.runtime.network_estimator import NetworkEstimator
 
 REQUIRED_OF_ARMS: Final = ("workspace", "tcp_speed", "arm_state_age")

@@ -14,8 +14,8 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaMode, JsonSchemaValue, models_json_schema
 from pydantic_core import core_schema
 
+from touchcell.cell.config.cell_plan import CellFile
 from touchcell.cell.config.meanings import meanings, summary
-from touchcell.cell.config.schema import CellFile
 from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.registry import Registry

@@ -18,7 +18,7 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 if TYPE_CHECKING:
-    from touchcell.cell.config.schema import ArmSection, BoxSection, CapsuleSection, CellPlan
+    from touchcell.cell.config.cell_plan import ArmSection, BoxSection, CapsuleSection, CellPlan
 
 
 def build_planning_scene(plan: CellPlan, arms: Mapping[str, Any], names: Mapping[str, str]) -> PlanningScene:

@@ -5,13 +5,11 @@ Files come from people and from scripts: encodings, aliases, nesting, tags and s
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import stat
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
 from pathlib import Path
 from typing import Any, ClassVar, Final, TypeVar, get_args
 
@@ -76,18 +74,24 @@ class YamlFile:
     def validate(self, model: type[M], data: Any, at: KeyPath = ()) -> M:
         """Build ``model`` from ``data``, which stands at ``at``. Raises InvalidCell with every mistake.
 
-        Types are strict: text is no number, and true is no number.
+        Text is never taken for a number or a boolean, nor a boolean for a number.
         """
         try:
-            # Strict rules for JSON let a list be a tuple and text be a path, which those for Python values do not.
-            return model.model_validate_json(json.dumps(data, default=_plain), strict=True)
+            built = model.model_validate(data)
         except ValidationError as error:
             details = [dict(detail) for detail in error.errors()]
             raise InvalidCell([self._explain(model, data, at, detail) for detail in _merged(details)]) from None
+        wrong = [
+            self.problem(path, f"must be {_WANTED[type(made)]}, not {_short(found)}", value=found)
+            for path, found, made in _converted(data, built, at)
+        ]
+        if wrong:
+            raise InvalidCell(wrong)
+        return built
 
     def _explain(self, model: type[BaseModel], data: Any, at: KeyPath, detail: dict[str, Any]) -> ConfigError:
         location: KeyPath = detail["loc"]
-        path = self._written(at, location)
+        path = (*at, *_written(data, location))
         value = detail.get("input")
         kind = detail["type"]
         context = detail.get("ctx", {})
@@ -118,7 +122,11 @@ class YamlFile:
             return self.problem(path, "has no value", hint="write one behind the colon, or leave the key out")
         reason = detail["msg"].removeprefix("Value error, ")
         reason = reason.replace("Input should be", "must be").replace("valid dictionary", "mapping")
-        reason = reason.replace("an object", "a mapping").replace("a valid array", "a list")
+        reason = reason.replace("a valid tuple", "a list").replace("a valid list", "a list")
+        reason = re.sub(
+            r"^Unable to parse input string as an? (\w+), exceeded maximum size", r"must be a valid \1", reason
+        )
+        reason = re.sub(r", unable to (parse|interpret) .*", "", reason)
         shown = "" if isinstance(value, dict | list) else f", not {_short(value)}"
         hint = "write it in quotes" if kind == "string_type" and isinstance(value, int | float | bool) else ""
         return self.problem(path, reason[:1].lower() + reason[1:] + shown, value=value, hint=hint)
@@ -130,15 +138,19 @@ class YamlFile:
         known = {field.alias or name for each in models for name, field in each.model_fields.items()}
         return self.problem(path, "unknown key", value=value, hint=suggest(key, known))
 
-    def _written(self, at: KeyPath, location: KeyPath) -> KeyPath:
-        """``location`` as far as it stands in the file: without the union tags that pydantic puts in."""
-        path = at
-        for part in location:
-            if (*path, part) in self.lines:
-                path = (*path, part)
-        return path
+
+def _written(data: Any, location: KeyPath) -> KeyPath:
+    """``location`` as far as it is in ``data``: without the union tags that pydantic puts in."""
+    path: KeyPath = ()
+    for part in location:
+        in_list = isinstance(data, list | tuple) and isinstance(part, int) and part < len(data)
+        if in_list or (isinstance(data, dict) and part in data):
+            data = data[part]
+            path = (*path, part)
+    return path
 
 
+_A_NUMBER: Final = "must be a valid integer"
 _NUMBERS: Final = {2: "two", 3: "three", 4: "four", 6: "six", 7: "seven"}
 _MEANINGS: Final = (("_mm_deg", " [x y z mm, rx ry rz deg]"), ("_mm", " [x y z]"))
 
@@ -148,9 +160,27 @@ def _short(value: Any) -> str:
     return shown if len(shown) <= 60 else f"{shown[:57]}..."
 
 
-def _plain(value: Any) -> Any:
-    """What the command line and the planner put between a file's own values."""
-    return value.value if isinstance(value, Enum) else str(value)
+_WANTED: Final = {bool: "a boolean, true or false", int: "a valid integer", float: "a valid number"}
+
+
+def _converted(data: Any, made: Any, at: KeyPath) -> Iterator[tuple[KeyPath, Any, Any]]:
+    """Places where pydantic made a number of text or of a boolean, or a boolean of text: it takes "yes" for true."""
+    if isinstance(made, BaseModel) and isinstance(data, dict):
+        names = {field.alias or name: name for name, field in type(made).model_fields.items()}
+        if len(data) == 1 and not names.keys() & data.keys():
+            # A section that is wrapped in its own name, as a task's step.
+            ((key, inner),) = data.items()
+            yield from _converted(inner, made, (*at, key))
+        for key in names.keys() & data.keys():
+            yield from _converted(data[key], getattr(made, names[key]), (*at, key))
+    elif isinstance(made, Mapping) and isinstance(data, dict):
+        for key in made.keys() & data.keys():
+            yield from _converted(data[key], made[key], (*at, key))
+    elif isinstance(made, list | tuple) and isinstance(data, list | tuple):
+        for index, (inner, value) in enumerate(zip(data, made, strict=False)):
+            yield from _converted(inner, value, (*at, index))
+    elif type(made) in _WANTED and isinstance(data, str | bool) and type(data) is not type(made):
+        yield at, data, made
 
 
 def _merged(details: list[dict[str, Any]]) -> list[dict[str, Any]]:

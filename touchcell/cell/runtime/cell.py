@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from touchcell.cell.config.schema import CellPlan
+from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.recording.dataset_writer import Collection
 from touchcell.cell.runtime.sensor import Sensor
 from touchcell.cell.runtime.watchdog import NullWatchdog, Watchdog

@@ -8,8 +8,8 @@ from functools import partial
 from typing import cast
 
 from touchcell.cell.config.armed import require_armed
+from touchcell.cell.config.cell_plan import REDUCED_SPEED_M_S, CellPlan
 from touchcell.cell.config.planning_scene import build_planning_scene
-from touchcell.cell.config.schema import REDUCED_SPEED_M_S, CellPlan
 from touchcell.cell.recording.dataset_writer import Collection
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.devices import build_devices, build_world

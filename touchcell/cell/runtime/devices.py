@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from touchcell.cell.config.schema import CellPlan, DevicePlan
+from touchcell.cell.config.cell_plan import CellPlan, DevicePlan
 from touchcell.cell.runtime.watchdog import NullWatchdog, Watchdog
 from touchcell.drivers.core.clock import Clock, MonotonicClock, VirtualClock
 from touchcell.drivers.core.device import Device

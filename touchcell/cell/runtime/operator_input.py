@@ -155,6 +155,11 @@ def running(runs: Path) -> list[Path]:
     return sorted(file.parent for file in runs.glob(f"*/{PID_FILE}") if _owner(file) is not None)
 
 
+def is_running(folder: Path) -> bool:
+    """Whether the run in ``folder`` goes on."""
+    return _owner(folder / PID_FILE) is not None
+
+
 def ask_to_stop(folder: Path, *, at_once: bool) -> None:
     """Ask the run in ``folder`` to stop.
 

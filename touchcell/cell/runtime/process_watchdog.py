@@ -14,7 +14,7 @@ from touchcell.drivers.hosting.groups import Group, HostedDevice
 from touchcell.drivers.hosting.layouts import Reason
 
 if TYPE_CHECKING:
-    from touchcell.cell.config.schema import CellPlan, DevicePlan
+    from touchcell.cell.config.cell_plan import CellPlan, DevicePlan
     from touchcell.drivers.hosting.chain import Chain
 
 SCENE: Final = "scene"

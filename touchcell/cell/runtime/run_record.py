@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 from touchcell.cell.errors import RecordingError, UnexpectedError
-from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.recording.mcap import Recorder, encode
 from touchcell.cell.recording.messages import (
     command_message,
     contact_message,
@@ -31,8 +31,8 @@ logger = logging.getLogger(__name__)
 class Box(Protocol):
     """Something that keeps messages and never fails; see ``touchcell.cell.runtime.black_box``."""
 
-    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
-        """Keep one message."""
+    def add(self, topic: str, t_ns: int, data: bytes) -> None:
+        """Keep one message, encoded as for the recording."""
         ...
 
 
@@ -134,16 +134,26 @@ class RunRecord:
 
     def write(self, topic: str, t_ns: int, message: Mapping[str, Any], *, boxed: bool = True) -> None:
         """Record one message, in the black box only if ``boxed``."""
+        boxed = boxed and self._box is not None
+        if not boxed and self._recorder is None:
+            return
+        try:
+            data = encode(message)
+        except Exception as error:
+            # A value of a plug-in's that is no JSON; the rest of the run is recorded.
+            logger.exception("a message of %s is left out", topic)
+            self.error = self.error or UnexpectedError(error)
+            return
         if boxed and self._box is not None:
             try:
-                self._box.add(topic, t_ns, message)
+                self._box.add(topic, t_ns, data)
             except Exception:
                 logger.exception("the black box failed and takes no more messages")
                 self._box = None
         if self._recorder is None:
             return
         try:
-            self._recorder.write(topic, t_ns, message)
+            self._recorder.write_encoded(topic, t_ns, data)
         except RecordingError as error:
             self._give_up(error)
         except Exception as error:

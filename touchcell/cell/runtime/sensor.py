@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from touchcell.cell.config.schema import CellPlan
+from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.recording.messages import belief_message, pose_message
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.protocols import FrameSource

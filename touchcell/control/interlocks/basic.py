@@ -315,7 +315,11 @@ class FrameAgeConfig(InterlockSettings):
 
 
 class ArmStateAgeConfig(SpatialInterlockConfig):
-    """Largest age of an arm state."""
+    """Largest age of an arm state.
+
+    Attributes:
+        limit_ms: largest age; an arm that is missing is a violation too.
+    """
 
     kind: Literal["arm_state_age"]
     limit_ms: PositiveFloat

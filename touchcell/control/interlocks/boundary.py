@@ -210,6 +210,13 @@ class WorkspaceConfig(GradedSettings):
 
     ``margin_mm`` is the free space around the box: a cell whose stopping distance may exceed it is refused. A point
     that was outside counts as inside again a fifth of the margin inside the box.
+
+    Attributes:
+        arm: role of the arm.
+        sensor: role of the sensor whose tip stays inside; none for the tool centre point of an arm without one.
+        min_mm: lower corner of the box in the arm's base frame.
+        max_mm: upper corner of the box.
+        margin_mm: free space around the box: a cell whose stopping distance may exceed it is refused.
     """
 
     kind: Literal["workspace"]
@@ -259,7 +266,14 @@ class WorkspaceConfig(GradedSettings):
 
 
 class TiltConfig(GradedSettings):
-    """Cone for the z axis of a sensor, or of the tool of an arm without one; ``direction`` is along base axes."""
+    """Cone for the z axis of a sensor, or of the tool of an arm without one; ``direction`` is along base axes.
+
+    Attributes:
+        arm: role of the arm.
+        sensor: role of the sensor whose axis stays in the cone; none for the tool's.
+        direction: axis of the cone along base axes.
+        limit_deg: half of the cone's opening.
+    """
 
     kind: Literal["tilt"]
     arm: str

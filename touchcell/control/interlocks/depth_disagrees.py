@@ -149,8 +149,13 @@ def _push(arm: ArmView, T_base_sensor: Array, now_ns: int) -> float:
 class DepthDisagreesConfig(GradedSettings):
     """Largest difference between the estimated depth and the depth by travel since first contact, or by force.
 
-    ``states`` are those in which the surface stands still. ``stiffness_n_mm`` of skin and surface adds the comparison
-    with the force, for arms that report a wrench, in every state.
+    Attributes:
+        limit_mm: largest difference.
+        hold_ms: time for which it may be exceeded.
+        slide_mm: sideways travel after which the reference is taken anew, at the estimated depth.
+        stiffness_n_mm: of skin and surface; adds the comparison with the force, in every state, for arms that report a
+            wrench.
+        states: task states in which the surface stands still.
     """
 
     kind: Literal["depth_disagrees"]

@@ -42,7 +42,12 @@ class _LargestShare:
 class ExternalTorqueConfig(GradedSettings):
     """Largest external torque of each joint of an arm, and how long it may be exceeded.
 
-    One limit counts for all joints. Missing torques are a fault.
+    Missing torques are a fault.
+
+    Attributes:
+        arm: role of the arm.
+        limit_nm: largest torque of each joint, or one number for all.
+        hold_ms: time for which it may be exceeded.
     """
 
     kind: Literal["external_torque"]

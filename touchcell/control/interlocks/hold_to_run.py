@@ -59,7 +59,11 @@ def _moves(arm: ArmView) -> bool:
 
 
 class HoldToRunConfig(InterlockSettings):
-    """Arms move only while an enabling device is held; ``limit_ms`` is the largest age of its position."""
+    """Arms move only while an enabling device is held.
+
+    Attributes:
+        limit_ms: largest age of its position.
+    """
 
     kind: Literal["hold_to_run"]
     limit_ms: PositiveFloat

@@ -39,8 +39,12 @@ class _Pressure:
 class PressureConfig(GradedSettings):
     """Largest contact force and pressure at every body region that the tool may touch.
 
-    The transient limits count at once, the quasi-static ones after half a second. ``contact_area_mm2`` is the smallest
-    area with which the tool can touch: that of its sharpest edge, not of its face.
+    The transient limits count at once, the quasi-static ones after half a second.
+
+    Attributes:
+        arm: role of the arm.
+        regions: body regions of ISO/TS 15066 that the tool may touch.
+        contact_area_mm2: smallest area with which the tool can touch: that of its sharpest edge, not of its face.
     """
 
     kind: Literal["pressure"]

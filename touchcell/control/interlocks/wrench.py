@@ -32,7 +32,14 @@ class _Norm:
 
 
 class WrenchConfig(GradedSettings):
-    """Largest force and torque on an arm's tool, and how long they may be exceeded. A missing wrench is a fault."""
+    """Largest force and torque on an arm's tool, and how long they may be exceeded. A missing wrench is a fault.
+
+    Attributes:
+        arm: role of the arm.
+        limit_n: largest norm of the force.
+        limit_nm: largest norm of the torque.
+        hold_ms: time for which either may be exceeded.
+    """
 
     kind: Literal["wrench"]
     arm: str

@@ -34,7 +34,7 @@ from touchcell.drivers.core.joint_setpoint import JointSetpoint
 from touchcell.drivers.core.protocols import StopCategory
 from touchcell.drivers.core.samples import JointState, Stamped
 from touchcell.drivers.core.spec import DriverConfig
-from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, SerialChain, Tool
+from touchcell.drivers.kinematics.chain import ChainDescription, ChainFile, DifferentialIk, SerialChain, Tool
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 from touchcell.logs import OncePerCause
@@ -69,7 +69,7 @@ class BusArmConfig(DriverConfig):
         on_disconnect: what an energised arm does when it is disconnected.
     """
 
-    chain: str
+    chain: ChainFile
     tool: Tool = Tool()
     rate_hz: Positive
     max_silence_s: Positive = 0.1

@@ -81,6 +81,10 @@ class SceneSection(BaseModel):
         """Build the scene; its motions start now."""
         raise NotImplementedError
 
+    def modules(self) -> Mapping[str, str]:
+        """Return the optional modules that it needs, each with the key that asks for it."""
+        return {}
+
 
 @dataclass(frozen=True, slots=True)
 class SceneSpec:

@@ -52,6 +52,7 @@ class Capabilities:
         falls_on_power_loss: whether the arm sinks when power is lost.
         hardware_validated: False while the driver has been tested with emulators only.
         virtual_time: whether the device runs on an injected clock; real hardware does not.
+        needs_scene: whether the device exists only in a simulated scene.
     """
 
     kind: str
@@ -66,6 +67,7 @@ class Capabilities:
     falls_on_power_loss: bool = False
     hardware_validated: bool = False
     virtual_time: bool = False
+    needs_scene: bool = False
 
     def __post_init__(self) -> None:
         require_protocols(self.provides)

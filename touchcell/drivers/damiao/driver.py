@@ -44,7 +44,7 @@ from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.damiao import codec
 from touchcell.drivers.damiao.bus import Address, MotorBus
 from touchcell.drivers.damiao.codec import Feedback, MitCommand, Register
-from touchcell.drivers.kinematics.chain import GRAVITY_M_S2, ChainDescription, SerialChain, Vector3
+from touchcell.drivers.kinematics.chain import GRAVITY_M_S2, ChainDescription, ChainFile, SerialChain, Vector3
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 
@@ -106,7 +106,7 @@ class DamiaoCanConfig(BusArmConfig):
     bitrate: int = Field(default=1_000_000, gt=0)
     data_bitrate: int = Field(default=5_000_000, gt=0)
 
-    chain: str = "generic_6r"
+    chain: ChainFile = "generic_6r"
     gravity_m_s2: Vector3 = GRAVITY_M_S2
     motors: tuple[MotorConfig, ...] = Field(min_length=1)
 

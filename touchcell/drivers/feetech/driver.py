@@ -43,7 +43,7 @@ from touchcell.drivers.feetech import codec
 from touchcell.drivers.feetech.bus import ServoBus
 from touchcell.drivers.feetech.codec import FaultBit, Register, ServoState
 from touchcell.drivers.kinematics.adjustment import Adjustment
-from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain
+from touchcell.drivers.kinematics.chain import ChainDescription, ChainFile, SerialChain
 from touchcell.drivers.kinematics.twist_projection import project_to_feasible
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
@@ -121,7 +121,7 @@ class FeetechSerialConfig(BusArmConfig):
     baudrate: int = Field(default=1_000_000, gt=0)
     echo: bool = False
 
-    chain: str = "so101_5r"
+    chain: ChainFile = "so101_5r"
     servos: tuple[ServoConfig, ...] = Field(min_length=1)
 
     rate_hz: Annotated[float, Field(ge=10.0, le=200.0)] = 50.0

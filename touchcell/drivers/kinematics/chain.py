@@ -26,6 +26,11 @@ from touchcell.drivers.kinematics.joint_limits import (
 from touchcell.errors import ConfigError
 from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.types import Array
+from touchcell.input_file import InputFile, files_in
+
+_CHAINS = Path(__file__).parent / "chains"
+ChainFile = Annotated[str, InputFile("a chain", files_in(_CHAINS, ".yaml"), suffixes=(".yaml", ".yml"))]
+"""Key of a driver that names a shipped chain or a YAML file with one."""
 
 Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -122,11 +127,10 @@ class ChainDescription(_Description):
     @classmethod
     def shipped(cls, name: str) -> ChainDescription:
         """Return a description shipped with touchcell. Raises ConfigError for an unknown name."""
-        folder = Path(__file__).parent / "chains"
-        known = sorted(path.stem for path in folder.glob("*.yaml"))
+        known = sorted(path.stem for path in _CHAINS.glob("*.yaml"))
         if name not in known:
             raise ConfigError(f"unknown chain {name!r}", key="chain", value=name, hint=f"known: {', '.join(known)}")
-        return cls.read(folder / f"{name}.yaml")
+        return cls.read(_CHAINS / f"{name}.yaml")
 
     @classmethod
     def named(cls, chain: str) -> ChainDescription:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -17,6 +18,7 @@ from touchcell.drivers.replay.dataset import natural_order, read_split
 from touchcell.errors import DataError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.input_file import InputFile
 
 
 class ReplayArmConfig(DriverConfig):
@@ -28,7 +30,7 @@ class ReplayArmConfig(DriverConfig):
         rate_hz: images per second.
     """
 
-    data: Path
+    data: Annotated[Path, InputFile("a data set", folder=True)]
     split: str
     rate_hz: float = Field(default=30.0, gt=0.0, le=1000.0)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.replay.dataset import IMAGE_FOLDER, natural_order
 from touchcell.geometry.types import ImageArray
+from touchcell.input_file import InputFile
 
 CAPABILITIES = Capabilities(
     kind="camera",
@@ -45,7 +47,7 @@ class ReplayCameraConfig(DriverConfig):
         rate_hz: images per second.
     """
 
-    data: Path
+    data: Annotated[Path, InputFile("a data set", folder=True)]
     split: str | None = None
     rate_hz: float = Field(default=30.0, gt=0.0, le=1000.0)
 

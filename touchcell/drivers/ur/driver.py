@@ -47,7 +47,7 @@ from touchcell.drivers.core.protocols import (
 )
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
-from touchcell.drivers.kinematics.chain import ChainDescription, DifferentialIk, LocalIk, SerialChain, Tool
+from touchcell.drivers.kinematics.chain import ChainDescription, ChainFile, DifferentialIk, LocalIk, SerialChain, Tool
 from touchcell.drivers.ur import codec as ur_codec
 from touchcell.drivers.ur.control import ControlLink
 from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyMode, power_fault, program_fault, safety_fault
@@ -95,7 +95,7 @@ class UrConfig(DriverConfig):
 
     host: str = Field(min_length=1)
     flange_to_tcp_mm_deg: tuple[float, float, float, float, float, float]
-    chain: str = "ur5e"
+    chain: ChainFile = "ur5e"
     limits: LimitsConfig = LimitsConfig()
     joint_limits: JointLimitsConfig = JointLimitsConfig()
     stop_accel_m_s2: Annotated[float, Field(gt=0.0, le=10.0)] = 3.0
@@ -141,7 +141,9 @@ class UrArm(Arm):
     """
 
     def __init__(self, name: str, config: UrConfig, clock: Clock) -> None:
-        super().__init__(name, clock, config.limits.build(), stop_categories=_STOPS)
+        super().__init__(
+            name, clock, config.limits.build(), stop_categories=_STOPS, max_state_age_s=config.state_timeout_s
+        )
         self._config = config
         self._flange_to_tcp = _pose_vector(se3.from_euler_mm_deg(np.array(config.flange_to_tcp_mm_deg)))
         self._chain = config.described_chain()

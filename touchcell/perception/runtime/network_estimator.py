@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
 
-from pydantic import PositiveFloat
+from pydantic import PositiveFloat, model_validator
 
 from touchcell.errors import ConfigError
+from touchcell.input_file import BUILTIN, InputFile, files_in
 from touchcell.paths import MODELS
 from touchcell.perception.runtime.estimator_spec import EstimatorConfig, EstimatorContext, EstimatorSpec
 from touchcell.perception.runtime.filter_spec import FilterSection
@@ -16,7 +17,13 @@ from touchcell.plugin_section import Section
 if TYPE_CHECKING:
     from touchcell.perception.runtime.pipeline import ContactPipeline
 
-BUILTIN: Final = "builtin:"
+_MODEL: Final = InputFile(
+    "a model file",
+    files_in(MODELS, ".safetensors"),
+    BUILTIN,
+    hint="`touchcell train --data DIR --out NAME.safetensors` writes one, --model names another",
+)
+_CALIBRATION: Final = InputFile("a calibration file", hint="`touchcell calibrate` writes one")
 
 
 class GateConfig(Section):
@@ -30,6 +37,15 @@ class GateConfig(Section):
     touch_percent: PositiveFloat
     release_percent: PositiveFloat
 
+    @model_validator(mode="after")
+    def _hysteresis(self) -> Self:
+        if self.release_percent >= self.touch_percent:
+            raise ValueError(
+                f"release_percent {self.release_percent:g} is not below touch_percent {self.touch_percent:g}: "
+                "a contact would end as it begins"
+            )
+        return self
+
 
 class NetworkEstimator(EstimatorConfig):
     """Image -> network -> filter. ``calibration`` is a file of ``touchcell calibrate``.
@@ -42,8 +58,8 @@ class NetworkEstimator(EstimatorConfig):
     """
 
     kind: Literal["network"]
-    model: str
-    calibration: str | None = None
+    model: Annotated[str, _MODEL]
+    calibration: Annotated[str | None, _CALIBRATION] = None
     gate: GateConfig | None = None
     filter: FilterSection | None = None
 

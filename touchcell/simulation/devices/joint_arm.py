@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -35,6 +35,7 @@ from touchcell.drivers.kinematics.inverse import joints_for_pose
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.input_file import InputFile
 from touchcell.simulation.scene import Scene, physics_engine
 from touchcell.simulation.timeline import DEFAULT_STEP_S, Phase, Timeline
 
@@ -90,7 +91,7 @@ class SimJointArmConfig(DriverConfig):
     joint_limits: JointLimitsConfig = JointLimitsConfig()
     max_ttl_s: float = Field(default=1.0, gt=0.0, le=10.0)
     physics_step_ms: float = Field(default=1.0, ge=0.05, le=2.0)
-    menagerie: str | None = Field(
+    menagerie: Annotated[str | None, InputFile("a checkout of MuJoCo Menagerie", folder=True)] = Field(
         default=None,
         description="checkout of MuJoCo Menagerie whose arm to use, else $MENAGERIE_ROOT; rods if neither is set",
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -17,10 +17,12 @@ from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
+from touchcell.input_file import InputFile, files_in
 from touchcell.simulation.faults import FrameFaults
 from touchcell.simulation.render import FrameRenderer, Lighting
 from touchcell.simulation.scene import Carrier, LoadReceiver, MeasuredCarrier, Scene
 from touchcell.simulation.tip import Tip
+from touchcell.simulation.tip_file import SHIPPED as TIPS
 from touchcell.simulation.tip_file import load_tip
 
 CAPABILITIES = Capabilities(
@@ -28,6 +30,7 @@ CAPABILITIES = Capabilities(
     provides=frozenset({FrameSource, HealthSource}),
     state_rate_hz=30.0,
     virtual_time=True,
+    needs_scene=True,
 )
 
 _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
@@ -61,7 +64,10 @@ class SimTactipConfig(DriverConfig):
     exposure: float = Field(default=1.0, gt=0.0, le=10.0)
     blur_px: float = Field(default=0.0, ge=0.0, le=20.0)
     dropped: float = Field(default=0.0, ge=0.0, le=0.9)
-    tip: str | None = None
+    tip: Annotated[
+        str | None,
+        InputFile("a tip file", files_in(TIPS, ".yaml"), hint="`touchcell calibrate-sim` writes one"),
+    ] = None
     output: Literal["raw", "processed"] = "raw"
 
 

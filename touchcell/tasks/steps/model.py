@@ -25,7 +25,7 @@ from pydantic_core import CoreSchema
 
 from touchcell.errors import suggest
 from touchcell.tasks.contact_servo import ContactServoConfig, Six, SixGains
-from touchcell.tasks.interface import TaskConfig
+from touchcell.tasks.interface import CONTACT_DEPTH, DEPTH, DISTANCE, SPEED, TaskConfig
 
 Three = tuple[float, float, float]
 NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
@@ -44,7 +44,7 @@ class Until(TaskConfig):
     """
 
     contact: bool | None = None
-    depth_mm: PositiveFloat | None = None
+    depth_mm: Annotated[PositiveFloat | None, DEPTH] = None
     distance_mm: PositiveFloat | None = None
     time_s: PositiveFloat | None = None
 
@@ -95,7 +95,7 @@ class Move(_Step):
     by_mm_deg: Six | Three | None = None
     velocity_mm_deg_s: Six | None = None
     frame: Literal["base", "tool", "sensor", "contact"] = "sensor"
-    speed_mm_s: PositiveFloat = 20.0
+    speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
     turn_deg_s: PositiveFloat = 20.0
     until: Until | None = None
     tolerance_mm: PositiveFloat = 0.2
@@ -128,8 +128,8 @@ class Servo(_Step):
     """
 
     kind: Literal["servo"] = "servo"
-    reference_mm_deg: Six | None = None
-    depth_mm: PositiveFloat | None = None
+    reference_mm_deg: Annotated[Six | None, CONTACT_DEPTH] = None
+    depth_mm: Annotated[PositiveFloat | None, DEPTH] = None
     velocity_mm_deg_s: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     until: Until
     timeout_s: PositiveFloat = 60.0
@@ -167,8 +167,8 @@ class Retract(_Step):
     """
 
     kind: Literal["retract"] = "retract"
-    distance_mm: PositiveFloat
-    speed_mm_s: PositiveFloat = 20.0
+    distance_mm: Annotated[PositiveFloat, DISTANCE]
+    speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
     timeout_s: PositiveFloat = 30.0
 
 

@@ -1,0 +1,199 @@
+"""What a valid cell file would still be refused for by ``touchcell run``, or would surely trip or fail on."""
+
+from __future__ import annotations
+
+import importlib.util
+import struct
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from pydantic import BaseModel
+
+from touchcell.cell.config.yaml_file import KeyPath, YamlFile
+from touchcell.drivers.core.arm import LimitsConfig
+from touchcell.drivers.core.scene import scene_section
+from touchcell.errors import ConfigError, suggest
+from touchcell.geometry import se3
+from touchcell.input_file import BUILTIN
+from touchcell.tasks.interface import Demand
+
+if TYPE_CHECKING:
+    from touchcell.cell.config.cell_plan import CellPlan
+
+# Numbers that are equal but for rounding are no contradiction.
+_SLACK: Final = 1.0 + 1e-9
+_LONGEST_HEADER: Final = 100 << 20
+
+
+def unfeasible(file: YamlFile, plan: CellPlan) -> list[ConfigError]:
+    """Return one problem for everything that ``plan`` would be refused for, or would surely trip or fail on."""
+    return [
+        *_models(file, plan),
+        *_scene(file, plan),
+        *_interlock_sensors(file, plan),
+        *_depths(file, plan),
+        *_speeds(file, plan),
+        *_distances(file, plan),
+        *_starts(file, plan),
+    ]
+
+
+def _models(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Files of models that are no models. Their names and places are checked with all other input files."""
+    for name in plan.sensors:
+        model = getattr(plan.cell.sensors[name].estimator, "model", None)
+        if isinstance(model, str) and not model.startswith(BUILTIN) and not _is_safetensors(Path(model)):
+            at = ("sensors", name, "estimator", "model")
+            hint = "a model file is what `touchcell train --data DIR --out NAME.safetensors` writes"
+            yield file.problem(at, "is no model file", value=model, hint=hint)
+
+
+def _is_safetensors(path: Path) -> bool:
+    """Whether the file begins with a safetensors header: its length and a JSON object."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(9)
+            size = path.stat().st_size
+    except OSError:
+        return False
+    length = struct.unpack("<Q", head[:8])[0] if len(head) == 9 else 0
+    return 2 <= length <= min(_LONGEST_HEADER, size - 8) and head[8:] == b"{"
+
+
+def _scene(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    if plan.cell.scene is None:
+        for device in {**plan.arms, **plan.sensors}.values():
+            if device.spec.capabilities.needs_scene:
+                kind = "arms" if device.name in plan.arms else "sensors"
+                hint = "add `scene:`, e.g. {surfaces: {plane: {kind: plane}}}"
+                yield file.problem((kind, device.name, "driver"), f"{device.spec.name} needs a scene", hint=hint)
+        return
+    section = scene_section().model_validate(plan.cell.scene)
+    for module, key in section.modules().items():
+        if importlib.util.find_spec(module) is None:
+            hint = "pip install 'touchcell[physics]'"
+            yield file.problem(("scene", key), f"needs {module}, which is not installed", hint=hint)
+
+
+def _interlock_sensors(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    for name, entry in plan.cell.interlocks.items():
+        role = getattr(entry, "sensor", None)
+        if isinstance(role, str) and role not in plan.sensor_roles:
+            known = sorted(plan.sensor_roles)
+            hint = suggest(role, known, otherwise="its sensors are") if known else "leave out `sensor:`"
+            at = ("interlocks", name, "sensor")
+            yield file.problem(at, f"the task has no sensor {role!r}", value=role, hint=hint)
+
+
+def _depths(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    limits = _limits(plan, "depth", "limit_mm")
+    if not limits:
+        return
+    rule, limit_mm = min(limits.items(), key=lambda each: each[1])
+    for key, depth_mm in _demands(plan.task_config, "depth"):
+        if depth_mm >= limit_mm:
+            yield file.problem(
+                ("task", *key),
+                f"{depth_mm:g} mm is not below the limit of interlocks.{rule}, {limit_mm:g} mm, which would trip",
+                value=depth_mm,
+                hint=f"press less deep, or raise interlocks.{rule}.limit_mm as far as the sensor allows",
+            )
+
+
+def _speeds(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    """Speeds that no arm of the task may have. (Which of several arms a speed is of, its task knows alone.)"""
+    bounds = {
+        f"arms.{device.name}.limits.tcp_speed_m_s": 1e3 * limits.tcp_speed_m_s
+        for device in plan.arms.values()
+        if isinstance(limits := getattr(device.config, "limits", None), LimitsConfig)
+    }
+    rules = {f"interlocks.{name}.limit_m_s": 1e3 * m_s for name, m_s in _limits(plan, "tcp_speed", "limit_m_s").items()}
+    for key, speed_mm_s in _demands(plan.task_config, "speed"):
+        for group, reason in ((bounds, "is more than any arm may move"), (rules, "would trip")):
+            if not group:
+                continue
+            bound, limit_mm_s = max(group.items(), key=lambda each: each[1])
+            if speed_mm_s > limit_mm_s * _SLACK:
+                yield file.problem(
+                    ("task", *key),
+                    f"{speed_mm_s:g} mm/s {reason}: {bound} is {limit_mm_s:g} mm/s",
+                    value=speed_mm_s,
+                    hint=f"at most {limit_mm_s:g} mm/s",
+                )
+                break
+
+
+def _distances(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    boxes: list[Any] = [box for box in plan.cell.interlocks.values() if _is_kind(box, "workspace")]
+    if not boxes:
+        return
+    longest_mm = max(float(np.linalg.norm(np.subtract(box.max_mm, box.min_mm))) for box in boxes)
+    for key, distance_mm in _demands(plan.task_config, "distance"):
+        if distance_mm > longest_mm * _SLACK:
+            yield file.problem(
+                ("task", *key),
+                f"{distance_mm:g} mm is longer than the largest workspace, {longest_mm:.0f} mm from corner to corner",
+                value=distance_mm,
+                hint="go less far, or make the workspace larger",
+            )
+
+
+def _starts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    boxes: dict[str, Any] = {rule: box for rule, box in plan.cell.interlocks.items() if _is_kind(box, "workspace")}
+    for rule, box in boxes.items():
+        name = plan.arm_roles.get(box.arm, box.arm)
+        start = getattr(plan.arms[name].config, "start_pose_mm_deg", None) if name in plan.arms else None
+        if start is None:
+            continue
+        T = se3.from_euler_mm_deg(start)
+        sensor = plan.sensor_roles.get(box.sensor or "")
+        if sensor is not None:
+            T = T @ plan.cell.sensors[sensor].T_tcp_sensor
+        at_mm = 1e3 * T[:3, 3]
+        outside = [
+            f"{axis} = {value:g} mm, limit {low if value < low else high:g} mm"
+            for axis, value, low, high in zip("xyz", at_mm.round(3), box.min_mm, box.max_mm, strict=True)
+            if not low <= value <= high
+        ]
+        if outside:
+            point = "the tool" if sensor is None else f"{sensor!r}"
+            yield file.problem(
+                ("arms", name, "start_pose_mm_deg"),
+                f"{point} is outside interlocks.{rule} there, which would trip at once: {'; '.join(outside)}",
+                value=start,
+                hint="start inside, or make the workspace larger",
+            )
+
+
+def _limits(plan: CellPlan, kind: str, key: str) -> Mapping[str, float]:
+    """Limit of each interlock of ``kind``, by the name of the interlock."""
+    entries = {name: entry for name, entry in plan.cell.interlocks.items() if _is_kind(entry, kind)}
+    return {name: float(getattr(entry, key)) for name, entry in entries.items()}
+
+
+def _is_kind(entry: Any, kind: str) -> bool:
+    return bool(getattr(entry, "kind", "") == kind)
+
+
+def _demands(config: Any, quantity: str, at: KeyPath = ()) -> Iterator[tuple[KeyPath, float]]:
+    """What a task's parameters ask for, with the key of each; steps of a task are wrapped in their own names."""
+    if isinstance(config, list | tuple):
+        for index, each in enumerate(config):
+            yield from _demands(each, quantity, (*at, index, *_wrapper(each)))
+    if not isinstance(config, BaseModel):
+        return
+    for name, info in type(config).model_fields.items():
+        value = getattr(config, name)
+        demand = next((each for each in info.metadata if isinstance(each, Demand)), None)
+        if demand is None:
+            yield from _demands(value, quantity, (*at, name))
+        elif demand.quantity == quantity and value is not None:
+            numbers = value if isinstance(value, tuple) else (value,)
+            yield (*at, name), float(max(numbers) if demand.item is None else numbers[demand.item])
+
+
+def _wrapper(step: Any) -> KeyPath:
+    kind = getattr(step, "kind", None)
+    return (kind,) if isinstance(kind, str) else ()

@@ -1,0 +1,161 @@
+"""A ring of messages in a file of fixed size that outlives its writer: a kill, a crash, a full disk.
+
+The file's blocks are allocated before the first message, and each message is handed to the kernel in one call: what was
+added is in the file whatever becomes of the process, and no message needs room on the disk. (Writing through a mapping
+would be as lasting, but ends the process by SIGBUS where the file is truncated or its blocks are copied on write.)
+
+The ring is a row of segments. Records follow each other within a segment, each with a running number and a checksum; a
+reader takes a segment's records as long as both fit, so neither torn records nor those of an earlier round are read.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from touchcell.cell.errors import RecordingError
+from touchcell.cell.recording.mcap import Message
+
+_MAGIC: Final = b"tchring1"
+_HEAD: Final = struct.Struct("<8sIIII")
+_HEAD_BYTES: Final = 4096
+_RECORD: Final = struct.Struct("<IIQqH")
+_SEGMENTS: Final = 16
+_LEAST_SEGMENT: Final = 16 * 1024
+_LONGEST_TOPIC: Final = 0xFFFF
+
+
+class RingWriter:
+    """Writes a ring, which is made anew.
+
+    Args:
+        path: the file; None keeps the ring in this process's memory only.
+        size: bytes of all segments; less, down to 256 KiB, where the disk has not four times as much.
+        about: what the ring is of, up to about 4000 bytes of JSON.
+
+    Raises:
+        RecordingError: the file cannot be made, or the disk has no room for it.
+    """
+
+    def __init__(self, path: Path | None, size: int, about: Mapping[str, Any]) -> None:
+        self.path = path
+        self._number = 0
+        self._segment = self._at = 0
+        self._failed = False
+        try:
+            if path is None:
+                self._fd = os.memfd_create("touchcell-ring", os.MFD_CLOEXEC)
+            else:
+                self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+                disk = os.fstatvfs(self._fd)
+                size = min(size, disk.f_bavail * disk.f_frsize // 4)
+            self._segment_bytes = max(size // _SEGMENTS, _LEAST_SEGMENT)
+            os.posix_fallocate(self._fd, 0, _HEAD_BYTES + _SEGMENTS * self._segment_bytes)
+            told = json.dumps(about, default=str).encode()[: _HEAD_BYTES - _HEAD.size]
+            head = _HEAD.pack(_MAGIC, _SEGMENTS, self._segment_bytes, len(told), zlib.crc32(told))
+            os.pwrite(self._fd, head + told, 0)
+        except OSError as error:
+            raise RecordingError(
+                path or Path("memory"), f"cannot be made: {error.strerror}", hint="free some space"
+            ) from None
+
+    @property
+    def failed(self) -> bool:
+        """Whether a write has failed; nothing more is written then."""
+        return self._failed
+
+    def add(self, topic: str, t_ns: int, data: bytes) -> None:
+        """Append one message; one that is longer than a segment, or comes after a failure, is left out."""
+        name = topic.encode()[:_LONGEST_TOPIC]
+        length = len(name) + len(data)
+        whole = _RECORD.size + length
+        if self._failed or whole > self._segment_bytes:
+            return
+        if self._at + whole > self._segment_bytes:
+            self._segment, self._at = (self._segment + 1) % _SEGMENTS, 0
+        self._number += 1
+        head = _RECORD.pack(0, length, self._number, t_ns, len(name))[4:]
+        body = head + name + data
+        record = zlib.crc32(body).to_bytes(4, "little") + body
+        try:
+            os.pwrite(self._fd, record, _HEAD_BYTES + self._segment * self._segment_bytes + self._at)
+        except OSError:
+            self._failed = True
+        self._at += whole
+
+    def sync(self) -> None:
+        """Have the disk keep it, for the case that the power fails too."""
+        if self.path is not None and not self._failed:
+            try:
+                os.fdatasync(self._fd)
+            except OSError:
+                self._failed = True
+
+    def messages(self) -> list[Message]:
+        """What is in it, oldest first."""
+        return _messages(self._fd, _SEGMENTS, self._segment_bytes)
+
+    def close(self) -> None:
+        """Let go of the file, which stays; again does nothing."""
+        if self._fd >= 0:
+            fd, self._fd = self._fd, -1
+            os.close(fd)
+
+
+def read_ring(path: Path) -> tuple[dict[str, Any], list[Message]]:
+    """What a ring is of, and its messages, oldest first.
+
+    Raises:
+        RecordingError: ``path`` is missing or no ring.
+    """
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError as error:
+        raise RecordingError(path, f"cannot be read: {error.strerror}") from None
+    try:
+        head = os.pread(fd, _HEAD_BYTES, 0)
+        if len(head) < _HEAD.size or not head.startswith(_MAGIC):
+            raise RecordingError(path, "is no black box")
+        _, segments, segment_bytes, length, check = _HEAD.unpack_from(head)
+        told = head[_HEAD.size : _HEAD.size + length]
+        about = _parsed(told) if zlib.crc32(told) == check else None
+        if segments * segment_bytes > os.fstat(fd).st_size:
+            raise RecordingError(path, "is damaged: its head does not fit its size")
+        return about or {}, _messages(fd, segments, segment_bytes)
+    except OSError as error:
+        raise RecordingError(path, f"cannot be read: {error.strerror}") from None
+    finally:
+        os.close(fd)
+
+
+def _messages(fd: int, segments: int, segment_bytes: int) -> list[Message]:
+    found: list[tuple[int, Message]] = []
+    for k in range(segments):
+        segment = os.pread(fd, segment_bytes, _HEAD_BYTES + k * segment_bytes)
+        at, expected = 0, None
+        while at + _RECORD.size <= len(segment):
+            check, length, number, t_ns, name_length = _RECORD.unpack_from(segment, at)
+            end = at + _RECORD.size + length
+            if end > len(segment) or name_length > length or number != (expected or number) or number == 0:
+                break
+            if zlib.crc32(segment[at + 4 : end]) != check:
+                break
+            name, data = segment[at + _RECORD.size :][:name_length], segment[at + _RECORD.size + name_length : end]
+            message = _parsed(data)
+            if message is not None:
+                found.append((number, Message(name.decode(errors="replace"), t_ns, message)))
+            at, expected = end, number + 1
+    return [message for _, message in sorted(found, key=lambda each: each[0])]
+
+
+def _parsed(data: bytes) -> dict[str, Any] | None:
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError):
+        return None
+    return value if isinstance(value, dict) else None
