@@ -224,7 +224,7 @@ class Impatient(RuleBasedStateMachine):
     def start(self, category: int) -> None:
         cell = waiting_cell(max_duration_s=100.0)
         cell["arms"]["arm"]["stop_category"] = category
-        cell["task"]["distance_mm"] = 1000
+        cell["task"]["distance_mm"] = 400
         self.run = OperatedRun(Path(self.folder.name), cell)
         self.allowed = True
         follow = self.run.arm._body.follow
