@@ -193,3 +193,8 @@ def test_the_healthy_cell_is_fresh_at_rest_and_without_contact() -> None:
     assert not view.arms["arm"].state.value.twist.any()
     assert not view.sensors["sensor"].in_contact
     assert view.sensors["sensor"].arm == "arm"
+
+
+def test_a_proof_logs_no_trips(caplog: pytest.LogCaptureFixture) -> None:
+    proven(ProvableConfig())
+    assert caplog.records == []

@@ -64,9 +64,14 @@ class ResetRefused:
 
 
 class Latch:
-    """Latch for violations. Not thread-safe."""
+    """Latch for violations. Not thread-safe.
 
-    def __init__(self) -> None:
+    Args:
+        logger: of causes and resets.
+    """
+
+    def __init__(self, logger: logging.Logger = _logger) -> None:
+        self._logger = logger
         self._state = LatchState.CLEAR
         self._causes: dict[tuple[str, str], Violation] = {}
         self._present = False
@@ -103,7 +108,7 @@ class Latch:
             if key not in self._causes:
                 self._causes[key] = violation
                 kind = violation.severity.name.lower()
-                _logger.warning("%s: %s: %s: %s", kind, violation.interlock, violation.subject, violation.reason)
+                self._logger.warning("%s: %s: %s: %s", kind, violation.interlock, violation.subject, violation.reason)
             self._latest_ns = max(self._latest_ns, violation.t_ns)
             if violation.severity is Severity.FAULT:
                 self._state = LatchState.FAULTED
@@ -129,7 +134,7 @@ class Latch:
             if applies:
                 return ResetRefused(reason)
         done = ResetDone(token.operator, self.causes)
-        _logger.info("reset by %s", token.operator)
+        self._logger.info("reset by %s", token.operator)
         self._state = LatchState.CLEAR
         self._causes.clear()
         self._used = token
