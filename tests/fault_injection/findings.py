@@ -30,6 +30,7 @@ from tests.fault_injection import fuzz_cells, fuzz_recordings
 from tests.helpers.operated_run import OperatedRun, waiting_cell
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.recording.mcap import Damage, read
 from touchcell.cell.runtime.black_box import read_left_ring
 from touchcell.cell.runtime.operator_channel import OperatorChannel
@@ -75,8 +76,7 @@ def _shipped(cell: str = "surface_follow_sim", **changes: Any) -> dict[str, Any]
 
 
 def _true_contact(data: dict[str, Any]) -> dict[str, Any]:
-    for sensor in data["sensors"].values():
-        sensor["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(data)
     return data
 
 

@@ -104,7 +104,7 @@ def _time_us(call: Callable[[int], object]) -> float:
 def _review_us(
     section: Mapping[str, Any], views: Sequence[CellView], planning_scene: PlanningScene | None = None
 ) -> float:
-    poses = {role: np.eye(4) for role in ("sensor", "leader_sensor", "follower_sensor")}
+    poses = {role: np.eye(4) for role in views[0].sensors}
     supervisor = Supervisor(build_interlocks(parse_interlocks(section), poses, planning_scene), Latch())
     median_us = _time_us(lambda k: supervisor.review(views[k]))
     assert supervisor.latch.first_cause is None, supervisor.latch.first_cause

@@ -119,7 +119,7 @@ def test_an_arm_that_ignores_every_command_still_leaves_a_black_box(
 
 def test_limited_tells_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = yaml.safe_load(SHIPPED.read_text())
-    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(data)
     data["arms"]["arm"]["limits"] |= {"tcp_rot_accel_rad_s2": 0.01}
     cell, folder = tmp_path / "cell.yaml", tmp_path / "run"
     cell.write_text(yaml.safe_dump(data))

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED
 from touchcell.cell.cli.main import main
+from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording import mcap
 from touchcell.cell.recording.mcap import encode, read
@@ -29,7 +30,7 @@ DIE_AT = 900
 
 def true_contact_cell(folder: Path, **changes: Any) -> Path:
     data = yaml.safe_load((CONFIGS / "surface_follow_sim.yaml").read_text())
-    data["sensors"]["sensor"]["estimator"] = {"kind": "true_contact"}
+    put_on_true_contact(data)
     data |= changes
     path = folder / "cell.yaml"
     path.write_text(yaml.safe_dump(data))

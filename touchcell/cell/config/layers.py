@@ -7,17 +7,20 @@ left out. Each key remembers the file and line, or the option, that it comes fro
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from touchcell.cell.config.settings import with_settings
+from touchcell.cell.config.true_contact import answerable
 from touchcell.cell.config.yaml_file import KeyPath, YamlFile, load
 
 EXTENDS: Final = "extends"
 PRIVATE: Final = "x-"
 OPTION: Final = Path("--set")
 _MOST_LAYERS: Final = 8
+_logger = logging.getLogger(__name__)
 
 
 def load_layers(path: Path, settings: Mapping[str, Any] | None = None) -> YamlFile:
@@ -25,7 +28,8 @@ def load_layers(path: Path, settings: Mapping[str, Any] | None = None) -> YamlFi
 
     Args:
         path: the cell file.
-        settings: values in place of the files' own, by dotted key.
+        settings: values in place of the files' own, by dotted key. With another estimator go the interlocks that only
+            the one before could answer.
 
     Raises:
         ConfigError: as ``yaml_file.load``; ``extends`` is no path, leads in a circle or too far; a setting's key leads
@@ -39,7 +43,19 @@ def load_layers(path: Path, settings: Mapping[str, Any] | None = None) -> YamlFi
         at = tuple(int(part) if part.isdigit() else part for part in key.split("."))
         lines = {known: line for known, line in lines.items() if known[: len(at)] != at} | {at: 0}
         sources = {known: source for known, source in sources.items() if known[: len(at)] != at} | {at: OPTION}
-    return YamlFile(path, with_settings(merged.data, settings), lines, sources)
+    data = with_settings(merged.data, settings)
+    if any(key.endswith(".estimator") for key in settings):
+        data = _without_unanswered(data)
+    return YamlFile(path, data, lines, sources)
+
+
+def _without_unanswered(data: dict[str, Any]) -> dict[str, Any]:
+    """Return ``data`` without interlocks that no estimator of it answers any more, and say which those are."""
+    interlocks, kept = data.get("interlocks"), answerable(data)
+    left = sorted(str(name) for name in interlocks if name not in kept) if isinstance(interlocks, Mapping) else []
+    if left:
+        _logger.warning("left out with the estimator that they ask: interlocks %s", ", ".join(left))
+    return {**data, "interlocks": kept} if left else data
 
 
 def explain(file: YamlFile) -> str:

@@ -27,8 +27,17 @@ def answerable(data: Mapping[str, Any]) -> dict[str, Any]:
     Standard deviations, training ranges, innovations and markers are reported by networks only, and the true contact
     comes without images. A cell with such an interlock would be refused.
     """
-    kinds = {sensor["estimator"]["kind"] for sensor in data.get("sensors", {}).values()}
+    sensors, interlocks = data.get("sensors"), data.get("interlocks")
+    if not isinstance(sensors, Mapping) or not isinstance(interlocks, Mapping):
+        return dict(interlocks) if isinstance(interlocks, Mapping) else {}
+    kinds = {_kind(sensor.get("estimator")) for sensor in sensors.values() if isinstance(sensor, Mapping)}
     unanswered = set() if "network" in kinds else set(_OF_NETWORKS)
     if not kinds & {"network", "known_surface"}:
         unanswered |= _OF_IMAGES
-    return {name: entry for name, entry in data.get("interlocks", {}).items() if entry["kind"] not in unanswered}
+    return {name: entry for name, entry in interlocks.items() if _kind(entry) not in unanswered}
+
+
+def _kind(section: Any) -> str:
+    """Return the ``kind`` of a section, empty where a file that is not checked yet names none."""
+    kind = section.get("kind") if isinstance(section, Mapping) else None
+    return kind if isinstance(kind, str) else ""
