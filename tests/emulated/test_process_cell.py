@@ -80,6 +80,7 @@ def nothing_is_left_behind() -> Iterator[None]:
 def separate_cell(tmp_path: Path, **changes: Any) -> Path:
     data = yaml.safe_load(SHIPPED.read_text()) | {"time": "real", "processes": "separate", "rate_hz": RATE_HZ} | changes
     data["arms"]["arm"]["limits"]["tcp_speed_m_s"] = 0.03
+    data["interlocks"]["tcp_speed"]["limit_m_s"] = 0.085
     path = tmp_path / "cell.yaml"
     path.write_text(yaml.safe_dump(data))
     return path
@@ -381,6 +382,7 @@ def test_the_ground_truth_of_a_scene_in_a_host_is_published_and_recorded(tmp_pat
     data = yaml.safe_load((SHIPPED.parent / "single_push_sim.yaml").read_text())
     data |= {"time": "real", "processes": "separate", "rate_hz": RATE_HZ}
     data["arms"]["arm"]["limits"]["tcp_speed_m_s"] = 0.03
+    data["interlocks"]["tcp_speed"]["limit_m_s"] = 0.085
     put_on_true_contact(data)
     path = tmp_path / "cell.yaml"
     path.write_text(yaml.safe_dump(data))

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import yaml
@@ -15,6 +15,7 @@ import yaml
 from touchcell.cell.config.cell_plan import CellFile, CellPlan, DevicePlan
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.true_contact import answerable
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.drivers.core.spec import DRIVERS
@@ -24,6 +25,16 @@ from touchcell.testing.emulation.process import EmulatorProcess
 SPEED_M_S: Final = 0.03
 PERIOD_S: Final = 2.0
 EMULATORS: Final = "emulators.json"
+
+
+_BOX = {"kind": "workspace", "min_mm": [-500, -200, 0], "max_mm": [500, 200, 400], "margin_mm": 60}
+# What each arm that moves must have; lax, so that the watchdog chain is what finds a fault.
+_INTERLOCKS: Final[Mapping[str, Any]] = {
+    "left_box": {**_BOX, "arm": "left"},
+    "right_box": {**_BOX, "arm": "right"},
+    "speed": {"kind": "tcp_speed", "limit_m_s": 0.25, "limit_rad_s": 1.2},
+    "stale_arm": {"kind": "arm_state_age", "limit_ms": 900},
+}
 
 
 class Sway:
@@ -96,6 +107,7 @@ def two_arm_plan(
             "processes": processes,
             "on_trip": on_trip,
             "arms": arms,
+            "interlocks": _INTERLOCKS,
             "task": {"name": SPEC.name},
         }
     )
@@ -132,6 +144,7 @@ def pushing_plan(folder: Path, rate_hz: float) -> CellPlan:
         }
         for name, sensor in data["sensors"].items()
     }
+    data["interlocks"] = answerable(data)
     path = folder / "cell.yaml"
     path.write_text(yaml.safe_dump(data))
     return plan_cell(path)
