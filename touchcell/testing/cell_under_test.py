@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from os import PathLike
@@ -96,9 +97,9 @@ class CellUnderTest:
     def __repr__(self) -> str:
         return f"<CellUnderTest {self.plan.cell.name!r}: {self.state} after {self.t_s:.3f} s>"
 
-    def add(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
+    def add(self, topic: str, t_ns: int, data: bytes) -> None:
         """Keep one message; called by the run loop."""
-        self.messages.append(Message(topic, t_ns, data))
+        self.messages.append(Message(topic, t_ns, json.loads(data)))
 
     # What is the case.
 

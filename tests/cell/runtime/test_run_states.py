@@ -122,7 +122,7 @@ class Watched:
         self.told: list[str] = []
         self.while_stopping: Callable[[], None] | None = None
         cell = waiting_cell(max_duration_s=30.0)
-        cell["task"]["distance_mm"] = 1000
+        cell["task"]["distance_mm"] = 400
         self.run = OperatedRun(folder, cell, box=self)
         self.state = lambda: self.run.loop.state
         follow, stop = self.run.arm._body.follow, self.run.arm.stop

@@ -6,7 +6,7 @@ import importlib.util
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from pydantic import BaseModel
@@ -19,15 +19,46 @@ from touchcell.geometry import se3
 from touchcell.input_file import BUILTIN
 from touchcell.tasks.interface import Demand
 
-if TYPE_CHECKING:
-    from touchcell.cell.config.schema import CellPlan
-
 # Numbers that are equal but for rounding are no contradiction.
 _SLACK: Final = 1.0 + 1e-9
 _LONGEST_HEADER: Final = 100 << 20
 
 
-def unfeasible(file: YamlFile, plan: CellPlan) -> list[ConfigError]:
+class Planned(Protocol):
+    """What is needed of a plan: the file's sections, the devices and roles of the task, and its parameters."""
+
+    @property
+    def cell(self) -> Any:
+        """The cell file's own sections."""
+        ...
+
+    @property
+    def arms(self) -> Mapping[str, Any]:
+        """Plans of the task's arms, by name."""
+        ...
+
+    @property
+    def sensors(self) -> Mapping[str, Any]:
+        """Plans of the task's sensors, by name."""
+        ...
+
+    @property
+    def arm_roles(self) -> Mapping[str, str]:
+        """Role in the task -> name in the cell."""
+        ...
+
+    @property
+    def sensor_roles(self) -> Mapping[str, str]:
+        """Role in the task -> name in the cell."""
+        ...
+
+    @property
+    def task_config(self) -> BaseModel:
+        """The task's parameters."""
+        ...
+
+
+def unfeasible(file: YamlFile, plan: Planned) -> list[ConfigError]:
     """Return one problem for everything that ``plan`` would be refused for, or would surely trip or fail on."""
     return [
         *_models(file, plan),
@@ -40,7 +71,7 @@ def unfeasible(file: YamlFile, plan: CellPlan) -> list[ConfigError]:
     ]
 
 
-def _models(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+def _models(file: YamlFile, plan: Planned) -> Iterator[ConfigError]:
     """Files of models that are no models. Their names and places are checked with all other input files."""
     for name in plan.sensors:
         model = getattr(plan.cell.sensors[name].estimator, "model", None)
@@ -62,7 +93,7 @@ def _is_safetensors(path: Path) -> bool:
     return 2 <= length <= min(_LONGEST_HEADER, size - 8) and head[8:] == b"{"
 
 
-def _scene(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+def _scene(file: YamlFile, plan: Planned) -> Iterator[ConfigError]:
     if plan.cell.scene is None:
         for device in {**plan.arms, **plan.sensors}.values():
             if device.spec.capabilities.needs_scene:
@@ -77,7 +108,7 @@ def _scene(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
             yield file.problem(("scene", key), f"needs {module}, which is not installed", hint=hint)
 
 
-def _interlock_sensors(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+def _interlock_sensors(file: YamlFile, plan: Planned) -> Iterator[ConfigError]:
     for name, entry in plan.cell.interlocks.items():
         role = getattr(entry, "sensor", None)
         if isinstance(role, str) and role not in plan.sensor_roles:
@@ -87,7 +118,7 @@ def _interlock_sensors(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
             yield file.problem(at, f"the task has no sensor {role!r}", value=role, hint=hint)
 
 
-def _depths(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+def _depths(file: YamlFile, plan: Planned) -> Iterator[ConfigError]:
     limits = _limits(plan, "depth", "limit_mm")
     if not limits:
         return
@@ -102,7 +133,7 @@ def _depths(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
             )
 
 
-def _speeds(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+def _speeds(file: YamlFile, plan: Planned) -> Iterator[ConfigError]:
     """Speeds that no arm of the task may have. (Which of several arms a speed is of, its task knows alone.)"""
     bounds = {
         f"arms.{device.name}.limits.tcp_speed_m_s": 1e3 * limits.tcp_speed_m_s
@@ -125,7 +156,7 @@ def _speeds(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                 break
 
 
-def _distances(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+def _distances(file: YamlFile, plan: Planned) -> Iterator[ConfigError]:
     boxes: list[Any] = [box for box in plan.cell.interlocks.values() if _is_kind(box, "workspace")]
     if not boxes:
         return
@@ -140,7 +171,7 @@ def _distances(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
             )
 
 
-def _starts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+def _starts(file: YamlFile, plan: Planned) -> Iterator[ConfigError]:
     boxes: dict[str, Any] = {rule: box for rule, box in plan.cell.interlocks.items() if _is_kind(box, "workspace")}
     for rule, box in boxes.items():
         name = plan.arm_roles.get(box.arm, box.arm)
@@ -167,7 +198,7 @@ def _starts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
             )
 
 
-def _limits(plan: CellPlan, kind: str, key: str) -> Mapping[str, float]:
+def _limits(plan: Planned, kind: str, key: str) -> Mapping[str, float]:
     """Limit of each interlock of ``kind``, by the name of the interlock."""
     entries = {name: entry for name, entry in plan.cell.interlocks.items() if _is_kind(entry, kind)}
     return {name: float(getattr(entry, key)) for name, entry in entries.items()}
