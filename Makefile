@@ -11,8 +11,8 @@ demo: .venv/core
 
 # Tests beside emulators one after another, since they have deadlines; the others on all cores.
 test: check
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not emulated and not stress"
-	$(BIN)/python -m pytest -m "emulated and not stress"
+	TOUCHCELL_REQUIRE_COMPILED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not emulated and not stress"
+	TOUCHCELL_REQUIRE_COMPILED=1 $(BIN)/python -m pytest -m "emulated and not stress"
 
 fast: .venv/dev
 	$(BIN)/python -m pytest -m "not slow and not stress"

@@ -33,18 +33,18 @@ def test_a_cause_is_warned_of_once_until_it_is_forgotten(caplog: pytest.LogCaptu
 
 def test_dropped_frames_are_logged_once_for_each_kind(caplog: pytest.LogCaptureFixture) -> None:
     monitor = FrameMonitor("tip")
-    monitor.miss(0, overrun=False)
+    monitor.count_lost(0, overrun=False)
     for _ in range(2):
-        monitor.miss(3, overrun=False)
-        monitor.miss(2, overrun=True)
-        monitor.refuse("out_of_order")
+        monitor.count_lost(3, overrun=False)
+        monitor.count_lost(2, overrun=True)
+        monitor.count_bad("out_of_order")
     assert warnings(caplog) == [
         "tip: 3 frames were lost on their way",
         "tip: dropped 2 frames that were not read in time",
         "tip: dropped a bad frame (out of order)",
     ]
     monitor.reset_errors()
-    monitor.refuse("out_of_order")
+    monitor.count_bad("out_of_order")
     assert len(warnings(caplog)) == 4
 
 
@@ -62,14 +62,14 @@ def test_a_refused_command_is_logged_once_until_one_is_accepted(caplog: pytest.L
 
 
 def test_a_run_writes_its_log(tmp_path: Path) -> None:
-    cell = tc.load_cell("surface_follow_sim", set={"interlocks.indentation.limit_mm": 1.0})
+    cell = tc.load_cell("surface_follow_sim", set={"interlocks.uncertain.limit_mm": 0.01})
     run = tc.run(cell, out=tmp_path / "run")
     assert run.outcome == "tripped"
     log = (run.folder / LOG).read_text()
     for line in (
         "INFO    touchcell.drivers.core.device: arm: active",
         "INFO    touchcell.tasks.state_machine: surface_following: prepare -> approach by ",
-        "WARNING touchcell.control.latch: trip: indentation: sensor: ",
+        "WARNING touchcell.control.latch: trip: uncertain: sensor: ",
         "INFO    touchcell.cell.cli.run: surface_follow_sim: tripped after ",
     ):
         assert line in log

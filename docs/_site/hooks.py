@@ -1,4 +1,4 @@
-"""Hooks of the site: the reference of the command line is what the parsers themselves print."""
+"""Hooks of the site: references of the command line and of all keys, from the parsers and models themselves."""
 
 from __future__ import annotations
 
@@ -8,12 +8,25 @@ import os
 import re
 from typing import Any
 
-PLACE = "<!-- generated: command line -->"
+COMMAND_LINE = "<!-- generated: command line -->"
+KEYS = "<!-- generated: keys -->"
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Fill the place of generated text on a page."""
-    return markdown.replace(PLACE, command_line()) if PLACE in markdown else markdown
+    """Fill the places of generated text on a page."""
+    for place, text in ((COMMAND_LINE, command_line), (KEYS, keys)):
+        if place in markdown:
+            markdown = markdown.replace(place, text())
+    return markdown
+
+
+def keys() -> str:
+    """Return the reference of all keys of cell files, as Markdown, a level below the page's title."""
+    from touchcell.cell.cli.catalog import KINDS
+    from touchcell.cell.cli.reference import page_of
+
+    lines = [line for kind in KINDS for line in (*page_of(kind), "")]
+    return "\n".join(f"#{line}" if line.startswith("#") else line for line in lines)
 
 
 def command_line() -> str:

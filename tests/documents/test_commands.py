@@ -32,7 +32,7 @@ def _commands() -> Iterator[Command]:
     for block in all_blocks(*SHELL):
         for line in block.text.replace("\\\n", " ").splitlines():
             for part in re.split(r"\s*(?:;|&&|\|)\s+", line.removeprefix("$ ")):
-                words = shlex.split(part, comments=True)
+                words = shlex.split(re.sub(r"\s>\s*\S+", "", part), comments=True)
                 while words and re.fullmatch(r"env|[A-Z_0-9]+=.*", words[0]):
                     words.pop(0)
                 if words:

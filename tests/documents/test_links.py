@@ -10,7 +10,7 @@ import pytest
 from tests.documents.pages import DOCS, PAGES, anchors, links, prose
 from touchcell.paths import CHECKOUT
 
-OUTSIDE = re.compile(r"\b(?:PEERS|NUMERICS|(?:SPEC|SIMULATION|PROTOCOLS|PERCEPTION) part|findings)\b")
+OUTSIDE = re.compile(r"\b(?:PEERS|NUMERICS|(?:SPEC|SIMULATION|PROTOCOLS|PERCEPTION) part|findings/)\b")
 
 
 def _names(page: Path) -> str:

@@ -25,7 +25,7 @@ def cell_of(path: Path, **arm: object) -> Path:
     cell["sensors"]["sensor"] = {
         "driver": "v4l2",
         "device": "/dev/no-such-camera",
-        "estimator": {"kind": "network", "model": "builtin:none"},
+        "estimator": {"kind": "network", "model": "builtin:sim_gdn"},
         "mounted_on": "arm",
     }
     del cell["scene"]

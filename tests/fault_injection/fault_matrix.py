@@ -113,9 +113,15 @@ FAULTS: Final = (
         obeys=False,
         extra_m_s=0.03,
     ),
-    Fault("arm: deaf", "arm", _and_stop(_arm(deaf=True)), frozenset(), {}),
+    Fault("arm: ignores_stops", "arm", _and_stop(_arm(ignores_stops=True)), frozenset(), {}),
     Fault(
-        "arm: runs_on", "arm", _and_stop(_arm(runs_on=True)), frozenset({"stop"}), _STANDS, obeys=False, extra_m_s=0.02
+        "arm: ignores_expiry",
+        "arm",
+        _and_stop(_arm(ignores_expiry=True)),
+        frozenset({"stop"}),
+        _STANDS,
+        obeys=False,
+        extra_m_s=0.02,
     ),
     Fault("camera: frozen", "camera", _camera(frozen=True), frozenset({"frame_frozen"}), {}),
     Fault("camera: last_seq", "camera", _camera(last_seq=0), frozenset({"frame_age"}), {}),

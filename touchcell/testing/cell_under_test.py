@@ -33,12 +33,18 @@ class Message:
     Attributes:
         topic: e.g. "/arms/arm/command".
         t_ns: time on the cell's clock.
-        data: content, units in the keys.
+        encoded: content as JSON.
     """
 
     topic: str
     t_ns: int
-    data: Mapping[str, Any]
+    encoded: bytes
+
+    @property
+    def data(self) -> Mapping[str, Any]:
+        """Content, units in the keys."""
+        content: Mapping[str, Any] = json.loads(self.encoded)
+        return content
 
 
 class CellUnderTest:
@@ -154,7 +160,8 @@ class CellUnderTest:
 
     def values(self, topic: str, key: str) -> list[Any]:
         """Recorded values of one key of one topic, in order."""
-        return [each.data[key] for each in self.messages if each.topic == topic and key in each.data]
+        found = (each.data for each in self.messages if each.topic == topic)
+        return [data[key] for data in found if key in data]
 
     # What the test does.
 

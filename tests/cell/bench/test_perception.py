@@ -34,7 +34,7 @@ def test_without_data_the_shipped_model_is_run_on_simulated_frames(
     words = ["--", "--images", "12", "--frames", "4", "--runtimes", "onnxruntime"]
     assert main(["bench", "perception", "--out", str(tmp_path), *words]) == EXIT_OK
     text = capsys.readouterr().out
-    assert text.startswith("12 simulated camera frames and the model that ships")
+    assert text.startswith("12 simulated camera frames and the shipped model")
     assert (tmp_path / "perception.txt").read_text() in text
     (row,) = json.loads((tmp_path / "perception.json").read_text())["rows"]
     assert (row["estimator"], row["runtime"], row["all"]["n"]) == ("sim_gdn", "onnxruntime", 12)

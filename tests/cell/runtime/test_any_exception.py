@@ -80,7 +80,7 @@ PLACES: dict[str, Callable[[Cell, Recorder, BlackBox, Exception], Any]] = {
     "the task's trip": lambda cell, recorder, box, error: Raises(cell.task, "trip", error),
     "an interlock": lambda cell, recorder, box, error: Replaced(cell, error),
     "the supervisor": lambda cell, recorder, box, error: Raises(cell.supervisor, "review", error),
-    "the recorder": lambda cell, recorder, box, error: Raises(recorder, "write", error),
+    "the recorder": lambda cell, recorder, box, error: Raises(recorder, "write_encoded", error),
     "the black box": lambda cell, recorder, box, error: Raises(box, "add", error),
     "the scene": lambda cell, recorder, box, error: Raises(cell.scene, "objects", error),
     "the watchdog's beat": lambda cell, recorder, box, error: Raises(cell.watchdog, "beat", error),

@@ -224,7 +224,7 @@ class Impatient(RuleBasedStateMachine):
     def start(self, category: int) -> None:
         cell = waiting_cell(max_duration_s=100.0)
         cell["arms"]["arm"]["stop_category"] = category
-        cell["task"]["distance_mm"] = 1000
+        cell["task"]["distance_mm"] = 400
         self.run = OperatedRun(Path(self.folder.name), cell)
         self.allowed = True
         follow = self.run.arm._body.follow
@@ -342,8 +342,8 @@ def test_reset_without_a_run_that_waits(
 
 def test_reset_and_resume_from_another_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cell = waiting_cell()
-    # It trips by itself: pressed in deeper than allowed by the task's own depth.
-    cell["interlocks"]["indentation"]["limit_mm"] = 1.0
+    # It trips by itself: gliding shears the contact, and the shear stays when the arm has stopped.
+    cell["interlocks"]["shear"] = {"kind": "shear", "limit_mm": 0.05, "hold_ms": 20}
     path, folder = tmp_path / "cell.yaml", tmp_path / "run"
     path.write_text(yaml.safe_dump(cell))
     command = [sys.executable, "-m", "touchcell", "run", str(path), "--out", str(folder), "--quiet"]
@@ -358,9 +358,9 @@ def test_reset_and_resume_from_another_shell(tmp_path: Path, capsys: pytest.Capt
     assert main(["reset", str(folder)]) == EXIT_TASK_FAILED
     assert "refused: a cause is still present" in capsys.readouterr().out
     # Black box and reason are there while it waits.
-    assert json.loads((folder / "blackbox.json").read_text())["causes"][0]["interlock"] == "indentation"
+    assert json.loads((folder / "blackbox.json").read_text())["causes"][0]["interlock"] == "shear"
     assert main(["stop", str(folder)]) == EXIT_OK
     told, _ = process.communicate(timeout=DEADLINE_S)
-    assert "tripped: indentation" in told
+    assert "tripped: shear" in told
     assert process.returncode == 3
     assert not is_waiting(folder)

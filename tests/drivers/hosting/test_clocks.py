@@ -31,7 +31,7 @@ SETTABLE = {
     "date.today",
 }
 FOR_PEOPLE = {
-    ROOT / "touchcell" / "cell" / "cli" / "run.py",
+    ROOT / "touchcell" / "cell" / "runtime" / "run_directory.py",
     ROOT / "touchcell" / "cell" / "analysis" / "provenance.py",
 }
 """They name the run folder and date a figure."""

@@ -1,4 +1,4 @@
-"""``touchcell why``: explains in words why a run did not end as done, with a plot around the moment."""
+"""``touchcell why``: explains why a run did not end as done, with a plot around the moment."""
 
 from __future__ import annotations
 

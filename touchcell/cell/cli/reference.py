@@ -27,12 +27,13 @@ def write_reference(folder: Path) -> list[Path]:
     pages = []
     for kind in KINDS:
         page = folder / f"keys-{kind}.md"
-        page.write_text("\n".join(_page(kind)) + "\n")
+        page.write_text("\n".join(page_of(kind)) + "\n")
         pages.append(page)
     return pages
 
 
-def _page(kind: str) -> Iterator[str]:
+def page_of(kind: str) -> Iterator[str]:
+    """Yield the lines of the page of a kind."""
     yield f"# {_TITLES[kind]}"
     yield ""
     yield f"Made from what is installed; `touchcell describe {kind} NAME` prints the same."

@@ -71,7 +71,7 @@ class Damage:
 
 
 class _File:
-    """An unbuffered file: what is written has left the process, or an OSError says so, and nothing is tried later."""
+    """An unbuffered file: a write reaches the system or raises OSError, and is never repeated later."""
 
     def __init__(self, path: Path) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)

@@ -78,7 +78,11 @@ class Missing:
 
 
 class OverrunConfig(InterlockSettings):
-    """Longest time between two control cycles, in place of the one that follows from rate and limits of age."""
+    """Longest time between two control cycles, in place of the one that follows from rate and limits of age.
+
+    Attributes:
+        limit_ms: longest time from one cycle to the next.
+    """
 
     kind: Literal["overrun"]
     limit_ms: PositiveFloat

@@ -1,0 +1,1 @@
+"""Templates of the packages that ``touchcell new`` writes."""
