@@ -105,7 +105,7 @@ class CellUnderTest:
 
     def add(self, topic: str, t_ns: int, data: bytes) -> None:
         """Keep one message; called by the run loop."""
-        self.messages.append(Message(topic, t_ns, json.loads(data)))
+        self.messages.append(Message(topic, t_ns, data))
 
     # What is the case.
 
