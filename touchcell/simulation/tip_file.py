@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -52,7 +53,7 @@ def load_tip(name: str) -> TipFile:
         ConfigError: no such file, or its content is invalid.
     """
     shipped = SHIPPED / f"{name}.yaml"
-    path = shipped if shipped.is_file() else Path(name)
+    path = shipped if os.path.isfile(shipped) else Path(name)
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
         return TipFile.model_validate(data)

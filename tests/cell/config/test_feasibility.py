@@ -66,6 +66,8 @@ def only_problem(path: Path, **options: Any) -> ConfigError:
             "no such file",
         ),
         (("latency_ms: 10", "tip: none"), "sensors.sensor.tip", "no such file"),
+        (("latency_ms: 10", f"tip: {'9' * 5000}x"), "sensors.sensor.tip", "no such file"),
+        (("[-80, 0, 25,", "[-80, 0, 1e70,"), "arms.arm.start_pose_mm_deg", "larger than"),
         (("name: surface_follow_sim", "name: ../../evil"), "name", "run folders"),
         (("name: surface_follow_sim", "name: ''"), "name", "run folders"),
         (("name: surface_follow_sim", f"name: {'x' * 400}"), "name", "run folders"),
@@ -170,3 +172,8 @@ def test_a_data_set_that_nothing_reads_is_refused(tmp_path: Path, capsys: pytest
     path = written(tmp_path)
     assert main(["run", str(path), "--data", str(tmp_path), "--out", str(tmp_path / "run")]) == EXIT_BAD_INPUT
     assert "no device reads" in capsys.readouterr().err
+
+
+def test_a_base_whose_name_is_too_long_for_a_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="extends: no such file"):
+        plan_cell(written(tmp_path, ("schema: 1", f"schema: 1\nextends: {'9' * 5000}x")))

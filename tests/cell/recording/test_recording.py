@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import os
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -167,3 +168,14 @@ def test_a_chunk_that_would_fill_the_memory_is_not_unpacked(tmp_path: Path) -> N
 
 def test_no_mutant_of_a_recording_raises_anything_else_or_is_read_as_something_else(tmp_path: Path) -> None:
     assert [tried for tried in try_mutants(150, seed=3, folder=tmp_path) if tried.problem] == []
+
+
+def test_a_length_beyond_all_memory_is_damage(tmp_path: Path) -> None:
+    whole = original()
+    # The length of the data of a chunk, behind the name of its compression.
+    at = whole.index(b"\x03\x00\x00\x00lz4", len(whole) // 2) + 7
+    path = tmp_path / "run.mcap"
+    path.write_bytes(whole[:at] + struct.pack("<Q", 2**64 - 1) + whole[at + 8 :])
+    kept, named = damaged(path)
+    assert named
+    assert kept[-1] == 999

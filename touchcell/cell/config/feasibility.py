@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
 from pydantic import BaseModel
 
 from touchcell.cell.config.yaml_file import KeyPath, YamlFile
@@ -16,6 +16,7 @@ from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.scene import scene_section
 from touchcell.errors import ConfigError, suggest
 from touchcell.geometry import se3
+from touchcell.geometry.errors import GeometryError
 from touchcell.input_file import BUILTIN
 from touchcell.tasks.interface import Demand
 
@@ -129,7 +130,7 @@ def _distances(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     boxes: list[Any] = [box for box in plan.cell.interlocks.values() if _is_kind(box, "workspace")]
     if not boxes:
         return
-    longest_mm = max(float(np.linalg.norm(np.subtract(box.max_mm, box.min_mm))) for box in boxes)
+    longest_mm = max(math.dist(box.max_mm, box.min_mm) for box in boxes)
     for key, distance_mm in _demands(plan.task_config, "distance"):
         if distance_mm > longest_mm * _SLACK:
             yield file.problem(
@@ -147,7 +148,12 @@ def _starts(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
         start = getattr(plan.arms[name].config, "start_pose_mm_deg", None) if name in plan.arms else None
         if start is None:
             continue
-        T = se3.from_euler_mm_deg(start)
+        try:
+            T = se3.from_euler_mm_deg(start)
+        except GeometryError as error:
+            hint = "millimetres and degrees"
+            yield file.problem(("arms", name, "start_pose_mm_deg"), f"is no pose: {error}", value=start, hint=hint)
+            continue
         sensor = plan.sensor_roles.get(box.sensor or "")
         if sensor is not None:
             T = T @ plan.cell.sensors[sensor].T_tcp_sensor

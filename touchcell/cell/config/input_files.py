@@ -1,4 +1,7 @@
-"""Finds the files that a cell file names: beside it, never by chance in the working directory."""
+"""Finds the files that a cell file names: beside it, never by chance in the working directory.
+
+``os.path`` in place of ``Path``, whose tests raise for a name that is too long.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +73,7 @@ def _found(file: YamlFile, reference: InputFile, name: str, at: KeyPath, problem
         return name
     folder = file.source(at).parent
     path = folder / name
-    if path.is_dir() if reference.folder else path.is_file():
+    if os.path.isdir(path) if reference.folder else os.path.isfile(path):
         return str(path.absolute())
     reason, hint = _wrong(reference, path), _remedy(reference, name, folder)
     problems.append(file.problem(at, reason, value=name, hint=hint))
@@ -78,13 +81,13 @@ def _found(file: YamlFile, reference: InputFile, name: str, at: KeyPath, problem
 
 
 def _wrong(reference: InputFile, path: Path) -> str:
-    if not path.exists():
+    if not os.path.exists(path):
         return f"no such {'folder' if reference.folder else 'file'}: {path}"
     return f"is {'no folder' if reference.folder else f'no file, as {reference.noun} is'}: {path}"
 
 
 def _remedy(reference: InputFile, name: str, folder: Path) -> str:
-    if not (folder / name).exists() and Path(name).exists():
+    if not os.path.exists(folder / name) and os.path.exists(name):
         return f"paths are relative to the cell file: write {os.path.relpath(name, folder)}"
     shipped = ", ".join(f"{reference.prefix}{each}" for each in reference.shipped())
     parts = [reference.hint, f"shipped: {shipped}" if shipped else "", "paths are relative to the cell file"]

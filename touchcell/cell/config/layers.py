@@ -8,6 +8,7 @@ left out. Each key remembers the file and line, or the option, that it comes fro
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -81,7 +82,7 @@ def _load(path: Path, above: Sequence[Path]) -> YamlFile:
         raise file.problem((EXTENDS,), "leads back to a file that extends this one", value=base_name)
     if len(above) >= _MOST_LAYERS:
         raise file.problem((EXTENDS,), f"leads through more than {_MOST_LAYERS} files", value=base_name)
-    if not base_path.is_file():
+    if not os.path.isfile(base_path):  # Path.is_file raises for a name that is too long
         raise file.problem(
             (EXTENDS,), "no such file", value=base_name, hint="the path is relative to the file that names it"
         )

@@ -6,13 +6,14 @@ task fit, and says which devices the task does not need, so that they are not ev
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 from pydantic import BaseModel
 
 from touchcell.cell.config.cell_plan import (
@@ -292,7 +293,7 @@ class _Planner:
         readers = [name for name, device in devices.items() if "data" in type(device.config).model_fields]
         if not readers:
             reason, hint = "no driver of this cell replays a data set", "leave out --data"
-        elif not Path(data).is_dir():
+        elif not os.path.isdir(data):
             reason, hint = f"{data}: there is no such folder", f"{', '.join(readers)} would replay it"
         else:
             return
@@ -356,7 +357,7 @@ class _Planner:
                 continue
             arm = arms.get(arm_roles.get(entry.arm, entry.arm))
             section = cell.sensors.get(sensor_roles.get(entry.sensor or "", ""))
-            lever_m = 0.0 if section is None else 1e-3 * float(np.linalg.norm(section.tcp_to_sensor_mm_deg[:3]))
+            lever_m = 0.0 if section is None else 1e-3 * (math.hypot(*section.tcp_to_sensor_mm_deg[:3]))
             way = None if arm is None else _overshoot(arm, lever_m, cell.rate_hz)
             if arm is None or way is None:
                 continue
@@ -390,7 +391,7 @@ class _Planner:
                     hint="name capsules: body: [{from_mm: [0, 0, 0], to_mm: [0, 0, -100], radius_mm: 40}]",
                 )
             ends = [end for part in body for end in (part.from_mm, part.to_mm) if end is not None]
-            lever_m = 1e-3 * max((float(np.linalg.norm(end)) for end in ends), default=0.0)
+            lever_m = 1e-3 * max((math.hypot(*end) for end in ends), default=0.0)
             if (way := _overshoot(arm, lever_m, cell.rate_hz)) is not None:
                 ways.append(way)
         both = combined(sorted(ways, key=lambda way: way.total_m)[-2:])

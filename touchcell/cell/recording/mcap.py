@@ -41,6 +41,8 @@ _MAGIC: Final = b"\x89MCAP0\r\n"
 _RECORD_HEAD: Final = 9
 _LAST_KIND: Final = int(max(Opcode))
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
+# What the parsers of records raise for bytes that are none; an overflow for lengths beyond all memory.
+_UNREADABLE: Final = (McapError, struct.error, UnicodeDecodeError, OverflowError, MemoryError)
 _LONGEST_RECORD: Final = 1 << 28
 _LONGEST_CHUNK: Final = 1 << 26
 # Repeated JSON keys shrink to a tenth or so; what expands more is no recording but a trap.
@@ -313,7 +315,7 @@ class _Reader:
                 yield self._message(content, offset)
             elif kind == Opcode.STATISTICS:
                 self._promised = Statistics.read(ReadDataStream(BytesIO(content))).message_count
-        except (McapError, struct.error, UnicodeDecodeError) as error:
+        except _UNREADABLE as error:
             raise _Damaged(f"a record is damaged: {error or type(error).__name__}") from None
 
     def _chunk(self, content: bytes, offset: int) -> Iterator[Message]:
@@ -370,7 +372,7 @@ class _Reader:
             if head[0] == Opcode.CHANNEL:
                 try:
                     self._register(self._stream.read(length))
-                except (McapError, struct.error, UnicodeDecodeError):
+                except _UNREADABLE:
                     return
             offset += _RECORD_HEAD + length
 
