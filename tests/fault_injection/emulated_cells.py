@@ -159,7 +159,7 @@ def _cell(
     }
     moving = {
         **boxes,
-        "tcp_speed": {"kind": "tcp_speed", "limit_m_s": 0.25, "limit_rad_s": 2.0},
+        "tcp_speed": {"kind": "tcp_speed", "limit_m_s": 0.25, "limit_rad_s": 1.4},
         "indentation": {"kind": "depth", "limit_mm": 9},
         "stale_frame": {"kind": "frame_age", "limit_ms": 500},
         "stale_arm": {"kind": "arm_state_age", "limit_ms": 300},

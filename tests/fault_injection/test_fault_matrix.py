@@ -66,7 +66,7 @@ def test_the_matrix_detects_a_missing_interlock(tmp_path: Path) -> None:
     put_on_true_contact(data)
     for name, entry in list(data["interlocks"].items()):
         if entry["kind"] == "arm_state_age":
-            data["interlocks"][name] = {**entry, "limit_ms": 10_000}
+            data["interlocks"][name] = {**entry, "limit_ms": 990}
     path = tmp_path / "cell.yaml"
     path.write_text(yaml.safe_dump(data))
     stale = next(fault for fault in FAULTS if fault.name == "arm: stale")

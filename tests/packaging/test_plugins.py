@@ -211,8 +211,10 @@ def test_a_cell_of_foreign_parts_is_checked_and_run(site: Path, tmp_path: Path) 
     cell = ACME / "cell.yaml"
     done = python(site, "-m", "touchcell", "check", cell)
     assert done.returncode == 0, done.stderr
-    for line in ("arm: acme_arm", "sensor: acme_camera", "wrist: acme_scale", "interlock force: acme_force"):
+    for line in ("arm: acme_arm", "sensor: acme_camera", "wrist: acme_scale"):
         assert line in done.stdout
+    (proof,) = [line.split("  ") for line in done.stdout.splitlines() if "acme_force" in line]
+    assert [cell.strip() for cell in proof if cell][:5] == ["force", "acme_force", "scale", "5 N", "pressed too hard"]
     done = python(site, "-m", "touchcell", "run", cell, "--out", tmp_path / "run", "--quiet")
     assert done.returncode == 0, done.stdout + done.stderr
     recorded: dict[str, list[Any]] = {}

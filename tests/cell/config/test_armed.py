@@ -76,6 +76,7 @@ def test_a_cell_with_every_interlock_of_two_arms_is_armed(tmp_path: Path) -> Non
     lines = proof_table(plan)
     assert lines[0].split() == [
         "interlock",
+        "kind",
         "subject",
         "limit",
         "trips",
@@ -87,7 +88,21 @@ def test_a_cell_with_every_interlock_of_two_arms_is_armed(tmp_path: Path) -> Non
         "left",
     ]
     (depth,) = [line for line in lines if line.startswith("indentation") and "leader" in line]
-    assert depth.split()[1:] == ["leader_sensor", "7", "mm", "pressed", "in", "by", "7.14", "mm", "0", "ms", "-", "-"]
+    assert depth.split()[1:] == [
+        "depth",
+        "leader_sensor",
+        "7",
+        "mm",
+        "pressed",
+        "in",
+        "by",
+        "7.14",
+        "mm",
+        "0",
+        "ms",
+        "-",
+        "-",
+    ]
     (wall,) = [line for line in lines if line.startswith("leader_box") and "400 mm" in line]
     assert wall.split("  ")[-1].strip() == "5.7 mm"
 

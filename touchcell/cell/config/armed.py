@@ -23,6 +23,7 @@ from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.protocols import ExternalTorqueSource, ReadingSource, TwistSink, WrenchSource
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
+from touchcell.geometry.types import Array
 from touchcell.tasks.interface import TaskContext
 
 if TYPE_CHECKING:
@@ -38,7 +39,9 @@ REQUIRED_OF_NETWORKS: Final = ("out_of_range",)
 REQUIRED_OF_READINGS: Final = frozenset({"reading_age"})
 """Kinds that a task which moves an arm must have if it uses the readings of another device."""
 
-_COLUMNS = ("interlock", "subject", "limit", "trips at", "after", "stops within", "margin left")
+_COLUMNS = ("interlock", "kind", "subject", "limit", "trips at", "after", "stops within", "margin left")
+_ABILITIES: Final = {"true_contact": False, "known_surface": True}
+"""Estimators of this package that are no networks, and whether their images can be checked."""
 _TIP_M = 0.02
 """No tip is pressed in or sheared further than its own radius."""
 _LONGEST_REACH_M = 3.0
@@ -86,6 +89,11 @@ def cell_facts(plan: CellPlan, scene: PlanningScene | None = None) -> CellFacts:
         sensors,
         planned_scene(plan, role_of) if scene is None else scene,
         plan.cell.enabling_device is not None,
+        tuple(
+            role
+            for role, name in plan.auxiliary_roles.items()
+            if ReadingSource in plan.auxiliaries[name].spec.capabilities.provides
+        ),
     )
 
 
@@ -200,16 +208,17 @@ def _sensor_facts(plan: CellPlan, name: str, role_of: Mapping[str, str]) -> Sens
     estimator = section.estimator
     if isinstance(estimator, NetworkEstimator):
         return _network_facts(estimator, arm, section.T_tcp_sensor, float(rate_hz))
-    images = estimator.kind == "known_surface"
     kind = estimator.kind.replace("_", " ")
+    if estimator.kind not in _ABILITIES:
+        # What an estimator of another package reports is not known: all of it, until it says less.
+        return _unknown(kind, arm, section.T_tcp_sensor, float(rate_hz))
+    images = _ABILITIES[estimator.kind]
     return SensorFacts(
         kind, arm, section.T_tcp_sensor, _TIP_M, _TIP_M, math.pi, frame_rate_hz=float(rate_hz), images=images
     )
 
 
-def _network_facts(
-    estimator: NetworkEstimator, arm: str | None, T_tcp_sensor: np.ndarray, rate_hz: float
-) -> SensorFacts:
+def _network_facts(estimator: NetworkEstimator, arm: str | None, T_tcp_sensor: Array, rate_hz: float) -> SensorFacts:
     from touchcell.perception.errors import ModelError
     from touchcell.perception.models.architecture import LOG_PRECISION_BOUNDS
     from touchcell.perception.models.model_file import load_header
@@ -219,8 +228,7 @@ def _network_facts(
         header = load_header(model_path(estimator.model))
     except ModelError:
         # Without its model the cell cannot be composed; until then its ranges are not known.
-        name = f"network {estimator.model}"
-        return SensorFacts(name, arm, T_tcp_sensor, _TIP_M, _TIP_M, math.pi, _TIP_M, rate_hz, True, True, True, True)
+        return _unknown(f"network {estimator.model}", arm, T_tcp_sensor, rate_hz)
     labels = header.labels
     # Largest values along one component alone, at the corners of what was taught.
     if labels.are_contacts:
@@ -254,6 +262,11 @@ def _network_facts(
     )
 
 
+def _unknown(name: str, arm: str | None, T_tcp_sensor: Array, rate_hz: float) -> SensorFacts:
+    """Return the facts of an estimator that may report whatever a tip can meet."""
+    return SensorFacts(name, arm, T_tcp_sensor, _TIP_M, _TIP_M, math.pi, _TIP_M, rate_hz, True, True, True, True)
+
+
 def proof_table(plan: CellPlan) -> list[str]:
     """Return the lines of a table of what trips each interlock, one for each interlock, subject and limit."""
     if not plan.proofs:
@@ -280,7 +293,7 @@ def _badness(proof: Proof) -> float:
 
 
 def _row(plan: CellPlan, proof: Proof) -> tuple[str, ...]:
-    first = (proof.interlock, proof.subject or "-", proof.limit or "-")
+    first = (proof.interlock, proof.kind, proof.subject or "-", proof.limit or "-")
     if proof.tripped_s is None:
         return (*first, f"{'CANNOT' if proof.fatal else 'not'}: {proof.problem}", "", "", "")
     distance = plan.stopping_distances.get(proof.interlock)

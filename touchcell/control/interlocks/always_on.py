@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from pydantic import PositiveFloat
 
 from touchcell.control.interlocks.basic import ArmStateAgeConfig, FrameAgeConfig
+from touchcell.control.interlocks.coverage import SILENCE_S, CellFacts, Fault
 from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.settings import InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
@@ -87,9 +88,19 @@ class OverrunConfig(InterlockSettings):
     kind: Literal["overrun"]
     limit_ms: PositiveFloat
 
+    def faults(self, facts: CellFacts) -> Iterator[Fault]:
+        """Return a loop that hangs for a second."""
+        hint = f"lower it below {1e3 * SILENCE_S:g} ms"
+        yield Fault(_LOOP, "hangs", f"{self.limit_ms:g} ms", _hung, within_s=0.0, key="limit_ms", hint=hint)
+
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the ``Overrun`` interlock."""
         return Overrun(name, self.level, 1e-3 * self.limit_ms)
+
+
+def _hung(view: CellView, t_s: float) -> CellView:
+    """Return a cycle that comes a second too late."""
+    return replace(view, now_ns=view.now_ns + round(1e9 * SILENCE_S))
 
 
 OVERRUN = InterlockSpec("overrun", "no control cycle comes late; always on, with a limit of its own", OverrunConfig)

@@ -14,7 +14,7 @@ from typing import Any, Final, Protocol, runtime_checkable
 import numpy as np
 
 from touchcell.control.interlocks.planning_scene import PlanningScene
-from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
+from touchcell.control.interlocks.snapshot import ArmView, CellView, DeviceView, SensorView
 from touchcell.drivers.core.gate import TwistLimits
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.errors import suggest
@@ -89,6 +89,7 @@ class CellFacts:
         arms, sensors: by role.
         scene: where the arms stand and what they look like.
         enabling_device: True if an operator input holds the cell enabled.
+        devices: roles of other devices that are read.
     """
 
     period_s: float
@@ -97,6 +98,7 @@ class CellFacts:
     sensors: Mapping[str, SensorFacts]
     scene: PlanningScene = field(default_factory=PlanningScene)
     enabling_device: bool = False
+    devices: Sequence[str] = ()
 
     def healthy(self, now_ns: int, task_state: str) -> CellView:
         """Return a snapshot with fresh data in which every arm is at rest and no sensor in contact."""
@@ -114,7 +116,8 @@ class CellFacts:
                 markers=1.0 if sensor.markers else None,
                 arm=sensor.arm,
             )
-        return CellView(now_ns, arms, sensors, task_state)
+        devices = {role: DeviceView(Stamped({}, now_ns, now_ns)) for role in self.devices}
+        return CellView(now_ns, arms, sensors, task_state, devices=devices)
 
     def base(self, arm: str) -> Array:
         """Return the pose (4, 4) of an arm's base in the world."""
@@ -197,6 +200,12 @@ def with_arm(view: CellView, role: str, **changes: Any) -> CellView:
 def with_sensor(view: CellView, role: str, **changes: Any) -> CellView:
     """Return ``view`` with changed attributes of one sensor."""
     return replace(view, sensors={**view.sensors, role: replace(view.sensors[role], **changes)})
+
+
+def with_reading(view: CellView, role: str, age_s: float = 0.0, **values: float) -> CellView:
+    """Return ``view`` with named numbers that another device has read, ``age_s`` ago."""
+    reading: Stamped[Mapping[str, float]] = Stamped(values, view.now_ns - round(1e9 * age_s), view.now_ns)
+    return replace(view, devices={**view.devices, role: replace(view.devices[role], reading=reading)})
 
 
 def with_motion(view: CellView, role: str, T_base_tcp: Array | None = None, twist: Array | None = None) -> CellView:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 from pydantic import PositiveFloat
 
+from touchcell.control.interlocks.coverage import SILENCE_S, CannotTrip, CellFacts, Change, Fault, with_reading
 from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.settings import InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
@@ -47,9 +48,21 @@ class ReadingAgeConfig(InterlockSettings):
     kind: Literal["reading_age"]
     limit_ms: PositiveFloat
 
+    def faults(self, facts: CellFacts) -> Iterator[Fault | CannotTrip]:
+        """Return each device that is read and falls silent."""
+        if not facts.devices:
+            yield CannotTrip("", "no other device is read", "kind", "leave it out")
+        for role in facts.devices:
+            limit, hint = f"{self.limit_ms:g} ms", f"lower it below {1e3 * SILENCE_S:g} ms"
+            yield Fault(role, "silent", limit, _silent(role), within_s=SILENCE_S, key="limit_ms", hint=hint)
+
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
         """Return the ``ReadingAge`` interlock."""
         return ReadingAge(name, self.level, 1e-3 * self.limit_ms)
+
+
+def _silent(role: str) -> Change:
+    return lambda view, t_s: with_reading(view, role, t_s)
 
 
 READING_AGE = InterlockSpec("reading_age", "readings of other devices are fresh", ReadingAgeConfig)

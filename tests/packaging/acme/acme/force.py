@@ -1,11 +1,12 @@
 """An interlock: no reading ``force_n`` of a device exceeds a limit."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 from pydantic import PositiveFloat
 
+from touchcell.control.interlocks.coverage import CellFacts, Fault, with_reading
 from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.settings import InterlockSettings
 from touchcell.control.interlocks.snapshot import CellView
@@ -38,6 +39,15 @@ class ForceConfig(InterlockSettings):
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> Interlock:
         return Force(name, self.level, self.device, self.limit_n)
+
+    def faults(self, facts: CellFacts) -> Iterator[Fault]:
+        def pressed(view: CellView, t_s: float) -> CellView:
+            return with_reading(view, self.device, force_n=1.1 * self.limit_n)
+
+        def free(view: CellView, t_s: float) -> CellView:
+            return with_reading(view, self.device, force_n=0.0)
+
+        yield Fault(self.device, "pressed too hard", f"{self.limit_n:g} N", pressed, free)
 
 
 SPEC = InterlockSpec("acme_force", "no force on a device exceeds a limit", ForceConfig)
