@@ -106,8 +106,6 @@ class Workspace:
         min_m: lower corner (3,).
         max_m: upper corner (3,).
         leave_m: how far inside a point that was outside has to be to count as inside.
-        sensor: role of the sensor that is the point; None for the tool centre point.
-        margin_m: what may lie outside before anything is hit.
     """
 
     name: str
@@ -117,8 +115,6 @@ class Workspace:
     min_m: Array
     max_m: Array
     leave_m: float
-    sensor: str | None = None
-    margin_m: float = 0.0
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
         """Return a violation for the axis along which the point is furthest outside, unless it comes back."""
@@ -170,7 +166,6 @@ class Tilt:
         axis_tcp: (3,) unit vector of the guarded axis in the tool frame.
         direction: (3,) unit vector of the cone's axis along base axes.
         limit_rad: half of the cone's opening.
-        sensor: role of the sensor whose axis it is; None for the tool's.
     """
 
     name: str
@@ -179,7 +174,6 @@ class Tilt:
     axis_tcp: Array
     direction: Array
     limit_rad: float
-    sensor: str | None = None
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
         """Return a violation while the axis is outside the cone, unless it comes back."""
@@ -261,8 +255,7 @@ class WorkspaceConfig(GradedSettings):
         min_m, max_m = 1e-3 * np.array(self.min_mm), 1e-3 * np.array(self.max_mm)
         # A box that is thinner than its margin still has an inside.
         leave_m = min((1.0 - LEAVE) * 1e-3 * self.margin_mm, 0.25 * float(np.min(max_m - min_m)))
-        margin_m = 1e-3 * self.margin_mm
-        return Workspace(name, self.level, self.arm, T_tcp_point, min_m, max_m, leave_m, self.sensor, margin_m)
+        return Workspace(name, self.level, self.arm, T_tcp_point, min_m, max_m, leave_m)
 
 
 class TiltConfig(GradedSettings):
@@ -313,7 +306,7 @@ class TiltConfig(GradedSettings):
         """Return the ``Tilt`` interlock. Raises ConfigError for a sensor that the cell does not have."""
         axis = _guarded(name, self.sensor, T_tcp_sensor)[:3, 2]
         direction = np.array(self.direction) / np.linalg.norm(self.direction)
-        return Tilt(name, self.level, self.arm, axis, direction, math.radians(self.limit_deg), self.sensor)
+        return Tilt(name, self.level, self.arm, axis, direction, math.radians(self.limit_deg))
 
 
 def _guard_problem(arm: str, sensor: str | None, facts: CellFacts) -> CannotTrip | None:
