@@ -14,6 +14,19 @@ from collections.abc import Callable
 _MADE_UP_FOR = 50
 
 
+def following_tick(due_ns: int, now_ns: int, period_ns: int) -> tuple[int, int, bool]:
+    """Plan the tick after the one that was due at ``due_ns`` and comes now.
+
+    Returns:
+        when the next is due, in how many nanoseconds to wake up for it, and whether this one was late.
+    """
+    late_ns = now_ns - due_ns
+    if late_ns > _MADE_UP_FOR * period_ns:
+        due_ns = now_ns
+    next_due_ns = due_ns + period_ns
+    return next_due_ns, max(next_due_ns - now_ns, 3 * period_ns // 4), late_ns > period_ns // 4
+
+
 class _Timespec(ctypes.Structure):
     _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
 
@@ -60,10 +73,6 @@ class Ticker:
             os.read(self._fd, 8)
         except BlockingIOError:
             return
-        now_ns = time.monotonic_ns()
-        late_ns = now_ns - self._due_ns
-        if late_ns > _MADE_UP_FOR * self._period_ns:
-            self._due_ns = now_ns
-        self._due_ns += self._period_ns
-        self._arm(max(self._due_ns - now_ns, 3 * self._period_ns // 4))
-        self._on_tick(late_ns > self._period_ns // 4)
+        self._due_ns, in_ns, late = following_tick(self._due_ns, time.monotonic_ns(), self._period_ns)
+        self._arm(in_ns)
+        self._on_tick(late)
