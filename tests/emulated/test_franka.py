@@ -176,7 +176,7 @@ def test_a_pure_rotation_keeps_the_tool_centre_point_in_place(benches: Callable[
     harness = benches(flange_to_tcp_mm_deg=TOOL_MM_DEG)
     lease = harness.active()
     T_before = np.array(harness.truth()["T_base_ee"])
-    harness.send([0, 0, 0, 0.1, -0.2, 0.05], lease, 0.5)
+    harness.send_at_speed([0, 0, 0, 0.1, -0.2, 0.05], lease, 0.5)
     harness.moved()
     eventually(lambda: np.linalg.norm(harness.arm.tcp().value.twist[3:]) > 0.2)
     np.testing.assert_allclose(harness.arm.tcp().value.twist[:3], 0, atol=1e-4)
@@ -191,7 +191,7 @@ def test_a_twist_along_tool_axes_moves_along_the_tool(benches: Callable[..., Fra
     harness = benches(flange_to_tcp_mm_deg=TOOL_MM_DEG)
     lease = harness.active()
     T_before = np.array(harness.truth()["T_base_ee"])
-    harness.send([0, 0, 0.05, 0, 0, 0], lease, frame=TwistFrame.TCP)
+    harness.send_at_speed([0, 0, 0.05, 0, 0, 0], lease, frame=TwistFrame.TCP)
     harness.moved()
     harness.rested()
     moved = harness.position() - T_before[:3, 3]
@@ -201,7 +201,7 @@ def test_a_twist_along_tool_axes_moves_along_the_tool(benches: Callable[..., Fra
 def test_the_time_to_live_ends_the_motion_while_python_hangs(harness: FrankaHarness) -> None:
     lease = harness.active()
     before = harness.position()
-    harness.send([0.05, 0, 0, 0, 0, 0], lease)
+    harness.send_at_speed([0.05, 0, 0, 0, 0, 0], lease)
     # A C call that keeps the interpreter lock: no Python thread of this process can do anything meanwhile.
     ctypes.PyDLL(None).usleep(700_000)
     truth = harness.truth()
@@ -395,7 +395,7 @@ def test_an_arm_that_is_locked_cannot_be_activated(harness: FrankaHarness) -> No
 
 def test_the_contact_backstop_stops_the_arm_and_stays(harness: FrankaHarness) -> None:
     lease = harness.active()
-    harness.send([0.05, 0, 0, 0, 0, 0], lease, 1.0)
+    harness.send_at_speed([0.05, 0, 0, 0, 0, 0], lease, 1.0)
     eventually(lambda: harness.truth()["twist"][0] > 0.049)
     before = harness.emulator.fault("external_wrench", [12, 0, 17, 0, 0, 0])["position_m"]
     fault = faulted(harness)
@@ -480,7 +480,7 @@ def test_a_link_that_is_late_still_moves_it(harness: FrankaHarness) -> None:
     lease = harness.active()
     harness.emulator.fault("delay", 0.005)
     before = harness.position()
-    harness.send([0.05, 0, 0, 0, 0, 0], lease)
+    harness.send_at_speed([0.05, 0, 0, 0, 0, 0], lease)
     harness.moved()
     harness.rested()
     assert harness.truth()["reflexes"] == 0

@@ -149,6 +149,9 @@ def test_joints_are_kept_from_their_limits(arm: UrArm, lease: Lease) -> None:
     sample = arm.joints(0.2)
     arm._chain.upper[5] = sample.value.q[5] + np.deg2rad(1.0)
     J = arm._chain.jacobian(sample.value.q)
+    # A zero twist first: a command from rest begins with the acceleration of a millisecond.
+    arm.send_twist(TwistCommand(np.zeros(6), TwistFrame.BASE, CLOCK.now_ns(), 0.5), lease)
+    CLOCK.sleep_until_ns(CLOCK.now_ns() + 150_000_000)
     sent = arm.send_twist(TwistCommand(0.4 * J[:, 5], TwistFrame.BASE, CLOCK.now_ns(), 0.2), lease)
     np.testing.assert_allclose(
         np.linalg.solve(J, sent.command.twist), [0, 0, 0, 0, 0, arm._chain.speed[5] / 5.0], atol=1e-3

@@ -70,6 +70,14 @@ class FrankaHarness:
         command = TwistCommand(np.asarray(twist, dtype=np.float64), frame, self.clock.now_ns(), ttl_s)
         return self.arm.send_twist(command, lease)
 
+    def send_at_speed(
+        self, twist: Any, lease: Lease, ttl_s: float = 0.2, frame: TwistFrame = TwistFrame.BASE
+    ) -> Sent[TwistCommand]:
+        """Send one twist that may have its full speed at once: a zero twist has been in force before it."""
+        self.send(np.zeros(6), lease, 0.5)
+        self.clock.sleep_until_ns(self.clock.now_ns() + 150_000_000)
+        return self.send(twist, lease, ttl_s, frame)
+
     def truth(self) -> dict[str, Any]:
         """Return the ground truth of the emulator."""
         return self.emulator.state()
