@@ -67,7 +67,7 @@ def connect_never_energises(context: ConformanceContext) -> None:
 
 @check("truth", "process")
 def failed_connect_can_be_retried(context: ConformanceContext) -> None:
-    """Without a device ``connect`` raises within 15 s, leaves DISCONNECTED, and works once the device is there."""
+    """Without a device ``connect`` raises within 15 s, leaves DISCONNECTED, and works once the device is available."""
     context.under_test.clear()
     start_ns = context.clock.now_ns()
     with pytest.raises(DeviceError):
