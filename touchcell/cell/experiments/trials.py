@@ -24,6 +24,8 @@ from touchcell.cell.analysis.code_identity import CodeIdentity, code_identity, d
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.settings import with_settings
+from touchcell.cell.config.true_contact import answerable
 from touchcell.cell.config.yaml_file import YamlFile
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.experiments.executors import EXECUTORS, Lost, Workers
@@ -68,18 +70,24 @@ class Trial:
     def cell_data(self) -> dict[str, Any]:
         """The whole cell file with the changes, without interlocks that ask what its estimators no longer report.
 
-        Files that it names have absolute paths.
+        Files that it names have absolute paths; those in ``changes`` are relative to the working directory.
 
         Raises:
             ConfigError: the file is invalid, or a key leads nowhere.
         """
         path = Path(self.cell)
         path = path if path.is_absolute() else CONFIGS / path
+        file = load_layers(path)
         for key in self.changes:
-            _check_way(load_layers(path).data, key, self.cell)
-        file = load_layers(path, self.changes)
-        data: dict[str, Any] = _with_absolute_paths(file, file.data, ())
-        return {key: value for key, value in data.items() if key != "sweep"}
+            _check_way(file.data, key, self.cell)
+        changes = {
+            key: _with_absolute_paths(None, value, (key.rpartition(".")[2],)) for key, value in self.changes.items()
+        }
+        data = with_settings(_with_absolute_paths(file, file.data, ()), changes)
+        if any(key.endswith(".estimator") for key in changes):
+            data["interlocks"] = answerable(data)
+        data.pop("sweep", None)
+        return data
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,13 +312,13 @@ def _check_way(data: dict[str, Any], key: str, file: str) -> None:
         section = section[word]
 
 
-def _with_absolute_paths(file: YamlFile, value: Any, at: tuple[str | int, ...]) -> Any:
+def _with_absolute_paths(file: YamlFile | None, value: Any, at: tuple[str | int, ...]) -> Any:
     if isinstance(value, dict):
         return {key: _with_absolute_paths(file, inner, (*at, key)) for key, inner in value.items()}
     if isinstance(value, list):
         return [_with_absolute_paths(file, inner, (*at, index)) for index, inner in enumerate(value)]
     if isinstance(value, str) and ("." in value or os.sep in value or at[-1] in _FOLDER_KEYS):
-        path = file.source(at).parent / value
+        path = (Path() if file is None else file.source(at).parent) / value
         if os.path.exists(path):
             return str(path.absolute())
     return value

@@ -64,8 +64,7 @@ def search(
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    sampler = optuna.samplers.TPESampler(seed=seed, constraints_func=lambda trial: trial.user_attrs["constraint"])
-    study = optuna.create_study(sampler=sampler)
+    study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed))
     perform = Perform(sweep.measure, folder / "trials")
     batch = max(1, (workers or Workers()).jobs)
     finished: list[Finished] = []
@@ -83,7 +82,7 @@ def search(
         ended = perform_all(perform, made, workers=workers, executor=executor, live=live, title=f"search {measure}")
         for each, result in zip(asked, ended, strict=True):
             value = result.measures.get(measure)
-            each.set_user_attr("constraint", [0.0 if result.done else 1.0])
+            each.set_constraint("ends as done", 0.0 if result.done else 1.0)
             if value is None:
                 study.tell(each, state=optuna.trial.TrialState.FAIL)
             else:
