@@ -1,7 +1,7 @@
 """``python -m benchmarks executors``: what an executor adds to each trial, and whether an interruption loses any.
 
 ``no-op`` is the time for each of many pieces of work that do nothing, without the start of the workers; ``sweep`` is
-the time of a real sweep over the CPU time of its trials shared among the workers; ``killed`` ends the command of a sweep by
+the time of a real sweep over the time of its trials shared among the workers; ``killed`` ends the command of a sweep by
 SIGKILL at random moments and counts trials that were lost, or run twice after they had finished.
 """
 

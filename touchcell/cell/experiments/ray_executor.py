@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -11,8 +12,12 @@ from touchcell.cell.experiments.remote_work import LimitedWork
 
 def run(work: Callable[[Any], Any], items: Sequence[Any], workers: Workers) -> Iterator[tuple[int, Any]]:
     """Run ``work`` as Ray tasks of one core each, without retries."""
+    import cloudpickle
     import ray
 
+    # Ray has a cloudpickle of its own.
+    for module in cloudpickle.list_registry_pickle_by_value():
+        ray.cloudpickle.register_pickle_by_value(sys.modules[module])
     here = {} if workers.address else {"num_cpus": workers.jobs, "include_dashboard": False}
     ray.init(address=workers.address or "local", log_to_driver=False, **here)
     try:
@@ -29,7 +34,8 @@ def run(work: Callable[[Any], Any], items: Sequence[Any], workers: Workers) -> I
             try:
                 yield index, ray.get(done)
             except ray.exceptions.RayError as error:
-                yield index, Lost(f"{type(error).__name__}: {str(error).splitlines()[0]}")
+                cause = getattr(error, "cause", None) or error
+                yield index, Lost(f"{type(cause).__name__}: {str(cause).strip().splitlines()[0]}")
     finally:
         ray.shutdown()
 
