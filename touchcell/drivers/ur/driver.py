@@ -378,7 +378,8 @@ class UrArm(Arm):
                 link.tick()
             except DeviceError as error:
                 trouble = self._explain(error) if self._supervised_from_seq is not None else None
-        if trouble is not None and self.state is not Lifecycle.DISCONNECTED:
+        # What lasts is found again after a recovery: reported while it goes on, it would make the recovery fail.
+        if trouble is not None and self.state not in (Lifecycle.DISCONNECTED, Lifecycle.FAULTED):
             self._to_faulted(trouble)
         if self.state is Lifecycle.FAULTED:
             self._drop_program()
