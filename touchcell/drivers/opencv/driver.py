@@ -156,8 +156,13 @@ class OpencvCamera(Camera):
             capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, codec.EXPOSURE_MANUAL)
             given = int(capture.get(cv2.CAP_PROP_AUTO_EXPOSURE))
             self._expect("automatic exposure", codec.EXPOSURE_MANUAL, given)
+        if capture.get(cv2.CAP_PROP_AUTO_WB) > 0.0:
+            capture.set(cv2.CAP_PROP_AUTO_WB, 0.0)
+            self._expect("automatic white balance", 0, int(capture.get(cv2.CAP_PROP_AUTO_WB)))
         unit = codec.EXPOSURE_UNIT_US
         self._exposure_us = self._set_value(capture, cv2.CAP_PROP_EXPOSURE, "exposure_us", config.exposure_us, unit)
+        if self._exposure_us is not None and self._exposure_us * config.rate_hz > 1e6:
+            raise UnsupportedSetting(self.name, "exposure_us", f"at most {1e6 / config.rate_hz:.0f}", self._exposure_us)
         self._gain = self._set_value(capture, cv2.CAP_PROP_GAIN, "gain", config.gain, 1)
 
     def _set_value(
@@ -198,6 +203,8 @@ class OpencvCamera(Camera):
         if previous_ns is not None:
             periods = round((t_ns - previous_ns) * 1e-9 * self._config.rate_hz)
             self._monitor.count_lost(max(0, periods - 1), overrun=overrun)
+            if not overrun:
+                self._rate.note((t_ns - previous_ns) * 1e-9, 1)
         if codec.damage(data, self._config.pixel_format, self._config.width_px, self._config.height_px):
             self._monitor.count_bad("damaged")
             return
