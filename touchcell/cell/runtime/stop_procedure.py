@@ -1,4 +1,4 @@
-"""What stops a run's arms: all are told in the same moment, and each is watched until it stands."""
+"""What stops a run's arms: all are commanded in the same moment, and each is watched until it stands."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class StopProcedure:
         self._stopper = Stopper(arms, cell.stop_categories, cell.clock, 1.0 / cell.rate_hz, cell.holding)
 
     def begin(self, *, tripped: bool) -> None:
-        """Tell all arms to stop: as the cell file says when something is wrong, else holding where they are.
+        """Command all arms to stop: as the cell file says when something is wrong, else holding where they are.
 
         Other devices that can be stopped then stop and hold; nothing waits for them.
         """
@@ -50,7 +50,7 @@ class StopProcedure:
                     self._record.event("stop failed", f"{role}: {error}")
 
     def await_rest(self) -> Mapping[str, StopReport]:
-        """Watch the arms that were told to stop until they stand."""
+        """Watch the arms that were commanded to stop until they stand."""
         stops = self._stopper.watch(self._on_state, self._on_escalation)
         for role, report in stops.items():
             if report.problem:
