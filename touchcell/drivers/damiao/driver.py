@@ -73,7 +73,7 @@ class MotorConfig(BaseModel):
         kd_n_m_s_rad: damping of its position loop, N m s/rad.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
     esc_id: int = Field(ge=1, le=0x7F)
     mst_id: int = Field(ge=1, le=0x7FE)

@@ -77,7 +77,7 @@ class ServoConfig(BaseModel):
         homing_offset_ticks: value stored in the servo when it was calibrated.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
     id: int = Field(ge=0, le=253)
     zero_ticks: int = Field(default=2048, gt=-codec.TICKS_PER_TURN, lt=2 * codec.TICKS_PER_TURN)

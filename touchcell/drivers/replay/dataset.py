@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
-import cv2
 import numpy as np
 
 from touchcell.errors import DataError
@@ -135,6 +134,8 @@ def read_image(path: Path) -> ImageArray:
     Raises:
         DataError: the file is missing, not an image, or truncated.
     """
+    import cv2
+
     try:
         encoded = path.read_bytes()
     except OSError as error:
