@@ -43,7 +43,10 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
         ("tests/drivers/core/test_gate_refusals.py", "tests/drivers/core/test_gate.py"),
     ),
     "command_checks": ("touchcell/drivers/core/command_checks.py", ("tests/drivers/core/test_gate_refusals.py",)),
-    "lease": ("touchcell/drivers/core/lease.py", ("tests/drivers/core",)),
+    "lease": (
+        "touchcell/drivers/core/lease.py",
+        ("tests/drivers/core/test_gate_refusals.py", "tests/drivers/core/test_gate.py"),
+    ),
     "latch": ("touchcell/control/latch.py", ("tests/control/test_latch.py", "tests/control/test_supervisor.py")),
     "supervisor": (
         "touchcell/control/supervisor.py",
