@@ -15,6 +15,7 @@ BENCHMARKS = {
     "armed": "benchmarks.armed",
     "calibration": "benchmarks.calibration",
     "emulated-push": "benchmarks.emulated_push",
+    "executors": "benchmarks.executors",
     "faults": "tests.fault_injection.faults",
     "filter": "benchmarks.filter",
     "findings": "tests.fault_injection.findings",
