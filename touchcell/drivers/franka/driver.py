@@ -101,6 +101,7 @@ class FrankaConfig(DriverConfig):
         stop_dynamics_factor: the same for stopping, also at the end of a time-to-live.
         contact_force_limit_n: external force at which libfranka's thread brakes the arm, within a millisecond.
         contact_torque_limit_nm: external torque at which the controller itself stops the arm with a reflex.
+        state_timeout_s: oldest pose with which a twist may be followed.
         flange_to_tcp_mm_deg: tool centre point in the flange frame, [x y z alpha beta gamma]; None leaves the end
             effector as it is set in Desk.
     """
@@ -113,6 +114,7 @@ class FrankaConfig(DriverConfig):
     stop_dynamics_factor: float = Field(default=0.2, gt=0.0, le=1.0)
     contact_force_limit_n: float = Field(default=20.0, gt=0.0, le=100.0)
     contact_torque_limit_nm: float = Field(default=10.0, gt=0.0, le=50.0)
+    state_timeout_s: float = Field(default=0.1, gt=0.0, le=1.0)
     flange_to_tcp_mm_deg: tuple[float, float, float, float, float, float] | None = None
 
     def described_chain(self) -> SerialChain:
@@ -145,7 +147,13 @@ class FrankaArm(Arm):
     """
 
     def __init__(self, name: str, config: FrankaConfig, clock: Clock) -> None:
-        super().__init__(name, clock, config.limits.build(), stop_categories=CAPABILITIES.stop_categories)
+        super().__init__(
+            name,
+            clock,
+            config.limits.build(),
+            stop_categories=CAPABILITIES.stop_categories,
+            max_state_age_s=config.state_timeout_s,
+        )
         self._config = config
         self._franky: Any = None
         self._robot: Any = None
