@@ -371,10 +371,10 @@ class UrArm(Arm):
             try:
                 self._supervise_once()
             except DeviceError as error:
-                self._to_faulted(error)
+                self._report(error)
             except Exception as error:
                 # The thread must live on: it alone ends expired twists, drops the program and removes power.
-                self._to_faulted(
+                self._report(
                     DeviceFault(
                         self.name,
                         f"supervision failed: {error!r}",
@@ -395,12 +395,17 @@ class UrArm(Arm):
                 link.tick()
             except DeviceError as error:
                 trouble = self._explain(error) if self._supervised_from_seq is not None else None
-        if trouble is not None and self.state is not Lifecycle.DISCONNECTED:
-            self._to_faulted(trouble)
+        if trouble is not None:
+            self._report(trouble)
         if self.state is Lifecycle.FAULTED:
             self._drop_program()
         if self._power_off_by is not None:
             self._react_to_power_off()
+
+    def _report(self, trouble: DeviceError) -> None:
+        # What lasts is found again after a recovery: reported while it goes on, it would make the recovery fail.
+        if self.state not in (Lifecycle.DISCONNECTED, Lifecycle.FAULTED):
+            self._to_faulted(trouble)
 
     def _find_fault(self, snapshot: Snapshot, supervised_from_seq: int | None) -> DeviceError | None:
         reader = self._opened()
