@@ -73,7 +73,6 @@ CAPABILITIES = Capabilities(
 
 _WATCHDOG_S = 0.02
 _FIRST_STATE_S = 2.0
-_SILENCE_S = 0.5
 _FRESH_S = 0.25
 _RECOVERY_S = 5.0
 # franky's motions are smooth already, and libfranka's filter assumes that no state is ever lost: after a loss it jumps.
@@ -104,6 +103,7 @@ class FrankaConfig(DriverConfig):
         state_timeout_s: oldest pose with which a twist may be followed.
         flange_to_tcp_mm_deg: tool centre point in the flange frame, [x y z alpha beta gamma]; None leaves the end
             effector as it is set in Desk.
+        state_timeout_s: age of the state that is a fault.
     """
 
     host: str = Field(min_length=1)
@@ -116,6 +116,7 @@ class FrankaConfig(DriverConfig):
     contact_torque_limit_nm: float = Field(default=10.0, gt=0.0, le=50.0)
     state_timeout_s: float = Field(default=0.1, gt=0.0, le=1.0)
     flange_to_tcp_mm_deg: tuple[float, float, float, float, float, float] | None = None
+    state_timeout_s: float = Field(default=0.1, ge=0.02, le=1.0)
 
     def described_chain(self) -> SerialChain:
         """Return the chain of an FR3 with the configured tool, or with none where Desk has set it."""
@@ -295,6 +296,13 @@ class FrankaArm(Arm):
             self._reader.close()
         self._reader = None
         self._robot = None
+
+    def _present_fault(self) -> DeviceError | None:
+        reading = self._newest()
+        if reading.mode in _OBEYS and not reading.errors:
+            return None
+        fault = self._fault(reading)
+        return fault if fault.needs is Remedy.RECOVER else None
 
     def _configure(self) -> None:
         config = self._config
@@ -502,8 +510,8 @@ class FrankaArm(Arm):
         reader, reading = self._open_reader(), self._newest()
         if reader.failure is not None:
             raise self._to_faulted(reader.failure)
-        if self._age_s(reading) > _SILENCE_S:
-            raise self._to_faulted(TransportTimeout(self.name, "state", _SILENCE_S))
+        if self._age_s(reading) > self._config.state_timeout_s:
+            raise self._to_faulted(TransportTimeout(self.name, "state", self._config.state_timeout_s))
         if self.state is not Lifecycle.ACTIVE:
             return
         if reading.mode not in _OBEYS or reader.aborted is not None:
