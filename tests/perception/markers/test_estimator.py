@@ -18,7 +18,8 @@ torch = pytest.importorskip("torch")
 from touchcell.drivers.core.clock import VirtualClock  # noqa: E402
 from touchcell.geometry import se3  # noqa: E402
 from touchcell.perception.errors import ImageError, ModelError, TrainingError  # noqa: E402
-from touchcell.perception.markers.estimator import MarkerEstimator, mixed  # noqa: E402
+from touchcell.perception.markers.estimator import MarkerEstimator  # noqa: E402
+from touchcell.perception.markers.layers import mixed  # noqa: E402
 from touchcell.perception.markers.matching import DisplacementModel, MarkerField  # noqa: E402
 from touchcell.perception.models.model_file import Labels, Model, load_model, save_model  # noqa: E402
 from touchcell.perception.networks.checkpoint import EpochRecord, checkpoint_path  # noqa: E402
