@@ -212,7 +212,14 @@ def test_numpy_and_torch_agree(trained: Path) -> None:
             outputs = network(inputs.expand(QUICK.networks, 1, -1)).numpy()[:, 0].astype(np.float64)
         mean, sigma = mixed(outputs[:, :6], outputs[:, 12:], model.header.labels)
         field = MarkerField(
-            displacements, displacements, np.ones(331, bool), np.zeros(QUICK.modes), score=1.0, rms_px=0.1, valid=True
+            displacements,
+            displacements,
+            np.ones(331, bool),
+            np.zeros(QUICK.modes),
+            score=1.0,
+            rms_px=0.1,
+            explained=1.0,
+            valid=True,
         )
         found = estimator.infer(field)
         np.testing.assert_allclose(found[0], mean, atol=1e-4)
