@@ -173,6 +173,7 @@ def fit_transfer(old: OldSensor, outputs: Array, displacements: NDArray[Any], co
         raise TrainingError("labels or outputs of the old networks do not vary", hint="collect varied contacts")
     placeholder = BlockSpec(kernel=_START, mean=0.0, unit=1.0)
     spec = TransferSpec(
+        markers=len(old.reference),
         contacts=len(contacts),
         components=len(basis),
         image_turn=old.image_turn,

@@ -17,10 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.errors import ModelError
-from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.architecture_spec import ArchitectureSection
 from touchcell.perception.models.camera_change import CameraChange
 from touchcell.perception.models.labels import CONTACT_NAMES, contact_from_xi, shear_direction, xi_gaussian
-from touchcell.perception.models.marker_architecture import MarkerArchitecture
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.models.transfer_spec import TransferSpec
 
@@ -164,7 +163,7 @@ class Header(BaseModel):
 
     format_version: Literal[1] = 1
     touchcell_version: str
-    architecture: Annotated[Architecture | MarkerArchitecture, Field(discriminator="kind")]
+    architecture: ArchitectureSection
     preprocessing: Preprocessing
     labels: Labels
     sigma_scale: SixPositive
@@ -187,7 +186,7 @@ class Header(BaseModel):
             raise ValueError("the preprocessing's output_size is not the architecture's input_size")
         if (self.transfer is None) != (self.network_labels is None):
             raise ValueError("transfer and network_labels belong together")
-        if self.transfer is not None and not isinstance(self.architecture, MarkerArchitecture):
+        if self.transfer is not None and self.architecture.kind != "markers":
             raise ValueError("only a marker model can be transferred")
         return self
 
@@ -298,20 +297,15 @@ def _parse_header(text: str | None, path: Path) -> Header:
 
 
 def _key(error: str, location: tuple[int | str, ...]) -> str:
-    """Return the header field that an error of pydantic refers to; its path includes the architecture's kind."""
-    parts = [str(part) for part in location]
-    if error.startswith("union_tag"):
-        parts.append("kind")
-    elif parts[:1] == ["architecture"]:
-        parts[1:2] = []
-    return ".".join(parts)
+    """Return the header field that an error of pydantic refers to; an unknown architecture is one of its kind."""
+    return ".".join([*map(str, location), *(["kind"] if error.startswith("plugin") else [])])
 
 
 def _check_tensors(model: Model, path: Path) -> None:
     architecture, transfer = model.header.architecture, model.header.transfer
     shapes = architecture.tensor_shapes()
-    if transfer is not None and isinstance(architecture, MarkerArchitecture):
-        shapes |= transfer.tensor_shapes(architecture.markers)
+    if transfer is not None:
+        shapes |= transfer.tensor_shapes()
     for name in shapes.keys() | model.tensors.keys():
         if name not in model.tensors:
             raise ModelError(path, "missing tensor", key=name)

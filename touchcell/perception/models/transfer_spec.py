@@ -43,6 +43,7 @@ class TransferSpec(BaseModel):
     """Gaussian processes from the networks' outputs and the sensor's own marker displacements to its contacts.
 
     Attributes:
+        markers: number of markers in the lattice.
         contacts: number of labelled contacts that it was fitted to.
         components: number of principal components of the displacements.
         image_turn: sign of the rotation of the networks' axes when the markers turn from u to v.
@@ -60,6 +61,7 @@ class TransferSpec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    markers: int = Field(gt=0)
     contacts: int = Field(gt=1)
     components: int = Field(gt=0)
     image_turn: Literal[-1, 1]
@@ -79,14 +81,14 @@ class TransferSpec(BaseModel):
     process_share: SixNotNegative
     floor: SixNotNegative
 
-    def tensor_shapes(self, markers: int) -> dict[str, tuple[int, ...]]:
+    def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return names and shapes of its tensors in a model file."""
-        n, k = self.contacts, self.components
+        n, k, m = self.contacts, self.components, self.markers
         shapes: dict[str, tuple[int, ...]] = {
             "transfer.outputs": (n, 6),
             "transfer.scores": (n, k),
-            "transfer.mean": (2 * markers,),
-            "transfer.basis": (k, 2 * markers),
+            "transfer.mean": (2 * m,),
+            "transfer.basis": (k, 2 * m),
         }
         for name in BLOCKS:
             rows = 2 * n if name in PAIRS else n
