@@ -44,6 +44,7 @@ def _add_training(commands: Subparsers) -> None:
         help="such as gdn, cnn or markers, see `touchcell list` (default: %(default)s)",
     )
     train.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
+    train.add_argument("--rings", type=positive, help="of a marker estimator's lattice (default: 10)")
     train.add_argument("--networks", type=positive, help="of a marker estimator, whose mixture it gives (default: 2)")
     train.add_argument(
         "--short-side",
@@ -129,7 +130,12 @@ def _train(options: argparse.Namespace) -> int:
     from touchcell.cell.config.settings import parse_settings
     from touchcell.perception.networks.trainer import train
 
-    named = {"epochs": options.epochs, "networks": options.networks, "short_side_px": options.short_side}
+    named = {
+        "epochs": options.epochs,
+        "networks": options.networks,
+        "rings": options.rings,
+        "short_side_px": options.short_side,
+    }
     train(
         options.data,
         options.out,
