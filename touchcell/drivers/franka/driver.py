@@ -100,10 +100,9 @@ class FrankaConfig(DriverConfig):
         stop_dynamics_factor: the same for stopping, also at the end of a time-to-live.
         contact_force_limit_n: external force at which libfranka's thread brakes the arm, within a millisecond.
         contact_torque_limit_nm: external torque at which the controller itself stops the arm with a reflex.
-        state_timeout_s: oldest pose with which a twist may be followed.
         flange_to_tcp_mm_deg: tool centre point in the flange frame, [x y z alpha beta gamma]; None leaves the end
             effector as it is set in Desk.
-        state_timeout_s: age of the state that is a fault.
+        state_timeout_s: oldest state with which a twist is followed; an older one is a fault.
     """
 
     host: str = Field(min_length=1)
@@ -114,9 +113,8 @@ class FrankaConfig(DriverConfig):
     stop_dynamics_factor: float = Field(default=0.2, gt=0.0, le=1.0)
     contact_force_limit_n: float = Field(default=20.0, gt=0.0, le=100.0)
     contact_torque_limit_nm: float = Field(default=10.0, gt=0.0, le=50.0)
-    state_timeout_s: float = Field(default=0.1, gt=0.0, le=1.0)
     flange_to_tcp_mm_deg: tuple[float, float, float, float, float, float] | None = None
-    state_timeout_s: float = Field(default=0.1, ge=0.02, le=1.0)
+    state_timeout_s: float = Field(default=0.5, ge=0.02, le=1.0)
 
     def described_chain(self) -> SerialChain:
         """Return the chain of an FR3 with the configured tool, or with none where Desk has set it."""
