@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -55,13 +56,17 @@ def print_devices() -> None:
         print(line)
 
 
-def probe_cell(path: Path) -> list[Probe]:
+def probe_cell(path: Path, settings: Mapping[str, Any] | None = None) -> list[Probe]:
     """Connect every device of a cell file one after the other, in PASSIVE only, and ask what it tells.
+
+    Args:
+        path: the cell file.
+        settings: values in place of the file's own, by dotted key.
 
     Raises:
         ConfigError: the cell file is not valid.
     """
-    plan: CellPlan = plan_cell(path)
+    plan: CellPlan = plan_cell(path, settings=settings)
     return [_probe(device, plan.devices[name].spec.name) for name, device in build_devices(plan, plan.devices).items()]
 
 

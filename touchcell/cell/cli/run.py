@@ -79,6 +79,7 @@ def run_cell(
     *,
     data: Path | None = None,
     model: str | None = None,
+    settings: Mapping[str, Any] | None = None,
     out: Path | None = None,
     live: bool = True,
     moving: bool = False,
@@ -89,6 +90,7 @@ def run_cell(
         path: the cell file.
         data: for drivers that replay a data set.
         model: estimator model in place of the file's own.
+        settings: values in place of the file's own, by dotted key.
         out: run folder, made for this run or empty.
         live: show a progress line.
         moving: also make the animation of a simulated run.
@@ -96,7 +98,8 @@ def run_cell(
     Raises:
         ConfigError, ModelError, RunFolderError, ConnectError: before anything moves.
     """
-    run = run_plan(plan_cell(path, {} if data is None else {"data": data}, model=model), out=out, live=live)
+    plan = plan_cell(path, {} if data is None else {"data": data}, model=model, settings=settings)
+    run = run_plan(plan, out=out, live=live)
     if run.summary:
         say(run.summary)
     if moving:

@@ -42,8 +42,11 @@ def load_layers(path: Path, settings: Mapping[str, Any] | None = None) -> YamlFi
     lines, sources = dict(merged.lines), dict(merged.sources)
     for key in settings:
         at = tuple(int(part) if part.isdigit() else part for part in key.split("."))
-        lines = {known: line for known, line in lines.items() if known[: len(at)] != at} | {at: 0}
-        sources = {known: source for known, source in sources.items() if known[: len(at)] != at} | {at: OPTION}
+        # Sections that only the setting makes come from it too.
+        made = [at[:count] for count in range(1, len(at) + 1) if at[:count] not in lines or count == len(at)]
+        lines = {known: line for known, line in lines.items() if known[: len(at)] != at} | dict.fromkeys(made, 0)
+        sources = {known: source for known, source in sources.items() if known[: len(at)] != at}
+        sources |= dict.fromkeys(made, OPTION)
     data = with_settings(merged.data, settings)
     if any(key.endswith(".estimator") for key in settings):
         data = _without_unanswered(data)
