@@ -32,7 +32,14 @@ def add_cell(parser: argparse.ArgumentParser) -> None:
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
-    """``--set``: values in place of the cell file's own."""
+    """``--on`` and ``--set``: the world of a cell, and values in place of the file's own."""
+    parser.add_argument(
+        "--on",
+        choices=("sim", "emulated", "bench"),
+        dest="world",
+        help="sim: simulated devices in place of real ones; emulated: real drivers on emulators that start by "
+        "themselves; bench: nothing simulated (default: as the file is written)",
+    )
     parser.add_argument(
         "--set",
         action="append",

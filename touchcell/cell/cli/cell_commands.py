@@ -37,6 +37,7 @@ def _run(options: argparse.Namespace) -> int:
 
     return run_cell(
         find_cell(options.cell),
+        world=options.world,
         settings=parse_settings(options.settings),
         data=options.data,
         model=options.model,
@@ -49,16 +50,21 @@ def _run(options: argparse.Namespace) -> int:
 def _check(options: argparse.Namespace) -> int:
     from touchcell.cell.config.armed import proof_table
     from touchcell.cell.config.layers import explain, load_layers
-    from touchcell.cell.config.schema import plan_cell
     from touchcell.cell.config.settings import parse_settings
+    from touchcell.cell.runtime.worlds import plan_for
 
     file, settings = find_cell(options.cell), parse_settings(options.settings)
-    if options.explain:
+    if options.explain and options.world is None:
         print(explain(load_layers(file, settings)))
-    plan = plan_cell(file, {} if options.data is None else {"data": options.data}, settings=settings)
+    overrides = {} if options.data is None else {"data": options.data}
+    plan = plan_for(file, options.world, overrides, settings=settings)
     if options.explain:
+        if options.world is not None:
+            print(explain(load_layers(file, settings, plan.world_settings)))
         return EXIT_OK
-    print(f"{options.cell}: {plan.cell.name} is valid")
+    print(f"{options.cell}: {plan.cell.name} is valid{'' if options.world is None else f' on {options.world}'}")
+    for note in plan.notes:
+        print(f"  {note}")
     print(f"  task     {plan.task.name}: {plan.task.summary}")
     for device in plan.built.values():
         print(f"  {device.spec.capabilities.kind:<8} {device.name}: {device.spec.name}, {device.spec.summary}")

@@ -28,6 +28,6 @@ def _probe(options: argparse.Namespace) -> int:
     from touchcell.cell.cli.devices import print_probes, probe_cell
     from touchcell.cell.config.settings import parse_settings
 
-    probes = probe_cell(find_cell(options.cell), parse_settings(options.settings))
+    probes = probe_cell(find_cell(options.cell), parse_settings(options.settings), options.world)
     print_probes(probes)
     return EXIT_DEVICE_LOST if any(probe.error for probe in probes) else EXIT_OK

@@ -14,6 +14,7 @@ from typing import Literal, Self, final
 import numpy as np
 from pydantic import Field, model_validator
 
+from touchcell.drivers.core.behaviour import CameraBehaviour
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import CorruptMessage, DeviceError, StaleData, TransportTimeout
@@ -59,6 +60,13 @@ class CameraConfig(DriverConfig):
         if self.stall_s * self.rate_hz < _STALL_PERIODS:
             raise ValueError(f"stall_s must be at least {_STALL_PERIODS} periods, {_STALL_PERIODS / self.rate_hz:g} s")
         return self
+
+
+def camera_behaviour(config: CameraConfig) -> CameraBehaviour:
+    """Return how a USB camera behaves: a frame arrives about one period after its exposure."""
+    return CameraBehaviour(
+        config.rate_hz, 1.0 / config.rate_hz, config.width_px, config.height_px, color=config.color == "bgr"
+    )
 
 
 class UnsupportedSetting(ConfigError):
