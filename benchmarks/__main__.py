@@ -14,6 +14,7 @@ BENCHMARKS = {
     "adapt": "benchmarks.adapt",
     "calibration": "benchmarks.calibration",
     "emulated-push": "benchmarks.emulated_push",
+    "executors": "benchmarks.executors",
     "faults": "tests.fault_injection.faults",
     "filter": "benchmarks.filter",
     "findings": "tests.fault_injection.findings",

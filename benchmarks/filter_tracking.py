@@ -77,6 +77,9 @@ class GaussianContact(ContactSource):
         if now_ns // _FRAME_NS > self._seq:
             self._seq = now_ns // _FRAME_NS
             self._captured = self._truth.update(now_ns)
+            if self._newest is None and self._captured is not None:
+                # A run begins with a frame, as after the activation of a camera.
+                self._newest = self._estimate(self._captured)
         newest = self._newest
         if self._filter is None or newest is None or newest.belief is None:
             return newest

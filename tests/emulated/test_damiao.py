@@ -486,3 +486,38 @@ def test_a_motor_that_will_not_enable_leaves_none_enabled(arm: DamiaoCanArm, emu
         arm.activate()
     assert emulator.state()["enabled"] == 0
     assert arm.state is Lifecycle.READY
+
+
+def test_a_full_transmit_queue_drops_no_arm(arm: DamiaoCanArm, emulator: EmulatorProcess) -> None:
+    activate(arm)
+    start = position(emulator.wait_for(enabled=6))
+    emulator.fault("tx_full", 12)
+    wait(lambda: int(arm.health()["not_sent"]) >= 12)
+    commands = emulator.state()["commands"]
+    wait(lambda: emulator.state()["commands"] > commands + 300)
+    assert arm.state is Lifecycle.ACTIVE
+    assert emulator.state()["enabled"] == 6
+    np.testing.assert_allclose(position(emulator.state()), start, atol=1e-3)
+
+
+def test_a_failing_control_loop_keeps_holding_the_arm(
+    arm: DamiaoCanArm, emulator: EmulatorProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    activate(arm)
+    start = position(emulator.wait_for(enabled=6))
+
+    def fail(now_ns: int, dt_s: float) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(arm._setpoint, "step", fail)
+    wait(lambda: faulted(arm))
+    commands = emulator.state()["commands"]
+    wait(lambda: emulator.state()["commands"] > commands + 600)
+    assert emulator.state()["enabled"] == 6
+    np.testing.assert_allclose(position(emulator.state()), start, atol=2e-3)
+    monkeypatch.undo()
+    sample = arm.joints().seq
+    wait(lambda: arm.joints().seq > sample)
+    arm.recover(TOKEN)
+    arm.activate()
+    assert emulator.state()["enabled"] == 6

@@ -14,8 +14,11 @@ from typing import Any
 
 import pytest
 
+from tests.helpers.tactile_samples import write_split
 from touchcell.cell.recording.mcap import read
 from touchcell.paths import CHECKOUT
+from touchcell.perception.errors import ModelError
+from touchcell.perception.runtime.estimators import load_estimator
 
 ACME = Path(__file__).parent / "acme"
 
@@ -163,6 +166,23 @@ for path in sys.argv[1:]:
 print(json.dumps(found))
 """
 
+PREDICT = """
+import sys
+from pathlib import Path
+sys.modules["torch"] = None
+import numpy as np
+from touchcell.cell.cli.main import main
+import touchcell as tc
+from touchcell.drivers.replay.dataset import read_split
+data, out = sys.argv[1:]
+arguments = ["train", "--kind", "acme_linear", "--set", "side_px=20", "--data", data, "--out", out]
+assert main(arguments) == 0
+estimator, split = tc.load_estimator(out), read_split(Path(data), "val")
+predicted = np.stack([estimator.predict(image).pose_mm_deg for image in split.read()])
+errors, labels = np.abs(predicted - split.contact_mm_deg)[:, :2], split.contact_mm_deg[:, :2]
+print(type(estimator).__name__, *errors.mean(axis=0), *labels.std(axis=0))
+"""
+
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -173,7 +193,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (broken / "broken" / "__init__.py").write_text("SPEC = 'no spec'\n")
     points = "".join(
         f'[project.entry-points."touchcell.{group}"]\nbroken = "broken:SPEC"\nmissing = "broken.nowhere:SPEC"\n'
-        for group in SPECS
+        for group in (*SPECS, "architectures", "trainers")
     )
     head = '[build-system]\nrequires = ["setuptools"]\nbuild-backend = "setuptools.build_meta"\n'
     (broken / "pyproject.toml").write_text(
@@ -272,6 +292,50 @@ def test_the_list_shows_them_and_names_what_is_broken(site: Path) -> None:
     for summary in ("arm of another package", "no force on a device exceeds a limit", "a plane that rises along x"):
         assert summary in done.stdout
     assert "of broken 0.1 cannot be imported" in done.stdout
+
+
+def test_a_foreign_trainer_writes_a_model_that_the_foreign_architecture_predicts_with(
+    site: Path, tmp_path: Path
+) -> None:
+    write_split(tmp_path, "train", n=150, seed=1)
+    write_split(tmp_path, "val", n=40, seed=2)
+    done = python(site, "-c", PREDICT, tmp_path, tmp_path / "m.safetensors")
+    assert done.returncode == 0, done.stderr
+    name, *figures = done.stdout.split()
+    error_x, error_y, spread_x, spread_y = map(float, figures)
+    assert name == "Linear"
+    assert error_x < 0.5 * spread_x
+    assert error_y < 0.5 * spread_y
+
+
+def test_foreign_trainers_and_architectures_are_described_and_their_mistakes_reported(
+    site: Path, tmp_path: Path
+) -> None:
+    done = python(site, "-m", "touchcell", "describe", "trainer", "acme_linear")
+    assert "side_px" in done.stdout
+    assert "side of the square image that the model sees" in done.stdout
+    done = python(site, "-m", "touchcell", "describe", "architecture", "acme_linear")
+    assert "input_size" in done.stdout
+    train = ("-m", "touchcell", "train", "--data", tmp_path, "--out", tmp_path / "m.safetensors", "--kind")
+    done = python(site, *train, "acme_liner")
+    assert (done.returncode, "did you mean 'acme_linear'?" in done.stderr) == (2, True), done.stderr
+    done = python(site, *train, "acme_linear", "--set", "sid_px=8")
+    assert done.returncode != 0
+    assert "kind acme_linear has no setting sid_px (did you mean 'side_px'?)" in done.stderr
+    done = python(site, *train, "acme_linear", "--set", "side_px=0")
+    assert "side_px 0: Input should be greater than 0" in done.stderr
+    done = python(site, *train, "broken")
+    assert "entry point broken = 'broken:SPEC' of broken 0.1 leads to a str, not to a TrainerSpec" in done.stderr
+
+
+def test_a_model_file_whose_architecture_is_not_installed_names_it(site: Path, tmp_path: Path) -> None:
+    write_split(tmp_path, "train", n=150, seed=1)
+    file = tmp_path / "m.safetensors"
+    done = python(site, "-m", "touchcell", "train", "--kind", "acme_linear", "--data", tmp_path, "--out", file)
+    assert done.returncode == 0, done.stderr
+    with pytest.raises(ModelError, match="unknown architecture 'acme_linear'") as caught:
+        load_estimator(file)
+    assert caught.value.key == "architecture.kind"
 
 
 def test_the_page_shows_the_package_as_it_is() -> None:

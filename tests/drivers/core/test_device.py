@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from touchcell.drivers.core.clock import VirtualClock
-from touchcell.drivers.core.device import DeactivatePolicy, Device, Lifecycle
+from touchcell.drivers.core.device import DeactivatePolicy, Device, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import CommandRejected, DeviceError, DeviceFault, DeviceGone, Rejection
 
 
@@ -26,6 +26,12 @@ class Gadget(Device):
     def _activate(self) -> None:
         if self.latch_on_the_way is not None:
             self._to_faulted(self.latch_on_the_way)
+
+    def _recover(self, token: OperatorToken) -> None:
+        if self.latch_on_the_way is not None:
+            thread = threading.Thread(target=self._to_faulted, args=(self.latch_on_the_way,))
+            thread.start()
+            thread.join()
 
     def _deactivate(self, policy: DeactivatePolicy) -> None:
         if self.raise_at_rest is not None:
@@ -126,3 +132,38 @@ def test_no_transition_overwrites_a_fault_of_the_last_moment(gadget: Gadget, tra
         getattr(gadget, transition)()
     assert gadget.state is Lifecycle.FAULTED
     assert gadget.fault is fault
+
+
+def test_a_fault_latched_by_another_thread_during_recovery_keeps_the_device_faulted(gadget: Gadget) -> None:
+    first, second = DeviceFault("gadget", "hot"), DeviceFault("gadget", "encoder")
+    gadget._to_faulted(first)
+    assert gadget.fault is first
+    gadget.latch_on_the_way = second
+    with pytest.raises(DeviceFault, match="encoder"):
+        gadget.recover(OperatorToken("anna", 1))
+    assert (gadget.state, gadget.fault) == (Lifecycle.FAULTED, second)
+    gadget.latch_on_the_way = None
+    gadget.recover(OperatorToken("anna", 2))
+    assert (gadget.state, gadget.fault) == (Lifecycle.READY, None)
+
+
+def test_a_fault_latched_in_the_last_moment_of_a_recovery_is_not_overwritten(gadget: Gadget) -> None:
+    gadget._to_faulted(DeviceFault("gadget", "hot"))
+    second = DeviceFault("gadget", "encoder")
+    recover = gadget._recover
+
+    def interrupt(token: OperatorToken) -> None:
+        recover(token)
+        gadget._state_lock = Interrupted(gadget, second)  # type: ignore[assignment]
+
+    gadget._recover = interrupt  # type: ignore[method-assign]
+    with pytest.raises(DeviceFault, match="encoder"):
+        gadget.recover(OperatorToken("anna", 1))
+    assert (gadget.state, gadget.fault) == (Lifecycle.FAULTED, second)
+
+
+def test_a_second_fault_before_a_recovery_does_not_make_it_fail(gadget: Gadget) -> None:
+    gadget._to_faulted(DeviceFault("gadget", "hot"))
+    gadget._to_faulted(DeviceFault("gadget", "hotter"))
+    gadget.recover(OperatorToken("anna", 1))
+    assert gadget.state is Lifecycle.READY

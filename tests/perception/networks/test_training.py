@@ -22,7 +22,8 @@ from touchcell.perception.models.model_file import Model, load_model  # noqa: E4
 from touchcell.perception.networks.checkpoint import EpochRecord, checkpoint_path  # noqa: E402
 from touchcell.perception.networks.dataset import LabelledImages  # noqa: E402
 from touchcell.perception.networks.progress import Display  # noqa: E402
-from touchcell.perception.networks.training import Settings, learning_rate, preprocessing_for, train, train_on_arrays  # noqa: E402
+from touchcell.perception.networks.trainer import train  # noqa: E402
+from touchcell.perception.networks.training import Settings, learning_rate, preprocessing_for, train_on_arrays  # noqa: E402
 
 ARCHITECTURE = Architecture(input_size=(32, 32), channels=(8, 16), hidden=32)
 QUICK = Settings(epochs=4, batch_size=16, learning_rate=3e-3)
@@ -214,7 +215,7 @@ def test_trains_from_a_folder(tmp_path: Path) -> None:
     text = io.StringIO()
     recorder = Recorder()
     out = tmp_path / "model.safetensors"
-    train(data, out, epochs=2, seed=3, cache=tmp_path / "cache", observer=recorder)
+    train(data, out, settings={"epochs": 2}, seed=3, cache=tmp_path / "cache", observer=recorder)
     assert recorder.decoded == {"train": 64, "val": 32}
     model = load_model(out)
     header = model.header
@@ -256,12 +257,12 @@ def test_a_short_side_shrinks_further(tmp_path: Path) -> None:
     with pytest.raises(TrainingError):
         preprocessing_for(image, 31)
     with pytest.raises(TrainingError):
-        train(tmp_path, tmp_path / "m.safetensors", kind="markers", short_side_px=70, observer=Recorder())
+        train(tmp_path, tmp_path / "m.safetensors", kind="markers", settings={"short_side_px": 70}, observer=Recorder())
 
 
 def test_number_of_networks_is_for_markers_alone(tmp_path: Path) -> None:
     with pytest.raises(TrainingError):
-        train(tmp_path, tmp_path / "m.safetensors", kind="gdn", networks=2, observer=Recorder())
+        train(tmp_path, tmp_path / "m.safetensors", kind="gdn", settings={"networks": 2}, observer=Recorder())
 
 
 def test_damaged_data_set_writes_nothing(tmp_path: Path) -> None:

@@ -18,6 +18,8 @@ from touchcell.control.interlocks.spec import INTERLOCKS
 from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.errors import ConfigError, suggest
+from touchcell.perception.models.architecture_spec import ARCHITECTURES
+from touchcell.perception.networks.trainer import TRAINERS
 from touchcell.perception.runtime.estimator_spec import ESTIMATORS
 from touchcell.perception.runtime.filter_spec import FILTERS
 from touchcell.plugin_section import PLUGIN
@@ -31,6 +33,8 @@ _REGISTRIES: Final[Mapping[str, Registry[Any]]] = {
     "task": TASKS,
     "interlock": INTERLOCKS,
     "estimator": ESTIMATORS,
+    "architecture": ARCHITECTURES,
+    "trainer": TRAINERS,
     "filter": FILTERS,
     "surface": SURFACES,
     "object": OBJECTS,

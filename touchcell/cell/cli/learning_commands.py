@@ -10,7 +10,7 @@ from touchcell.cell.cli.arguments import Subparsers, add_command, positive, whol
 from touchcell.cell.cli.exit_codes import EXIT_OK
 from touchcell.cell.config.find import find_cell
 
-_KINDS = ("gdn", "cnn", "markers")
+_SIMULATED_KINDS = ("gdn", "cnn", "markers")
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -32,9 +32,9 @@ def _add_training(commands: Subparsers) -> None:
     _add_out(train, "model file to write (.safetensors)")
     train.add_argument(
         "--kind",
-        choices=_KINDS,
         default="gdn",
-        help="Gaussian-density network, regression or marker estimator (default: %(default)s)",
+        metavar="TRAINER",
+        help="such as gdn, cnn or markers, see `touchcell list` (default: %(default)s)",
     )
     train.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
     train.add_argument("--networks", type=positive, help="of a marker estimator, whose mixture it gives (default: 2)")
@@ -44,13 +44,22 @@ def _add_training(commands: Subparsers) -> None:
         metavar="PX",
         help="least pixels of what a gdn or cnn sees, made by averaging whole ones (default: 100; 70 is twice as fast)",
     )
+    train.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="another setting, see `touchcell describe trainer TRAINER`",
+    )
     _add_seed(train)
     train.add_argument("--fresh", action="store_true", help="start again instead of resuming")
 
     train_sim = add_command(commands, "train-sim", _train_sim, "train the estimator that ships, on simulated images")
     _add_out(train_sim, "model file to write (.safetensors)")
     train_sim.add_argument("--samples", type=positive, default=12_000, help="simulated images (default: %(default)s)")
-    train_sim.add_argument("--kind", choices=_KINDS, default="gdn", help="as of `train` (default: %(default)s)")
+    train_sim.add_argument(
+        "--kind", choices=_SIMULATED_KINDS, default="gdn", help="as of `train` (default: %(default)s)"
+    )
     train_sim.add_argument("--tip", metavar="TIP", help="tip file of `calibrate-sim`, or the name of one that ships")
     train_sim.add_argument("--processed", action="store_true", help="for images as the public data have them")
     train_sim.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
@@ -110,17 +119,20 @@ def _add_seed(parser: argparse.ArgumentParser) -> None:
 
 
 def _train(options: argparse.Namespace) -> int:
-    from touchcell.perception.networks.training import train
+    from touchcell.cell.config.settings import parse_settings
+    from touchcell.perception.networks.trainer import train
 
+    named = {"epochs": options.epochs, "networks": options.networks, "short_side_px": options.short_side}
     train(
         options.data,
         options.out,
         kind=options.kind,
-        epochs=options.epochs,
-        networks=options.networks,
-        short_side_px=options.short_side,
         seed=options.seed,
         resume=not options.fresh,
+        settings={
+            **{key: value for key, value in named.items() if value is not None},
+            **parse_settings(options.set),
+        },
     )
     return EXIT_OK
 

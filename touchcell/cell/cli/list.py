@@ -7,12 +7,14 @@ from typing import Any
 
 from touchcell import compiled
 from touchcell.cell.bench.catalog import benchmark_names
+from touchcell.cell.experiments.executors import EXECUTORS
 from touchcell.cell.experiments.runner import EXPERIMENTS
-from touchcell.cell.experiments.trials import EXECUTORS
 from touchcell.control.interlocks.spec import INTERLOCKS
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
+from touchcell.perception.models.architecture_spec import ARCHITECTURES
+from touchcell.perception.networks.trainer import TRAINERS
 from touchcell.perception.runtime.estimator_spec import ESTIMATORS
 from touchcell.perception.runtime.filter_spec import FILTERS
 from touchcell.registry import Registry
@@ -32,6 +34,8 @@ def listing() -> dict[str, list[tuple[str, str]]]:
             *_rows(INTERLOCKS),
         ],
         "estimators": _rows(ESTIMATORS),
+        "architectures": _rows(ARCHITECTURES),
+        "trainers": _rows(TRAINERS),
         "filters": _rows(FILTERS),
         "surfaces": _rows(SURFACES),
         "objects": _rows(OBJECTS),

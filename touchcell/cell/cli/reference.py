@@ -14,6 +14,8 @@ _TITLES = {
     "task": "Tasks",
     "interlock": "Interlocks",
     "estimator": "Estimators",
+    "architecture": "Architectures of model files",
+    "trainer": "Trainers",
     "filter": "Filters",
     "surface": "Surfaces of a simulated scene",
     "object": "Shapes of objects in a simulated scene",

@@ -220,7 +220,6 @@ def _sensor_facts(plan: CellPlan, name: str, role_of: Mapping[str, str]) -> Sens
 
 def _network_facts(estimator: NetworkEstimator, arm: str | None, T_tcp_sensor: Array, rate_hz: float) -> SensorFacts:
     from touchcell.perception.errors import ModelError
-    from touchcell.perception.models.architecture import LOG_PRECISION_BOUNDS
     from touchcell.perception.models.model_file import load_header
     from touchcell.perception.runtime.network_estimator import model_path
 
@@ -242,8 +241,7 @@ def _network_facts(estimator: NetworkEstimator, arm: str | None, T_tcp_sensor: A
         pressed = se3.inverse(se3.exp(np.array([0.0, 0.0, labels.low[2], 0.0, 0.0, 0.0])))
         depth_m, shear_m = float(pressed[2, 3]), math.hypot(x, y)
         unit_m = 1.0
-    widest = math.exp(-LOG_PRECISION_BOUNDS[0]) if header.architecture.kind == "gdn" else 1.0
-    sigma_m = unit_m * float(header.calibrated(np.full(6, widest))[2] * labels.sigma_unit[2])
+    sigma_m = unit_m * float(header.calibrated(np.full(6, header.architecture.widest_sigma))[2] * labels.sigma_unit[2])
     drift_mm = getattr(estimator.filter, "drift_mm_per_sqrt_s", 0.0)
     sigma_m = max(sigma_m, 1e-3 * drift_mm * math.sqrt(_DRIFTS_S))
     return SensorFacts(
@@ -258,7 +256,7 @@ def _network_facts(estimator: NetworkEstimator, arm: str | None, T_tcp_sensor: A
         leaves_range=True,
         innovations=estimator.filter is not None,
         images=True,
-        markers=header.architecture.kind == "markers",
+        markers=header.architecture.reports_markers,
     )
 
 

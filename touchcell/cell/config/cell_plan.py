@@ -253,6 +253,7 @@ class CellFile(_Section):
         task: what the cell does.
         recording: what is recorded of a run besides numbers.
         collect: where a task that labels frames puts them.
+        sweep: what ``touchcell sweep`` changes from trial to trial; nothing else reads it.
     """
 
     schema_: Literal[1] = Field(alias="schema")
@@ -277,6 +278,7 @@ class CellFile(_Section):
     task: TaskSection
     recording: RecordingSection = RecordingSection()
     collect: CollectSection | None = None
+    sweep: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)

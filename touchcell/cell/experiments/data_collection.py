@@ -82,7 +82,7 @@ def _learned(folder: Path, data: Path) -> dict[str, float]:
 
     from touchcell.perception.networks.evaluate import evaluate
     from touchcell.perception.networks.progress import Display
-    from touchcell.perception.networks.training import train
+    from touchcell.perception.networks.trainer import train
 
     with (folder / "training.txt").open("w") as log, Display(Console(file=log)) as display:
         train(data, folder / _MODEL, kind=_KIND, cache=folder / "cache", observer=display)

@@ -69,6 +69,7 @@ class Device(ABC):
         self._state_lock = threading.RLock()
         self._state = Lifecycle.DISCONNECTED
         self._fault_error: DeviceError | None = None
+        self._faults_while_faulted: list[DeviceError] = []
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name!r}: {self._state.value}>"
@@ -121,11 +122,21 @@ class Device(ABC):
 
     @final
     def recover(self, token: OperatorToken) -> None:
-        """FAULTED -> READY, on a person's request; never on to ACTIVE. Raises if the cause is still there."""
-        self._require("recover", Lifecycle.FAULTED)
+        """FAULTED -> READY, on a person's request; never on to ACTIVE.
+
+        Raises:
+            DeviceError: the cause is still there, or a thread of the driver has latched another fault meanwhile, which
+                is then the device's fault.
+        """
+        with self._state_lock:
+            self._require("recover", Lifecycle.FAULTED)
+            self._faults_while_faulted.clear()
         self._recover(token)
         with self._state_lock:
             self._require("recover", Lifecycle.FAULTED)
+            if self._faults_while_faulted:
+                self._fault_error = self._faults_while_faulted[0]
+                raise self._fault_error
             self._fault_error = None
             self._state = Lifecycle.READY
         _logger.info("%s: recovered on request of %s", self.name, token.operator)
@@ -183,9 +194,15 @@ class Device(ABC):
             self._fault_error = None
 
     def _to_faulted(self, error: DeviceError) -> DeviceError:
-        """Latch the first fault; returns it so that callers can raise it."""
+        """Latch the first fault; returns ``error`` so that callers can raise it.
+
+        A fault latched while the device is FAULTED makes a recovery in progress fail, so a driver's thread reports a
+        condition that lasts once only, or only while the device is not FAULTED.
+        """
         with self._state_lock:
             if self._state is Lifecycle.FAULTED:
+                if not self._faults_while_faulted:
+                    self._faults_while_faulted.append(error)
                 return error
             # The error first: who reads the state from another thread finds it.
             self._fault_error = error

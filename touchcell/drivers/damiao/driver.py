@@ -43,7 +43,7 @@ from touchcell.drivers.core.protocols import (
 from touchcell.drivers.core.samples import JointState, Stamped
 from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.damiao import codec
-from touchcell.drivers.damiao.bus import Address, MotorBus
+from touchcell.drivers.damiao.bus import TRIES, Address, MotorBus
 from touchcell.drivers.damiao.codec import Feedback, MitCommand, Register
 from touchcell.drivers.kinematics.chain import GRAVITY_M_S2, ChainDescription, ChainFile, SerialChain, Vector3
 from touchcell.errors import ConfigError
@@ -51,6 +51,8 @@ from touchcell.geometry.types import Array
 
 _MAX_BUS_LOAD = 0.8
 _PLAUSIBLE_JUMP_RAD = 0.1
+# While one motor is asked, the others hear nothing: all tries together must not last as long as their watchdog.
+_ASKING_FRACTION = 0.75
 
 _DOES_NOT_ENABLE = codec.StatusCode(
     "does not enable", FaultClass.INTERNAL, Remedy.OPERATOR, "check power and emergency stop"
@@ -170,15 +172,17 @@ class DamiaoCanArm(BusArm):
         self._bus = MotorBus(
             name,
             addresses,
-            partial(_open_bus, name, config),
+            partial(open_bus, name, config),
             clock,
             max_silence_s=config.max_silence_s,
+            answer_s=config.watchdog_s * _ASKING_FRACTION / TRIES,
             fd=config.fd,
         )
 
     def _reset_state(self) -> None:
         super()._reset_state()
         self._answers: list[Reply[Feedback] | None] = [None] * len(self._config.motors)
+        self._held: tuple[Array, Array] | None = None
 
     def watchdog_s(self) -> float:
         """Return the timeout after which the motors disable themselves, as read back; the longest of them."""
@@ -352,9 +356,20 @@ class DamiaoCanArm(BusArm):
             frames = [command if on else None for command, on in zip(commands, self._enabled, strict=True)]
         self._take(self._bus.exchange(frames, until_ns))
 
+    def _repeat_commands(self) -> None:
+        if self._held is not None:
+            q, tau = self._held
+            frames = self._encode(q, np.zeros_like(q), tau)
+            self._bus.exchange([frame if on else None for frame, on in zip(frames, self._enabled, strict=True)], 0)
+
     def _frames(self, q: Array, dq: Array) -> list[bytes]:
         strongest = np.minimum(self._chain.torque, [self._bus.ranges(i).torque_n_m for i in range(len(q))])
         tau = np.clip(self._chain.gravity_torques(q), -strongest, strongest)
+        frames = self._encode(q, dq, tau)
+        self._held = q, tau
+        return frames
+
+    def _encode(self, q: Array, dq: Array, tau: Array) -> list[bytes]:
         motor_q = self._direction * (q - self._offset)
         motor_dq, motor_tau = self._direction * dq, self._direction * tau
         return [
@@ -416,7 +431,8 @@ class DamiaoCanArm(BusArm):
         limit_s = self._config.max_silence_s
         for motor, answer in zip(self._config.motors, self._answers, strict=True):
             if answer is not None and (now_ns - answer.t_ns) * 1e-9 > limit_s:
-                self._latch(TransportTimeout(self.name, f"reply of motor {motor.esc_id}", limit_s))
+                hint = f"the adapter reported: {self._bus.last_error}" if self._bus.last_error else ""
+                self._latch(TransportTimeout(self.name, f"reply of motor {motor.esc_id}", limit_s, hint=hint))
         self._check_missed()
 
     def _check_fences(self) -> None:
@@ -426,17 +442,32 @@ class DamiaoCanArm(BusArm):
                     self._check_watchdog(index, ticks)
 
 
-def _open_bus(device: str, config: DamiaoCanConfig) -> Any:
+def open_bus(device: str, config: DamiaoCanConfig) -> Any:
+    """Open the python-can bus of ``config`` at its bit rates. Raises ConnectError."""
     import can
 
+    is_kernels = config.interface == "socketcan"
+    # Adapters that python-can opens itself start at a rate of their own (slcan, gs_usb and pcan at 500 kbit/s or none).
+    rates = {} if is_kernels else {"bitrate": config.bitrate}
+    if config.fd and not is_kernels:
+        rates["data_bitrate"] = config.data_bitrate
+    options: dict[str, Any] = rates | config.bus_options
     try:
-        return can.Bus(interface=config.interface, channel=config.channel, fd=config.fd, **config.bus_options)
-    except (can.CanError, OSError, ValueError) as error:
+        bus = can.Bus(interface=config.interface, channel=config.channel, fd=config.fd, **options)
+    except (can.CanError, OSError, ValueError, TypeError) as error:
         raise ConnectError(
             device,
             f"cannot open CAN {config.interface} {config.channel}: {error}",
-            hint="is the interface up? `ip link set can0 up type can bitrate 1000000`",
+            hint="is the interface up? `ip link set can0 up type can bitrate 1000000`"
+            if is_kernels
+            else f"is the adapter plugged in, and does it support {config.bitrate} bit/s?",
         ) from None
+    if config.fd and bus.protocol is can.CanProtocol.CAN_20:
+        bus.shutdown()
+        raise ConnectError(
+            device, f"{config.interface} does not send CAN FD frames", hint="set fd: false, or use another adapter"
+        )
+    return bus
 
 
 def _motor_fault(device: str, esc_id: int, status: int, code: codec.StatusCode) -> DeviceFault:

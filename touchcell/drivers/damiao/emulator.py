@@ -106,6 +106,7 @@ class DamiaoArm(Emulator):
         "error_frames": "report this many bus errors",
         "fault_bits": "[motor index, status nibble]: the motor reports it and disables itself",
         "hot": "[motor index, degrees Celsius] of the winding; at 100 the motor disables itself",
+        "tx_full": "the adapter's transmit queue refuses this many frames of the host",
         "push": "[motor index, N m]: external torque on that joint",
         "refuse": "this motor (index from 0) does not enable",
         "nan": "the full-scale registers read as NaN",
@@ -204,6 +205,9 @@ class DamiaoArm(Emulator):
         elif fault == "error_frames":
             while self.spend(fault):
                 self._hub.send(_error_frame(can_errors.BUS_ERROR))
+        elif fault == "tx_full":
+            self._hub.fill_transmit_queues(int(value))
+            del self.active[fault]
         elif fault == "fault_bits":
             index, status = value
             self._let_go(self.motors[index], status)

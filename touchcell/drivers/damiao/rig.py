@@ -58,6 +58,7 @@ def rig(folder: Path, address: int) -> DeviceFixture:
             "foreign": (3, "transient"),
             "out_of_order": (3, "transient"),
             "error_frames": (3, "transient"),
+            "tx_full": (20, "transient"),
             "delay": (1.0, "fault"),
             "pause": (True, "fault"),
             "silent": (2, "fault"),

@@ -354,19 +354,22 @@ class UrArm(Arm):
             self._attempt(lambda: link.halt(self._config.stop_accel_m_s2))
 
     def _supervise(self) -> None:
-        try:
-            while not self._ending.wait(_KEEPER_PERIOD_S):
+        while not self._ending.wait(_KEEPER_PERIOD_S):
+            try:
                 self._supervise_once()
-        except BaseException as error:
-            self._to_faulted(
-                DeviceFault(
-                    self.name,
-                    f"supervision thread failed: {error!r}",
-                    fault_class=FaultClass.INTERNAL,
-                    needs=Remedy.POWER_CYCLE,
-                    hint="the watchdog stops the arm; disconnect and report this",
+            except DeviceError as error:
+                self._to_faulted(error)
+            except Exception as error:
+                # The thread must live on: it alone ends expired twists, drops the program and removes power.
+                self._to_faulted(
+                    DeviceFault(
+                        self.name,
+                        f"supervision failed: {error!r}",
+                        fault_class=FaultClass.INTERNAL,
+                        needs=Remedy.SERVICE,
+                        hint="the arm has been stopped; disconnect and report this",
+                    )
                 )
-            )
 
     def _supervise_once(self) -> None:
         # Read the state before the flag: a program seen stopped after the flag was raised is a fault.
@@ -379,7 +382,8 @@ class UrArm(Arm):
                 link.tick()
             except DeviceError as error:
                 trouble = self._explain(error) if self._supervised_from_seq is not None else None
-        if trouble is not None and self.state is not Lifecycle.DISCONNECTED:
+        # What lasts is found again after a recovery: reported while it goes on, it would make the recovery fail.
+        if trouble is not None and self.state not in (Lifecycle.DISCONNECTED, Lifecycle.FAULTED):
             self._to_faulted(trouble)
         if self.state is Lifecycle.FAULTED:
             self._drop_program()

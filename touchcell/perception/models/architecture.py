@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from touchcell.perception.models.architecture_spec import ArchitectureConfig
 
 Rate = Annotated[float, Field(ge=0.0, lt=1.0)]
 SixRates = tuple[Rate, Rate, Rate, Rate, Rate, Rate]
@@ -17,7 +20,7 @@ LOG_PRECISION_BOUNDS = (-3.0, 7.0)
 """Bounds of the logarithms of its inverse standard deviations: sigma from 20 label half-ranges to a thousandth."""
 
 
-class Architecture(BaseModel):
+class Architecture(ArchitectureConfig):
     """Blocks of 3x3 convolution, 2x2 maximum, normalisation and ReLU, then a hidden layer and the outputs.
 
     Source: Lloyd & Lepora 2024, 3.1.4 (``cnn``: six means) and 3.1.5 (``gdn``: six means and six logarithms of inverse
@@ -34,8 +37,6 @@ class Architecture(BaseModel):
         precision_dropout: rate before each of the six inverse standard deviations (gdn).
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     kind: Literal["gdn", "cnn"] = "gdn"
     input_size: tuple[int, int] = (128, 128)
     channels: Annotated[tuple[Annotated[int, Field(gt=0)], ...], Field(min_length=1)] = (8, 16, 32, 64, 128)
@@ -49,6 +50,11 @@ class Architecture(BaseModel):
         if min(self.feature_size) < 1:
             raise ValueError(f"{len(self.channels)} halvings leave nothing of an image of {self.input_size}")
         return self
+
+    @property
+    def widest_sigma(self) -> float:
+        """Largest standard deviation within the bounds, in label half-ranges; 1 for cnn, which reports none."""
+        return math.exp(-LOG_PRECISION_BOUNDS[0]) if self.kind == "gdn" else 1.0
 
     @property
     def outputs(self) -> int:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from touchcell.perception.models.architecture_spec import ArchitectureConfig
 
 Count = Annotated[int, Field(gt=0)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -14,7 +16,7 @@ LOG_PRECISION_BOUNDS = (-3.0, 6.0)
 """Bounds of the logarithms of inverse standard deviations, in label half-ranges."""
 
 
-class MarkerArchitecture(BaseModel):
+class MarkerArchitecture(ArchitectureConfig):
     """Markers are detected and matched to a lattice, and their displacements are the input of several small networks.
 
     The estimate is mean and variance of the mixture of the networks' Gaussians.
@@ -36,7 +38,7 @@ class MarkerArchitecture(BaseModel):
         networks: number of networks.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    reports_markers: ClassVar[bool] = True
 
     kind: Literal["markers"] = "markers"
     input_size: tuple[int, int]

@@ -17,10 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.errors import ModelError
-from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.architecture_spec import ArchitectureSection
 from touchcell.perception.models.camera_change import CameraChange
 from touchcell.perception.models.labels import CONTACT_NAMES, contact_from_xi, shear_direction, xi_gaussian
-from touchcell.perception.models.marker_architecture import MarkerArchitecture
 from touchcell.perception.models.preprocessing import Preprocessing
 
 FORMAT_VERSION = 1
@@ -161,7 +160,7 @@ class Header(BaseModel):
 
     format_version: Literal[1] = 1
     touchcell_version: str
-    architecture: Annotated[Architecture | MarkerArchitecture, Field(discriminator="kind")]
+    architecture: ArchitectureSection
     preprocessing: Preprocessing
     labels: Labels
     sigma_scale: SixPositive
@@ -289,13 +288,8 @@ def _parse_header(text: str | None, path: Path) -> Header:
 
 
 def _key(error: str, location: tuple[int | str, ...]) -> str:
-    """Return the header field that an error of pydantic refers to; its path includes the architecture's kind."""
-    parts = [str(part) for part in location]
-    if error.startswith("union_tag"):
-        parts.append("kind")
-    elif parts[:1] == ["architecture"]:
-        parts[1:2] = []
-    return ".".join(parts)
+    """Return the header field that an error of pydantic refers to; an unknown architecture is one of its kind."""
+    return ".".join([*map(str, location), *(["kind"] if error.startswith("plugin") else [])])
 
 
 def _check_tensors(model: Model, path: Path) -> None:

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array, ImageArray
-from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.architecture_spec import ArchitectureConfig
 from touchcell.perception.models.labels import contact_from_xi
-from touchcell.perception.models.marker_architecture import MarkerArchitecture
 from touchcell.perception.models.model_file import Header, Labels, Model, save_model, touchcell_version
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.checkpoint import Progress, delete_checkpoint
@@ -23,7 +22,7 @@ from touchcell.perception.networks.sigma_scaling import calibrate
 def write_trained(
     out: Path,
     *,
-    architecture: Architecture | MarkerArchitecture,
+    architecture: ArchitectureConfig,
     preprocessing: Preprocessing,
     labels: Labels,
     tensors: dict[str, NDArray[np.float32]],

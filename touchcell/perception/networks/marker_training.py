@@ -144,12 +144,12 @@ def train_markers(
 ) -> Model:
     """Learn to match the markers of ``data/train`` without its labels, then contact pose and shear with them.
 
-    Arguments, files written and resuming as ``training.train``; ``NAME_markers.png`` shows displacements and density.
+    Arguments, files written and resuming as ``trainer.train``; ``NAME_markers.png`` shows displacements and density.
     Matching is done once for the same images.
 
     Raises:
         DataError: the data set is damaged.
-        TrainingError: no lattice is found, too few images match, or as ``training.train``.
+        TrainingError: no lattice is found, too few images match, or as ``trainer.train``.
     """
     settings = settings or MarkerSettings()
     if observer is None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from touchcell.perception.networks.checkpoint import EpochRecord
+if TYPE_CHECKING:
+    from touchcell.perception.networks.checkpoint import EpochRecord
 
 
 class Observer(Protocol):

@@ -7,7 +7,8 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -40,7 +41,8 @@ from touchcell.perception.networks.contact_network import (
 )
 from touchcell.perception.networks.dataset import LabelledImages, default_cache, label_range, load_reduced
 from touchcell.perception.networks.export import write_trained
-from touchcell.perception.networks.progress import Display, Observer
+from touchcell.perception.networks.progress import Observer
+from touchcell.perception.networks.trainer import TrainingJob
 
 _EVALUATION_BATCH = 100
 _SHORT_SIDE_PX = 100
@@ -102,98 +104,43 @@ def learning_rate(step: int, steps: int, peak: float) -> float:
     return peak * max(1e-4, 1.0 - (step - hold) / (steps - hold))
 
 
-def train(
-    data: Path,
-    out: Path,
-    *,
-    kind: Literal["gdn", "cnn", "markers"] = "gdn",
-    epochs: int | None = None,
-    networks: int | None = None,
-    short_side_px: int | None = None,
-    seed: int = 0,
-    resume: bool = True,
-    cache: Path | None = None,
-    observer: Observer | None = None,
-) -> None:
-    """Train on ``data/train``, select by ``data/val``, and write the model file ``out`` with two figures beside it.
-
-    An interrupted training continues from its last complete epoch when the same call is made again, and ends in the
-    same model as an uninterrupted one.
+def train_on_images(job: TrainingJob, *, kind: Literal["gdn", "cnn"], epochs: int, short_side_px: int) -> Model:
+    """Train a network on the images of a data set.
 
     Args:
-        data: data set, see ``touchcell.drivers.replay.dataset``; its image out of contact, where it has one, is stored
-            for the contact gate.
-        out: ``NAME.safetensors``; figures become ``NAME_predictions.png`` and ``NAME_curves.png``.
-        kind: gdn predicts a Gaussian, cnn means alone; markers as ``marker_training``.
-        epochs: None for the default of ``Settings`` or ``MarkerSettings``.
-        networks: of a marker estimator; None for the default of ``MarkerSettings``.
-        short_side_px: smallest short side of a gdn or cnn's input, see ``preprocessing_for``; None for its default.
-        seed: of everything random; the same seed on the same machine gives the same file, except for the time it took.
-        resume: continue an interrupted training; False starts again.
-        cache: folder for preprocessed images; None for ``dataset.default_cache()``.
-        observer: receives the progress; None shows it on the terminal.
+        job: data set and file to write.
+        kind: of network.
+        epochs: passes over the images.
+        short_side_px: smallest short side of its input, see ``preprocessing_for``.
 
     Raises:
         DataError: the data set is damaged.
-        TrainingError: the labels cannot be learned, the loss is not finite, the training diverged, or the interrupted
-            training had other settings or data.
+        TrainingError: as ``trainer.train``.
     """
-    if observer is None:
-        with Display() as display:
-            train(
-                data,
-                out,
-                kind=kind,
-                epochs=epochs,
-                networks=networks,
-                short_side_px=short_side_px,
-                seed=seed,
-                resume=resume,
-                cache=cache,
-                observer=display,
-            )
-        return
-    if kind == "markers":
-        from touchcell.perception.networks.marker_training import MarkerSettings, train_markers
-
-        if short_side_px is not None:
-            raise TrainingError(
-                "markers are detected at full resolution", hint="--short-side applies to --kind gdn or cnn"
-            )
-        marker_settings = MarkerSettings(seed=seed)
-        if epochs is not None:
-            marker_settings = replace(marker_settings, epochs=epochs)
-        if networks is not None:
-            marker_settings = replace(marker_settings, networks=networks)
-        train_markers(data, out, settings=marker_settings, resume=resume, cache=cache, observer=observer)
-        return
-    if networks is not None:
-        raise TrainingError(f"kind {kind} is a single network", hint="the number of networks applies to --kind markers")
-    splits = {name: read_split(data, name) for name in ("train", "val")}
-    first = next(splits["train"].read())
-    preprocessing = preprocessing_for(first, _SHORT_SIDE_PX if short_side_px is None else short_side_px)
+    splits = {name: read_split(job.data, name) for name in ("train", "val")}
+    preprocessing = preprocessing_for(next(splits["train"].read()), short_side_px)
     sets = {
         name: LabelledImages(
             load_reduced(
                 split,
                 preprocessing,
-                cache=cache or default_cache(),
-                progress=lambda done, total, name=name: observer.images(name, done, total),  # type: ignore[misc]
+                cache=job.cache or default_cache(),
+                progress=partial(job.observer.images, name),
             ),
             xi_from_contact(split.contact_mm_deg),
         )
         for name, split in splits.items()
     }
-    train_on_arrays(
+    return train_on_arrays(
         sets["train"],
         sets["val"],
-        out,
+        job.out,
         preprocessing=preprocessing,
         kind=kind,
-        settings=Settings(seed=seed) if epochs is None else Settings(seed=seed, epochs=epochs),
-        reference=None if (rest := read_rest(data)) is None else preprocessing.reduce(rest),
-        resume=resume,
-        observer=observer,
+        settings=Settings(seed=job.seed, epochs=epochs),
+        reference=None if (rest := read_rest(job.data)) is None else preprocessing.reduce(rest),
+        resume=job.resume,
+        observer=job.observer,
     )
 
 
@@ -248,7 +195,7 @@ def train_on_arrays(
         observer: receives the progress.
 
     Raises:
-        TrainingError: as ``train``.
+        TrainingError: as ``trainer.train``.
     """
     settings = settings or Settings()
     architecture = architecture or Architecture(kind=kind, input_size=preprocessing.output_size)

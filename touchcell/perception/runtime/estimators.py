@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from touchcell.perception.models.architecture_spec import ARCHITECTURES
 from touchcell.perception.models.model_file import Model, load_model
 from touchcell.perception.models.prediction import ContactEstimator
-from touchcell.perception.runtime.inference import ContactModel
 
 
 def load_estimator(path: Path, calibration: Path | None = None) -> ContactEstimator:
@@ -38,8 +38,5 @@ def load_estimator(path: Path, calibration: Path | None = None) -> ContactEstima
 
 def estimator_of(model: Model) -> ContactEstimator:
     """Build the estimator that a model of any kind describes."""
-    if model.header.architecture.kind == "markers":
-        from touchcell.perception.markers.estimator import MarkerEstimator
-
-        return MarkerEstimator(model)
-    return ContactModel(model)
+    estimator: ContactEstimator = ARCHITECTURES.load(model.header.architecture.kind).build(model)
+    return estimator
