@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from touchcell.cell.cli.arguments import Subparsers, add_cell, add_command
+from touchcell.cell.cli.arguments import Subparsers, add_cell, add_command, add_settings
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_DEVICE_LOST, EXIT_OK
 from touchcell.cell.cli.output import warn
 from touchcell.cell.config.find import find_cell
@@ -16,6 +16,7 @@ def add_parser(commands: Subparsers) -> None:
     add_command(commands, "devices", _devices, "list cameras, serial ports and CAN interfaces, and what they need")
     probe = add_command(commands, "probe", _probe, "connect a cell's devices without energising any; print their state")
     add_cell(probe)
+    add_settings(probe)
     recover = add_command(commands, "recover", _recover, "clear the faults of a cell's devices, after asking")
     add_cell(recover)
 
@@ -38,7 +39,8 @@ def _recover(options: argparse.Namespace) -> int:
 
 def _probe(options: argparse.Namespace) -> int:
     from touchcell.cell.cli.devices import print_probes, probe_cell
+    from touchcell.cell.config.settings import parse_settings
 
-    probes = probe_cell(find_cell(options.cell))
+    probes = probe_cell(find_cell(options.cell), parse_settings(options.settings), options.world)
     print_probes(probes)
     return EXIT_DEVICE_LOST if any(probe.error for probe in probes) else EXIT_OK

@@ -14,6 +14,7 @@ from typing import Literal, Self, final
 import numpy as np
 from pydantic import Field, model_validator
 
+from touchcell.drivers.core.behaviour import CameraBehaviour
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
@@ -77,6 +78,13 @@ class CameraConfig(DriverConfig):
                 f"{1e6 / self.rate_hz:.0f} us: the camera would deliver fewer frames"
             )
         return self
+
+
+def camera_behaviour(config: CameraConfig) -> CameraBehaviour:
+    """Return how a USB camera behaves: a frame arrives about one period after its exposure."""
+    return CameraBehaviour(
+        config.rate_hz, 1.0 / config.rate_hz, config.width_px, config.height_px, color=config.color == "bgr"
+    )
 
 
 class UnsupportedSetting(ConfigError):

@@ -13,11 +13,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from functools import partial
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from touchcell.drivers.core.behaviour import ArmBehaviour
 from touchcell.drivers.core.bus_arm import BusArm, BusArmConfig
 from touchcell.drivers.core.bus_reply import Reply
 from touchcell.drivers.core.clock import Clock
@@ -513,6 +514,22 @@ def _build(name: str, config: DamiaoCanConfig, context: DriverContext) -> Damiao
     return DamiaoCanArm(name, config, context.clock)
 
 
+HOME_DEG: Final = (0.0, 40.0, 90.0, 0.0, 50.0, 0.0)
+"""Tool in front of the base, pointing down, of a ``generic_6r`` arm."""
+
+
+def behaviour(config: DamiaoCanConfig) -> ArmBehaviour:
+    """Return how the arm behaves: one cycle of the bus until a setpoint is sent, one until it acts."""
+    home_deg = HOME_DEG if config.joint_count == len(HOME_DEG) else config.park_deg or (0.0,) * config.joint_count
+    return ArmBehaviour(
+        state_rate_hz=config.rate_hz,
+        latency_s=2.0 / config.rate_hz,
+        home_deg=home_deg,
+        max_state_age_s=config.max_silence_s,
+        watchdog_s=config.watchdog_s,
+    )
+
+
 SPEC = DriverSpec(
     name="damiao_can",
     summary="arm of Damiao MIT-mode motors on CAN or CAN FD (OpenArm, YAM, reBot class), over python-can",
@@ -529,4 +546,5 @@ SPEC = DriverSpec(
         falls_on_power_loss=True,
     ),
     build=_build,
+    behaviour=behaviour,
 )

@@ -18,11 +18,12 @@ import hashlib
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from touchcell.drivers.core.behaviour import ArmBehaviour
 from touchcell.drivers.core.bus_arm import BusArm, BusArmConfig
 from touchcell.drivers.core.bus_reply import Reply
 from touchcell.drivers.core.clock import Clock
@@ -521,6 +522,21 @@ def _build(name: str, config: FeetechSerialConfig, context: DriverContext) -> Fe
     return FeetechSerialArm(name, config, context.clock)
 
 
+HOME_DEG: Final = (0.0, 10.0, 90.0, 80.0, 0.0)
+"""Tool in front of the base, pointing down, of an ``so101_5r`` arm."""
+
+
+def behaviour(config: FeetechSerialConfig) -> ArmBehaviour:
+    """Return how the arm behaves: one cycle of the bus until a goal is sent, one until it acts."""
+    home_deg = HOME_DEG if config.joint_count == len(HOME_DEG) else config.park_deg or (0.0,) * config.joint_count
+    return ArmBehaviour(
+        state_rate_hz=config.rate_hz,
+        latency_s=2.0 / config.rate_hz,
+        home_deg=home_deg,
+        max_state_age_s=config.max_silence_s,
+    )
+
+
 SPEC = DriverSpec(
     name="feetech_serial",
     summary="arm of Feetech STS3215 bus servos on a serial port (SO-100, SO-101 class)",
@@ -537,4 +553,5 @@ SPEC = DriverSpec(
         falls_on_power_loss=True,
     ),
     build=_build,
+    behaviour=behaviour,
 )

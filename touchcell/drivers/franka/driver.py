@@ -16,13 +16,14 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Final
 from xml.etree import ElementTree
 
 import numpy as np
 from pydantic import Field
 
 from touchcell.drivers.core.arm import Arm, JointLimitsConfig, LimitsConfig
+from touchcell.drivers.core.behaviour import ArmBehaviour
 from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.command_checks import finite_array
@@ -617,11 +618,31 @@ def _build(name: str, config: FrankaConfig, context: DriverContext) -> FrankaArm
     return FrankaArm(name, config, context.clock)
 
 
+HOME_DEG: Final = (0.0, -45.0, 0.0, -135.0, 0.0, 90.0, 45.0)
+"""Ready pose of Franka's own examples."""
+
+_ACCEL_M_S2, _ROT_ACCEL_RAD_S2 = 9.0, 17.0
+"""Largest Cartesian accelerations of an FR3 (Franka, "Robot and interface specifications")."""
+
+
+def behaviour(config: FrankaConfig) -> ArmBehaviour:
+    """Return how the arm behaves: it stops with a fraction of its largest accelerations."""
+    return ArmBehaviour(
+        state_rate_hz=CAPABILITIES.state_rate_hz,
+        latency_s=0.003,
+        home_deg=HOME_DEG,
+        stop_accel_m_s2=config.stop_dynamics_factor * _ACCEL_M_S2,
+        stop_rot_accel_rad_s2=config.stop_dynamics_factor * _ROT_ACCEL_RAD_S2,
+        watchdog_s=_WATCHDOG_S,
+    )
+
+
 SPEC = DriverSpec(
     name="franka",
     summary="Franka FR3 and Research 3 over franky: velocity streaming with a native time-to-live, contact backstop",
     config=FrankaConfig,
     capabilities=CAPABILITIES,
     build=_build,
+    behaviour=behaviour,
     extra="franka",
 )

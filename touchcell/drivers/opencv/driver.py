@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING
 
-from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting
+from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting, camera_behaviour
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import ConnectError, DeviceGone
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
@@ -247,4 +247,5 @@ SPEC = DriverSpec(
     config=OpencvCameraConfig,
     capabilities=Capabilities(kind="camera", provides=frozenset({FrameSource, HealthSource}), state_rate_hz=30.0),
     build=build,
+    behaviour=camera_behaviour,
 )

@@ -11,12 +11,13 @@ import math
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Final, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from touchcell.drivers.core.arm import Arm, JointLimitsConfig, LimitsConfig
+from touchcell.drivers.core.behaviour import ArmBehaviour
 from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
@@ -638,6 +639,24 @@ def _build(name: str, config: UrConfig, context: DriverContext) -> UrArm:
     return UrArm(name, config, context.clock)
 
 
+HOME_DEG: Final = (0.0, -90.0, -90.0, -90.0, 90.0, 0.0)
+"""Home of a new e-Series arm: upper arm upright, tool down (Universal Robots, user manual, "Home")."""
+
+
+def behaviour(config: UrConfig) -> ArmBehaviour:
+    """Return how the arm behaves: speedL with the configured deceleration, a watchdog in the controller."""
+    return ArmBehaviour(
+        state_rate_hz=RATE_HZ,
+        # One control period until the program reads its registers, one until the arm moves.
+        latency_s=2.0 / RATE_HZ,
+        home_deg=HOME_DEG,
+        stop_accel_m_s2=config.stop_accel_m_s2,
+        stop_rot_accel_rad_s2=config.stop_accel_m_s2,
+        max_state_age_s=config.state_timeout_s,
+        watchdog_s=1.0 / config.watchdog_hz,
+    )
+
+
 SPEC = DriverSpec(
     name="ur",
     summary="Universal Robots e-Series (PolyScope 5) over ur-rtde",
@@ -654,5 +673,6 @@ SPEC = DriverSpec(
         falls_on_power_loss=False,
     ),
     build=_build,
+    behaviour=behaviour,
     extra="ur",
 )

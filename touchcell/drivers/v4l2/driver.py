@@ -6,9 +6,11 @@ Source: the kernel's "Video for Linux API", chapters "Streaming I/O (Memory Mapp
 from __future__ import annotations
 
 import math
+import os
 import time
+from pathlib import Path
 
-from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting
+from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting, camera_behaviour
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.errors import ConnectError, DeviceFault, DeviceGone, FaultClass, Remedy, TransportError
@@ -17,6 +19,7 @@ from touchcell.drivers.core.samples import Quality
 from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.v4l2 import codec
 from touchcell.drivers.v4l2.node import KernelCalls, SystemCalls, VideoNode
+from touchcell.drivers.v4l2.shim import EMULATED_CAMERAS, ShimCalls
 
 _LONGEST_PAUSE_S = 0.5
 _FEWEST_BUFFERS = 4
@@ -286,8 +289,9 @@ def is_stable_name(path: str) -> bool:
 
 
 def build(name: str, config: V4l2Config, context: DriverContext) -> V4l2Camera:
-    """Build a DISCONNECTED camera."""
-    return V4l2Camera(name, context.clock, config)
+    """Build a DISCONNECTED camera; an emulated one where the variable of emulated cameras names their folder."""
+    folder = os.environ.get(EMULATED_CAMERAS)
+    return V4l2Camera(name, context.clock, config, ShimCalls(Path(folder)) if folder else None)
 
 
 SPEC = DriverSpec(
@@ -296,4 +300,5 @@ SPEC = DriverSpec(
     config=V4l2Config,
     capabilities=Capabilities(kind="camera", provides=frozenset({FrameSource, HealthSource}), state_rate_hz=30.0),
     build=build,
+    behaviour=camera_behaviour,
 )
