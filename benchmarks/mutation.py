@@ -38,9 +38,15 @@ Change = Callable[[ast.AST], None]
 
 _INTERLOCKS = ("tests/control/interlocks", "tests/control/test_supervisor.py")
 MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "gate": ("touchcell/drivers/core/gate.py", ("tests/drivers/core/test_gate_refusals.py", "tests/drivers/core")),
+    "gate": (
+        "touchcell/drivers/core/gate.py",
+        ("tests/drivers/core/test_gate_refusals.py", "tests/drivers/core/test_gate.py"),
+    ),
     "command_checks": ("touchcell/drivers/core/command_checks.py", ("tests/drivers/core/test_gate_refusals.py",)),
-    "lease": ("touchcell/drivers/core/lease.py", ("tests/drivers/core",)),
+    "lease": (
+        "touchcell/drivers/core/lease.py",
+        ("tests/drivers/core/test_gate_refusals.py", "tests/drivers/core/test_gate.py"),
+    ),
     "latch": ("touchcell/control/latch.py", ("tests/control/test_latch.py", "tests/control/test_supervisor.py")),
     "supervisor": (
         "touchcell/control/supervisor.py",
@@ -55,8 +61,14 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "depth_disagrees": ("touchcell/control/interlocks/depth_disagrees.py", _INTERLOCKS),
     "pressure": ("touchcell/control/interlocks/pressure.py", _INTERLOCKS),
     "hold_to_run": ("touchcell/control/interlocks/hold_to_run.py", _INTERLOCKS),
-    "stopping": ("touchcell/cell/runtime/stopping.py", ("tests/cell/runtime/test_stopping.py",)),
-    "reset_procedure": ("touchcell/cell/runtime/reset_procedure.py", ("tests/cell/runtime/test_reset.py",)),
+    "stopping": (
+        "touchcell/cell/runtime/stopping.py",
+        ("tests/cell/runtime/test_stopping_measures.py", "tests/cell/runtime/test_stopping.py"),
+    ),
+    "reset_procedure": (
+        "touchcell/cell/runtime/reset_procedure.py",
+        ("tests/cell/runtime/test_reset_procedure.py", "tests/cell/runtime/test_reset.py"),
+    ),
 }
 """Modules by name: the file, and the tests that are about it."""
 
@@ -110,12 +122,14 @@ def mutants(source: str) -> Iterator[Mutant]:
 
 
 def _roots(node: ast.AST) -> Iterator[ast.AST]:
-    """Return what below ``node`` is not to be changed: annotations, which nothing evaluates, and spared functions."""
+    """Return what below ``node`` is not to be changed: annotations, words, and spared functions."""
     if isinstance(node, ast.FunctionDef):
         if node.name in _SPARED:
             yield node
         if node.returns is not None:
             yield node.returns
+    if isinstance(node, ast.JoinedStr):
+        yield node
     annotation = node.annotation if isinstance(node, ast.arg | ast.AnnAssign) else None
     if annotation is not None:
         yield annotation

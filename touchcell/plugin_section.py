@@ -20,7 +20,7 @@ PLUGIN: Final = "x-plugin"
 class Section(BaseModel):
     """Base of a plug-in's section: unknown keys are refused, values are frozen and finite."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 class HasConfig(Protocol):
@@ -77,5 +77,7 @@ class PluginSection:
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         models = [self.registry.load(name).config for name in self.registry.names()]
+        for model in models:
+            model.model_rebuild()
         union = handler(core_schema.union_schema([model.__pydantic_core_schema__ for model in models]))
         return union | {PLUGIN: self.registry.noun}

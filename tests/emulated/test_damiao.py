@@ -521,3 +521,14 @@ def test_a_failing_control_loop_keeps_holding_the_arm(
     arm.recover(TOKEN)
     arm.activate()
     assert emulator.state()["enabled"] == 6
+
+
+def test_an_encoder_one_turn_off_is_counted_into_the_joints_range(arm: DamiaoCanArm, emulator: EmulatorProcess) -> None:
+    emulator.fault("turn_off", [1, -1])
+    activate(arm)
+    state = emulator.wait_for(enabled=6)
+    np.testing.assert_allclose(arm.joints().value.q, state["q_rad"], atol=5e-3)
+    assert arm.health()["turns_added"] == "0 1 0 0 0 0"
+    commands = state["commands"]
+    wait(lambda: emulator.state()["commands"] > commands + 300)
+    np.testing.assert_allclose(position(emulator.state()), position(state), atol=2e-3)

@@ -26,7 +26,7 @@ class Topic(Mapping[str, NDArray[Any]]):
     Attributes:
         name: such as "/arms/arm/tcp".
         t_s: (n,) time of each row since the start of the recording.
-        columns: (n,) numbers, NaN where none was recorded; (n, k) for lists; words and ragged lists as objects.
+        columns: (n,) numbers, NaN where none was recorded; (n, k) for lists; strings and ragged lists as objects.
         units: unit by column, "" for what has none.
     """
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from types import ModuleType
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,6 +36,8 @@ def _in_rows(image: ImageArray) -> ImageArray:
 
 def median_5(image: ImageArray) -> ImageArray:
     """Return the median of 5x5 pixels of a grey image, its border replicated; takes half the time of OpenCV's."""
+    import cv2
+
     if _FOUND is None:
         return np.asarray(cv2.medianBlur(np.ascontiguousarray(image), 5), np.uint8)
     medians = np.empty(image.shape, np.uint8)
@@ -53,6 +54,8 @@ def threshold(image: ImageArray, block_px: int, offset: float, *, of_median_5: b
         offset: grey levels.
         of_median_5: take the medians of 5x5 pixels first, without storing the whole filtered image.
     """
+    import cv2
+
     if _FOUND is None:
         image = median_5(image) if of_median_5 else np.ascontiguousarray(image)
         mean, binary = cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY
@@ -70,6 +73,8 @@ def area_means(image: ImageArray, size: tuple[int, int]) -> ImageArray:
         image: uint8 (height, width).
         size: (height, width) of the result.
     """
+    import cv2
+
     (height, width), (rows, columns) = image.shape, size
     factor = height // rows
     whole = height % rows == 0 and width % columns == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,6 +35,8 @@ def expose(
     cover: ImageArray, contrast: ImageArray, background: ImageArray, noise: NDArray[np.int8], top: int, left: int
 ) -> ImageArray:
     """Return ``background + contrast * cover / 255`` (height, width), plus the window of ``noise`` at (top, left)."""
+    import cv2
+
     height, width = cover.shape
     clean = cv2.add(cv2.multiply(cover, contrast, scale=1.0 / 255.0), background)
     grain: NDArray[np.int8] = np.ascontiguousarray(noise[top : top + height, left : left + width])

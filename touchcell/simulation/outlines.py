@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 
 from touchcell.geometry.types import Array
@@ -71,6 +70,8 @@ def _moved(points: Array, T: Array) -> Array:
 
 
 def _hull_mm(points: Array, view: View) -> Array:
+    import cv2
+
     flat = (1e3 * points[:, list(view)]).astype(np.float32)
     hull = cv2.convexHull(flat)[:, 0].astype(np.float64)
     return np.concatenate([hull, hull[:1]])

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Protocol, cast
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -116,6 +115,8 @@ class FrameRenderer:
 
     def raw(self, pixels: Array, frame: int = 0) -> ImageArray:
         """Render a grey frame (480, 640) with discs at ``pixels`` (n, 2); ``frame`` selects the noise."""
+        import cv2
+
         width, height = FRAME_SIZE
         cover = np.zeros((height, width), np.uint8)
         self._stamps.paint(cover, pixels)

@@ -26,7 +26,7 @@ class TipFile(BaseModel):
         measured: fit method and marker errors on held-out images, for the operator.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
     schema_: Literal[1] = Field(default=1, alias="schema")
     tip: TipParameters

@@ -43,7 +43,7 @@ DISTANCE: Final = Demand("distance")
 class TaskConfig(BaseModel):
     """Base of every task's parameters: unknown keys refused, values frozen, units in the names."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,10 @@ import pytest
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.cli.main import main
 from touchcell.cell.experiments.executors import Workers
+from touchcell.cell.experiments.run_trials import perform_all
 from touchcell.cell.experiments.runner import EXPERIMENTS, ExperimentSpec, Scale, run_experiment
 from touchcell.cell.experiments.table import Column, Row, table, to_json
-from touchcell.cell.experiments.trials import Finished, Perform, Trial, perform_all
+from touchcell.cell.experiments.trials import Finished, Perform, Trial
 from touchcell.cell.recording.mcap import read
 from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS

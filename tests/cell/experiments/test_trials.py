@@ -17,8 +17,9 @@ from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.cli.main import main
 from touchcell.cell.experiments.elsewhere import WorkerDiffers
 from touchcell.cell.experiments.executors import Workers
+from touchcell.cell.experiments.run_trials import perform_all
 from touchcell.cell.experiments.runner import stale_note
-from touchcell.cell.experiments.trials import LOG, Finished, Perform, Trial, files_named, perform_all
+from touchcell.cell.experiments.trials import LOG, Finished, Perform, Trial, files_named
 from touchcell.cell.recording.mcap import read
 from touchcell.paths import CONFIGS
 

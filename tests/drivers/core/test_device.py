@@ -8,7 +8,15 @@ import pytest
 
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.device import DeactivatePolicy, Device, Lifecycle, OperatorToken
-from touchcell.drivers.core.errors import CommandRejected, DeviceError, DeviceFault, DeviceGone, Rejection
+from touchcell.drivers.core.errors import (
+    CommandRejected,
+    DeviceError,
+    DeviceFault,
+    DeviceGone,
+    LifecycleError,
+    Rejection,
+    Remedy,
+)
 
 
 class Gadget(Device):
@@ -18,16 +26,29 @@ class Gadget(Device):
         super().__init__("gadget", VirtualClock())
         self.latch_on_the_way: DeviceError | None = None
         self.raise_at_rest: DeviceError | None = None
+        self.has_fault: DeviceError | None = None
+        self.raise_in_configure: DeviceError | None = None
+        self.configured = 0
 
     def _open(self) -> None: ...
 
     def _close(self) -> None: ...
+
+    def _present_fault(self) -> DeviceError | None:
+        return self.has_fault
+
+    def _configure(self) -> None:
+        if self.raise_in_configure is not None:
+            raise self.raise_in_configure
+        self.configured += 1
 
     def _activate(self) -> None:
         if self.latch_on_the_way is not None:
             self._to_faulted(self.latch_on_the_way)
 
     def _recover(self, token: OperatorToken) -> None:
+        if self.has_fault is not None:
+            raise self.has_fault
         if self.latch_on_the_way is not None:
             thread = threading.Thread(target=self._to_faulted, args=(self.latch_on_the_way,))
             thread.start()
@@ -132,6 +153,34 @@ def test_no_transition_overwrites_a_fault_of_the_last_moment(gadget: Gadget, tra
         getattr(gadget, transition)()
     assert gadget.state is Lifecycle.FAULTED
     assert gadget.fault is fault
+
+
+def test_a_device_with_a_fault_from_before_is_faulted_once_connected_and_configured_by_recovery() -> None:
+    gadget = Gadget()
+    gadget.has_fault = DeviceFault("gadget", "stopped by its watchdog")
+    gadget.connect()
+    assert (gadget.state, gadget.fault) == (Lifecycle.FAULTED, gadget.has_fault)
+    with pytest.raises(LifecycleError, match="stopped by its watchdog"):
+        gadget.configure()
+    with pytest.raises(DeviceFault):
+        gadget.recover(OperatorToken("test", 0))
+    gadget.has_fault = None
+    gadget.recover(OperatorToken("test", 0))
+    assert (gadget.state, gadget.configured) == (Lifecycle.READY, 1)
+    gadget.activate()
+    assert gadget.state is Lifecycle.ACTIVE
+
+
+@pytest.mark.parametrize(
+    ("needs", "state"), [(Remedy.RECOVER, Lifecycle.FAULTED), (Remedy.OPERATOR, Lifecycle.PASSIVE)]
+)
+def test_a_fault_found_by_configuring_is_latched_if_recovery_can_clear_it(needs: Remedy, state: Lifecycle) -> None:
+    gadget = Gadget()
+    gadget.connect()
+    gadget.raise_in_configure = DeviceFault("gadget", "protective stop", needs=needs)
+    with pytest.raises(DeviceFault, match="protective stop"):
+        gadget.configure()
+    assert gadget.state is state
 
 
 def test_a_fault_latched_by_another_thread_during_recovery_keeps_the_device_faulted(gadget: Gadget) -> None:

@@ -18,8 +18,8 @@ def test_a_rate_as_promised_with_jitter_is_no_fault() -> None:
 
 
 @pytest.mark.parametrize("true_hz", [16.0, 32.5, 53.0, 70.0])
-def test_another_rate_is_a_fault_within_two_seconds(true_hz: float) -> None:
-    assert after(FrameRate(60.0), [1 / true_hz] * 60).is_broken
+def test_another_rate_is_a_fault_within_120_frames(true_hz: float) -> None:
+    assert after(FrameRate(60.0), [1 / true_hz] * 120).is_broken
 
 
 def test_every_third_frame_missing_without_a_gap_in_the_numbers_is_a_fault() -> None:
@@ -35,3 +35,7 @@ def test_lost_frames_that_the_numbers_tell_are_no_fault_of_the_rate() -> None:
 
 def test_a_stall_is_no_fault_of_the_rate() -> None:
     assert not after(FrameRate(60.0), [1 / 60] * 59 + [1.5] + [1 / 60] * 59).is_broken
+
+
+def test_a_moment_in_which_the_machine_is_busy_is_no_fault() -> None:
+    assert not after(FrameRate(60.0), [1 / 60] * 60 + [2.5 / 60] * 40 + [1 / 60] * 60).is_broken

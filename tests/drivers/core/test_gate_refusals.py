@@ -168,6 +168,12 @@ def test_no_two_leases_are_equal(harness: GateHarness) -> None:
     assert harness.desk.owner == second.owner
 
 
+def test_a_released_lease_is_nobodys_and_can_be_acquired_by_another(harness: GateHarness) -> None:
+    harness.desk.release(harness.lease)
+    assert harness.desk.owner is None
+    assert harness.desk.acquire("other").owner == harness.desk.owner == "other"
+
+
 def test_of_concurrent_threads_exactly_one_acquires_the_lease() -> None:
     desk = LeaseManager("arm")
     given_out: list[Lease] = []

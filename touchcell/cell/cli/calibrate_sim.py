@@ -1,6 +1,6 @@
 """``touchcell calibrate-sim``: the simulated tip made like a real one, from a score of labelled images.
 
-Images of ``train`` teach, without labels, which marker is where. The labels of a few then tell camera, mount, slip and
+Images of ``train`` teach, without labels, which marker is where. The labels of a few then give camera, mount, slip and
 skin; others of ``train``, and some of ``val`` where there is one, tell how far other markers are off.
 """
 

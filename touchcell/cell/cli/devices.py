@@ -26,7 +26,7 @@ class Probe:
 
     Attributes:
         name, driver: of the device.
-        readings: what it told, in words.
+        readings: what it reported, as text.
         error: why it could not be reached, or None.
     """
 
@@ -56,7 +56,7 @@ def print_devices() -> None:
 
 
 def probe_cell(path: Path) -> list[Probe]:
-    """Connect every device of a cell file one after the other, in PASSIVE only, and ask what it tells.
+    """Connect every device of a cell file one after the other, in PASSIVE only, and ask what it reports.
 
     Raises:
         ConfigError: the cell file is not valid.
@@ -66,7 +66,7 @@ def probe_cell(path: Path) -> list[Probe]:
 
 
 def print_probes(probes: Sequence[Probe]) -> None:
-    """Print what each device told."""
+    """Print what each device reported."""
     for probe in probes:
         print(f"{probe.name} ({probe.driver}): {'passive, answers' if probe.error is None else 'DOES NOT ANSWER'}")
         if probe.error is not None:

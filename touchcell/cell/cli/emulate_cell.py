@@ -152,7 +152,7 @@ class CellEmulator(Emulator):
             process.stop()
 
     def state(self) -> dict[str, Any]:
-        """What is true: where objects and sensors are, and what these touch; cameras as their own emulators tell."""
+        """What is true: where objects and sensors are, and what these touch; cameras as their own emulators report."""
         scene = self._scene
         if scene is None:
             return {}

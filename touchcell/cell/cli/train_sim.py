@@ -2,7 +2,7 @@
 
 Frames are drawn as the simulated camera draws them and go through the model's own preprocessing, so that training and
 serving cannot differ. The sensors scatter a little about the default one, so that the model learns the kind and not
-one of them by heart. With a tip file they scatter about a real sensor, and labels are what its arm was told to do: such
+one of them by heart. With a tip file they scatter about a real sensor, and labels are what its arm was commanded: such
 an estimator reads the real sensor's images, as far as the simulation is true.
 """
 

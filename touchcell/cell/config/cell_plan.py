@@ -42,19 +42,19 @@ def _folder_name(name: str) -> str:
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 class OpenSection(BaseModel):
     """A section whose other keys belong to the driver or task that it names."""
 
-    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 class CapsuleSection(_Section):
     """A part of an arm: all within ``radius_mm`` of a segment from ``from_mm`` to ``to_mm`` in the tool's frame.
 
-    ``from_base_mm`` in place of ``from_mm`` is a place in the base's frame: for the forearm of an arm that tells only
+    ``from_base_mm`` in place of ``from_mm`` is a place in the base's frame: for the forearm of an arm that reports only
     where its tool is.
 
     Attributes:
@@ -222,7 +222,7 @@ class CellFile(_Section):
 
     ``on_trip: end`` ends a run that has tripped; ``wait_for_reset`` keeps it up, with the arms stopped and watched,
     until a person has reset it and lets the task start again. ``emulated_scene`` is what `touchcell emulate cell` puts
-    around the cell's arms and cameras; nothing else looks at it.
+    around the cell's arms and cameras; nothing else reads it.
 
     Attributes:
         schema_: version of the format; 1.

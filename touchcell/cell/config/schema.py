@@ -286,7 +286,7 @@ class _Planner:
         return replace(plan, proofs=proofs)
 
     def _require_data_is_used(self, cell: CellFile, devices: Mapping[str, DevicePlan]) -> None:
-        """A data set that is given is there, and something reads it or writes it."""
+        """A data set that is given exists, and something reads it or writes it."""
         data = self._overrides.get("data")
         if data is None or cell.collect is not None:
             return

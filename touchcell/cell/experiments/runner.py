@@ -16,8 +16,9 @@ from typing import Any, Final
 from touchcell.cell.analysis.provenance import provenance
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.experiments.executors import Workers
+from touchcell.cell.experiments.run_trials import perform_all
 from touchcell.cell.experiments.table import Column, Row, table, to_json
-from touchcell.cell.experiments.trials import Finished, Perform, Trial, perform_all
+from touchcell.cell.experiments.trials import Finished, Perform, Trial
 from touchcell.registry import Registry
 
 

@@ -1,6 +1,6 @@
 """The black box: the last ten seconds of a run, in a file that outlives the run's process.
 
-It holds what the recording holds but images, and is there whatever ends the run: a trip, a failure, `kill -9`, a crash,
+It holds what the recording holds but images, and survives whatever ends the run: a trip, a failure, `kill -9`, a crash,
 a lack of memory, a full disk. A run that ends by itself writes it as ``blackbox.mcap`` and ``blackbox.json`` for people
 and other programs, and removes the ring; a ring that is left belongs to a run that could not.
 """

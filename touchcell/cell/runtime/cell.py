@@ -16,6 +16,7 @@ from touchcell.control.supervisor import Supervisor
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device, Lifecycle
 from touchcell.drivers.core.enabling import EnablingDevice
+from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import StopCategory
 from touchcell.tasks.interface import Task
 
@@ -37,7 +38,7 @@ class Cell:
         new_task: makes it anew, in its first state, after a trip.
         stop_categories: by which each arm stops when something is wrong, by role.
         holding: roles of arms that keep their power when another's fault stops them.
-        watched_joints: roles of arms whose joint angles an interlock looks at.
+        watched_joints: roles of arms whose joint angles an interlock reads.
         watched_wrenches, watched_torques: roles of arms whose wrench, or external torque, an interlock needs.
         enabling_device: operator input of a cell whose file names one.
         scene: what is simulated around the arms, as far as it can be looked into; None in a cell of real devices.
@@ -93,6 +94,12 @@ class Cell:
             self._exit.enter_context(self.watchdog)
             for device in self._devices():
                 self._exit.enter_context(device)
+                if device.state is Lifecycle.FAULTED:
+                    raise DeviceError(
+                        device.name,
+                        f"has a fault from before: {device.fault}",
+                        hint="`touchcell recover CELL` clears it, after asking you",
+                    )
                 device.configure()
             self.require_armed()
             # Every device must answer before the first one is energised.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """What is there before any device of this process.
+    """What exists before any device of this process.
 
     Attributes:
         clock: time of the cell.
@@ -70,7 +70,7 @@ def build_devices(
         plan: a checked cell file.
         wanted: arms before the sensors that they carry.
         clock: in place of the one that the file asks for.
-        scene: the simulated scene, if it is there already.
+        scene: the simulated scene, if it exists already.
         present: devices that are there already.
     """
     clock = clock or _clock(plan)

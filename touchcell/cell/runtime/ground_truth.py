@@ -1,6 +1,6 @@
 """What is known to be true: the simulator's own contact, or the label of a replayed image.
 
-In place of an estimate it shows control error apart from estimation error; beside one it tells the estimate's error.
+In place of an estimate it shows control error apart from estimation error; beside one it gives the estimate's error.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The control cycle: read the arms, perceive, let the task think, let the supervisor judge, send, record.
 
-One thread. Its states are those of ``touchcell.cell.runtime.run_states``. Whatever goes wrong, all arms are told to
-stop before anything else happens, each is watched until it stands, and the run ends in a report, or waits for the
+One thread. Its states are those of ``touchcell.cell.runtime.run_states``. Whatever goes wrong, all arms are commanded
+to stop before anything else happens, each is watched until it stands, and the run ends in a report, or waits for the
 operator if its cell file says so.
 """
 
@@ -107,7 +107,7 @@ class RunLoop:
 
     def run(self) -> RunResult:
         """Run until the task has finished, the supervisor has tripped, or something has failed. Never raises for what
-        devices, tasks, data or disk do: that ends in a result, with the arms told to stop."""
+        devices, tasks, data or disk do: that ends in a result, with the arms commanded to stop."""
         try:
             while self.step():
                 pass
@@ -176,7 +176,7 @@ class RunLoop:
             self._pacing.restart()
 
     def enter_stopping(self, record: TransitionRecord) -> None:
-        """Called on entry to STOPPING: all arms are told to stop."""
+        """Called on entry to STOPPING: all arms are commanded to stop."""
         latch = self._cell.supervisor.latch
         if record.event == FAULT:
             self._error = self._error or TouchcellError(record.reason)
@@ -196,7 +196,7 @@ class RunLoop:
         self._pacing.restart()
 
     def waits_for_reset(self) -> bool:
-        """Whether the run waits for the operator once its arms stand: after a trip, if the cell file says so."""
+        """Whether the run waits for the operator once its arms stand: after a trip, if the cell file asks for it."""
         latched = self._cell.supervisor.latch.first_cause is not None
         return self._reset is not None and latched and self._machine.records[-1].event == TRIP
 

@@ -1,6 +1,6 @@
 """Operator requests to a run that has tripped: reset and resume, by a key or from another shell, and their answers.
 
-Another shell connects to a UNIX socket in the run folder, which is there only while the run waits. Its mode lets only
+Another shell connects to a UNIX socket in the run folder, which exists only while the run waits. Its mode lets only
 this user connect, and the peer's credentials are checked besides. A message is one packet of bounded size, nothing
 blocks the loop, and what is malformed is logged and dropped. Requests made before the run waits do not count.
 """

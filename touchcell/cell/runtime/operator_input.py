@@ -1,4 +1,4 @@
-"""How a person stops a running cell, and lets one that has tripped go on: keys, signals, a lost terminal, other shells.
+"""How a person stops a running cell, and resumes one that has tripped: keys, signals, a lost terminal, other shells.
 
 All of them only ask; the loop looks once a cycle. This is no emergency stop: that one is wired.
 """
@@ -43,7 +43,7 @@ class NoSuchRun(TouchcellError):
 
 
 class FolderInUse(TouchcellError):
-    """Another run goes on in the run folder.
+    """Another run is in progress in the run folder.
 
     Attributes:
         folder: the run folder.
@@ -132,7 +132,7 @@ def reachable(folder: Path) -> Iterator[None]:
     """While inside, ``touchcell stop FOLDER`` finds this process: by a file with its number, locked while it lives.
 
     Raises:
-        FolderInUse: another run goes on there.
+        FolderInUse: another run is in progress there.
     """
     with (folder / PID_FILE).open("a") as file:
         try:
@@ -151,12 +151,12 @@ def reachable(folder: Path) -> Iterator[None]:
 
 
 def running(runs: Path) -> list[Path]:
-    """Folders below ``runs`` whose run goes on."""
+    """Folders below ``runs`` whose run is in progress."""
     return sorted(file.parent for file in runs.glob(f"*/{PID_FILE}") if _owner(file) is not None)
 
 
 def is_running(folder: Path) -> bool:
-    """Whether the run in ``folder`` goes on."""
+    """Whether the run in ``folder`` is in progress."""
     return _owner(folder / PID_FILE) is not None
 
 
@@ -186,7 +186,7 @@ def await_end(folder: Path, wait_s: float = _WAIT_S) -> bool:
 
 
 def _owner(file: Path) -> int | None:
-    """Process that holds the file; None where nobody does, so that a number left by a crash reaches no stranger."""
+    """Process that holds the file; None where no process does, so that a number left by a crash reaches no stranger."""
     try:
         with file.open() as stream:
             try:

@@ -97,7 +97,7 @@ class ProcessWatchdog:
         self.chain.begin()
 
     def beat(self) -> None:
-        """Say that the loop goes on."""
+        """Report that the loop is alive."""
         self.chain.beat()
 
     def alarms(self, now_ns: int) -> Sequence[Violation]:
@@ -126,7 +126,7 @@ class ProcessWatchdog:
         )
 
     def end(self) -> None:
-        """Nobody is guarded any more."""
+        """Nothing is guarded any more."""
         self.chain.end()
 
     def clear(self) -> None:

@@ -41,7 +41,7 @@ class RunResult:
     """How a run ended and how long its cycles took.
 
     Attributes:
-        outcome: in one word.
+        outcome: a single term.
         reason: in one sentence; empty when the task simply finished.
         state: the task's last state.
         duration_s: cell time from start to end.

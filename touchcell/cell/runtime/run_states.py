@@ -36,8 +36,8 @@ class RunState(Enum):
 def run_table(max_duration_s: float) -> Table:
     """The states of a run whose task may take ``max_duration_s`` from each start to its end.
 
-    All ways out of motion lead through STOPPING, on whose entry all arms are told to stop, and out of STOPPING only
-    ``stopped`` leads. Nothing but ``resume`` leads from a trip back to motion, and only while the latch is clear.
+    All ways out of motion lead through STOPPING, on whose entry all arms are commanded to stop, and out of STOPPING
+    only ``stopped`` leads. Nothing but ``resume`` leads from a trip back to motion, and only while the latch is clear.
     """
     s = RunState
     return Table(

@@ -29,7 +29,7 @@ class Sensor:
     """One tactile sensor in a running cell.
 
     Attributes:
-        source: tells its contact.
+        source: gives its contact.
         arm_role: role of the arm that carries it, None where nothing moves it.
         T_tcp_sensor: (4, 4) its pose in that arm's tool frame.
         truth: what is known to be true: the simulator's own contact, or the label of a replayed image.
@@ -49,7 +49,7 @@ class Sensor:
 
     @property
     def frame(self) -> Stamped[Frame] | None:
-        """The newest frame that was looked at; None from a source that looks at none."""
+        """The newest frame that was processed; None from a source that processes none."""
         return self.source.frame
 
     def await_frame(self) -> None:

@@ -1,4 +1,4 @@
-"""What stops a run's arms and other devices: all are told in the same moment, and each is watched until it stands."""
+"""What stops a run's arms and other devices: all are commanded in the same moment, and each is watched to rest."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class StopProcedure:
         self._devices_deadline_ns = 0
 
     def begin(self, *, tripped: bool) -> None:
-        """Tell all arms to stop: as the cell file says when something is wrong, else holding where they are.
+        """Command all arms to stop: as the cell file says when something is wrong, else holding where they are.
 
         Other devices that can be stopped then stop and hold.
         """
@@ -58,7 +58,7 @@ class StopProcedure:
                     self._record.event("stop failed", f"{role}: {error}")
 
     def await_rest(self) -> Mapping[str, StopReport]:
-        """Watch the arms, then the other devices that were told to stop, until they stand."""
+        """Watch the arms, then the other devices that were commanded to stop, until they stand."""
         stops = self._stopper.watch(self._on_state, self._on_escalation)
         for role, report in stops.items():
             if report.problem:

@@ -29,7 +29,7 @@ class StopReport:
     """How one arm came to rest.
 
     Attributes:
-        category: by which it was told to stop first.
+        category: by which it was commanded to stop first.
         speed_m_s: of its tool centre point when it was told; None where it could not be read.
         time_s: until it stood; None if it never did.
         distance_m: farthest way from where it was told; None where it could not be read.
@@ -119,7 +119,7 @@ class Stopper:
         self._stopping: dict[str, _Stopping] = {}
 
     def stop(self, *, tripped: bool, distrusted: Collection[str] = ()) -> Mapping[str, Exception]:
-        """Tell every arm to stop, whatever the drivers of others raise; returns what was raised, by role.
+        """Command every arm to stop, whatever the drivers of others raise; returns what was raised, by role.
 
         Args:
             tripped: whether something is wrong; an arm whose work is merely done stops and holds.
@@ -149,7 +149,7 @@ class Stopper:
         on_state: Callable[[str, Stamped[TcpState]], None],
         on_escalation: Callable[[str, StopReport, float], None],
     ) -> Mapping[str, StopReport]:
-        """Look at every stopping arm until it stands or has had its time twice over; returns a report for each.
+        """Watch every stopping arm until it stands or has had its time twice over; returns a report for each.
 
         Args:
             on_state: called with every state that is read on the way.
@@ -232,7 +232,7 @@ class Stopper:
 
 
 def _strongest(arm: ServoArm) -> StopCategory:
-    """The strongest category that an arm offers; one that cannot be asked is told to stop and hold."""
+    """The strongest category that an arm offers; one that cannot be asked is commanded to stop and hold."""
     try:
         return min(arm.stop_categories)
     except Exception:

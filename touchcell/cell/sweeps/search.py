@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from touchcell.cell.experiments.executors import Workers
-from touchcell.cell.experiments.trials import Finished, Perform, Trial, perform_all
+from touchcell.cell.experiments.run_trials import perform_all
+from touchcell.cell.experiments.trials import Finished, Perform, Trial
 from touchcell.cell.sweeps.factors import Distribution
 from touchcell.cell.sweeps.sweep import Sweep
 from touchcell.errors import ConfigError

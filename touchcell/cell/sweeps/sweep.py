@@ -16,9 +16,10 @@ import numpy as np
 from touchcell.cell.analysis.provenance import provenance
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.experiments.executors import Workers
+from touchcell.cell.experiments.run_trials import perform_all
 from touchcell.cell.experiments.runner import stale_note, table_rows
 from touchcell.cell.experiments.table import Column, table
-from touchcell.cell.experiments.trials import Finished, Perform, Trial, perform_all
+from touchcell.cell.experiments.trials import Finished, Perform, Trial
 from touchcell.cell.sweeps.factors import Factors
 from touchcell.cell.sweeps.measures import run_measures
 from touchcell.errors import ConfigError, suggest

@@ -228,7 +228,7 @@ def of_each_sensor(
 
     Args:
         facts: of the cell.
-        able: tells sensors that can show the fault.
+        able: selects sensors that can show the fault.
         lacks: what the others lack, after the name of their estimator.
         fault: makes the fault of a role.
     """
@@ -277,7 +277,7 @@ def role_problem(role: str, roles: Iterable[str], what: str, key: str) -> Cannot
 
 
 def mount_problem(sensor: str, arm: str, facts: CellFacts, key: str) -> CannotTrip | None:
-    """Return what is wrong with a sensor that is said to sit on an arm; None if it does."""
+    """Return what is wrong with a sensor that is configured to sit on an arm; None if it does."""
     for role, roles, what in ((arm, facts.arms, "arm"), (sensor, facts.sensors, "sensor")):
         if (problem := role_problem(role, roles, what, key)) is not None:
             return problem

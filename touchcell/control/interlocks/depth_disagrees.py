@@ -1,6 +1,6 @@
 """A second depth channel that does not know the network: travel of the arm, and force where it is measured.
 
-Beyond the depth that a network was trained on, its estimate falls again and looks healthy. The arm's own poses tell how
+Beyond the depth that a network was trained on, its estimate falls again and looks healthy. The arm's own poses give how
 far it has travelled into a surface that stands still, and its wrench how hard it presses. Either has to agree with the
 estimate (two channels compared, ISO 13849-1:2023, 6.1.3.2.5; not safety-rated).
 """

@@ -30,7 +30,7 @@ class HoldToRun:
     limit_s: float
 
     def check(self, view: CellView) -> Violation | None:
-        """Return a violation for the first arm that moves, or is commanded to, while nobody enables it."""
+        """Return a violation for the first arm that moves, or is commanded to, while it is not enabled."""
         problem = self._problem(view)
         if problem is None:
             return None

@@ -23,7 +23,7 @@ class InterlockSettings(BaseModel):
         severity: ``limit`` slows the motion first, ``trip`` stops it, ``fault`` stops it and distrusts the device.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
     kind: str
     severity: Literal["trip", "fault"] = "trip"

@@ -183,7 +183,7 @@ class FrameFrozenConfig(InterlockSettings):
     limit_ms: PositiveFloat
 
     def faults(self, facts: CellFacts) -> Iterable[Fault | CannotTrip]:
-        """Return each sensor with an image that stays the same while time goes on."""
+        """Return each sensor with an image that stays the same while time passes."""
 
         def frozen(role: str, sensor: SensorFacts) -> Fault:
             content = 0 if sensor.images else None

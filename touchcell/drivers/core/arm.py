@@ -146,7 +146,7 @@ class Arm(Device):
         """Follow ``command`` until it expires; returns what was really sent, along base axes.
 
         Raises:
-            CommandRejected: nothing was sent; ``reason`` tells why.
+            CommandRejected: nothing was sent; ``reason`` gives the cause.
             StaleData: the pose is too old to turn a twist along tool axes, or the joints to be kept within limits.
         """
         stop_count = self._stop_count
@@ -223,7 +223,7 @@ class Arm(Device):
         return twist_base, ()
 
     def kinematics(self) -> DifferentialIk | None:
-        """Of its joints, for an arm that tells them and whose chain is known; None for others."""
+        """Of its joints, for an arm that reports them and whose chain is known; None for others."""
         return None
 
     def _local_ik(self) -> LocalIk | None:

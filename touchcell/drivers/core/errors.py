@@ -51,7 +51,7 @@ class ConnectError(DeviceError):
 
 
 class TransportError(DeviceError):
-    """A message was lost or damaged. Transient by nature: drivers count them and give up on a budget."""
+    """A message was lost or damaged. Transient by nature: drivers count them and fail when a budget is spent."""
 
 
 class TransportTimeout(TransportError):

@@ -91,7 +91,7 @@ class TwistGate:
 
         Args:
             command: what is asked for.
-            lease: of whoever asks.
+            lease: of the caller.
             state: of the arm.
             T_base_tcp: (4, 4) for commands along tool axes.
             follow: asked first what the arm can follow at all.

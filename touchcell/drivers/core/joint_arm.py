@@ -61,6 +61,9 @@ class JointArm(Arm):
     def _local_ik(self) -> LocalIk:
         return self._ik_at(self._ik, self.joints(self._max_state_age_s).value.q)
 
+    def _present_fault(self) -> DeviceError | None:
+        return self._latched_fault
+
     def _latch(self, error: DeviceError) -> None:
         """Store the first fault, stop the setpoint, and set FAULTED."""
         new = self._latched_fault is None

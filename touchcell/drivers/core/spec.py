@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class DriverConfig(BaseModel):
     """Base of every driver's configuration: unknown keys are rejected, instances are frozen, units are in the names."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
     def described_chain(self) -> SerialChain | None:
         """Return the kinematic chain that an arm's configuration names, with its tool; None without one.

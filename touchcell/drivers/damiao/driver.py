@@ -10,6 +10,7 @@ position and disables itself after its own timeout. **An arm without brakes sink
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from functools import partial
 from typing import Annotated, Any, Literal, Self
@@ -48,6 +49,9 @@ from touchcell.drivers.kinematics.chain import GRAVITY_M_S2, ChainDescription, C
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 
+_logger = logging.getLogger(__name__)
+
+_TURN_RAD = 2.0 * np.pi
 _MAX_BUS_LOAD = 0.8
 _PLAUSIBLE_JUMP_RAD = 0.1
 # While one motor is asked, the others hear nothing: all tries together must not last as long as their watchdog.
@@ -73,7 +77,7 @@ class MotorConfig(BaseModel):
         kd_n_m_s_rad: damping of its position loop, N m s/rad.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
     esc_id: int = Field(ge=1, le=0x7F)
     mst_id: int = Field(ge=1, le=0x7FE)
@@ -166,7 +170,8 @@ class DamiaoCanArm(BusArm):
         super().__init__(name, config, clock, SerialChain(config.describe(), config.tool, config.gravity_m_s2))
         motors = config.motors
         self._direction = np.array([motor.direction for motor in motors], dtype=np.float64)
-        self._offset = np.deg2rad([motor.offset_deg for motor in motors])
+        self._zero = np.deg2rad([motor.offset_deg for motor in motors])
+        self._offset = self._zero
         addresses = [Address(motor.esc_id, motor.mst_id) for motor in motors]
         self._bus = MotorBus(
             name,
@@ -182,6 +187,7 @@ class DamiaoCanArm(BusArm):
         super()._reset_state()
         self._answers: list[Reply[Feedback] | None] = [None] * len(self._config.motors)
         self._held: tuple[Array, Array] | None = None
+        self._turns: Array | None = None
 
     def watchdog_s(self) -> float:
         """Return the timeout after which the motors disable themselves, as read back; the longest of them."""
@@ -197,6 +203,7 @@ class DamiaoCanArm(BusArm):
             "bus_state": self._bus.state,
             "bus_error": self._bus.last_error,
             "bus_load": self._config.bus_load,
+            "turns_added": "" if self._turns is None else " ".join(f"{turn / _TURN_RAD:.0f}" for turn in self._turns),
         }
         readings |= super().health()
         for joint, answer in zip(self._chain.joint_names, self._answers, strict=True):
@@ -239,7 +246,7 @@ class DamiaoCanArm(BusArm):
                     f"joint {joint} is outside its limits",
                     fault_class=FaultClass.MOTION,
                     needs=Remedy.OPERATOR,
-                    hint="move it back by hand, or correct offset_deg and direction",
+                    hint="move it back by hand; only if its angle is wrong, correct offset_deg and direction",
                 )
             for index in range(len(self._enabled)):
                 self._check_watchdog(index, int(self._bus.read(index, Register.TIMEOUT)))
@@ -408,6 +415,9 @@ class DamiaoCanArm(BusArm):
 
     def _publish(self, answers: list[Reply[Feedback]]) -> None:
         feedback = np.array([(a.state.q, a.state.dq, a.state.tau) for a in answers])
+        if self._turns is None:
+            self._turns = self._count_turns(self._direction * feedback[:, 0] + self._zero)
+            self._offset = self._zero + self._turns
         state = JointState(
             self._direction * feedback[:, 0] + self._offset,
             self._direction * feedback[:, 1],
@@ -415,6 +425,25 @@ class DamiaoCanArm(BusArm):
         )
         self._seq += 1
         self._joints = Stamped(state, min(answer.t_ns for answer in answers), self._seq)
+
+    def _count_turns(self, q: Array) -> Array:
+        """Return whole turns (n,) rad to add to joint angles, where a motor has powered up one turn off.
+
+        Only where its angle is outside the joint's range and one turn leads into it, which is unique.
+        """
+        turns = np.zeros_like(q)
+        for index, (angle, lower, upper) in enumerate(zip(q, self._chain.lower, self._chain.upper, strict=True)):
+            fits = [turn for turn in (-_TURN_RAD, 0.0, _TURN_RAD) if lower <= angle + turn <= upper]
+            if len(fits) == 1 and fits[0]:
+                turns[index] = fits[0]
+                _logger.warning(
+                    "%s: joint %s powered up one turn off, at %.1f deg; taken as %.1f deg",
+                    self.name,
+                    self._chain.joint_names[index],
+                    np.rad2deg(angle),
+                    np.rad2deg(angle + fits[0]),
+                )
+        return turns
 
     def _check_status(self, index: int, status: int) -> None:
         esc_id = self._config.motors[index].esc_id

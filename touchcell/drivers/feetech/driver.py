@@ -77,7 +77,7 @@ class ServoConfig(BaseModel):
         homing_offset_ticks: value stored in the servo when it was calibrated.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
     id: int = Field(ge=0, le=253)
     zero_ticks: int = Field(default=2048, gt=-codec.TICKS_PER_TURN, lt=2 * codec.TICKS_PER_TURN)
@@ -334,6 +334,15 @@ class FeetechSerialArm(BusArm):
             raise _servo_fault(self.name, servo, state.status, found[0])
         if state.torque_limit != self._torque_limit:
             raise _lost_power(self.name, servo)
+        if not 0 <= state.position < codec.TICKS_PER_TURN:
+            raise DeviceFault(
+                self.name,
+                f"servo {servo} is at {state.position} ticks, outside 0 to 4095 by its homing offset",
+                vendor_code="position",
+                fault_class=FaultClass.MOTION,
+                needs=Remedy.OPERATOR,
+                hint="move the joint to the middle of its range by hand; if that does not help, calibrate again",
+            )
         angle = self._angle(index, state.position)
         if not self._chain.lower[index] <= angle <= self._chain.upper[index]:
             raise DeviceFault(
@@ -347,6 +356,9 @@ class FeetechSerialArm(BusArm):
     def _angle(self, index: int, position: int) -> float:
         """Return the joint angle; the count continues beyond 4095 and 0 where that is nearer to the joint's range."""
         servo = self._config.servos[index]
+        if not 0 <= position < codec.TICKS_PER_TURN:
+            # The servo continues the count itself.
+            return servo.angle(position)
         return servo.angle(codec.unwrap(position, (servo.min_ticks + servo.max_ticks) / 2))
 
     def _enable(self, goals: list[int]) -> None:

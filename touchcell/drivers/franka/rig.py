@@ -20,7 +20,7 @@ def rig(folder: Path, address: int) -> DeviceFixture:
     """Build an arm at a loopback address of its own; it stores nothing in ``folder``."""
     host = host_of(address)
     # Emulators also run without a real-time kernel.
-    config = FrankaConfig(host=host, enforce_realtime=False)
+    config = FrankaConfig(host=host, enforce_realtime=False, state_timeout_s=0.5)
 
     def start() -> EmulatorProcess:
         return EmulatorProcess("franka", "--host", host).start()

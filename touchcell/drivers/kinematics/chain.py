@@ -41,7 +41,7 @@ GRAVITY_M_S2 = (0.0, 0.0, -9.80665)
 
 
 class _Description(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 class Placement(_Description):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import cv2
 import numpy as np
 from pydantic import Field
 
@@ -132,6 +131,8 @@ class ReplayCamera(Device):
         return self._newest
 
     def _decode(self, file: Path) -> ImageArray:
+        import cv2
+
         try:
             data = file.read_bytes()
         except OSError as error:

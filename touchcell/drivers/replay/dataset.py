@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
-import cv2
 import numpy as np
 
 from touchcell.errors import DataError
@@ -177,6 +176,8 @@ def read_image(path: Path) -> ImageArray:
     Raises:
         DataError: the file is missing, not an image, truncated, or of 16 bits with unscaled values.
     """
+    import cv2
+
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return _last_frame(path)
     try:
@@ -206,6 +207,8 @@ def read_image(path: Path) -> ImageArray:
 def _last_frame(path: Path) -> ImageArray:
     if not path.is_file():
         raise DataError(path, "cannot be read: no such file")
+    import cv2
+
     video, last = cv2.VideoCapture(str(path)), None
     try:
         while (step := video.read())[0]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-import cv2
 import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -28,7 +27,7 @@ class CameraChange(BaseModel):
         rms_px: residual of the undeformed markers after the change.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True, defer_build=True)
 
     schema_: Literal[1] = Field(default=1, alias="schema")
     zoom: float = Field(gt=0.2, lt=5.0, allow_inf_nan=False)
@@ -67,6 +66,8 @@ class CameraChange(BaseModel):
 
     def image(self, image: ImageArray) -> ImageArray:
         """Return an image as the training camera would have taken it; outside is black, binary images stay binary."""
+        import cv2
+
         height, width = image.shape[:2]
         warped = np.asarray(cv2.warpAffine(image, self.matrix, (width, height), flags=cv2.INTER_CUBIC), dtype=np.uint8)
         if ((image == 0) | (image == 255)).all():
@@ -75,6 +76,8 @@ class CameraChange(BaseModel):
 
     def undone(self, image: ImageArray) -> ImageArray:
         """Return an image of the training camera as this one would have taken it."""
+        import cv2
+
         height, width = image.shape[:2]
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         return np.asarray(cv2.warpAffine(image, self.matrix, (width, height), flags=flags), dtype=np.uint8)

@@ -92,7 +92,7 @@ class MarkerSize(BaseModel):
         longest_side_px: of the bounding box.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
     smallest_px: int = Field(gt=0)
     largest_px: int = Field(gt=0)

@@ -50,7 +50,7 @@ class Labels(BaseModel):
         high: largest label of the training set.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
     names: tuple[str, ...] = ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z")
     units: tuple[str, ...] = ("m", "m", "m", "rad", "rad", "rad")
@@ -159,7 +159,7 @@ class Header(BaseModel):
         training: settings and results of the training, for information.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
     format_version: Literal[1] = 1
     touchcell_version: str

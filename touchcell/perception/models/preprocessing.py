@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Literal, NamedTuple, cast
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -13,8 +12,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from touchcell.geometry.types import ImageArray
 from touchcell.perception import kernels
 from touchcell.perception.errors import ImageError
-
-_INTERPOLATIONS = {"linear": cv2.INTER_LINEAR, "nearest": cv2.INTER_NEAREST}
 
 
 class Crop(NamedTuple):
@@ -34,7 +31,7 @@ class AdaptiveThreshold(BaseModel):
         offset: grey levels below the mean.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
     block_px: int = Field(ge=3, le=255)
     offset: float = Field(allow_inf_nan=False)
@@ -65,7 +62,7 @@ class Preprocessing(BaseModel):
         interpolation: of the resize.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
     input_size: tuple[int, int]
     input_channels: Literal[1, 3] = 1
@@ -109,6 +106,8 @@ class Preprocessing(BaseModel):
         Raises:
             ImageError: the image is of another size, channel count or type.
         """
+        import cv2
+
         self._check(image)
         if self.crop is not None:
             image = image[self.crop.top : self.crop.bottom, self.crop.left : self.crop.right]
@@ -129,7 +128,8 @@ class Preprocessing(BaseModel):
         if self.interpolation == "area":
             return kernels.area_means(image, self.output_size)
         height, width = self.output_size
-        return cast(ImageArray, cv2.resize(image, (width, height), interpolation=_INTERPOLATIONS[self.interpolation]))
+        method = cv2.INTER_LINEAR if self.interpolation == "linear" else cv2.INTER_NEAREST
+        return cast(ImageArray, cv2.resize(image, (width, height), interpolation=method))
 
     def apply(self, image: ImageArray) -> NDArray[np.float32]:
         """Return the network input: float32 (1, height, width) in [0, 1]. Raises as ``reduce``."""
@@ -157,6 +157,8 @@ class Preprocessing(BaseModel):
 
 
 def _median(image: ImageArray, side_px: int) -> ImageArray:
+    import cv2
+
     if side_px == 5:
         return kernels.median_5(image)
     return cast(ImageArray, cv2.medianBlur(np.ascontiguousarray(image), side_px))
