@@ -1,9 +1,9 @@
 """A cell file and what it builds on: ``extends``, ``x-`` keys, and settings from the command line, merged.
 
-``extends: base.yaml`` takes another file as the base (its path is relative to the file that names it). Mappings are
-merged key by key, except one that names another driver, kind or task than the base's: it replaces the base's, as any
-other value does. Top-level keys that begin with ``x-`` hold YAML anchors and are
-left out. Each key remembers the file and line, or the option, that it comes from.
+``extends: base.yaml`` takes another file as the base: its path is relative to the file that names it, or it is the bare
+name of a cell that ships. Mappings are merged key by key, but for a section that names another driver, kind or task;
+any other value replaces the base's. Top-level keys that begin with ``x-`` hold YAML anchors and are left out. Each key
+remembers the file and line, or the option, that it comes from.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.settings import with_settings
 from touchcell.cell.config.true_contact import answerable
 from touchcell.cell.config.yaml_file import KeyPath, YamlFile, load
@@ -89,6 +90,8 @@ def _load(path: Path, above: Sequence[Path]) -> YamlFile:
     if not isinstance(base_name, str) or not base_name:
         raise file.problem((EXTENDS,), "is no path of a cell file", value=base_name, hint="e.g. `extends: base.yaml`")
     base_path = path.parent / base_name
+    if not os.path.lexists(base_path) and Path(base_name).name == base_name:
+        base_path = find_cell(base_path)
     if base_path.resolve() in [*above, resolved]:
         raise file.problem((EXTENDS,), "leads back to a file that extends this one", value=base_name)
     if len(above) >= _MOST_LAYERS:
