@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -24,3 +26,15 @@ def test_two_cells_that_share_an_arm_exclude_each_other(tmp_path: Path) -> None:
             pass
     with bench_lock(steps, tmp_path):
         pass
+
+
+def test_locks_are_for_every_user_of_the_machine(tmp_path: Path) -> None:
+    follow = plan_in_world(CONFIGS / "surface_follow_bench.yaml", "bench")
+    before = os.umask(0o077)
+    try:
+        with bench_lock(follow, tmp_path / "locks"):
+            pass
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "locks").stat().st_mode) == 0o1777
+    assert {stat.S_IMODE(lock.stat().st_mode) for lock in (tmp_path / "locks").iterdir()} == {0o666}

@@ -62,7 +62,9 @@ def bench_lock(plan: CellPlan, folder: Path | None = None) -> Iterator[None]:
         BenchTaken: somebody else holds one of them.
     """
     folder = folder or Path(tempfile.gettempdir()) / "touchcell-bench"
-    folder.mkdir(mode=0o1777, parents=True, exist_ok=True)
+    if not folder.is_dir():
+        folder.mkdir(parents=True, exist_ok=True)
+        folder.chmod(0o1777)  # the mode of mkdir is subject to the umask
     with ExitStack() as held:
         for name, address in sorted(addresses(plan).items()):
             digest = hashlib.sha256(address.encode()).hexdigest()[:16]
@@ -85,6 +87,11 @@ def _locked(path: Path, device: str, address: str) -> Iterator[None]:
 
 
 def _opened(path: Path) -> TextIO:
-    # Of whoever came first, and for everybody to lock.
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    """Open a lock that belongs to the user who came first, and that all users may take."""
+    try:
+        # Without O_CREAT: Linux refuses it for another user's file in a sticky folder (fs.protected_regular).
+        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    except FileNotFoundError:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC)
+        os.fchmod(descriptor, 0o666)
     return os.fdopen(descriptor, "r+")
