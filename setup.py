@@ -16,6 +16,13 @@ setup(
             optional=True,
         ),
         Extension(
+            "touchcell.drivers.v4l2._jpegc",
+            sources=["touchcell/drivers/v4l2/_jpegc.c"],
+            extra_compile_args=["-O3"],
+            # Without a compiler only the markers of JPEG frames are checked.
+            optional=True,
+        ),
+        Extension(
             "touchcell.perception._kernelsc",
             sources=["touchcell/perception/_kernelsc.c"],
             depends=[

@@ -12,8 +12,10 @@ from pathlib import Path
 
 BENCHMARKS = {
     "adapt": "benchmarks.adapt",
+    "armed": "benchmarks.armed",
     "calibration": "benchmarks.calibration",
     "emulated-push": "benchmarks.emulated_push",
+    "executors": "benchmarks.executors",
     "faults": "tests.fault_injection.faults",
     "filter": "benchmarks.filter",
     "findings": "tests.fault_injection.findings",
@@ -23,6 +25,7 @@ BENCHMARKS = {
     "mutation": "benchmarks.mutation",
     "kinematics": "benchmarks.kinematics",
     "safety": "tests.fault_injection.safety",
+    "safety-against": "benchmarks.safety_against",
     "se3": "benchmarks.se3",
     "simulation": "benchmarks.simulation",
     "structure": "benchmarks.structure",

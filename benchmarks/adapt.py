@@ -1,51 +1,41 @@
 """``touchcell bench adapt``: accuracy over the number of labelled images of another sensor used for adaptation.
 
-A second real sensor is not available. One table is of real images that were rotated, zoomed and shifted, with labels
-about other axes; the other of a simulated sensor with another camera, mount, stiffness, skin and grip than the one that
-a model was trained on.
+One table is of a second real sensor, the other of a simulated one with another camera, mount, stiffness, skin and grip
+than the one that a model was trained on. Images to adapt with are drawn at random, several times; all errors are of
+images that were not among them.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
+from numpy.typing import NDArray
 
-from benchmarks.calibration import changed
 from touchcell.drivers.replay.dataset import read_image, read_split
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.perception.calibration.adaptation import (
-    AdaptSettings,
-    about_z,
-    adapt_to,
-    align_to_sensor,
-    layers_of,
-    outputs_of,
-    tune,
-)
-from touchcell.perception.calibration.marked_data import evenly
-from touchcell.perception.markers.detection import Discs, detect_markers
-from touchcell.perception.markers.estimator import matcher_of
+from touchcell.perception.calibration.adaptation import adapt_to
+from touchcell.perception.errors import TrainingError
+from touchcell.perception.markers.detection import Discs, detect_markers, typical_size
+from touchcell.perception.markers.estimator import MarkerEstimator
 from touchcell.perception.models.labels import contact_from_xi, xi_from_contact
 from touchcell.perception.models.marker_architecture import MarkerArchitecture, MarkerSize
 from touchcell.perception.models.model_file import Model, load_model
-from touchcell.perception.networks.marker_training import LabelledDiscs
+from touchcell.perception.models.prediction import Prediction
+from touchcell.perception.models.preprocessing import Preprocessing
+from touchcell.perception.networks.marker_training import LabelledDiscs, preprocessing_for
+from touchcell.perception.networks.scores import Scores
 from touchcell.simulation.mount import MountModel
 from touchcell.simulation.samples import Variation, contacts
 from touchcell.simulation.tip import TipParameters
 from touchcell.simulation.tip_file import load_tip
 
-COUNTS = (20, 50, 100, 200)
-_ORDER = (2, 3, 4, 0, 1, 5)
-
-_SCRATCH = AdaptSettings(steps=600, learning_rate=2e-3, hold=0.0, batch_size=64)
-_TURN_DEG, _ZOOM, _SHIFT_PX, _AXES_DEG = 70.0, 0.95, 6.0, 25.0
+COUNTS = (20, 50, 200)
+_DRAWN = 400
 
 
 @dataclass(frozen=True)
@@ -55,151 +45,116 @@ class Case:
     Attributes:
         title: of the table.
         model: model to be adapted.
-        few: images to adapt with.
-        held_out: images to measure on.
+        contacts: of the other sensor, to adapt with and to measure on.
+        preprocessing: of its images.
         size: of its markers.
-        best: errors of a model that was trained on all images of this sensor, and its description.
     """
 
     title: str
     model: Model
-    few: LabelledDiscs
-    held_out: LabelledDiscs
+    contacts: LabelledDiscs
+    preprocessing: Preprocessing
     size: MarkerSize
-    best: tuple[str, Array] | None = None
 
-    def some(self, count: int) -> LabelledDiscs:
-        """Return that many of the images to adapt with, evenly chosen."""
-        chosen = evenly(len(self.few.frames), count)
-        return LabelledDiscs([self.few.frames[i] for i in chosen], self.few.xi[chosen])
+    def some(self, chosen: NDArray[np.int64]) -> LabelledDiscs:
+        """Return some of the contacts."""
+        return LabelledDiscs([self.contacts.frames[i] for i in chosen], self.contacts.xi[chosen])
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
     """Measure, print, and write ``adapt.md``."""
     parser = argparse.ArgumentParser("touchcell bench adapt")
-    parser.add_argument("--data", type=Path, help="real images for the first table")
-    parser.add_argument("--model", type=Path, help="marker model that was trained on them")
+    parser.add_argument("--data", type=Path, help="labelled images of a second real sensor, for the first table")
+    parser.add_argument("--model", type=Path, help="marker model of the first real sensor")
     parser.add_argument("--sim-model", type=Path, help="of `train-sim --kind markers --processed --tip TIP`")
     parser.add_argument("--tip", default="franka_tactip_1", help="that TIP")
-    parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="images to adapt with, ascending")
-    parser.add_argument("--held-out", type=int, default=400, help="images to measure on")
+    parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="images to adapt with")
+    parser.add_argument("--seeds", type=int, default=3, help="draws of the images for each count")
     options = parser.parse_args(arguments)
     cases: list[Case] = []
     if options.data is not None and options.model is not None:
-        cases.append(_real(options.data, options.model, options.held_out))
+        cases.append(_real(options.data, options.model))
     if options.sim_model is not None:
-        cases.append(_simulated(options.sim_model, options.tip, options.held_out))
+        cases.append(_simulated(options.sim_model, options.tip))
     if not cases:
         parser.error("give --data and --model, or --sim-model")
-    lines = []
+    lines: list[str] = []
     for case in cases:
-        table = Table(title=case.title)
-        columns = ("", "z", "alpha", "beta", "x", "y", "gamma", "matched")
-        for name in columns:
-            table.add_column(name, justify="right" if name else "left")
+        columns = ("images", "", "z", "alpha", "beta", "x", "y", "gamma", "NLL", "NEES", "95 %", "in range")
         lines += ["", case.title, "", "| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
-        for name, mae, matched in _rows(case, options.counts):
-            row = [name, *(f"{mae[i]:.3f}" for i in _ORDER), "" if matched is None else f"{100 * matched:.1f} %"]
-            table.add_row(*row)
-            print("  ".join(row), flush=True)
-            lines.append("| " + " | ".join(row) + " |")
-        Console(width=130).print(table)
+        print("\n".join(lines[-4:]), flush=True)
+        for count in options.counts:
+            for row in _rows(case, count, options.seeds):
+                lines.append("| " + " | ".join(row) + " |")
+                print(lines[-1], flush=True)
     (out / "adapt.md").write_text("\n".join(lines).lstrip() + "\n", encoding="utf-8")
 
 
-def _rows(case: Case, counts: Sequence[int]) -> Iterator[tuple[str, Array, float | None]]:
-    old = case.model
-    yield "before", *_errors(old, case.held_out)
-    adapted = old
-    for count in counts:
-        adapted = _adapted(case, count)
-        yield f"after {count} images", *_errors(adapted, case.held_out)
-    yield f"networks from scratch on {counts[-1]}", *_errors(_scratch(case, adapted, counts[-1]), case.held_out)
-    if case.best is not None:
-        yield case.best[0], case.best[1], None
+def _rows(case: Case, count: int, seeds: int) -> list[list[str]]:
+    """Return a row of mean results of the adapted models, and rows of the candidates' errors on left-out contacts."""
+    total = len(case.contacts.frames)
+    measured: list[list[float]] = []
+    left_out: dict[str, list[Array]] = {}
+    methods = []
+    for seed in range(seeds):
+        order = np.random.default_rng(seed).permutation(total)
+        given, held_out = order[:count], order[max(count, total // 2) :]
+        try:
+            adapted = adapt_to(case.model, case.some(given), preprocessing=case.preprocessing, size=case.size)
+        except TrainingError as error:
+            methods.append(f"refused: {error}")
+            continue
+        methods.append(adapted.method)
+        for name, errors in adapted.left_out_mae.items():
+            left_out.setdefault(name, []).append(errors)
+        if len(held_out):
+            scores = predicted(adapted.model, case.some(held_out))
+            coverage = 100.0 * float(np.mean(list(scores.coverage(0.95).values())))
+            others = [float(scores.nll.mean()), float(scores.nees.mean()), coverage, 100.0 * scores.in_range.mean()]
+            measured.append([*scores.mae().values(), *others])
+    rows = []
+    if measured:
+        mean = np.mean(measured, axis=0)
+        figures = [f"{value:.3f}" for value in mean[:6]] + [f"{value:.2f}" for value in mean[6:]]
+        rows.append([str(count), f"adapted ({', '.join(sorted(set(methods)))}), {len(measured)} draws", *figures])
+    for name, several in left_out.items():
+        mae = np.mean(several, axis=0)[[2, 3, 4, 0, 1, 5]]
+        rows.append([str(count), f"left out: {name}", *(f"{value:.3f}" for value in mae), "", "", "", ""])
+    return rows or [[str(count), methods[-1], *[""] * 10]]
 
 
-def _adapted(case: Case, count: int) -> Model:
-    return adapt_to(case.model, case.some(count), preprocessing=case.model.header.preprocessing, size=case.size)
+def predicted(model: Model, contacts: LabelledDiscs) -> Scores:
+    """Return the scores of a marker model on discs."""
+    estimator = MarkerEstimator(model)
+    camera = model.header.camera
+    predictions: list[Prediction] = []
+    for discs in contacts.frames:
+        seen = discs if camera is None else Discs(camera.points(discs.centres), discs.areas)
+        field = estimator.match(seen)
+        predictions.append(estimator.decode(field, *estimator.infer(field)))
+    return Scores.of(contact_from_xi(contacts.xi), predictions)
 
 
-def _scratch(case: Case, adapted: Model, count: int) -> Model:
-    """Return networks trained from scratch; camera and matching are given to them."""
-    few = case.some(count)
-    brought = align_to_sensor(case.model, few)
-    rng = np.random.default_rng(0)
-    layers = []
-    for i, (weight, bias) in enumerate(layers_of(adapted)):
-        # First weights are per pixel: displacements have a magnitude of eight.
-        scale = 1.0 / np.sqrt(weight.shape[1]) / (8.0 if i == 0 else 1.0)
-        layers.append((rng.uniform(-scale, scale, weight.shape), np.zeros_like(bias)))
-    target = adapted.header.labels.targets(about_z(brought.turn_rad, few.xi[brought.matched]))
-    trained = tune(case.model, layers, brought.displacements[brought.matched], target, _SCRATCH)
-    tensors = dict(adapted.tensors)
-    for i, (weight, bias) in enumerate(trained):
-        tensors |= {f"layer{i}.weight": weight.astype(np.float32), f"layer{i}.bias": bias.astype(np.float32)}
-    return Model(adapted.header, tensors)
+def _real(data: Path, path: Path) -> Case:
+    split = read_split(data, "train")
+    images = [read_image(image) for image in split.images]
+    preprocessing = preprocessing_for(images[0])
+    size = typical_size(preprocessing.reduce(images[0]))
+    frames = [detect_markers(preprocessing.reduce(image), size) for image in images]
+    contacts = LabelledDiscs(frames, xi_from_contact(split.contact_mm_deg))
+    return Case(f"a second real sensor, {len(images)} images", load_model(path), contacts, preprocessing, size)
 
 
-def _errors(model: Model, contacts: LabelledDiscs) -> tuple[Array, float]:
-    """Return the MAE (6,) of x, y, z, alpha, beta, gamma, mm and deg.
-
-    And the fraction of images with matched markers.
-    """
-    architecture = model.header.architecture
-    assert isinstance(architecture, MarkerArchitecture)
-    matcher, camera = matcher_of(model, architecture), model.header.camera
-    frames = contacts.frames
-    if camera is not None:
-        frames = [Discs(camera.points(discs.centres), discs.areas) for discs in frames]
-    fields = [matcher.match(discs) for discs in frames]
-    displacements = np.stack([each.displacements.ravel() for each in fields]).astype(np.float32)
-    mean, _ = outputs_of(layers_of(model), displacements, model.header.labels)
-    mean[[not each.seen.any() for each in fields]] = 0.0
-    xi = xi_from_contact(model.header.labels.contacts(mean))
-    found = contact_from_xi(about_z(-np.radians(model.header.label_turn_deg), xi))
-    mae: Array = np.abs(found - contact_from_xi(contacts.xi)).mean(axis=0)
-    return mae, float(np.mean([each.valid for each in fields]))
-
-
-def _real(data: Path, path: Path, held_out: int) -> Case:
-    model = load_model(path)
-    architecture = model.header.architecture
-    if not isinstance(architecture, MarkerArchitecture):
-        raise SystemExit(f"{path} is not a marker model")
-    sets, unchanged = {}, None
-    for name, wanted in (("train", COUNTS[-1]), ("val", held_out)):
-        split = read_split(data, name)
-        chosen = evenly(len(split.images), wanted)
-        images = [model.header.preprocessing.reduce(read_image(split.images[i])) for i in chosen]
-        xi = xi_from_contact(split.contact_mm_deg[chosen])
-        if name == "val":
-            unchanged = LabelledDiscs([detect_markers(image, architecture.size) for image in images], xi)
-        other = [changed(image, _ZOOM, _TURN_DEG, _SHIFT_PX) for image in images]
-        sets[name] = LabelledDiscs(
-            [detect_markers(image, architecture.size) for image in other], about_z(np.radians(_AXES_DEG), xi)
-        )
-    assert unchanged is not None
-    title = (
-        f"real images, rotated by {_TURN_DEG:g} deg, zoomed {_ZOOM:g}, shifted {_SHIFT_PX:g} px; labels' axes turned"
-    )
-    best = ("trained on all, unchanged images", _errors(model, unchanged)[0])
-    return Case(title, model, sets["train"], sets["val"], architecture.size, best)
-
-
-def _simulated(path: Path, tip: str, held_out: int) -> Case:
+def _simulated(path: Path, tip: str) -> Case:
     model = load_model(path)
     architecture = model.header.architecture
     if not isinstance(architecture, MarkerArchitecture):
         raise SystemExit(f"{path} is not a marker model")
     sensor = load_tip(tip)
     other_tip, other_rig = second_sensor(sensor.tip, sensor.rig)
-    few = _drawn(other_tip, other_rig, COUNTS[-1], 11, model)
-    measured = _drawn(other_tip, other_rig, held_out, 12, model)
-    first = _drawn(sensor.tip, sensor.rig, held_out, 12, model)
-    best = ("the old sensor, by the old model", _errors(model, first)[0])
+    drawn = _drawn(other_tip, other_rig, _DRAWN, 11, model)
     title = "a simulated sensor with another camera, mount, stiffness, skin and grip"
-    return Case(title, model, few, measured, architecture.size, best)
+    return Case(title, model, drawn, model.header.preprocessing, architecture.size)
 
 
 def second_sensor(tip: TipParameters, rig: MountModel) -> tuple[TipParameters, MountModel]:

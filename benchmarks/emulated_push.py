@@ -23,12 +23,12 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
+from touchcell.cell.analysis.push_errors import off_normal_mm, target_m
 from touchcell.cell.analysis.run_data import tip_points
 from touchcell.cell.analysis.run_folder import RunFolder, object_poses, scene_time, sensor_poses, true_contacts
 from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_cell
-from touchcell.cell.experiments.push_measures import off_normal_mm, target_mm
 from touchcell.cell.recording.mcap import RECORDING, Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
@@ -224,7 +224,7 @@ def _push(run: RunFolder, outcome: str, truth: _Truth) -> Push:
         outcome,
         t_s,
         np.stack([np.interp(t_s + times[0], truth.t_s, column) for column in columns], axis=1),
-        off_normal_mm(truth.T_world_f[at_end], target_mm(run)),
+        off_normal_mm(truth.T_world_f[at_end], 1e3 * target_m(run)),
         {role: Latency(_sensing_s(run, role), _obeying_s(run, role)) for role in _SENSORS},
     )
 

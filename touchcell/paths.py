@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-_PACKAGE = Path(__file__).parent
-CHECKOUT = _PACKAGE.parent
+PACKAGE = Path(__file__).parent
+CHECKOUT = PACKAGE.parent
 """The repository, where touchcell is installed from one: it also has the benchmarks that are not shipped."""
-CONFIGS = _PACKAGE / "configs"
-MODELS = _PACKAGE / "perception" / "models"
+CONFIGS = PACKAGE / "configs"
+MODELS = PACKAGE / "perception" / "models"

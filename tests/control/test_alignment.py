@@ -80,6 +80,14 @@ def test_straight_ahead_nothing_moves_sideways():
     assert alignment.step(alignment.aim(FORWARD, np.eye(4)), 0.01) == pytest.approx(0.0, abs=1e-12)
 
 
+def test_the_object_is_nearer_to_the_tip_by_the_depth_of_the_contact():
+    touching = TargetAlignment(lambda middle, heading: [(0.3, 0.0)], GAINS).aim(FORWARD, np.eye(4))
+    T_f_s = se3.from_euler_mm_deg(np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0]))
+    pressed = TargetAlignment(lambda middle, heading: [(0.3, 0.0)], GAINS).aim(FORWARD, se3.inverse(T_f_s))
+    assert pressed.target_distance_m - touching.target_distance_m == pytest.approx(0.004)
+    assert pressed.remaining_m - touching.remaining_m == pytest.approx(0.004)
+
+
 def test_heading_is_that_of_the_contact_normal_not_of_the_sensor():
     alignment = TargetAlignment(lambda middle, heading: [(0.3, 0.0)], GAINS)
     # About the sensor's x axis, which points down: to the right as seen from above.

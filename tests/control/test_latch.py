@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -95,6 +97,26 @@ def test_reset_reports_what_it_cleared_and_each_token_works_once():
     latch.update([violation(t_ns=900)])
     latch.update([])
     assert latch.reset(held, at_rest=True, commanded=False) == ResetRefused(Refusal.OLD_TOKEN)
+
+
+def test_a_token_made_in_the_moment_of_the_violation_resets_it():
+    latch = Latch()
+    latch.update([violation(t_ns=100)])
+    latch.update([])
+    assert isinstance(reset(latch, at=100), ResetDone)
+
+
+def test_each_cause_and_the_reset_are_logged_once(caplog):
+    latch = Latch()
+    with caplog.at_level(logging.INFO, "touchcell.control.latch"):
+        for _ in range(3):
+            latch.update([violation()])
+        latch.update([])
+        reset(latch)
+    assert [(r.levelname, r.getMessage()) for r in caplog.records] == [
+        ("WARNING", "trip: depth: sensor: too deep"),
+        ("INFO", "reset by ada"),
+    ]
 
 
 class LatchAgainstModel(RuleBasedStateMachine):

@@ -148,3 +148,76 @@ def test_nothing_is_allowed_between_a_trip_and_a_reset(cycles):
         latched = latched or depth_m > 0.006
         assert verdict.allow == (not latched)
         assert (verdict.trip is None) == (not latched)
+
+
+@dataclass
+class Limits:
+    """An interlock that limits whenever ``on``, and trips after that or not as ``escalates`` is."""
+
+    on: bool = True
+    escalates: bool = True
+    name: str = "limits"
+    severity: Severity = Severity.LIMIT
+
+    def check(self, view: CellView) -> Violation | None:
+        found = Violation(self.name, self.severity, "arm", "slow down", view.now_ns, escalates=self.escalates)
+        return found if self.on else None
+
+
+def cycles(supervisor: Supervisor, start_ns: int, duration_ms: int) -> tuple[Severity, ...]:
+    """Review every 10 ms; return the severities of the last cycle."""
+    verdict = None
+    for k in range(duration_ms // 10 + 1):
+        verdict = supervisor.review(view(now_ns=start_ns + k * 10_000_000))
+    assert verdict is not None
+    return tuple(v.severity for v in verdict.violations)
+
+
+def test_a_limit_scales_the_speed_to_a_quarter():
+    supervisor = Supervisor([Warned()], Latch())
+    assert supervisor.review(view()).speed == 0.25
+    assert Supervisor([], Latch()).review(view()).speed == 1.0
+
+
+def test_a_refused_reset_does_not_forget_how_long_a_limit_has_lasted():
+    supervisor = Supervisor([Limits()], Latch())
+    cycles(supervisor, 0, 200)
+    refused = supervisor.reset(OperatorToken("ada", 210_000_000), view(now_ns=210_000_000))
+    assert refused == ResetRefused(Refusal.NOT_LATCHED)
+    assert cycles(supervisor, 220_000_000, 100) == (Severity.TRIP,)
+
+
+def test_time_that_does_not_count_is_not_held_against_a_later_limit_of_the_same_interlock():
+    rule = Limits(escalates=False)
+    supervisor = Supervisor([rule], Latch())
+    assert cycles(supervisor, 0, 1000) == (Severity.LIMIT,)
+    rule.escalates = True
+    assert cycles(supervisor, 1_010_000_000, 200) == (Severity.LIMIT,)
+    assert cycles(supervisor, 1_220_000_000, 200) == (Severity.TRIP,)
+
+
+def test_a_limit_that_lasted_long_is_forgotten_within_four_times_twice_its_time():
+    rule = Limits()
+    supervisor = Supervisor([rule], Latch())
+    cycles(supervisor, 0, 10_000)
+    rule.on = False
+    cycles(supervisor, 10_010_000_000, 1_600)
+    rule.on = True
+    assert cycles(supervisor, 11_620_000_000, 50) == (Severity.LIMIT,)
+
+
+@pytest.mark.parametrize(
+    ("measured", "at_rest"),
+    [
+        ((1e-3, 0, 0, 0, 0, 0), True),
+        ((1.1e-3, 0, 0, 0, 0, 0), False),
+        ((0, 0, 0, 0, 0, 1e-2), True),
+        ((0, 0, 0, 0, 0, 1.1e-2), False),
+        ((1e-3, 0, 0, 0, 1e-2, 0), True),
+    ],
+)
+def test_an_arm_is_at_rest_up_to_a_millimetre_and_a_hundredth_of_a_radian_per_second(measured, at_rest):
+    supervisor = Supervisor([DEPTH], Latch())
+    supervisor.review(view(depth_m=0.007))
+    outcome = supervisor.reset(OperatorToken("ada", 500), view(now_ns=400, measured=np.array(measured, float)))
+    assert isinstance(outcome, ResetDone) == at_rest

@@ -19,6 +19,7 @@ FOLLOWED: tuple[Path, ...] = (
     DOCS / "how-to" / "write-a-task.md",
     DOCS / "how-to" / "write-a-driver.md",
     DOCS / "how-to" / "write-an-interlock.md",
+    DOCS / "how-to" / "sweep.md",
 )
 """Pages that a test follows from top to bottom."""
 

@@ -29,7 +29,7 @@ def test_a_camera_is_listed_by_its_stable_name(tmp_path: Path, sockets: Path) ->
             kind="camera",
             address=str(links / "usb-TacTip-index0"),
             node=str(tmp_path / "video2"),
-            description="TacTip emulated on usb-0000:00:14.0-1: MJPG, YUYV, GREY",
+            description="TacTip emulated on usb-0000:00:14.0-3: MJPG, YUYV, GREY",
         )
     ]
 

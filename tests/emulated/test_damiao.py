@@ -486,3 +486,49 @@ def test_a_motor_that_will_not_enable_leaves_none_enabled(arm: DamiaoCanArm, emu
         arm.activate()
     assert emulator.state()["enabled"] == 0
     assert arm.state is Lifecycle.READY
+
+
+def test_a_full_transmit_queue_drops_no_arm(arm: DamiaoCanArm, emulator: EmulatorProcess) -> None:
+    activate(arm)
+    start = position(emulator.wait_for(enabled=6))
+    emulator.fault("tx_full", 12)
+    wait(lambda: int(arm.health()["not_sent"]) >= 12)
+    commands = emulator.state()["commands"]
+    wait(lambda: emulator.state()["commands"] > commands + 300)
+    assert arm.state is Lifecycle.ACTIVE
+    assert emulator.state()["enabled"] == 6
+    np.testing.assert_allclose(position(emulator.state()), start, atol=1e-3)
+
+
+def test_a_failing_control_loop_keeps_holding_the_arm(
+    arm: DamiaoCanArm, emulator: EmulatorProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    activate(arm)
+    start = position(emulator.wait_for(enabled=6))
+
+    def fail(now_ns: int, dt_s: float) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(arm._setpoint, "step", fail)
+    wait(lambda: faulted(arm))
+    commands = emulator.state()["commands"]
+    wait(lambda: emulator.state()["commands"] > commands + 600)
+    assert emulator.state()["enabled"] == 6
+    np.testing.assert_allclose(position(emulator.state()), start, atol=2e-3)
+    monkeypatch.undo()
+    sample = arm.joints().seq
+    wait(lambda: arm.joints().seq > sample)
+    arm.recover(TOKEN)
+    arm.activate()
+    assert emulator.state()["enabled"] == 6
+
+
+def test_an_encoder_one_turn_off_is_counted_into_the_joints_range(arm: DamiaoCanArm, emulator: EmulatorProcess) -> None:
+    emulator.fault("turn_off", [1, -1])
+    activate(arm)
+    state = emulator.wait_for(enabled=6)
+    np.testing.assert_allclose(arm.joints().value.q, state["q_rad"], atol=5e-3)
+    assert arm.health()["turns_added"] == "0 1 0 0 0 0"
+    commands = state["commands"]
+    wait(lambda: emulator.state()["commands"] > commands + 300)
+    np.testing.assert_allclose(position(emulator.state()), position(state), atol=2e-3)

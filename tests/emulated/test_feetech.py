@@ -582,3 +582,16 @@ def test_a_dead_host_leaves_the_arm_at_its_last_step(port: Path, servos: Emulato
         client.kill()
         client.wait()
         client.stdout.close()
+
+
+def test_a_servo_that_counts_below_zero_is_named_before_it_is_enabled(
+    arm: FeetechSerialArm, servos: EmulatorProcess
+) -> None:
+    servos.fault("turn_off", 2)
+    arm.connect()
+    assert int(arm.health()["elbow_ticks"]) < 0
+    arm.configure()
+    with pytest.raises(DeviceFault, match="outside 0 to 4095") as caught:
+        arm.activate()
+    assert caught.value.needs is Remedy.OPERATOR
+    assert servos.state()["energising"] == 0

@@ -95,7 +95,9 @@ def test_its_spec_needs_no_sdk() -> None:
 def test_a_missing_sdk_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "franky", None)
     arm = DRIVERS.load("franka").build(
-        "arm", FrankaConfig(host="127.0.0.1", enforce_realtime=False), DriverContext(MonotonicClock())
+        "arm",
+        FrankaConfig(host="127.0.0.1", enforce_realtime=False, state_timeout_s=0.5),
+        DriverContext(MonotonicClock()),
     )
     with pytest.raises(ConnectError, match=r"touchcell\[franka\]"):
         arm.connect()
@@ -218,7 +220,7 @@ from touchcell.drivers.core.clock import MonotonicClock
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.franka.driver import FrankaArm, FrankaConfig
 clock = MonotonicClock()
-arm = FrankaArm("arm", FrankaConfig(host=sys.argv[1], enforce_realtime=False), clock)
+arm = FrankaArm("arm", FrankaConfig(host=sys.argv[1], enforce_realtime=False, state_timeout_s=0.5), clock)
 arm.connect(); arm.configure(); arm.activate()
 lease = arm.acquire("child")
 while True:

@@ -28,7 +28,7 @@ from touchcell.drivers.core.camera import UnsupportedSetting
 from touchcell.drivers.opencv.driver import OpencvCamera, OpencvCameraConfig
 
 def make(**settings):
-    defaults = {"device": "/dev/video0", "rate_hz": 120, "exposure_us": 15700, "gain": 10}
+    defaults = {"device": "/dev/video0", "rate_hz": 60, "exposure_us": 15700, "gain": 10}
     return OpencvCamera("tip", MonotonicClock(), OpencvCameraConfig.model_validate(defaults | settings))
 
 def ready(**settings):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import os
@@ -46,6 +47,7 @@ from touchcell.drivers.core.protocols import (
     TwistSink,
     WrenchSource,
 )
+from touchcell.drivers.kinematics.chain import ChainDescription
 from touchcell.drivers.ur import codec as ur_codec
 from touchcell.drivers.ur.driver import SPEC, UrArm, UrConfig
 from touchcell.drivers.ur.modes import (
@@ -778,3 +780,36 @@ def test_the_arm_stops_when_its_client_is_killed(emulator: EmulatorProcess, addr
     assert after_m < 0.05 * (WATCHDOG_S + 0.01) + 0.001, (
         f"{after_m * 1e3:.2f} mm after the last command of a killed client"
     )
+
+
+def test_a_slider_at_zero_in_motion_is_a_fault(arm: UrArm, emulator: EmulatorProcess, lease: Lease) -> None:
+    def move() -> bool:
+        with contextlib.suppress(DeviceError):
+            arm.send_twist(TwistCommand(np.array([0, 0, 0.02, 0, 0, 0]), TwistFrame.BASE, CLOCK.now_ns(), 0.2), lease)
+        return arm.state is Lifecycle.FAULTED
+
+    move()
+    emulator.fault("speed_slider", 0.5)
+    wait_until(lambda: arm.health()["speed_fraction"] == 0.5, "slider")
+    twist = TwistCommand(np.array([0, 0, 0.02, 0, 0, 0]), TwistFrame.BASE, CLOCK.now_ns(), 0.2)
+    assert "speed slider" in [a.limit for a in arm.send_twist(twist, lease).adjustments]
+    emulator.fault("speed_slider", 0)
+    wait_until(move, "fault")
+    assert "speed slider" in str(arm.fault)
+    with pytest.raises(DeviceFault, match="slider"):
+        arm.recover(TOKEN)
+    emulator.clear("speed_slider")
+    wait_until(lambda: arm.health()["speed_fraction"] == 1.0, "slider")
+    arm.recover(TOKEN)
+    assert arm.state is Lifecycle.READY
+
+
+def test_an_endless_wrist_may_turn_as_far_as_its_model_allows() -> None:
+    ur3e = ChainDescription.named("ur3e")
+    ends = np.deg2rad([max(-joint.lower_deg, joint.upper_deg) for joint in ur3e.joints])
+    receive = Receive()
+    receive.q = [0.0, 0.0, 0.0, 0.0, 0.0, 9.0]
+    assert StateReader(receive, VirtualClock(), ends).poll() is not None
+    reader = StateReader(receive, VirtualClock())
+    assert reader.poll() is None
+    assert "joint 6" in reader.last_corrupt

@@ -20,7 +20,9 @@ from touchcell.drivers.core.device import Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
     ConnectError,
     CorruptMessage,
+    DeviceFault,
     DeviceGone,
+    FaultClass,
     LifecycleError,
     StaleData,
     TransportTimeout,
@@ -55,7 +57,7 @@ def process(folder: Path) -> Iterator[EmulatorProcess]:
 @pytest.fixture
 def emulator(process: EmulatorProcess) -> Iterator[EmulatorProcess]:
     yield process
-    for fault in ("pause", "delay", "freeze_frame", "exposure_drift", "stuck_controls", "no_monotonic", "unplug"):
+    for fault in process.state()["faults"]:
         process.clear(fault)
 
 
@@ -64,9 +66,7 @@ def make(folder: Path, emulator: EmulatorProcess) -> Iterator[Callable[..., V4l2
     made: list[V4l2Camera] = []
 
     def build(**settings: object) -> V4l2Camera:
-        config = V4l2Config.model_validate(
-            {"device": NODE, "rate_hz": 120, "gain": 10, "exposure_us": 15700} | settings
-        )
+        config = V4l2Config.model_validate({"device": NODE, "rate_hz": 60, "gain": 10, "exposure_us": 15700} | settings)
         made.append(V4l2Camera("tip", MonotonicClock(), config, ShimCalls(folder)))
         return made[-1]
 
@@ -184,7 +184,6 @@ def test_settings_read_back_in_health(camera: V4l2Camera, emulator: EmulatorProc
     [
         ({"width_px": 700}, "width_px", 640),
         ({"rate_hz": 47.0}, "rate_hz", 60.0),
-        ({"exposure_us": 1_000_000}, "exposure_us", 500_000),
         ({"gain": 200}, "gain", 100),
     ],
 )
@@ -219,7 +218,14 @@ def test_a_control_that_silently_keeps_its_value_is_refused(
 
 @pytest.mark.parametrize(
     "settings",
-    [{"rate_hz": float("nan")}, {"exposure_us": 150}, {"width_px": 0}, {"gane": 3}, {"stall_s": 0.05}],
+    [
+        {"rate_hz": float("nan")},
+        {"exposure_us": 150},
+        {"exposure_us": 40_000},
+        {"width_px": 0},
+        {"gane": 3},
+        {"stall_s": 0.05},
+    ],
 )
 def test_nonsense_is_refused_before_any_device_is_touched(settings: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=next(iter(settings))):
@@ -581,3 +587,103 @@ def test_an_unknown_fault_is_a_typed_error(emulator: EmulatorProcess) -> None:
 def test_a_folder_without_images_is_a_typed_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="contains no images"):
         picture.files(tmp_path)
+
+
+def test_junk_after_the_end_of_a_picture_is_padding(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
+    emulator.fault("padding", 10**6)
+    first = camera.latest().seq
+    assert all(frame.quality is Quality.GOOD for frame in read(camera, 40))
+    assert camera.latest().seq - first >= 39
+    assert camera.health()["frames_bad"] == 0
+
+
+def test_a_picture_with_a_hole_is_never_good(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
+    emulator.fault("hole", 5)
+    read_until(camera, "frames_bad_damaged", 5)
+    assert camera.health()["frames_bad"] == 5
+    assert camera.state is Lifecycle.READY
+
+
+def test_a_rate_that_is_not_delivered_is_a_fault(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
+    assert camera.state is Lifecycle.READY
+    emulator.fault("true_rate", 32.5)
+    with pytest.raises(DeviceFault, match="frames/s, not 60") as caught:
+        read_until(camera, "frames_good", 1e9)
+    assert caught.value.fault_class is FaultClass.CONFIGURATION
+    assert camera.state is Lifecycle.FAULTED
+    emulator.clear("true_rate")
+    camera.recover(TOKEN)
+    assert len(read(camera, 70)) == 70
+    assert camera.health()["frame_rate_hz"] == pytest.approx(60.0, rel=0.1)
+
+
+def test_automatics_are_switched_off(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
+    controls = emulator.state()["controls"]
+    assert controls["Exposure, Dynamic Framerate"] == 0
+    assert controls["White Balance, Automatic"] == 0
+
+
+def test_a_camera_that_forgets_its_settings_is_refused(
+    make: Callable[..., V4l2Camera], emulator: EmulatorProcess
+) -> None:
+    emulator.fault("forgets")
+    camera = make()
+    camera.connect()
+    with pytest.raises(DeviceFault, match="by itself"):
+        camera.configure()
+    assert camera.state is Lifecycle.PASSIVE
+
+
+def test_settings_that_change_later_are_a_fault(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
+    emulator.fault("reset_controls")
+    assert camera.health()["state"] == "faulted"
+    assert isinstance(camera.fault, DeviceFault)
+    camera.recover(TOKEN)
+    assert camera.health()["exposure_us"] == 15700
+
+
+def test_an_own_exposure_longer_than_a_frame_is_refused(make: Callable[..., V4l2Camera]) -> None:
+    camera = make(rate_hz=120, exposure_us=None)
+    camera.connect()
+    with pytest.raises(UnsupportedSetting) as caught:
+        camera.configure()
+    assert caught.value.setting == "exposure_us"
+
+
+def test_a_camera_of_one_rate_is_used_and_measured(make: Callable[..., V4l2Camera], emulator: EmulatorProcess) -> None:
+    ready(make()).disconnect()
+    emulator.fault("no_s_parm")
+    right = ready(make(rate_hz=60))
+    assert len(read(right, 5)) == 5
+    right.disconnect()
+    wrong = ready(make(rate_hz=30))
+    with pytest.raises(DeviceFault, match="frames/s, not 30"):
+        read_until(wrong, "frames_good", 1e9)
+
+
+def test_a_full_usb_bus_is_explained(make: Callable[..., V4l2Camera], emulator: EmulatorProcess) -> None:
+    emulator.fault("no_bandwidth")
+    camera = make()
+    camera.connect()
+    with pytest.raises(ConnectError, match="bandwidth"):
+        camera.configure()
+
+
+def test_another_camera_after_replugging_is_refused(camera: V4l2Camera, emulator: EmulatorProcess) -> None:
+    emulator.fault("unplug")
+    with pytest.raises(DeviceGone):
+        read_until(camera, "frames_good", 1e9)
+    emulator.fault("other_camera")
+    emulator.clear("unplug")
+    with pytest.raises(ConnectError, match="another camera"):
+        camera.recover(TOKEN)
+    assert camera.state is Lifecycle.FAULTED
+    emulator.clear("other_camera")
+    camera.recover(TOKEN)
+    assert camera.state is Lifecycle.READY
+
+
+def test_a_camera_at_another_bus_than_expected_is_refused(make: Callable[..., V4l2Camera]) -> None:
+    make(expect_bus="usb-0000:00:14.0-8").connect()
+    with pytest.raises(ConnectError, match=r"14\.0-8, not at"):
+        make(expect_bus="usb-0000:00:14.0-1").connect()

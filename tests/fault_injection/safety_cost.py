@@ -18,10 +18,13 @@ import yaml
 from touchcell.cell.config.armed import REQUIRED_OF_ARMS, REQUIRED_OF_SENSORS
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.planning_scene import link_capsules
+from touchcell.control.interlocks.always_on import always_on
 from touchcell.control.interlocks.collision import TOOL, Capsule
 from touchcell.control.interlocks.config import build_interlocks, parse_interlocks
+from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.planning_scene import Body, PlanningScene
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
+from touchcell.control.interlocks.timers import TimedInterlock
 from touchcell.control.latch import Latch
 from touchcell.control.supervisor import Supervisor
 from touchcell.drivers.core.clock import VirtualClock
@@ -73,6 +76,9 @@ def costs() -> dict[str, float]:
     found[f"review: one arm and sensor, {len(shipped)} interlocks"] = _review_us(shipped, one)
     for name, entry in shipped.items():
         found[f"  of it {entry['kind']}"] = round(max(0.0, _review_us({name: entry}, one) - bare), 2)
+    found[f"review: one arm and sensor, {len(shipped)} interlocks and those always on"] = _review_us(
+        shipped, one, always=True
+    )
     pair = _for_two(shipped)
     bare = found["review: two arms and sensors, finite only"] = _review_us({}, two)
     found[f"review: two arms and sensors, {len(pair)} interlocks"] = _review_us(pair, two)
@@ -102,10 +108,17 @@ def _time_us(call: Callable[[int], object]) -> float:
 
 
 def _review_us(
-    section: Mapping[str, Any], views: Sequence[CellView], planning_scene: PlanningScene | None = None
+    section: Mapping[str, Any],
+    views: Sequence[CellView],
+    planning_scene: PlanningScene | None = None,
+    *,
+    always: bool = False,
 ) -> float:
     poses = {role: np.eye(4) for role in views[0].sensors}
-    supervisor = Supervisor(build_interlocks(parse_interlocks(section), poses, planning_scene), Latch())
+    rules: list[Interlock | TimedInterlock] = [*build_interlocks(parse_interlocks(section), poses, planning_scene)]
+    if always:
+        rules.extend(always_on(1e9 / _PERIOD_NS, (), moved=True, arms=views[0].arms, sensors=views[0].sensors))
+    supervisor = Supervisor(rules, Latch())
     median_us = _time_us(lambda k: supervisor.review(views[k]))
     assert supervisor.latch.first_cause is None, supervisor.latch.first_cause
     return median_us

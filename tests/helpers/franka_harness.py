@@ -45,7 +45,9 @@ class FrankaHarness:
         host = fresh_host()
         self.clock = MonotonicClock()
         self.emulator = EmulatorProcess("franka", "--host", host, timeout_s=DEADLINE_S).start()
-        self.config = FrankaConfig.model_validate({"host": host, "enforce_realtime": False} | config)
+        self.config = FrankaConfig.model_validate(
+            {"host": host, "enforce_realtime": False, "state_timeout_s": 0.5} | config
+        )
         self.arm = self.another()
 
     def another(self) -> FrankaArm:

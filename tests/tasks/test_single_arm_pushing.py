@@ -69,3 +69,26 @@ def test_without_a_path_past_the_obstacle_it_faults_before_it_pushes(tmp_path):
     assert pushed.cell.task.state == "faulted"
     assert "no path" in pushed.cell.task.transitions[-1].reason
     assert pushed.object_mm_deg[:2] == pytest.approx((0.0, 3.0), abs=0.1)
+
+
+@pytest.mark.parametrize("cell", [CELL, "dual_push_sim.yaml"])
+def test_an_object_that_is_lost_beside_its_path_is_not_done(tmp_path, cell):
+    """Neither with one arm nor with two."""
+    pushed = push(cell_file(cell, **SHORT | {"task__max_cross_track_mm": 1.0}), tmp_path)
+    assert ("run", "missed", "retract") in pushed.path
+    assert pushed.cell.task.state == "failed"
+    missed = next(each for each in pushed.cell.task.transitions if each.event == "missed")
+    assert "beside its path, limit 1 mm" in missed.reason
+
+
+def test_an_object_that_ends_beyond_the_tolerance_is_not_done(tmp_path):
+    pushed = push(cell_file(CELL, **SHORT | {"task__arrival_tolerance_mm": 0.001}), tmp_path)
+    assert pushed.path == [*WHOLE[:3], ("run", "missed", "retract"), ("retract", "retracted", "failed")]
+    assert "mm from the target, tolerance 0.001 mm" in pushed.cell.task.transitions[3].reason
+
+
+def test_a_heading_beyond_the_tolerance_is_not_done(tmp_path):
+    changes = {"task__goal_heading_deg": 10.0, "task__arrival_tolerance_deg": 0.001, "task__target_mm": [180, 15]}
+    pushed = push(cell_file(CELL, **SHORT | changes), tmp_path)
+    assert pushed.path[-1] == ("retract", "retracted", "failed")
+    assert "deg off at the target" in pushed.cell.task.transitions[3].reason

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -184,6 +186,11 @@ def every_way() -> set[tuple[str, str, str]]:
             finish(plant, task)
     plant, task = KinematicPlant(gap_mm=25.0), build()
     finish(plant, task)
+    with patch.object(Follow, "shortfall", return_value="5 mm from the target"):
+        plant, task = reached("run")
+        finish(plant, task)
+    assert task.transitions[-2].reason == "5 mm from the target"
+    assert not task.succeeded
     return seen
 
 

@@ -29,7 +29,7 @@ class AlignmentGains:
         kd: lateral speed per rate of the bearing, m per rad.
         limit_m_s: largest lateral speed.
         look_ahead_m: look-ahead distance along the path.
-        lead_m: distance from the centre of the tip forward to the object's turning centre.
+        lead_m: distance from the centre of the tip forward to the object's turning centre, where the tip just touches.
     """
 
     kp: float
@@ -49,6 +49,7 @@ class Aim:
         remaining_m: remaining path length.
         cross_track_error_m: distance of the object from its path, positive to its left.
         target_lateral_error_m: distance of the target from the contact normal, positive to its left.
+        target_distance_m: distance of the target from the object's turning centre.
         heading_rad: heading of the contact normal in the base frame.
     """
 
@@ -56,6 +57,7 @@ class Aim:
     remaining_m: float
     cross_track_error_m: float
     target_lateral_error_m: float
+    target_distance_m: float
     heading_rad: float
 
 
@@ -112,7 +114,10 @@ class TargetAlignment:
         length = math.hypot(normal[0], normal[1])
         nx, ny = float(normal[0]) / length, float(normal[1]) / length
         tip = float(T_base_sensor[0, 3]), float(T_base_sensor[1, 3])
-        centre = tip[0] + self._gains.lead_m * nx, tip[1] + self._gains.lead_m * ny
+        # The tip gives way: the object's surface is nearer to the tip's centre by the depth of the contact.
+        depth_m = max(0.0, -float(T_s_f[:3, 2] @ T_s_f[:3, 3]))
+        lead_m = self._gains.lead_m - depth_m
+        centre = tip[0] + lead_m * nx, tip[1] + lead_m * ny
         heading = math.atan2(ny, nx)
         if self._path is None:
             self._path = Path([centre, *self._route(centre, heading)])
@@ -124,7 +129,8 @@ class TargetAlignment:
         target = self._path.end
         target_aside = nx * (target[1] - tip[1]) - ny * (target[0] - tip[0])
         remaining_m = self._path.length_m - place.along_m
-        return Aim(theta, remaining_m, place.cross_track_error_m, target_aside, heading)
+        distance_m = math.hypot(target[0] - centre[0], target[1] - centre[1])
+        return Aim(theta, remaining_m, place.cross_track_error_m, target_aside, distance_m, heading)
 
     def step(self, aim: Aim, dt_s: float) -> float:
         """Return the speed of the contact to the left of the contact normal, m/s."""

@@ -41,6 +41,10 @@ class Behavior(Protocol):
         """
         ...
 
+    def shortfall(self) -> str:
+        """Return by how much a behavior that has finished missed its goal; empty if it reached it."""
+        ...
+
     def telemetry(self) -> Mapping[str, float]:
         """Return named numbers for recording and plots, units in the names."""
         ...

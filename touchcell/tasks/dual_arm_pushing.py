@@ -96,6 +96,10 @@ class Follow:
         self._y_is_left = -float(np.sign(now[2, 0]))
         return False
 
+    def shortfall(self) -> str:
+        """Return nothing: the leader decides."""
+        return ""
+
     def telemetry(self) -> Mapping[str, float]:
         """Return no further telemetry."""
         return {}

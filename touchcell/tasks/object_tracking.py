@@ -52,6 +52,10 @@ class Track:
         self._left_s -= dt_s
         return self._left_s <= 0.0
 
+    def shortfall(self) -> str:
+        """Return nothing: it finishes when its time is over."""
+        return ""
+
     def telemetry(self) -> Mapping[str, float]:
         """Return no further telemetry."""
         return {}

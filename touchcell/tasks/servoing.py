@@ -94,6 +94,7 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float) -> Table:
             TransitionDef("lost", s.SETTLE, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.SETTLE, s.RETRACT),
             TransitionDef("finished", s.RUN, s.RETRACT),
+            TransitionDef("missed", s.RUN, s.RETRACT),
             TransitionDef("lost", s.RUN, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.RUN, s.RETRACT),
             TransitionDef("retracted", s.RETRACT, s.STOPPED, guard="was_stopped"),
@@ -222,7 +223,11 @@ class ServoTask(MachineTask):
                 # Every servo processes the cycle, even if another one has already finished.
                 finished = [servo.advance(dt_s) for servo in servos]
                 if any(finished):
-                    self._post("finished")
+                    shortfalls = [servo.run.shortfall() for servo in servos]
+                    if missed := next(filter(None, shortfalls), ""):
+                        self._post("missed", missed)
+                    else:
+                        self._post("finished")
             case ServoState.RETRACT:
                 if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in servos):
                     self._post("retracted")

@@ -45,6 +45,10 @@ class PushConfig(ContactServoConfig):
         align_kd_mm_per_deg: derivative gain on the bearing.
         align_max_mm_s: largest lateral speed.
         push_timeout_s: longest duration of the push.
+        arrival_tolerance_mm: the task is done only if the object's centre, where touch and arm pose put it, ends this
+            close to the target.
+        arrival_tolerance_deg: likewise for ``goal_heading_deg``.
+        max_cross_track_mm: the push is given up where the object's centre is farther than this from its path.
     """
 
     renamed_keys: ClassVar[Mapping[str, str]] = {"middle_mm": "object_center_offset_mm"}
@@ -66,6 +70,9 @@ class PushConfig(ContactServoConfig):
     align_kd_mm_per_deg: NonNegativeFloat = 0.0
     align_max_mm_s: PositiveFloat = 10.0
     push_timeout_s: PositiveFloat = 120.0
+    arrival_tolerance_mm: PositiveFloat = 5.0
+    arrival_tolerance_deg: PositiveFloat = 10.0
+    max_cross_track_mm: PositiveFloat = 60.0
 
     def alignment(self) -> TargetAlignment:
         """Return the steering controller, in SI units."""
@@ -110,6 +117,8 @@ class Push:
         self._timeout_s = config.push_timeout_s
         self._alignment = config.alignment()
         self._goal_heading_deg = config.goal_heading_deg
+        self._tolerance_m, self._tolerance_deg = 1e-3 * config.arrival_tolerance_mm, config.arrival_tolerance_deg
+        self._max_cross_track_m = 1e-3 * config.max_cross_track_mm
         self._aim: Aim | None = None
         self._left_m_s = 0.0
         self._y_is_left = 1.0
@@ -130,7 +139,7 @@ class Push:
         return self._timeout_s
 
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
-        """Update target alignment; return True when the target is reached."""
+        """Update target alignment; return True at the end of the path, or where the object is too far from it."""
         if T_s_f is None:
             self._alignment.pause()
             self._left_m_s = 0.0
@@ -138,17 +147,43 @@ class Push:
         self._y_is_left = -float(np.sign(now[2, 0]))
         self._aim = self._alignment.aim(now, T_s_f)
         self._left_m_s = self._alignment.step(self._aim, dt_s)
-        return self._aim.remaining_m <= 0.0
+        return self._aim.remaining_m <= 0.0 or self._strayed(self._aim)
+
+    def shortfall(self) -> str:
+        """Return how far the object ended from its target, or from its path, if that is beyond the tolerances."""
+        aim = self._aim
+        if aim is None:
+            return ""
+        if self._strayed(aim):
+            return (
+                f"object {1e3 * abs(aim.cross_track_error_m):.1f} mm beside its path, limit "
+                f"{1e3 * self._max_cross_track_m:g} mm; {1e3 * aim.target_distance_m:.0f} mm from the target"
+            )
+        if aim.target_distance_m > self._tolerance_m:
+            distance_mm = 1e3 * aim.target_distance_m
+            return f"object {distance_mm:.1f} mm from the target, tolerance {1e3 * self._tolerance_m:g} mm"
+        error_deg = self._heading_error_deg(aim)
+        if error_deg is not None and abs(error_deg) > self._tolerance_deg:
+            return f"heading {error_deg:+.1f} deg off at the target, tolerance {self._tolerance_deg:g} deg"
+        return ""
+
+    def _strayed(self, aim: Aim) -> bool:
+        return abs(aim.cross_track_error_m) > self._max_cross_track_m
+
+    def _heading_error_deg(self, aim: Aim) -> float | None:
+        goal_deg = self._goal_heading_deg
+        return None if goal_deg is None else math.remainder(math.degrees(aim.heading_rad) - goal_deg, 360.0)
 
     def telemetry(self) -> Mapping[str, float]:
         """Return remaining distance, lateral errors, heading, and the alignment command."""
         if self._aim is None:
             return {}
         heading_deg = float(np.degrees(self._aim.heading_rad))
-        goal_deg = self._goal_heading_deg
-        off = {} if goal_deg is None else {"heading_error_deg": math.remainder(heading_deg - goal_deg, 360.0)}
+        error_deg = self._heading_error_deg(self._aim)
+        off = {} if error_deg is None else {"heading_error_deg": error_deg}
         return {
             "remaining_mm": 1e3 * self._aim.remaining_m,
+            "target_distance_mm": 1e3 * self._aim.target_distance_m,
             "target_lateral_error_mm": 1e3 * self._aim.target_lateral_error_m,
             "cross_track_error_mm": 1e3 * self._aim.cross_track_error_m,
             "bearing_deg": float(np.degrees(self._aim.theta_rad)),

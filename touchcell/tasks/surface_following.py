@@ -60,6 +60,10 @@ class Follow:
         self._left_m -= float(self._direction @ now[:3, :3].T @ (now[:3, 3] - before[:3, 3]))
         return self._left_m <= 0.0
 
+    def shortfall(self) -> str:
+        """Return nothing: it finishes where its distance is covered."""
+        return ""
+
     def telemetry(self) -> Mapping[str, float]:
         """Return no further telemetry."""
         return {}

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import pytest
 
 if TYPE_CHECKING:
+    from touchcell.cell.config.worlds import WorldName
     from touchcell.testing.cell_under_test import CellUnderTest
 
 
@@ -20,6 +22,7 @@ class CellFactory(Protocol):
         self,
         file: str | PathLike[str],
         *,
+        on: WorldName | None = None,
         set: Mapping[str, Any] | None = None,
         faults: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> CellUnderTest:
@@ -29,8 +32,10 @@ class CellFactory(Protocol):
 
 @pytest.fixture
 def cell() -> Iterator[CellFactory]:
-    """Makes running cells: ``cell("cell.yaml", set={"task.depth_mm": 2}, faults={"arm": {"stale": True}})``."""
+    """Makes running cells: ``cell("cell.yaml", on="sim", set={"task.depth_mm": 2}, faults={...})``."""
     # Imported where it is used: a test session that needs no cell pays nothing for this plugin.
+    from touchcell.cell.config.find import find_cell
+    from touchcell.cell.runtime.worlds import cell_in_world
     from touchcell.testing.cell_under_test import CellUnderTest
 
     with ExitStack() as cells:
@@ -38,9 +43,14 @@ def cell() -> Iterator[CellFactory]:
         def running(
             file: str | PathLike[str],
             *,
+            on: WorldName | None = None,
             set: Mapping[str, Any] | None = None,
             faults: Mapping[str, Mapping[str, Any]] | None = None,
         ) -> CellUnderTest:
-            return cells.enter_context(CellUnderTest(file, set=set, faults=faults))
+            if on != "emulated":
+                return cells.enter_context(CellUnderTest(file, on=on, set=set, faults=faults))
+            settings = {"on_trip": "wait_for_reset", **(set or {})}
+            plan = cells.enter_context(cell_in_world(find_cell(Path(file)), on, settings=settings))
+            return cells.enter_context(CellUnderTest(plan, faults=faults))
 
         yield running

@@ -3,28 +3,38 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
+from pydantic import TypeAdapter
+
+from touchcell.cell.config.armed import cell_facts
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.find import find_cell
-from touchcell.cell.config.schema import plan_cell
-from touchcell.cell.runtime.compose import compose
+from touchcell.cell.config.schema import plan_in_world
+from touchcell.cell.config.worlds import WorldName
+from touchcell.cell.runtime.compose import AnyInterlock, compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest
 from touchcell.cell.runtime.run_result import RunResult
 from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.cell.runtime.stopping import StopReport
+from touchcell.control.interlocks.config import InterlocksConfig
+from touchcell.control.interlocks.coverage import CannotTrip, Fault, Provable
+from touchcell.control.interlocks.settings import InterlockSettings
 from touchcell.control.interlocks.violation import Violation
+from touchcell.control.proof import prove
 from touchcell.drivers.core.device import Device
 from touchcell.errors import ConfigError, suggest
+from touchcell.testing.shown_interlock import Shown, shown
 
 OPERATOR: Final = "test"
 _LIMIT_S: Final = 60.0
+_TRIPS_WITHIN_S: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +65,8 @@ class CellUnderTest:
     manager it is connected and activated, and given back at the end.
 
     Args:
-        file: a cell file, or the name of one that ships.
+        file: a cell file, or the name of one that ships; or a plan, that waits for a reset after a trip.
+        on: the world that it runs in; None as the file is written.
         set: values in place of the file's own, by dotted key.
         faults: faults from the start, by device: ``{"arm": {"stale": True}}``.
 
@@ -65,21 +76,27 @@ class CellUnderTest:
 
     def __init__(
         self,
-        file: str | PathLike[str],
+        file: str | PathLike[str] | CellPlan,
         *,
+        on: WorldName | None = None,
         set: Mapping[str, Any] | None = None,
         faults: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> None:
-        self.plan: CellPlan = plan_cell(find_cell(Path(file)), settings={"on_trip": "wait_for_reset", **(set or {})})
-        if self.plan.cell.time != "simulated":
+        if isinstance(file, CellPlan):
+            self.plan = file
+        else:
+            settings = {"on_trip": "wait_for_reset", **(set or {})}
+            self.plan = plan_in_world(find_cell(Path(file)), on, settings=settings)
+        if self.plan.cell.time != "simulated" and not isinstance(file, CellPlan):
             raise ConfigError(
                 "runs in real time, so a test cannot step it",
                 file=str(self.plan.file),
                 key="time",
                 value=self.plan.cell.time,
-                hint="use a cell with `time: simulated` and simulated devices",
+                hint='run it on="sim", or use a cell with `time: simulated`',
             )
-        self.cell = compose(self.plan)
+        self._shown: dict[str, Shown] = {}
+        self.cell = compose(self.plan, arrange=self._arrange)
         self.messages: list[Message] = []
         self._stop = StopRequest()
         self._channel = OperatorChannel()
@@ -124,6 +141,11 @@ class CellUnderTest:
     def waits_for_reset(self) -> bool:
         """Whether the cell has tripped and waits for the operator."""
         return self._loop.state.name == "WAITING_FOR_RESET"
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the run is over."""
+        return not self._going
 
     @property
     def result(self) -> RunResult:
@@ -234,6 +256,60 @@ class CellUnderTest:
         if (present := getattr(found, "faults", None)) is not None:
             found.faults = type(present)()  # type: ignore[attr-defined]
 
+    def provoke(self, interlock: str, settings: Mapping[str, Any] | None = None) -> Violation:
+        """Show an interlock, alone, the first fault that must trip it, until it trips; return the first cause.
+
+        The other interlocks go on seeing the cell as it is, so that what trips is this one. It works in
+        every world: a bench stops its real arms.
+
+        Args:
+            interlock: its name in the cell file.
+            settings: of the interlock that the fault is made for; None for its own.
+
+        Raises:
+            ConfigError: there is no such interlock, or nothing that this cell can show trips it.
+        """
+        fault = next((each for each in self._faults(interlock, settings) if isinstance(each, Fault)), None)
+        if fault is None:
+            raise ConfigError("nothing that this cell can show trips it", key=f"interlocks.{interlock}")
+        self._shown[interlock].begin(fault, cell_facts(self.plan), self.cell.clock.now_ns())
+        try:
+            return self.run_until_trip(limit_s=fault.before_s + fault.within_s + _TRIPS_WITHIN_S)
+        finally:
+            self._shown[interlock].end()
+
+    def assert_armed(self, interlock: str, settings: Mapping[str, Any], after_s: float) -> None:
+        """Fail the test unless each fault that trips an interlock with ``settings`` trips the cell's in time.
+
+        Args:
+            interlock: its name in the cell file.
+            settings: as the cell file had them when the test was written.
+            after_s: the time that it took then, at most.
+        """
+        expected = _settings_of(interlock, settings)
+        proofs = prove(interlock, expected, self._shown_or_missing(interlock).rule, cell_facts(self.plan))
+        for proof in proofs:
+            assert proof.tripped_s is not None or not proof.fatal, f"{interlock} of {proof.subject}: {proof.problem}"
+            late = proof.tripped_s is not None and proof.tripped_s > after_s + 2.0 / self.cell.rate_hz
+            assert not late, f"{interlock} of {proof.subject}: {proof.fault}: {proof.tripped_s} s, expected {after_s} s"
+        own = self.plan.cell.interlocks[interlock]
+        assert own.level == expected.level, f"{interlock}: level is {own.level.name}, expected {expected.level.name}"
+
+    def _faults(self, interlock: str, settings: Mapping[str, Any] | None) -> Iterator[Fault | CannotTrip]:
+        self._shown_or_missing(interlock)
+        own = self.plan.cell.interlocks[interlock] if settings is None else _settings_of(interlock, settings)
+        if isinstance(own, Provable):
+            yield from own.faults(cell_facts(self.plan))
+
+    def _shown_or_missing(self, interlock: str) -> Shown:
+        assert interlock in self._shown, f"the cell has no interlock {interlock!r}: {', '.join(self._shown) or 'none'}"
+        return self._shown[interlock]
+
+    def _arrange(self, interlocks: Sequence[AnyInterlock]) -> Sequence[AnyInterlock]:
+        """Put each interlock behind what it can be shown."""
+        self._shown = {each.name: shown(each) for each in interlocks}
+        return list(self._shown.values())
+
     def stop(self) -> None:
         """Ask for an orderly end, as Ctrl-C does."""
         self._stop.ask()
@@ -286,3 +362,9 @@ class CellUnderTest:
         if name not in devices:
             raise ConfigError(f"no device {name!r} in this cell", key=name, hint=suggest(name, devices))
         return devices[name]
+
+
+def _settings_of(name: str, settings: Mapping[str, Any]) -> InterlockSettings:
+    """Return the settings of one interlock, from what a cell file says of it."""
+    checked: Mapping[str, InterlockSettings] = TypeAdapter(InterlocksConfig).validate_python({name: dict(settings)})
+    return checked[name]

@@ -6,6 +6,8 @@ skips the question. Installed as an entry point of ``pytest11``; without ``--cel
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -14,8 +16,11 @@ import pytest
 
 if TYPE_CHECKING:
     from touchcell.cell.config.cell_plan import CellPlan, DevicePlan
+    from touchcell.drivers.core.clock import Clock
+    from touchcell.drivers.core.device import Device
     from touchcell.testing.emulation.rig import DeviceFixture, FixtureFactory
 
+_SHORT_MOVES = "and, if it is an arm, move about 10 mm along and 2 deg about every axis"
 _CONFIRMED = pytest.StashKey[set[str]]()
 
 
@@ -38,10 +43,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Deselect `hil` tests without a cell file."""
     if config.getoption("--cell"):
         return
-    on_hardware = [item for item in items if item.get_closest_marker("hil")]
+    on_hardware = [item for item in items if item.get_closest_marker("hil") and not is_generated(item)]
     if on_hardware:
         config.hook.pytest_deselected(items=on_hardware)
-        items[:] = [item for item in items if not item.get_closest_marker("hil")]
+        items[:] = [item for item in items if item not in on_hardware]
+
+
+def is_generated(item: pytest.Item) -> bool:
+    """Return whether the test is of a module that ``touchcell new hil`` has written, which names its own cell."""
+    return "hil_cell" in getattr(item, "fixturenames", ()) or hasattr(getattr(item, "cls", None), "generated_from")
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
@@ -56,10 +66,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     """Ask the operator once per device."""
     device = getattr(getattr(item, "cls", None), "driver", None)
     confirmed = item.config.stash[_CONFIRMED]
-    if device is None or device in confirmed or not item.get_closest_marker("hil"):
+    if device is None or device in confirmed or is_generated(item) or not item.get_closest_marker("hil"):
         return
     if not item.config.getoption("--hil-yes"):
-        _ask(item.config, device)
+        ask(item.config, device)
     confirmed.add(device)
 
 
@@ -111,10 +121,36 @@ def _scene_rate_hz(plan: CellPlan, device: DevicePlan) -> float | None:
     return 1e3 / SceneConfig.model_validate(plan.cell.scene).step_ms
 
 
-def _ask(config: pytest.Config, device: str) -> None:
+def rig_in(file: Path, plan: Callable[[], CellPlan], device: str, world: str) -> FixtureFactory:
+    """Return the fixture of one device of a cell in a world, without ground truth.
+
+    Args:
+        file: the cell file.
+        plan: returns its plan; emulators run and the bench is locked from its first call on.
+        device: name of the device.
+        world: where it runs.
+    """
+    from touchcell.cell.config.schema import plan_in_world
+
+    known = plan_in_world(file, world)  # type: ignore[arg-type]
+
+    def rig(folder: Path, address: int) -> DeviceFixture:
+        found = _rig_of(known, known.devices[device])(folder, address)
+
+        def build(clock: Clock) -> Device:
+            started = plan()
+            return _rig_of(started, started.devices[device])(folder, address).build(clock)
+
+        return replace(found, build=build)
+
+    return rig
+
+
+def ask(config: pytest.Config, device: str, what: str = _SHORT_MOVES) -> None:
+    """Ask the operator before a device is powered; end the session where nobody agrees."""
     capture = config.pluginmanager.getplugin("capturemanager")
     with capture.global_and_fixture_disabled():
-        print(f"\n{device} will be powered and, if it is an arm, move about 10 mm along and 2 deg about every axis.")
+        print(f"\n{device} will be powered {what}.")
         print("Is the space around it free, are people away, and is a hand on the emergency stop? Type yes: ", end="")
         try:
             answer = input()

@@ -11,9 +11,11 @@ import pytest
 
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.cli.main import main
+from touchcell.cell.experiments.executors import Workers
+from touchcell.cell.experiments.run_trials import perform_all
 from touchcell.cell.experiments.runner import EXPERIMENTS, ExperimentSpec, Scale, run_experiment
 from touchcell.cell.experiments.table import Column, Row, table, to_json
-from touchcell.cell.experiments.trials import Finished, Perform, Trial, perform_all
+from touchcell.cell.experiments.trials import Finished, Perform, Trial
 from touchcell.cell.recording.mcap import read
 from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
@@ -82,7 +84,7 @@ def test_an_interrupt_keeps_what_had_finished(tmp_path):
 
 def test_parallel_trials_give_the_same_results(tmp_path):
     alone = perform_all(Perform(duration, tmp_path / "alone"), TWO)
-    beside = perform_all(Perform(duration, tmp_path / "beside"), TWO, jobs=2)
+    beside = perform_all(Perform(duration, tmp_path / "beside"), TWO, workers=Workers(jobs=2))
     assert [each.measures for each in alone] == [each.measures for each in beside]
     recordings = [list(read(tmp_path / where / "fast" / "run.mcap")) for where in ("alone", "beside")]
     # The duration of a cycle depends on the machine.
@@ -120,7 +122,7 @@ def test_an_experiment_leaves_table_and_pictures(tmp_path):
         return [folder / "it.png"]
 
     tiny = ExperimentSpec("tiny", "two ways", lambda scale: TWO, duration, (Column("run_s", "s"),), draw)
-    text = run_experiment(tiny, tmp_path, Scale())
+    text = run_experiment(tiny, tmp_path, Scale()).text
     assert (tmp_path / "summary.txt").read_text() == text + "\n"
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["experiment"] == "tiny"

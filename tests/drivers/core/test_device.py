@@ -7,8 +7,16 @@ import threading
 import pytest
 
 from touchcell.drivers.core.clock import VirtualClock
-from touchcell.drivers.core.device import DeactivatePolicy, Device, Lifecycle
-from touchcell.drivers.core.errors import CommandRejected, DeviceError, DeviceFault, DeviceGone, Rejection
+from touchcell.drivers.core.device import DeactivatePolicy, Device, Lifecycle, OperatorToken
+from touchcell.drivers.core.errors import (
+    CommandRejected,
+    DeviceError,
+    DeviceFault,
+    DeviceGone,
+    LifecycleError,
+    Rejection,
+    Remedy,
+)
 
 
 class Gadget(Device):
@@ -18,14 +26,33 @@ class Gadget(Device):
         super().__init__("gadget", VirtualClock())
         self.latch_on_the_way: DeviceError | None = None
         self.raise_at_rest: DeviceError | None = None
+        self.has_fault: DeviceError | None = None
+        self.raise_in_configure: DeviceError | None = None
+        self.configured = 0
 
     def _open(self) -> None: ...
 
     def _close(self) -> None: ...
 
+    def _present_fault(self) -> DeviceError | None:
+        return self.has_fault
+
+    def _configure(self) -> None:
+        if self.raise_in_configure is not None:
+            raise self.raise_in_configure
+        self.configured += 1
+
     def _activate(self) -> None:
         if self.latch_on_the_way is not None:
             self._to_faulted(self.latch_on_the_way)
+
+    def _recover(self, token: OperatorToken) -> None:
+        if self.has_fault is not None:
+            raise self.has_fault
+        if self.latch_on_the_way is not None:
+            thread = threading.Thread(target=self._to_faulted, args=(self.latch_on_the_way,))
+            thread.start()
+            thread.join()
 
     def _deactivate(self, policy: DeactivatePolicy) -> None:
         if self.raise_at_rest is not None:
@@ -126,3 +153,66 @@ def test_no_transition_overwrites_a_fault_of_the_last_moment(gadget: Gadget, tra
         getattr(gadget, transition)()
     assert gadget.state is Lifecycle.FAULTED
     assert gadget.fault is fault
+
+
+def test_a_device_with_a_fault_from_before_is_faulted_once_connected_and_configured_by_recovery() -> None:
+    gadget = Gadget()
+    gadget.has_fault = DeviceFault("gadget", "stopped by its watchdog")
+    gadget.connect()
+    assert (gadget.state, gadget.fault) == (Lifecycle.FAULTED, gadget.has_fault)
+    with pytest.raises(LifecycleError, match="stopped by its watchdog"):
+        gadget.configure()
+    with pytest.raises(DeviceFault):
+        gadget.recover(OperatorToken("test", 0))
+    gadget.has_fault = None
+    gadget.recover(OperatorToken("test", 0))
+    assert (gadget.state, gadget.configured) == (Lifecycle.READY, 1)
+    gadget.activate()
+    assert gadget.state is Lifecycle.ACTIVE
+
+
+@pytest.mark.parametrize(
+    ("needs", "state"), [(Remedy.RECOVER, Lifecycle.FAULTED), (Remedy.OPERATOR, Lifecycle.PASSIVE)]
+)
+def test_a_fault_found_by_configuring_is_latched_if_recovery_can_clear_it(needs: Remedy, state: Lifecycle) -> None:
+    gadget = Gadget()
+    gadget.connect()
+    gadget.raise_in_configure = DeviceFault("gadget", "protective stop", needs=needs)
+    with pytest.raises(DeviceFault, match="protective stop"):
+        gadget.configure()
+    assert gadget.state is state
+
+
+def test_a_fault_latched_by_another_thread_during_recovery_keeps_the_device_faulted(gadget: Gadget) -> None:
+    first, second = DeviceFault("gadget", "hot"), DeviceFault("gadget", "encoder")
+    gadget._to_faulted(first)
+    assert gadget.fault is first
+    gadget.latch_on_the_way = second
+    with pytest.raises(DeviceFault, match="encoder"):
+        gadget.recover(OperatorToken("anna", 1))
+    assert (gadget.state, gadget.fault) == (Lifecycle.FAULTED, second)
+    gadget.latch_on_the_way = None
+    gadget.recover(OperatorToken("anna", 2))
+    assert (gadget.state, gadget.fault) == (Lifecycle.READY, None)
+
+
+def test_a_fault_latched_in_the_last_moment_of_a_recovery_is_not_overwritten(gadget: Gadget) -> None:
+    gadget._to_faulted(DeviceFault("gadget", "hot"))
+    second = DeviceFault("gadget", "encoder")
+    recover = gadget._recover
+
+    def interrupt(token: OperatorToken) -> None:
+        recover(token)
+        gadget._state_lock = Interrupted(gadget, second)  # type: ignore[assignment]
+
+    gadget._recover = interrupt  # type: ignore[method-assign]
+    with pytest.raises(DeviceFault, match="encoder"):
+        gadget.recover(OperatorToken("anna", 1))
+    assert (gadget.state, gadget.fault) == (Lifecycle.FAULTED, second)
+
+
+def test_a_second_fault_before_a_recovery_does_not_make_it_fail(gadget: Gadget) -> None:
+    gadget._to_faulted(DeviceFault("gadget", "hot"))
+    gadget._to_faulted(DeviceFault("gadget", "hotter"))
+    gadget.recover(OperatorToken("anna", 1))
+    assert gadget.state is Lifecycle.READY

@@ -159,6 +159,21 @@ def test_a_lease_equal_to_the_one_that_is_held_is_another_lease(harness: GateHar
     assert harness.desk.owner == "test", "a copy releases nothing either"
 
 
+def test_no_two_leases_are_equal(harness: GateHarness) -> None:
+    first = harness.lease
+    harness.desk.revoke()
+    second = harness.desk.acquire(first.owner)
+    assert first != second
+    harness.desk.release(first)
+    assert harness.desk.owner == second.owner
+
+
+def test_a_released_lease_is_nobodys_and_can_be_acquired_by_another(harness: GateHarness) -> None:
+    harness.desk.release(harness.lease)
+    assert harness.desk.owner is None
+    assert harness.desk.acquire("other").owner == harness.desk.owner == "other"
+
+
 def test_of_concurrent_threads_exactly_one_acquires_the_lease() -> None:
     desk = LeaseManager("arm")
     given_out: list[Lease] = []
@@ -380,6 +395,13 @@ def test_from_rest_every_command_obeys_acceleration_whatever_its_time_to_live(
         assert np.linalg.norm(sent.command.twist - before) <= 0.5 * step_s * (1 + 1e-9)
         assert sent.limited or k > 0
         before = sent.command.twist
+
+
+@pytest.mark.parametrize("ttl_s", [5e-324, 1e-310, 1e-200, 1e-12])
+def test_a_time_to_live_too_short_to_divide_by_is_limited_as_a_microsecond(harness: GateHarness, ttl_s: float) -> None:
+    for _ in range(3):
+        sent = harness.send(ttl_s=ttl_s)
+        assert 0.0 < np.linalg.norm(sent.command.twist) <= 0.5e-6
 
 
 def test_a_reset_makes_the_next_command_the_first(harness: GateHarness) -> None:

@@ -146,13 +146,20 @@ def test_state_blocks_have_sixteen_lengths_that_no_other_reply_has() -> None:
     assert codec.IDENTITY_LENGTH not in range(31, 47)
 
 
-@pytest.mark.parametrize("position", [4096, 32767, 0x8001])
-def test_positions_outside_one_turn_are_refused(position: int) -> None:
+@pytest.mark.parametrize("position", [8192, 32767, 0x9000])
+def test_positions_more_than_a_turn_out_of_range_are_refused(position: int) -> None:
     data = bytearray(state_block(40))
     data[16:18] = position.to_bytes(2, "little")
     with pytest.raises(CodecError) as caught:
         codec.decode_state(bytes(data))
     assert caught.value.field == "position"
+
+
+@pytest.mark.parametrize(("raw", "position"), [(0x8014, -20), (4100, 4100)])
+def test_a_homing_offset_may_move_the_count_out_of_one_turn(raw: int, position: int) -> None:
+    data = bytearray(state_block(40))
+    data[16:18] = raw.to_bytes(2, "little")
+    assert codec.decode_state(bytes(data)).position == position
 
 
 @given(st.binary(max_size=50))
@@ -162,7 +169,7 @@ def test_any_block_is_a_state_within_bounds_or_refused(data: bytes) -> None:
     except CodecError:
         return
     assert 31 <= len(data) <= 46
-    assert 0 <= state.position < 4096
+    assert -4096 < state.position < 8192
     assert -1.024 < state.load < 1.024
 
 

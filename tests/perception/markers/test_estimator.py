@@ -18,7 +18,8 @@ torch = pytest.importorskip("torch")
 from touchcell.drivers.core.clock import VirtualClock  # noqa: E402
 from touchcell.geometry import se3  # noqa: E402
 from touchcell.perception.errors import ImageError, ModelError, TrainingError  # noqa: E402
-from touchcell.perception.markers.estimator import MarkerEstimator, mixed  # noqa: E402
+from touchcell.perception.markers.estimator import MarkerEstimator  # noqa: E402
+from touchcell.perception.markers.layers import mixed  # noqa: E402
 from touchcell.perception.markers.matching import DisplacementModel, MarkerField  # noqa: E402
 from touchcell.perception.models.model_file import Labels, Model, load_model, save_model  # noqa: E402
 from touchcell.perception.networks.checkpoint import EpochRecord, checkpoint_path  # noqa: E402
@@ -211,7 +212,14 @@ def test_numpy_and_torch_agree(trained: Path) -> None:
             outputs = network(inputs.expand(QUICK.networks, 1, -1)).numpy()[:, 0].astype(np.float64)
         mean, sigma = mixed(outputs[:, :6], outputs[:, 12:], model.header.labels)
         field = MarkerField(
-            displacements, displacements, np.ones(331, bool), np.zeros(QUICK.modes), score=1.0, rms_px=0.1, valid=True
+            displacements,
+            displacements,
+            np.ones(331, bool),
+            np.zeros(QUICK.modes),
+            score=1.0,
+            rms_px=0.1,
+            explained=1.0,
+            valid=True,
         )
         found = estimator.infer(field)
         np.testing.assert_allclose(found[0], mean, atol=1e-4)

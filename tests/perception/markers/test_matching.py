@@ -115,6 +115,19 @@ def test_a_failed_guess_is_not_used(learned: Learned, sample: Simulated) -> None
         assert correct_fraction(lost, places) > 0.97 or not lost.valid
 
 
+def test_a_fifth_of_the_pins_may_have_broken_off(learned: Learned, sample: Simulated) -> None:
+    identity = identity_of(learned)
+    broken = np.random.default_rng(2).permutation(331)[:66]
+    valid, right = [], []
+    for pixels in sample.pixels[:40]:
+        places = inside(np.delete(pixels, broken, axis=0))
+        field = learned.matcher.match(Discs(places, np.full(len(places), 120.0)))
+        valid.append(field.valid)
+        right.append(correct_fraction(field, pixels[identity]) > 0.97)
+    assert np.mean(valid) >= 0.9
+    assert np.mean(np.array(right)[valid]) >= 0.95
+
+
 def test_a_jump_between_frames_is_survived(learned: Learned, sample: Simulated) -> None:
     identity = identity_of(learned)
     previous, right = None, []

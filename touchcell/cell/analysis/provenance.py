@@ -20,7 +20,7 @@ def provenance() -> dict[str, str]:
         "python": platform.python_version(),
         "numpy": np.__version__,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "commit": _commit(),
+        "commit": commit(),
     }
 
 
@@ -33,7 +33,7 @@ def _cpu_model() -> str:
     return names[0] if names else platform.machine()
 
 
-def _commit() -> str:
+def commit() -> str:
     """Return the short hash, with "+" if the tree has uncommitted changes; "unknown" outside a checkout."""
     try:
         return _git("rev-parse", "--short", "HEAD") + ("+" if _git("status", "--porcelain") else "")

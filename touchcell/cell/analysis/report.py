@@ -27,11 +27,21 @@ def write_report(folder: Path) -> str:
     run = load_run(folder / RECORDING)
     result_file = folder / "result.json"
     result = json.loads(result_file.read_text()) if result_file.exists() else {}
-    summary = summarise(run)
+    summary = {**_push_errors(folder), **summarise(run)}
     (folder / "summary.json").write_text(json.dumps({**result, **summary}, indent=1) + "\n")
     text = _text(folder, result, summary, _pictures(run, folder), run)
     (folder / "summary.txt").write_text(text + "\n")
     return text
+
+
+def _push_errors(folder: Path) -> dict[str, float]:
+    from touchcell.cell.analysis.push_errors import push_errors
+    from touchcell.cell.analysis.run_folder import RunFolder
+
+    try:
+        return dict(push_errors(RunFolder(folder)))
+    except (ConfigError, OSError):
+        return {}
 
 
 def _pictures(run: Run, folder: Path) -> list[Path]:
@@ -161,6 +171,7 @@ def _text(folder: Path, result: dict[str, Any], summary: dict[str, Any], picture
         lines.append(f"{result['cell']}: {result['task']} {result['outcome']} after {result['duration_s']:.2f} s")
         if result["reason"]:
             lines.append(f"  {result['reason']}")
+    lines += [f"  {_ENDED[name].format(summary[name])}" for name in _ENDED if name in summary]
     for sensor, kinds in summary["errors"].items():
         lines.append(f"{sensor}, error RMS    " + "".join(f"{name:>11}" for name in COMPONENTS))
         for kind, statistics in kinds.items():
@@ -181,6 +192,11 @@ def _text(folder: Path, result: dict[str, Any], summary: dict[str, Any], picture
     return "\n".join(lines)
 
 
+_ENDED = {
+    "object_error_mm": "object {:.1f} mm from the target",
+    "object_heading_error_deg": "object heading {:+.1f} deg off",
+    "target_error_mm": "contact normal {:.1f} mm from the target",
+}
 _KINDS = {
     "control": "true - reference",
     "estimation": "estimate - true",

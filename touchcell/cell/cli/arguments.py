@@ -31,6 +31,25 @@ def add_cell(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("cell", type=Path, metavar="CELL", help="cell file, or the name of one that ships")
 
 
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """``--on`` and ``--set``: the world of a cell, and values in place of the file's own."""
+    parser.add_argument(
+        "--on",
+        choices=("sim", "emulated", "bench"),
+        dest="world",
+        help="sim: simulated devices in place of real ones; emulated: real drivers on emulators that start by "
+        "themselves; bench: nothing simulated (default: as the file is written)",
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="settings",
+        metavar="KEY=VALUE",
+        help="value in place of the file's own, by dotted key, such as task.depth_mm=2.5; repeatable",
+    )
+
+
 def add_run_folder(parser: argparse.ArgumentParser, default: str = "the newest below runs/") -> None:
     """The run folder as an optional positional argument."""
     parser.add_argument("folder", type=Path, nargs="?", metavar="FOLDER", help=f"run folder (default: {default})")

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from touchcell.cell.cli.arguments import Subparsers, add_cell, add_command
+from touchcell.cell.cli.arguments import Subparsers, add_cell, add_command, add_settings
 from touchcell.cell.cli.exit_codes import EXIT_OK
 from touchcell.cell.config.find import find_cell
 
@@ -18,6 +18,7 @@ def add_parser(commands: Subparsers) -> None:
     """Declare the commands."""
     run = add_command(commands, "run", _run, "run a cell's task and report on it")
     add_cell(run)
+    add_settings(run)
     run.add_argument("--data", type=Path, metavar="DIR", help="data set folder for drivers that replay or collect one")
     run.add_argument("--model", metavar="FILE", help="model file in place of the one that the cell names")
     run.add_argument("--out", type=Path, metavar="FOLDER", help="run folder (default: runs/NAME-TIME)")
@@ -26,14 +27,21 @@ def add_parser(commands: Subparsers) -> None:
 
     check = add_command(commands, "check", _check, "validate a cell file without connecting anything")
     add_cell(check)
+    add_settings(check)
     check.add_argument("--data", type=Path, metavar="DIR", help="data set folder that the run will be given")
+    check.add_argument(
+        "--explain", action="store_true", help="print the merged file, with the file and line each value comes from"
+    )
 
 
 def _run(options: argparse.Namespace) -> int:
     from touchcell.cell.cli.run import run_cell
+    from touchcell.cell.config.settings import parse_settings
 
     return run_cell(
         find_cell(options.cell),
+        world=options.world,
+        settings=parse_settings(options.settings),
         data=options.data,
         model=options.model,
         out=options.out,
@@ -61,10 +69,22 @@ def _uncollected() -> Iterator[None]:
 
 def _check_cell(options: argparse.Namespace) -> int:
     from touchcell.cell.config.armed import proof_table
-    from touchcell.cell.config.schema import plan_cell
+    from touchcell.cell.config.layers import explain, load_layers
+    from touchcell.cell.config.settings import parse_settings
+    from touchcell.cell.runtime.worlds import plan_for
 
-    plan = plan_cell(find_cell(options.cell), {} if options.data is None else {"data": options.data})
-    print(f"{options.cell}: {plan.cell.name} is valid")
+    file, settings = find_cell(options.cell), parse_settings(options.settings)
+    if options.explain and options.world is None:
+        print(explain(load_layers(file, settings)))
+    overrides = {} if options.data is None else {"data": options.data}
+    plan = plan_for(file, options.world, overrides, settings=settings)
+    if options.explain:
+        if options.world is not None:
+            print(explain(load_layers(file, settings, plan.world_settings)))
+        return EXIT_OK
+    print(f"{options.cell}: {plan.cell.name} is valid{'' if options.world is None else f' on {options.world}'}")
+    for note in plan.notes:
+        print(f"  {note}")
     print(f"  task     {plan.task.name}: {plan.task.summary}")
     for device in plan.built.values():
         print(f"  {device.spec.capabilities.kind:<8} {device.name}: {device.spec.name}, {device.spec.summary}")

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from touchcell import compiled
 from touchcell.cell.cli import discovery
 from touchcell.cell.cli.discovery import Found
-from touchcell.cell.config.cell_plan import CellPlan
-from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.worlds import WorldName
 from touchcell.cell.runtime.devices import build_devices
+from touchcell.cell.runtime.worlds import cell_in_world
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.errors import DeviceError, LifecycleError
 from touchcell.drivers.core.protocols import FrameSource, HealthSource, JointSource, TcpSource
@@ -55,14 +56,20 @@ def print_devices() -> None:
         print(line)
 
 
-def probe_cell(path: Path) -> list[Probe]:
+def probe_cell(path: Path, settings: Mapping[str, Any] | None = None, world: WorldName | None = None) -> list[Probe]:
     """Connect every device of a cell file one after the other, in PASSIVE only, and ask what it reports.
+
+    Args:
+        path: the cell file.
+        settings: values in place of the file's own, by dotted key.
+        world: where; None as the file is written.
 
     Raises:
         ConfigError: the cell file is not valid.
     """
-    plan: CellPlan = plan_cell(path)
-    return [_probe(device, plan.devices[name].spec.name) for name, device in build_devices(plan, plan.devices).items()]
+    with cell_in_world(path, world, settings=settings) as plan:
+        devices = build_devices(plan, plan.devices if world is None else plan.built)
+        return [_probe(device, plan.devices[name].spec.name) for name, device in devices.items()]
 
 
 def print_probes(probes: Sequence[Probe]) -> None:

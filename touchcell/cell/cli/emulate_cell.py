@@ -23,29 +23,22 @@ from typing import Any
 import numpy as np
 
 from touchcell.cell.config.cell_plan import CellPlan
+from touchcell.cell.config.default_scene import start_of
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_cell
 from touchcell.drivers.core.clock import MonotonicClock
 from touchcell.drivers.core.errors import DeviceError
-from touchcell.drivers.franka.emulator import arm as franka_arm
-from touchcell.drivers.ur.emulator import kinematics as ur_model
 from touchcell.drivers.v4l2.emulator.server import V4l2Emulator
 from touchcell.drivers.v4l2.shim import environment
 from touchcell.errors import ConfigError
-from touchcell.geometry import se3
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.scene import Scene, SceneConfig
 from touchcell.simulation.tip import Tip
 from touchcell.testing.emulation.base import Emulator
+from touchcell.testing.emulation.in_cell import EMULATED
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.ticker import Ticker
-
-_FLANGES: Mapping[str, Callable[[Array], Array]] = {
-    "franka": lambda q: franka_arm.flange_pose(q)[0],
-    "ur": lambda q: ur_model.forward(q, np.eye(4))[0],
-}
-"""T_base_flange (4, 4) of an emulated arm from its joint angles, by driver, which is also the emulator's name."""
 
 _CAMERA = re.compile(r"/dev/(?:video|v4l/by-id/usb-TacTip_)(\d+)(?:-video-index0)?")
 # What an arm was asked less long ago than this is not asked again: scenes take their steps in bursts.
@@ -57,21 +50,18 @@ class EmulatedArm:
 
     Args:
         process: its emulator, running.
-        flange: T_base_flange (4, 4) from joint angles.
-        T_flange_tcp: (4, 4) its tool, None for the one that the emulator has.
+        T_base_tcp: (4, 4) where its tool is, from its state.
         T_world_base: (4, 4) where its base stands.
     """
 
     def __init__(
         self,
         process: EmulatorProcess,
-        flange: Callable[[Array], Array],
-        T_flange_tcp: Array | None,
+        T_base_tcp: Callable[[Mapping[str, Any]], Array],
         T_world_base: Array,
     ) -> None:
         self._process = process
-        self._flange = flange
-        self._T_flange_tcp = T_flange_tcp
+        self._T_base_tcp = T_base_tcp
         self._T_world_base = T_world_base
         self._T_world_tcp = self._ask()
         self._asked_ns = time.monotonic_ns()
@@ -86,12 +76,8 @@ class EmulatedArm:
         return self._T_world_tcp
 
     def _ask(self) -> Array:
-        state = self._process.state()
-        if self._T_flange_tcp is None:
-            T_base_tcp = np.array(state["T_base_ee"], dtype=np.float64)
-        else:
-            T_base_tcp = self._flange(np.array(state["q"], dtype=np.float64)) @ self._T_flange_tcp
-        return self._T_world_base @ T_base_tcp
+        T: Array = self._T_world_base @ self._T_base_tcp(self._process.state())
+        return T
 
 
 class CellEmulator(Emulator):
@@ -113,13 +99,7 @@ class CellEmulator(Emulator):
             raise ConfigError("there is nothing to touch", key="emulated_scene", hint="describe it as a `scene:`")
         self._scene_config = SceneConfig.model_validate(plan.cell.emulated_scene)
         self._plan = plan
-        for name, device in plan.arms.items():
-            if device.spec.name not in _FLANGES:
-                raise _not_emulated("arms", name, device.spec.name, "franka, ur")
-        self._arm_processes = {
-            name: EmulatorProcess(device.spec.name, "--host", str(getattr(device.config, "host", "")))
-            for name, device in plan.arms.items()
-        }
+        self._arm_processes = {name: _arm_process(plan, name) for name in plan.arms}
         self._arms: dict[str, EmulatedArm] = {}
         self._cameras = {name: self._camera(name, folder) for name in plan.sensors}
         self._scene: Scene | None = None
@@ -167,20 +147,16 @@ class CellEmulator(Emulator):
         }
 
     def _arm(self, name: str) -> EmulatedArm:
-        device, section = self._plan.arms[name], self._plan.cell.arms[name]
-        tool = getattr(device.config, "flange_to_tcp_mm_deg", None)
-        return EmulatedArm(
-            self._arm_processes[name],
-            _FLANGES[device.spec.name],
-            None if tool is None else se3.from_euler_mm_deg(tool),
-            section.T_world_base,
-        )
+        device = self._plan.arms[name]
+        where = EMULATED.load(device.spec.name).T_base_tcp
+        assert where is not None
+        return EmulatedArm(self._arm_processes[name], where(device.config), self._plan.cell.arms[name].T_world_base)
 
     def _camera(self, name: str, folder: Path) -> V4l2Emulator:
         device = self._plan.sensors[name]
         if device.spec.name != "v4l2":
             raise _not_emulated("sensors", name, device.spec.name, "v4l2")
-        if self._plan.cell.sensors[name].mounted_on is None:
+        if self._plan.cell.sensors[name].mounted_on is None and self._plan.arms:
             raise ConfigError("nothing carries it", key=f"sensors.{name}.mounted_on", hint="name one of the arms")
         node = str(getattr(device.config, "device", ""))
         found = _CAMERA.fullmatch(node)
@@ -195,13 +171,27 @@ class CellEmulator(Emulator):
 
     def _sensor_pose(self, name: str) -> Callable[[], Array]:
         section = self._plan.cell.sensors[name]
-        arm, T_tcp_s = self._arms[section.mounted_on or ""], section.T_tcp_sensor
+        T_tcp_s = section.T_tcp_sensor
+        if section.mounted_on is None:
+            return lambda: T_tcp_s
+        arm = self._arms[section.mounted_on]
         return lambda: arm.T_world_tcp() @ T_tcp_s
 
     def _picture(self, name: str, number: int) -> ImageArray:
         assert self._scene is not None
         pixels = self._tip.pixels(self._scene.contact(name).value.T_f_s)
         return self._renderers[name].raw(pixels, number)
+
+
+def _arm_process(plan: CellPlan, name: str) -> EmulatorProcess:
+    """Return the emulator of an arm, not started yet, at the start pose of the cell file."""
+    device, given = plan.arms[name], plan.cell.arms[name].start_pose_mm_deg
+    arms = [each for each in EMULATED.names() if EMULATED.load(each).start is not None]
+    start = EMULATED.load(device.spec.name).start if device.spec.name in arms else None
+    if start is None:
+        raise _not_emulated("arms", name, device.spec.name, ", ".join(arms))
+    q = None if given is None else start_of(plan, name, given).q
+    return start(device.config, None if q is None else np.degrees(q).tolist())
 
 
 def _advance(scene: Scene) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
 
@@ -11,6 +12,12 @@ from touchcell.cell.cli.exit_codes import EXIT_OK
 from touchcell.cell.config.find import find_cell
 
 _SIMULATED_KINDS = ("gdn", "cnn", "markers")
+_CANDIDATES = {
+    "mean": "mean of the labels",
+    "affine": "affine map",
+    "transfer": "Gaussian processes",
+    "scratch": "trained from scratch",
+}
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -37,6 +44,7 @@ def _add_training(commands: Subparsers) -> None:
         help="such as gdn, cnn or markers, see `touchcell list` (default: %(default)s)",
     )
     train.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
+    train.add_argument("--rings", type=positive, help="of a marker estimator's lattice (default: 10)")
     train.add_argument("--networks", type=positive, help="of a marker estimator, whose mixture it gives (default: 2)")
     train.add_argument(
         "--short-side",
@@ -102,7 +110,7 @@ def _add_calibration(commands: Subparsers) -> None:
     )
     adapt.add_argument("--model", type=Path, required=True, metavar="FILE", help="model file of a marker estimator")
     _add_data(adapt, "data set folder with train/ of the new sensor")
-    adapt.add_argument("--frames", type=positive, help="so many of its images, evenly chosen (default: all)")
+    adapt.add_argument("--frames", type=positive, help="so many of its images, evenly over the depths (default: all)")
     _add_out(adapt, "model file to write (.safetensors)")
 
 
@@ -122,7 +130,12 @@ def _train(options: argparse.Namespace) -> int:
     from touchcell.cell.config.settings import parse_settings
     from touchcell.perception.networks.trainer import train
 
-    named = {"epochs": options.epochs, "networks": options.networks, "short_side_px": options.short_side}
+    named = {
+        "epochs": options.epochs,
+        "networks": options.networks,
+        "rings": options.rings,
+        "short_side_px": options.short_side,
+    }
     train(
         options.data,
         options.out,
@@ -188,13 +201,28 @@ def _calibrate(options: argparse.Namespace) -> int:
 
 def _adapt(options: argparse.Namespace) -> int:
     from touchcell.perception.calibration.adaptation import adapt
+    from touchcell.perception.models.labels import CONTACT_NAMES
 
-    model = adapt(options.model, options.data, options.out, frames=options.frames)
-    told, camera = model.header.training, model.header.camera
+    result = adapt(options.model, options.data, options.out, frames=options.frames)
+    camera, convention = result.model.header.camera, result.convention
     assert camera is not None
-    print(f"{told['adapted_images_matched']} of {told['adapted_images']} images matched and learned from")
-    print(f"camera: zoom {camera.zoom:.4f}, turn {camera.turn_deg:.1f} deg; labels' axes:", end=" ")
-    print(f"{model.header.label_turn_deg:.1f} deg; wrote {options.out}")
+    print(f"{result.matched} of {result.images} images matched and learned from")
+    print(f"camera: zoom {camera.zoom:.4f}")
+    print(
+        f"labels: {'mirrored, ' if convention.mirrored else ''}"
+        f"{'shear of the opposite sign, ' if convention.shear_reversed else ''}"
+        f"tilt axes rotated by {math.degrees(convention.tilt_axes_rad):.0f} deg, "
+        f"shear axes by {math.degrees(convention.shear_axes_rad):.0f} deg"
+    )
+    print("mean absolute error on left-out images: " + ", ".join(CONTACT_NAMES))
+    for name, errors in result.left_out_mae.items():
+        chosen = " (taken)" if name == result.method else ""
+        print(f"  {_CANDIDATES[name]:<22}" + " ".join(f"{error:7.3f}" for error in errors) + chosen)
+    for name in result.no_better:
+        print(f"warning: {name} is estimated no better than by its mean; give more images")
+    for region in result.missing:
+        print(f"warning: no image with {region}")
+    print(f"wrote {options.out}")
     return EXIT_OK
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from touchcell import compiled
 from touchcell.cell.bench.catalog import benchmark_names
+from touchcell.cell.experiments.executors import EXECUTORS
 from touchcell.cell.experiments.runner import EXPERIMENTS
-from touchcell.cell.experiments.trials import EXECUTORS
 from touchcell.control.interlocks.spec import INTERLOCKS
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.errors import ConfigError

@@ -38,6 +38,11 @@ _GROUPS: Final = (
 _EXTRAS: Final = {
     "torch": "touchcell[train]",
     "mujoco": "touchcell[physics]",
+    "optuna": "touchcell[search]",
+    "distributed": "touchcell[dask]",
+    "dask": "touchcell[dask]",
+    "ray": "touchcell[ray]",
+    "submitit": "touchcell[slurm]",
     "shtab": "touchcell[completion]",
 }
 """Module -> what to install for it, of commands that need more than a running cell does. Drivers name their own."""

@@ -1,4 +1,4 @@
-"""``bench`` and ``experiment``: figures of this machine, and the paper's experiments."""
+"""``bench``, ``experiment``, ``sweep``: figures of this machine, the paper's experiments, and one's own."""
 
 from __future__ import annotations
 
@@ -6,9 +6,15 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from touchcell.cell.cli.arguments import RUNS, Subparsers, add_command, positive
-from touchcell.cell.cli.exit_codes import EXIT_OK
+from touchcell.cell.cli.arguments import RUNS, Subparsers, add_cell, add_command, positive
+from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED
+from touchcell.cell.cli.workers import add_workers, workers_of
+from touchcell.errors import ConfigError
+
+if TYPE_CHECKING:
+    from touchcell.cell.sweeps.sweep import Sweep
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -33,12 +39,32 @@ def add_parser(commands: Subparsers) -> None:
         metavar="DIR",
         help="folder with one for each (default: %(default)s)",
     )
-    experiment.add_argument("--jobs", type=positive, help="trials at a time (default: one for each core)")
-    experiment.add_argument(
-        "--executor", default="local", metavar="NAME", help="what runs the trials (default: %(default)s)"
-    )
+    add_workers(experiment)
     experiment.add_argument("--trials", type=positive, help="repetitions of each row (default: the experiment's own)")
     experiment.add_argument("--quick", action="store_true", help="the least that still shows every kind of row")
+
+    sweep = add_command(commands, "sweep", _sweep, "run a cell with many settings: tables, plots and worst cases")
+    add_cell(sweep)
+    values = "KEY=FIRST:LAST:COUNT, KEY=FIRST..LAST or KEY=A,B,C"
+    sweep.add_argument("--grid", action="append", default=[], metavar="KEY=VALUES", help=f"{values}; repeatable")
+    sweep.add_argument(
+        "--sample",
+        action="append",
+        default=[],
+        metavar="KEY=VALUES",
+        help="FIRST..LAST, uniform(LOW, HIGH), loguniform(LOW, HIGH), normal(MEAN, SD) or choice(A, B); repeatable",
+    )
+    sweep.add_argument("--samples", type=positive, help="draws at each point of the grid (default: as many as a range)")
+    sweep.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="in every trial; repeatable")
+    sweep.add_argument(
+        "--measure", action="append", default=[], metavar="NAME", help="number to show, with *; repeatable"
+    )
+    sweep.add_argument("--minimise", metavar="NAME", help="search the --sample ranges for the smallest NAME (Optuna)")
+    sweep.add_argument("--trials", type=positive, default=50, help="trials of a search (default: %(default)s)")
+    sweep.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder; the same command goes on in it (default: runs/sweeps/NAME)"
+    )
+    add_workers(sweep)
 
 
 def _bench(options: argparse.Namespace) -> int:
@@ -58,17 +84,90 @@ def _experiment(options: argparse.Namespace) -> int:
     names = EXPERIMENTS.names() if options.name == "all" else (options.name,)
     experiments = [EXPERIMENTS.load(name) for name in names]
     scale = Scale(options.trials, options.quick)
-    jobs = options.jobs or os.cpu_count() or 1
-    tables = []
+    tables, complete = [], True
     for experiment in experiments:
         folder = options.out / experiment.name
         try:
             live = sys.stdout.isatty()
-            tables.append(run_experiment(experiment, folder, scale, jobs=jobs, executor=options.executor, live=live))
+            result = run_experiment(
+                experiment,
+                folder,
+                scale,
+                workers=workers_of(options),
+                executor=options.executor,
+                keep_stale=options.keep_stale,
+                live=live,
+            )
         except KeyboardInterrupt:
             print(f"touchcell: what has finished is kept in {folder}; the same command goes on", file=sys.stderr)
             raise
-        print(tables[-1], flush=True)
+        tables.append(result.text)
+        complete = complete and result.complete
+        print(result.text, flush=True)
     if len(tables) > 1:
         (options.out / "summary.txt").write_text("\n\n".join(tables) + "\n")
+    return EXIT_OK if complete else EXIT_TASK_FAILED
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from dataclasses import replace
+
+    from touchcell.cell.config.find import find_cell
+    from touchcell.cell.config.settings import parse_settings
+    from touchcell.cell.sweeps.factors import make_factors
+    from touchcell.cell.sweeps.section import pairs, read_section
+    from touchcell.cell.sweeps.sweep import Sweep, run_sweep
+
+    cell = find_cell(options.cell)
+    section = read_section(cell)
+    workers = workers_of(options)
+    if section.time_limit_s is not None:
+        workers = replace(workers, time_limit_s=section.time_limit_s)
+    grid = {**section.grid, **pairs(options.grid, "--grid")}
+    sample = {**section.sample, **pairs(options.sample, "--sample")}
+    folder = options.out or RUNS / "sweeps" / cell.stem
+    searching = options.minimise is not None
+    factors = make_factors({} if searching else grid, sample, options.samples or section.samples, section.seed)
+    measures = tuple(options.measure) or section.measures
+    sweep = Sweep(cell, factors, measures, settings=parse_settings(options.set))
+    live = sys.stdout.isatty()
+    try:
+        if searching:
+            return _search(options, sweep, folder, live)
+        result = run_sweep(
+            sweep, folder, workers=workers, executor=options.executor, keep_stale=options.keep_stale, live=live
+        )
+    except KeyboardInterrupt:
+        print(f"touchcell: what has finished is kept in {folder}; the same command goes on", file=sys.stderr)
+        raise
+    print(result.text)
+    return EXIT_OK if result.complete else EXIT_TASK_FAILED
+
+
+def _search(options: argparse.Namespace, sweep: Sweep, folder: Path, live: bool) -> int:
+    from touchcell.cell.sweeps.factors import Distribution
+    from touchcell.cell.sweeps.search import search
+
+    space = {key: draw for key, draw in sweep.factors.sampled.items() if isinstance(draw, Distribution)}
+    if not space:
+        raise ConfigError("there is nothing to search", key="--minimise", hint="--sample 'task.gain=uniform(0.5, 2)'")
+    found = search(
+        sweep,
+        space,
+        options.minimise,
+        options.trials,
+        folder,
+        workers=workers_of(options),
+        executor=options.executor,
+        live=live,
+    )
+    if found.best is None:
+        print(f"none of {len(found.finished)} trials ended as done: {found.finished[-1].reason}")
+        return EXIT_TASK_FAILED
+    changes = {key: found.best.trial.changes[key] for key in space}
+    print(f"smallest {options.minimise} of {len(found.finished)} trials: {found.best.measures[options.minimise]:.4g}")
+    for key, value in changes.items():
+        print(f"  --set {key}={value}")
+    print(f"  touchcell run {found.best.folder.path}/cell.yaml")
     return EXIT_OK

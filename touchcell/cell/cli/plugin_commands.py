@@ -9,7 +9,7 @@ from touchcell.cell.cli.arguments import Subparsers, add_command
 from touchcell.cell.cli.exit_codes import EXIT_OK
 
 _INDENT = " " * 6
-_KINDS = ("driver", "camera", "task", "interlock", "estimator")
+_KINDS = ("driver", "camera", "task", "interlock", "estimator", "hil")
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -24,9 +24,13 @@ def add_parser(commands: Subparsers) -> None:
 
     add_command(commands, "schema", _schema, "print a JSON Schema of cell files, for editors")
 
-    new = add_command(commands, "new", _new, "write a package for a plug-in, whose tests are red until it is filled in")
-    new.add_argument("kind", choices=_KINDS, help="what to make; a driver is that of an arm")
-    new.add_argument("name", metavar="NAME", help="of the package and of the plug-in, such as my_arm")
+    new = add_command(commands, "new", _new, "write a package for a plug-in, or the tests of a cell")
+    new.add_argument(
+        "kind", choices=_KINDS, help="what to make; a driver is that of an arm, hil the tests of a cell file"
+    )
+    new.add_argument(
+        "name", metavar="NAME", help="of the package and of the plug-in, such as my_arm; for hil the cell file"
+    )
     new.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder to put it in (default: this one)")
 
 
@@ -62,6 +66,8 @@ def _describe(options: argparse.Namespace) -> int:
 
 
 def _new(options: argparse.Namespace) -> int:
+    if options.kind == "hil":
+        return _new_hil(options)
     from touchcell.cell.cli.scaffold import new
 
     files = new(options.kind, options.name, options.out)
@@ -69,6 +75,16 @@ def _new(options: argparse.Namespace) -> int:
         print(file)
     package = files[0].parent
     print(f"next: pip install -e {package}, then pytest {package}, and fill in {options.name}.py until it is green")
+    return EXIT_OK
+
+
+def _new_hil(options: argparse.Namespace) -> int:
+    from touchcell.cell.cli.new_hil import new_hil
+    from touchcell.cell.config.find import find_cell
+
+    module = new_hil(find_cell(Path(options.name)), options.out)
+    print(module)
+    print(f"next: pytest {module}; with --on emulated on emulators, with -m hil on the bench")
     return EXIT_OK
 
 

@@ -17,7 +17,7 @@ from touchcell.cell.analysis.report import write_report
 from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
 from touchcell.cell.cli.output import say, warn
 from touchcell.cell.config.cell_plan import CellPlan
-from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.worlds import WorldName
 from touchcell.cell.recording.mcap import RECORDING, Recorder
 from touchcell.cell.recording.reserved_file import ReservedFile
 from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, note_crashes, stop_record
@@ -30,6 +30,7 @@ from touchcell.cell.runtime.operator_input import stop_on_keys, stop_on_signals
 from touchcell.cell.runtime.run_directory import RunFolderError, run_directory
 from touchcell.cell.runtime.run_result import Outcome, Progress, RunResult
 from touchcell.cell.runtime.stop_request import StopRequest
+from touchcell.cell.runtime.worlds import cell_in_world
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.errors import TouchcellError
@@ -79,6 +80,8 @@ def run_cell(
     *,
     data: Path | None = None,
     model: str | None = None,
+    world: WorldName | None = None,
+    settings: Mapping[str, Any] | None = None,
     out: Path | None = None,
     live: bool = True,
     moving: bool = False,
@@ -89,6 +92,8 @@ def run_cell(
         path: the cell file.
         data: for drivers that replay a data set.
         model: estimator model in place of the file's own.
+        world: where it runs; None as the file is written.
+        settings: values in place of the file's own, by dotted key.
         out: run folder, made for this run or empty.
         live: show a progress line.
         moving: also make the animation of a simulated run.
@@ -96,7 +101,11 @@ def run_cell(
     Raises:
         ConfigError, ModelError, RunFolderError, ConnectError: before anything moves.
     """
-    run = run_plan(plan_cell(path, {} if data is None else {"data": data}, model=model), out=out, live=live)
+    overrides = {} if data is None else {"data": data}
+    with cell_in_world(path, world, overrides, model=model, settings=settings) as plan:
+        for note in plan.notes:
+            say(f"on {world}: {note}")
+        run = run_plan(plan, out=out, live=live)
     if run.summary:
         say(run.summary)
     if moving:

@@ -102,6 +102,8 @@ class ArmSection(OpenSection):
             then removes it.
         base_pose_mm_deg: pose of its base in the world frame.
         body: capsules in addition to those of the arm's chain, for ``clearance``.
+        start_pose_mm_deg: initial pose of the tool in the base frame, where a simulation or an emulator puts it; a real
+            arm starts where it is.
     """
 
     driver: str
@@ -109,6 +111,7 @@ class ArmSection(OpenSection):
     stop_category: Literal[1, 2] = 2
     base_pose_mm_deg: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     body: tuple[CapsuleSection, ...] = ()
+    start_pose_mm_deg: Six | None = None
 
     @property
     def T_world_base(self) -> Array:  # noqa: N802  the field's own name
@@ -227,6 +230,8 @@ class CellFile(_Section):
     Attributes:
         schema_: version of the format; 1.
         name: name of the cell, which names its run folders.
+        world: ``sim`` puts simulated stand-ins in place of real drivers, ``emulated`` runs them on emulators, ``bench``
+            refuses all that is simulated; ``--on`` sets it.
         time: ``simulated`` runs as fast as it can on a virtual clock, ``real`` in real time.
         rate_hz: control cycles per second.
         processes: ``separate`` runs devices in processes of their own with a watchdog, in real time only.
@@ -248,10 +253,12 @@ class CellFile(_Section):
         task: what the cell does.
         recording: what is recorded of a run besides numbers.
         collect: where a task that labels frames puts them.
+        sweep: what ``touchcell sweep`` changes from trial to trial; nothing else reads it.
     """
 
     schema_: Literal[1] = Field(alias="schema")
     name: Annotated[str, AfterValidator(_folder_name)]
+    world: Literal["sim", "emulated", "bench"] | None = None
     time: Literal["simulated", "real"]
     rate_hz: Annotated[float, Field(gt=0, le=1000)]
     processes: Literal["one", "separate"] = "one"
@@ -271,6 +278,7 @@ class CellFile(_Section):
     task: TaskSection
     recording: RecordingSection = RecordingSection()
     collect: CollectSection | None = None
+    sweep: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,6 +309,8 @@ class CellPlan:
         proofs: what made each interlock trip.
         auxiliaries: other devices that the task needs or that are read, by name in the cell.
         auxiliary_roles: role in the task -> name in the cell; a device without a role has its own name as role.
+        world_settings: values that its world put in place of the file's own, by dotted key, behind ``settings``.
+        notes: what its world does not show, and what it puts in place of something else.
     """
 
     file: Path
@@ -318,6 +328,8 @@ class CellPlan:
     auxiliaries: Mapping[str, DevicePlan] = field(default_factory=dict)
     auxiliary_roles: Mapping[str, str] = field(default_factory=dict)
     proofs: tuple[Proof, ...] = ()
+    world_settings: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         devices = [f"{name} {device.spec.name}" for name, device in self.built.items()]
@@ -330,7 +342,7 @@ class CellPlan:
 
     def text(self) -> str:
         """The cell file as it is planned: the file itself, or YAML of what comes of it and of what it extends."""
-        merged = load_layers(self.file, self.settings)
+        merged = load_layers(self.file, self.settings, self.world_settings)
         if not merged.sources:
             return self.file.read_text()
         return yaml.safe_dump(merged.data, sort_keys=False, allow_unicode=True)

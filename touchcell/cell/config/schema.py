@@ -12,7 +12,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from pydantic import BaseModel
 
@@ -30,16 +30,21 @@ from touchcell.cell.config.feasibility import unfeasible
 from touchcell.cell.config.input_files import with_input_files
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
+from touchcell.cell.config.worlds import WorldChanges, WorldName, world_changes
 from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile
 from touchcell.control.interlocks.boundary import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.core.protocols import JointSource, ReadingSource, protocol_names
 from touchcell.drivers.core.scene import scene_section
-from touchcell.drivers.core.spec import DRIVERS, DriverConfig
+from touchcell.drivers.core.spec import DRIVERS, AnyDriver, DriverConfig
+from touchcell.drivers.core.stand_in import STAND_INS, Placement
 from touchcell.errors import ConfigError, suggest
 from touchcell.input_file import BUILTIN
 from touchcell.tasks.interface import TASKS, AnyTask, TaskConfig
+
+EMULATED_CAMERAS: Final = "TOUCHCELL_V4L2"
+"""Variable that names the folder of emulated cameras."""
 
 M = TypeVar("M", bound=BaseModel)
 C = TypeVar("C", bound=DriverConfig)
@@ -51,6 +56,7 @@ def plan_cell(
     *,
     model: str | None = None,
     settings: Mapping[str, Any] | None = None,
+    world: WorldChanges | None = None,
     to_run: bool = True,
 ) -> CellPlan:
     """Read and check a cell file without connecting anything.
@@ -61,11 +67,12 @@ def plan_cell(
         model: network model in place of the one that the file names.
         to_run: False for the cell of a run that has been: its files may be gone, and its limits are not judged again.
         settings: values in place of the file's own, by dotted key ("task.speed_mm_s", "arms.arm.limits").
+        world: what the world that it runs in changes; see ``plan_in_world``.
 
     Raises:
         ConfigError: with file, line, key, value and remedy; InvalidCell for several at once.
     """
-    file = load_layers(Path(path), settings)
+    file = load_layers(Path(path), settings, None if world is None else world.settings)
     if model is not None and not model.startswith(BUILTIN):
         # Paths of the command line are relative to the working directory, those of the file to the file.
         model = str(Path(model).absolute())
@@ -77,7 +84,48 @@ def plan_cell(
             estimator = sensor.get("estimator") if isinstance(sensor, dict) else None
             if isinstance(estimator, dict) and estimator.get("kind") == "network":
                 estimator["model"] = model
-    return _Planner(file, overrides, settings or {}, to_run=to_run).plan()
+    plan = _Planner(file, overrides, settings or {}, to_run=to_run).plan()
+    return plan if world is None else replace(plan, world_settings=world.settings, notes=tuple(world.notes))
+
+
+def plan_in_world(
+    path: str | PathLike[str],
+    world: WorldName | None,
+    overrides: Mapping[str, Any] | None = None,
+    *,
+    model: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+    more: Mapping[str, Any] | None = None,
+) -> CellPlan:
+    """Read and check a cell file for one of its worlds; ``plan_cell`` has the other arguments.
+
+    Args:
+        path: the YAML file.
+        world: where it is to run; None as the file is written.
+        overrides, model, settings: see ``plan_cell``; all go before what the world changes.
+        more: further values that the world puts in place of the file's own, as the addresses of emulators.
+
+    Raises:
+        ConfigError: see ``plan_cell``; a device that the world has not.
+    """
+    if world is None:
+        return plan_cell(path, overrides, model=model, settings=settings)
+    found = _as_written(path, overrides, model, settings)
+    if found.cell.world is not None and world != "bench":
+        # The file has been through this already, as that of a run folder has.
+        return plan_cell(path, overrides, model=model, settings={**(settings or {}), "world": world})
+    changes = world_changes(found, world)
+    changes.settings.update(more or {})
+    return plan_cell(path, overrides, model=model, settings=settings, world=changes)
+
+
+def _as_written(
+    path: str | PathLike[str],
+    overrides: Mapping[str, Any] | None,
+    model: str | None,
+    settings: Mapping[str, Any] | None,
+) -> CellPlan:
+    return plan_cell(path, overrides, model=model, settings=settings, to_run=False)
 
 
 class _Planner:
@@ -154,10 +202,23 @@ class _Planner:
         return self._require_armed(planned)
 
     def _require_scene_fits(self, cell: CellFile) -> None:
+        if cell.world == "bench":
+            self._require_nothing_simulated(cell)
         if cell.scene is not None:
             self._validated(scene_section(), cell.scene, ("scene",))
         if cell.emulated_scene is not None:
             self._validated(scene_section(), cell.emulated_scene, ("emulated_scene",))
+
+    def _require_nothing_simulated(self, cell: CellFile) -> None:
+        if cell.enabling_device == "simulated":
+            self._add(("enabling_device",), "a simulated one is no device of a bench", hint="enabling_device: external")
+        for name, sensor in cell.sensors.items():
+            if sensor.estimator.needs_truth:
+                reason = f"{sensor.estimator.kind} asks a simulated scene, and a bench has none"
+                self._add(("sensors", name, "estimator"), reason, hint="kind: network or known_surface")
+        if (folder := os.environ.get(EMULATED_CAMERAS)) is not None:
+            reason = "emulated cameras are put in place of real ones by this variable"
+            self._problems.append(ConfigError(reason, key=EMULATED_CAMERAS, value=folder, hint="unset it"))
 
     def _task(self, cell: CellFile) -> tuple[AnyTask | None, TaskConfig | None]:
         try:
@@ -191,7 +252,12 @@ class _Planner:
 
     def _arm(self, cell: CellFile, name: str) -> DevicePlan | None:
         section = cell.arms[name]
-        shared = {"deactivate": section.deactivate, "base_pose_mm_deg": section.base_pose_mm_deg}
+        shared: dict[str, Any] = {
+            "deactivate": section.deactivate,
+            "base_pose_mm_deg": section.base_pose_mm_deg,
+        }
+        if section.start_pose_mm_deg is not None:
+            shared["start_pose_mm_deg"] = section.start_pose_mm_deg
         plan = self._device(cell, ("arms", name), section, shared, "arm")
         offered = plan.spec.capabilities.stop_categories if plan else ()
         if plan and offered and section.stop_category not in offered:
@@ -206,7 +272,7 @@ class _Planner:
     def _sensor(self, cell: CellFile, name: str) -> DevicePlan | None:
         section = cell.sensors[name]
         self._require_mount(cell, ("sensors", name), section.mounted_on)
-        if section.estimator.needs_truth and cell.scene is None:
+        if section.estimator.needs_truth and cell.scene is None and self._to_run:
             self._add(
                 ("sensors", name, "estimator"), f"{section.estimator.kind} needs a `scene:`", hint="use kind: network"
             )
@@ -256,6 +322,7 @@ class _Planner:
                 value=section.driver,
                 hint="`touchcell list` tells which drivers there are",
             )
+        spec = self._in_world(cell, at, section, spec)
         if cell.time == "simulated" and not spec.capabilities.virtual_time:
             self._add(
                 (*at, "driver"), f"{spec.name} cannot run in simulated time", value=spec.name, hint="set `time: real`"
@@ -268,6 +335,39 @@ class _Planner:
         if cell.reduced_speed:
             config = _at_reduced_speed(config)
         return DevicePlan(at[1], spec, self._with_input_files(config, at))
+
+    def _in_world(
+        self,
+        cell: CellFile,
+        at: tuple[str, str],
+        section: ArmSection | SensorSection | DeviceSection,
+        spec: AnyDriver,
+    ) -> AnyDriver:
+        """Return the driver that is used in the cell's world: a simulated stand-in, or the real one."""
+        able = spec.capabilities
+        if cell.world == "bench" and (able.virtual_time or able.needs_scene):
+            reason = f"{spec.name} is no device of a bench, and the cell is to run on the bench"
+            self._add((*at, "driver"), reason, value=spec.name, hint="name a driver of a real device, or run --on sim")
+        if cell.world == "emulated" and (able.virtual_time or able.needs_scene):
+            reason = f"{spec.name} is simulated already, and has no emulator"
+            self._add((*at, "driver"), reason, value=spec.name, hint="run --on sim")
+        if cell.world != "sim" or able.virtual_time:
+            return spec
+        try:
+            factory = STAND_INS.load(able.kind)
+        except ConfigError:
+            self._add((*at, "driver"), f"nothing simulates {_a(able.kind)}", value=spec.name, hint="leave it out")
+            return spec
+        if spec.behaviour is None:
+            reason = f"{spec.name} does not describe how its device behaves, so that nothing can simulate it"
+            self._add((*at, "driver"), reason, value=spec.name, hint="its DriverSpec needs `behaviour`")
+            return spec
+        place: dict[str, Any] = {}
+        if isinstance(section, ArmSection):
+            place = {"base_pose_mm_deg": section.base_pose_mm_deg, "start_pose_mm_deg": section.start_pose_mm_deg}
+        elif isinstance(section, SensorSection):
+            place = {"mounted_on": section.mounted_on, "tcp_to_sensor_mm_deg": section.tcp_to_sensor_mm_deg}
+        return factory(spec, Placement(**place))
 
     def _require_armed(self, plan: CellPlan) -> CellPlan:
         """An interlock that cannot trip, and what moves or feels and nothing guards, is refused."""

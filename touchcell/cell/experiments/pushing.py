@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from touchcell.cell.analysis.run_folder import Poses, RunFolder, object_poses, scene_time, sensor_poses, true_contacts
-from touchcell.cell.experiments.push_measures import OBJECT, lean_deg, off_normal_mm, pushed_until_s, target_mm
+from touchcell.cell.analysis.push_errors import push_errors
+from touchcell.cell.analysis.run_folder import RunFolder
+from touchcell.cell.experiments.push_measures import OBJECT, lean_deg
 from touchcell.cell.experiments.runner import ExperimentSpec, Scale
 from touchcell.cell.experiments.table import Column
 from touchcell.cell.experiments.trials import Finished, Trial
-from touchcell.geometry import se3
-from touchcell.geometry.types import Array
 
 SURFACES = ("mdf", "foam")
 PUSH_HEIGHT_MM = 45.0
@@ -36,7 +35,8 @@ ESTIMATORS: Mapping[str, Mapping[str, Any] | None] = {"learned": None, "true con
 COLUMNS = (
     Column("error_mm", "error mm", below=2.0),
     Column("error_mm", "worst", "worst"),
-    Column("object_center_offset_mm", "centre to target mm"),
+    Column("object_error_mm", "object mm"),
+    Column("object_error_mm", "worst", "worst"),
     Column("lean_max_deg", "lean deg", "worst"),
 )
 ERROR_NOTE = "error: distance of the target from the true contact normal at the end of the push, in top view"
@@ -201,22 +201,8 @@ def push_measures(run: RunFolder) -> dict[str, float]:
     """
     found = {"lean_max_deg": float(np.max(lean_deg(run)))}
     found["toppled"] = float(found["lean_max_deg"] > 45.0)
-    end_s = pushed_until_s(run)
-    if end_s is None or not any(event.data.get("event") == "finished" for event in run.recording.events):
-        return found
-    sensors = run.plan.sensor_roles
-    pushing = TWO_ARMS.sensors[0] if TWO_ARMS.sensors[0] in sensors else next(iter(sensors))
-    target = target_mm(run)
-    centre = 1e3 * object_poses(run)[OBJECT].at(np.array([end_s]))[0, :2, 3]
-    return found | {
-        "error_mm": off_normal_mm(_surface_pose(run, pushing, end_s), target),
-        "object_center_offset_mm": float(np.linalg.norm(target - centre)),
-    }
-
-
-def _surface_pose(run: RunFolder, sensor: str, t_s: float) -> Array:
-    """Return T_world_f (4, 4) of the true contact."""
-    T_world_s = sensor_poses(run, sensor).at(np.array([t_s]))[0]
-    series, contacts = true_contacts(run, sensor)
-    contact = Poses(scene_time(run, series), np.asarray(se3.from_euler_mm_deg(np.nan_to_num(contacts))))
-    return se3.compose(T_world_s, se3.inverse(contact.at(np.array([t_s]))[0]))
+    errors = push_errors(run)
+    arrived = any(event.data.get("event") == "finished" for event in run.recording.events)
+    if arrived and "target_error_mm" in errors:
+        found["error_mm"] = errors["target_error_mm"]
+    return found | {name: value for name, value in errors.items() if name != "target_error_mm"}

@@ -8,9 +8,10 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
+from touchcell.cell.analysis.push_errors import pushed_until_s, target_m
 from touchcell.cell.analysis.run_folder import Poses, RunFolder, object_poses, sensor_poses
 from touchcell.cell.experiments.frames import BLUE, ORANGE, frames_2d, label_2d, path_2d, save
-from touchcell.cell.experiments.push_measures import OBJECT, lean_deg, pushed_until_s, target_mm
+from touchcell.cell.experiments.push_measures import OBJECT, lean_deg
 from touchcell.cell.experiments.scenes import scene
 from touchcell.cell.experiments.trials import Finished
 from touchcell.simulation.outlines import ABOVE, SIDE, View, solid_outlines_mm
@@ -72,7 +73,7 @@ def _draw_push(axis: plt.Axes, run: RunFolder, view: View) -> None:
     if view == SIDE:
         axis.axhline(scene(run).table.height_mm, color="#8c8c8c", lw=1.0)
     else:
-        x, y = target_mm(run)
+        x, y = 1e3 * target_m(run)
         axis.plot(x, y, "o", ms=9, mfc="none", mec=_RED, mew=1.2)
         axis.plot(x, y, ".", ms=4, color=_RED)
 

@@ -15,8 +15,10 @@ from typing import Any, Final
 
 from touchcell.cell.analysis.provenance import provenance
 from touchcell.cell.analysis.run_folder import RunFolder
+from touchcell.cell.experiments.executors import Workers
+from touchcell.cell.experiments.run_trials import perform_all
 from touchcell.cell.experiments.table import Column, Row, table, to_json
-from touchcell.cell.experiments.trials import Finished, Perform, Trial, perform_all
+from touchcell.cell.experiments.trials import Finished, Perform, Trial
 from touchcell.registry import Registry
 
 
@@ -64,6 +66,19 @@ class ExperimentSpec:
     notes: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class ExperimentResult:
+    """What an experiment showed: its table, and all trials."""
+
+    text: str
+    finished: tuple[Finished, ...]
+
+    @property
+    def complete(self) -> bool:
+        """True if every trial came to an outcome of its cell."""
+        return not any(each.broken for each in self.finished)
+
+
 EXPERIMENTS: Final = Registry("touchcell.experiments", "experiment", ExperimentSpec)
 """All installed experiments."""
 
@@ -73,46 +88,59 @@ def run_experiment(
     folder: Path,
     scale: Scale,
     *,
-    jobs: int = 1,
+    workers: Workers | None = None,
     executor: str = "local",
+    keep_stale: bool = False,
     live: bool = False,
-) -> str:
-    """Run missing trials, then write table and figures into ``folder``; return the table.
+) -> ExperimentResult:
+    """Run missing trials, then write table and figures into ``folder``.
+
+    The table says so if trials that are kept were run by other code.
 
     Args:
         experiment: its spec.
         folder: for ``trials/``, ``summary.txt``, ``summary.json`` and the figures.
         scale: amount of it.
-        jobs: number of parallel trials, each in its own process; 1 runs in this process.
-        executor: name of what runs the trials.
+        workers: how many trials at a time, and their limits; one without limits runs in this process.
+        executor: name of what runs the trials, with ``:ADDRESS`` where it takes one.
+        keep_stale: keep finished trials of other code, too.
         live: show progress.
 
     Raises:
-        ConfigError: a trial's cell file is invalid.
+        ConfigError: there is no such executor.
+        WorkerDiffers: a worker elsewhere has other code.
         KeyboardInterrupt: every finished trial is kept.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    perform = Perform(experiment.measure, folder / "trials")
+    perform = Perform(experiment.measure, folder / "trials", keep_stale=keep_stale)
     finished = perform_all(
-        perform, experiment.trials(scale), jobs=jobs, executor=executor, live=live, title=experiment.name
+        perform, experiment.trials(scale), workers=workers, executor=executor, live=live, title=experiment.name
     )
-    rows = _rows(finished)
+    rows = table_rows(finished)
     text = table(f"{experiment.name}: {experiment.summary}", rows, experiment.columns, experiment.paper)
-    pictures = experiment.draw(finished, folder)
+    pictures = [] if any(each.broken for each in finished) else experiment.draw(finished, folder)
     lines = [
         text,
         *_troubles(finished),
+        *stale_note(finished, perform),
         *experiment.notes,
         f"folder: {folder}",
         *(f"  {picture.name}" for picture in pictures),
     ]
     whole = "\n".join(lines)
     (folder / "summary.txt").write_text(whole + "\n")
-    (folder / "summary.json").write_text(json.dumps(_summary(experiment, scale, rows), indent=1) + "\n")
-    return whole
+    (folder / "summary.json").write_text(json.dumps(_summary(experiment, scale, rows, finished), indent=1) + "\n")
+    return ExperimentResult(whole, tuple(finished))
 
 
-def _rows(finished: Sequence[Finished]) -> list[Row]:
+def stale_note(finished: Sequence[Finished], perform: Perform) -> list[str]:
+    """Return which commits ran those of the trials that were not run by the code of today; empty if all were."""
+    stale = Counter(each.commit for each in finished if each.digest != perform.code.digest)
+    return [f"{count} of the trials were run by other code, commit {commit}" for commit, count in stale.items()]
+
+
+def table_rows(finished: Sequence[Finished]) -> list[Row]:
+    """Return the trials by row, in the order in which rows first appear."""
     by_row: dict[str, list[Finished]] = {}
     for each in finished:
         by_row.setdefault(each.trial.row, []).append(each)
@@ -128,9 +156,12 @@ def _troubles(finished: Sequence[Finished]) -> list[str]:
     return [f"{line} ({count}x)" for line, count in Counter(lines).items()]
 
 
-def _summary(experiment: ExperimentSpec, scale: Scale, rows: Sequence[Row]) -> dict[str, Any]:
+def _summary(
+    experiment: ExperimentSpec, scale: Scale, rows: Sequence[Row], finished: Sequence[Finished]
+) -> dict[str, Any]:
     return {
         **provenance(),
+        "code": sorted({each.digest for each in finished}),
         "experiment": experiment.name,
         "trials": scale.trials,
         "quick": scale.quick,

@@ -1,34 +1,52 @@
-"""Trials: runs of cell files with some keys changed, in parallel processes, kept once they have finished."""
+"""Trials: runs of cell files with some keys changed, anywhere, each kept once it has finished.
+
+A trial is kept as long as nothing that it depends on has changed: its cell file, the files that this names, the code,
+and the versions of what computes. One that raises, hangs or is killed becomes a result with its reason.
+"""
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import yaml
 
+from touchcell.cell.analysis.code_identity import CodeIdentity, code_identity, digest_of
 from touchcell.cell.analysis.run_folder import RunFolder
+from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.settings import with_settings
 from touchcell.cell.config.true_contact import answerable
+from touchcell.cell.config.yaml_file import YamlFile
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.run_result import Outcome
-from touchcell.errors import ConfigError, suggest
+from touchcell.errors import ConfigError, TouchcellError, suggest
 from touchcell.paths import CONFIGS
-from touchcell.registry import Registry
 
-COLLECTED = "data"
+COLLECTED: Final = "data"
 """Subfolder of a trial's folder for collected frames."""
+LOG: Final = "trial.log"
+"""In a trial's folder: what was raised, where something was."""
+
+INVALID: Final = "invalid"
+"""Outcome of a trial whose cell cannot be run."""
+CRASHED: Final = "crashed"
+"""Outcome of a trial that raised."""
+LOST: Final = "lost"
+"""Outcome of a trial whose process was killed, or took too long."""
+BROKEN: Final = frozenset({INVALID, CRASHED, LOST})
+"""Outcomes that say nothing of the cell; such a trial is run again by the next call."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,35 +68,38 @@ class Trial:
     def cell_data(self) -> dict[str, Any]:
         """The whole cell file with the changes, without interlocks that ask what its estimators no longer report.
 
+        Files that it names have absolute paths; those in ``changes`` are relative to the working directory.
+
         Raises:
-            ConfigError: a key leads nowhere.
+            ConfigError: the file is invalid, or a key leads nowhere.
         """
         path = Path(self.cell)
-        data: dict[str, Any] = yaml.safe_load((path if path.is_absolute() else CONFIGS / path).read_text())
-        data = copy.deepcopy(data)
-        for key, value in self.changes.items():
-            *way, leaf = key.split(".")
-            section = data
-            for word in way:
-                if not isinstance(section.get(word), dict):
-                    raise ConfigError("no such section", file=self.cell, key=key, hint=suggest(word, list(section)))
-                section = section[word]
-            section[leaf] = copy.deepcopy(value)
-        if any(key.endswith(".estimator") for key in self.changes):
+        path = path if path.is_absolute() else CONFIGS / path
+        file = load_layers(path)
+        for key in self.changes:
+            _check_way(file.data, key, self.cell)
+        changes = {
+            key: _with_absolute_paths(None, value, (key.rpartition(".")[2],)) for key, value in self.changes.items()
+        }
+        data = with_settings(_with_absolute_paths(file, file.data, ()), changes)
+        if any(key.endswith(".estimator") for key in changes):
             data["interlocks"] = answerable(data)
+        data.pop("sweep", None)
         return data
 
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """A finished trial.
+    """A trial that has ended.
 
     Attributes:
         trial: the trial.
         folder: its run folder.
-        outcome: value of ``touchcell.cell.runtime.loop.Outcome``.
+        outcome: value of ``touchcell.cell.runtime.loop.Outcome``, or one of ``BROKEN``.
         reason: reason of the outcome.
         measures: named numbers.
+        commit: of the code that ran it.
+        digest: of that code and of what computes with it.
     """
 
     trial: Trial
@@ -86,11 +107,18 @@ class Finished:
     outcome: str
     reason: str
     measures: Mapping[str, float]
+    commit: str = ""
+    digest: str = ""
 
     @property
     def done(self) -> bool:
         """True if the task finished."""
         return self.outcome == Outcome.DONE.value
+
+    @property
+    def broken(self) -> bool:
+        """True if the trial did not get as far as an outcome of its cell."""
+        return self.outcome in BROKEN
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,22 +128,69 @@ class Perform:
     Attributes:
         measure: named numbers of a finished trial.
         root: holds one folder for each trial.
+        code: which code runs them.
+        keep_stale: keep finished trials of other code, too.
     """
 
     measure: Callable[[RunFolder], Mapping[str, float]]
     root: Path
+    code: CodeIdentity = field(default_factory=code_identity)
+    keep_stale: bool = False
 
     def __call__(self, trial: Trial) -> Finished:
-        """Run a trial and measure it; mark it as finished last."""
-        started = time.perf_counter()
+        """Run a trial and measure it; mark it as finished last. What it raises becomes its outcome."""
+        return self.run(trial, None)
+
+    def run(self, trial: Trial, data: dict[str, Any] | None) -> Finished:
+        """As ``__call__``, of cell file content ``data`` in place of the trial's own."""
         folder = self.root / trial.name
         folder.mkdir(parents=True, exist_ok=True)
-        marker = folder / "trial.json"
-        marker.unlink(missing_ok=True)
-        data = trial.cell_data()
-        settings = _digest(data)
+        for name in ("trial.json", LOG):
+            (folder / name).unlink(missing_ok=True)
+        try:
+            data = trial.cell_data() if data is None else data
+            record = self._record(trial, data, folder)
+        except ConfigError as error:
+            return self.record_broken(trial, INVALID, str(error))
+        except RecordingError:
+            raise  # The disk is full, or the folder cannot be written: no other trial would do better.
+        except Exception as error:
+            (folder / LOG).write_text(traceback.format_exc())
+            reason = str(error) if isinstance(error, TouchcellError) else f"{type(error).__name__}: {error}"
+            return self.record_broken(trial, CRASHED, f"{reason} (see {LOG})")
+        # A new RunFolder: the measured one holds its whole recording in memory.
+        return _finished(trial, RunFolder(folder), record)
+
+    def record_broken(self, trial: Trial, outcome: str, reason: str) -> Finished:
+        """Leave a record of a trial that has no result, and return it."""
+        folder = self.root / trial.name
+        folder.mkdir(parents=True, exist_ok=True)
+        record = {"outcome": outcome, "reason": reason, "measures": {}, "code": asdict(self.code)}
+        _write_whole(folder / "trial.json", json.dumps(record, indent=1))
+        return _finished(trial, RunFolder(folder), record)
+
+    def kept(self, trial: Trial) -> Finished | None:
+        """Return the trial's result from an earlier call, if nothing that it depends on has changed since.
+
+        Raises:
+            ConfigError: the trial's cell file is invalid.
+        """
+        folder = self.root / trial.name
+        try:
+            record = json.loads((folder / "trial.json").read_text())
+        except (OSError, ValueError):
+            return None
+        if record.get("outcome") in BROKEN or record.get("settings") != settings_digest(trial.cell_data()):
+            return None
+        if record["code"]["digest"] != self.code.digest and not self.keep_stale:
+            return None
+        return _finished(trial, RunFolder(folder), record)
+
+    def _record(self, trial: Trial, data: dict[str, Any], folder: Path) -> dict[str, Any]:
+        started = time.perf_counter()
+        settings, files = settings_digest(data), {str(path): digest_of(path) for path in files_named(data)}
         if "collect" in data:
-            data["collect"]["data"] = str(folder / COLLECTED)
+            data = {**data, "collect": {**data["collect"], "data": str(folder / COLLECTED)}}
         (folder / "cell.yaml").write_text(yaml.safe_dump(data, sort_keys=False))
         cell = compose(plan_cell(folder / "cell.yaml"))
         with Recorder(folder / "run.mcap") as recorder, cell:
@@ -123,6 +198,8 @@ class Perform:
         measures = self.measure(RunFolder(folder)) if result.cycles else {}
         record = {
             "settings": settings,
+            "code": asdict(self.code),
+            "files": files,
             "outcome": result.outcome.value,
             "reason": result.reason,
             "duration_s": result.duration_s,
@@ -130,91 +207,59 @@ class Perform:
             # Measures that are not finite are left out, as JSON has no number for them.
             "measures": {name: float(value) for name, value in measures.items() if math.isfinite(value)},
         }
-        _write_whole(marker, json.dumps(record, indent=1))
-        # A new RunFolder: the measured one holds its whole recording in memory.
-        return _finished(trial, RunFolder(folder), record)
-
-    def kept(self, trial: Trial) -> Finished | None:
-        """Return the trial's result from an earlier run of the experiment, if it had the same settings."""
-        folder = self.root / trial.name
-        try:
-            record = json.loads((folder / "trial.json").read_text())
-        except (OSError, ValueError):
-            return None
-        return _finished(trial, RunFolder(folder), record) if record["settings"] == _digest(trial.cell_data()) else None
+        _write_whole(folder / "trial.json", json.dumps(record, indent=1))
+        return record
 
 
-class Executor(Protocol):
-    """Runs trials somewhere: in processes of this machine, or on others."""
-
-    def __call__(self, perform: Perform, trials: Sequence[Trial], jobs: int, /) -> Iterator[Finished]:
-        """Run every trial by ``perform(trial)``, at most ``jobs`` at a time; yield each as it finishes, in any order.
-
-        Closing the iterator, or an interrupt, ends what runs.
-        """
-        ...
+def settings_digest(data: Mapping[str, Any]) -> str:
+    """Return the digest of a cell file's content and of the bytes of all files that it names."""
+    settings = hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode())
+    for path in files_named(data):
+        settings.update(digest_of(path).encode())
+    return settings.hexdigest()[:16]
 
 
-@dataclass(frozen=True, slots=True)
-class ExecutorSpec:
-    """Entry point of an executor (group ``touchcell.executors``).
-
-    Attributes:
-        name: value of ``--executor`` on the command line.
-        summary: one line for ``touchcell list``.
-        run: the executor.
-    """
-
-    name: str
-    summary: str
-    run: Executor
+def files_named(data: Any) -> list[Path]:
+    """Return the files and folders that a cell file's content names by absolute paths, without duplicates."""
+    if isinstance(data, Mapping):
+        return list(dict.fromkeys(path for value in data.values() for path in files_named(value)))
+    if isinstance(data, list | tuple):
+        return list(dict.fromkeys(path for value in data for path in files_named(value)))
+    return [Path(data)] if isinstance(data, str) and os.path.isabs(data) and os.path.exists(data) else []
 
 
-EXECUTORS: Final = Registry("touchcell.executors", "executor", ExecutorSpec)
-"""All installed executors."""
+_FOLDER_KEYS: Final = frozenset({"data", "folder", "menagerie"})
+"""Keys whose value may be the bare name of a folder; other names of files are known by their suffix."""
 
 
-def perform_all(
-    perform: Perform,
-    trials: Sequence[Trial],
-    *,
-    jobs: int = 1,
-    executor: str = "local",
-    live: bool = False,
-    title: str = "",
-) -> list[Finished]:
-    """Run the missing ones of ``trials``; return all of them in order.
+def _check_way(data: dict[str, Any], key: str, file: str) -> None:
+    *way, _ = key.split(".")
+    section: Any = data
+    for word in way:
+        if isinstance(section, list):
+            return
+        if not isinstance(section.get(word), dict | list):
+            raise ConfigError("no such section", file=file, key=key, hint=suggest(word, list(section)))
+        section = section[word]
 
-    Args:
-        perform: runs one.
-        trials: all trials.
-        jobs: number in parallel; 1 runs them in this process.
-        executor: name of what runs them.
-        live: show a progress bar.
-        title: on it.
 
-    Raises:
-        KeyboardInterrupt: running trials are ended; finished ones are kept.
-    """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    found = {trial.name: kept for trial in trials if (kept := perform.kept(trial)) is not None}
-    missing = [trial for trial in trials if trial.name not in found]
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, transient=True, disable=not live) as progress:
-        bar = progress.add_task(title, total=len(trials), completed=len(found))
-        for finished in EXECUTORS.load(executor).run(perform, missing, jobs):
-            found[finished.trial.name] = finished
-            progress.update(bar, advance=1, description=f"{title}: {finished.trial.name} {finished.outcome}")
-    return [found[trial.name] for trial in trials]
+def _with_absolute_paths(file: YamlFile | None, value: Any, at: tuple[str | int, ...]) -> Any:
+    if isinstance(value, dict):
+        return {key: _with_absolute_paths(file, inner, (*at, key)) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_with_absolute_paths(file, inner, (*at, index)) for index, inner in enumerate(value)]
+    if isinstance(value, str) and ("." in value or os.sep in value or at[-1] in _FOLDER_KEYS):
+        path = (Path() if file is None else file.source(at).parent) / value
+        if os.path.exists(path):
+            return str(path.absolute())
+    return value
 
 
 def _finished(trial: Trial, folder: RunFolder, record: Mapping[str, Any]) -> Finished:
-    return Finished(trial, folder, record["outcome"], record["reason"], record["measures"])
-
-
-def _digest(data: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
+    code = record["code"]
+    return Finished(
+        trial, folder, record["outcome"], record["reason"], record["measures"], code["commit"], code["digest"]
+    )
 
 
 def _write_whole(path: Path, text: str) -> None:

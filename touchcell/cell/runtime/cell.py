@@ -16,6 +16,7 @@ from touchcell.control.supervisor import Supervisor
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device, Lifecycle
 from touchcell.drivers.core.enabling import EnablingDevice
+from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import StopCategory
 from touchcell.tasks.interface import Task
 
@@ -93,6 +94,12 @@ class Cell:
             self._exit.enter_context(self.watchdog)
             for device in self._devices():
                 self._exit.enter_context(device)
+                if device.state is Lifecycle.FAULTED:
+                    raise DeviceError(
+                        device.name,
+                        f"has a fault from before: {device.fault}",
+                        hint="`touchcell recover CELL` clears it, after asking you",
+                    )
                 device.configure()
             self.require_armed()
             # Every device must answer before the first one is energised.

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import cast
+from typing import TypeAlias, cast
 
 from touchcell.cell.config.armed import require_armed
 from touchcell.cell.config.cell_plan import REDUCED_SPEED_M_S, CellPlan
@@ -18,6 +18,8 @@ from touchcell.cell.runtime.sensor import build_sensor
 from touchcell.control.interlocks.always_on import always_on
 from touchcell.control.interlocks.basic import TcpSpeed
 from touchcell.control.interlocks.config import build_interlocks
+from touchcell.control.interlocks.interlock import Interlock
+from touchcell.control.interlocks.timers import TimedInterlock
 from touchcell.control.interlocks.violation import Severity
 from touchcell.control.latch import Latch
 from touchcell.control.supervisor import Supervisor
@@ -28,14 +30,24 @@ from touchcell.drivers.core.protocols import ExternalTorqueSource, StopCategory,
 from touchcell.errors import ConfigError
 from touchcell.tasks.interface import Task, TaskContext
 
+AnyInterlock: TypeAlias = Interlock | TimedInterlock
 
-def compose(plan: CellPlan, *, clock: Clock | None = None, enabling_device: EnablingDevice | None = None) -> Cell:
+
+def compose(
+    plan: CellPlan,
+    *,
+    clock: Clock | None = None,
+    enabling_device: EnablingDevice | None = None,
+    arrange: Callable[[Sequence[AnyInterlock]], Sequence[AnyInterlock]] | None = None,
+) -> Cell:
     """Build everything that ``plan`` needs; nothing is connected yet.
 
     Args:
         plan: a checked cell file.
         clock: in place of the one that the file asks for.
         enabling_device: for a cell with ``enabling_device: external``.
+        arrange: returns the interlocks to use in place of the cell's own, which are proven to be armed all the same:
+            for tests that show an interlock what its cell does not.
 
     Raises:
         ConfigError: an interlock names what is not there, or there is no enabling device.
@@ -61,7 +73,7 @@ def compose(plan: CellPlan, *, clock: Clock | None = None, enabling_device: Enab
             arms=arms.keys(),
             sensors=sensors.keys(),
         ),
-        *configured,
+        *(configured if arrange is None else arrange(configured)),
         *_by_switch(plan),
     ]
     collection = _collection(plan)

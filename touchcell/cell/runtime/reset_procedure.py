@@ -93,4 +93,5 @@ class ResetProcedure:
         return True, "the task starts again from its first state"
 
     def _devices(self) -> list[Device]:
-        return [*self._cell.arms.values(), *self._cell.cameras.values()]
+        cell = self._cell
+        return [*cell.arms.values(), *cell.cameras.values(), *cell.auxiliaries.values()]

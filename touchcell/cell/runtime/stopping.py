@@ -72,7 +72,7 @@ class _Stopping:
     declared_s: float
     declared_m: float
     deadline_ns: int
-    farthest_m: float | None
+    farthest_m: float | None = None
     escalated: bool = False
     rest_ns: int | None = None
     problem: str = ""
@@ -171,7 +171,7 @@ class Stopper:
             limits = arm.limits
         except Exception as error:
             problem = f"cannot be watched, for its limits are not known: {error!r}"
-            return _Stopping(arm, category, now_ns, None, None, 0.0, 0.0, now_ns, None, problem=problem)
+            return _Stopping(arm, category, now_ns, None, None, 0.0, 0.0, now_ns, problem=problem)
         turn_s = limits.rot_speed_rad_s / limits.rot_accel_rad_s2
         try:
             sample = arm.tcp()
@@ -186,8 +186,7 @@ class Stopper:
         declared_s, declared_m = declared_stop(fastest, limits.accel_m_s2)
         declared_s = max(declared_s, turn_s + STOP_MARGIN_S)
         deadline_ns = now_ns + round(1e9 * declared_s)
-        farthest = None if start is None else 0.0
-        return _Stopping(arm, category, now_ns, start, speed_m_s, declared_s, declared_m, deadline_ns, farthest)
+        return _Stopping(arm, category, now_ns, start, speed_m_s, declared_s, declared_m, deadline_ns)
 
     def _tells(self, state: Stamped[TcpState], now_ns: int) -> bool:
         """Whether a state says where its arm is now: it is finite and not much older than a cycle."""

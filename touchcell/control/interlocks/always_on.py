@@ -66,9 +66,14 @@ class Missing:
 
     def evaluate(self, view: CellView, past: InterlockState) -> Judgement:
         """The first role that is missing, and since when sensors have been missing that were never seen."""
-        first_ns = past[_SINCE].since_ns if _SINCE in past else view.now_ns
-        seen = {role: TimerState(view.now_ns) for role in (*view.sensors, *past)}
-        state = {**seen, _SINCE: TimerState(first_ns)}
+        if _SINCE not in past:
+            past = {_SINCE: TimerState(view.now_ns)}
+        state = past
+        if not view.sensors.keys() <= past.keys():
+            state = {**past, **dict.fromkeys(view.sensors, TimerState(view.now_ns))}
+        if self.arms <= view.arms.keys() and self.sensors <= view.sensors.keys():
+            return None, state
+        first_ns = past[_SINCE].since_ns
         may_be_missing = (view.now_ns - first_ns) * 1e-9 <= FIRST_FRAME_S
         missing = sorted(self.arms - view.arms.keys()) + sorted(
             role for role in self.sensors - view.sensors.keys() if role in past or not may_be_missing

@@ -9,6 +9,7 @@ import logging
 import threading
 from abc import abstractmethod
 from collections import deque
+from contextlib import suppress
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -139,6 +140,7 @@ class BusArm(JointArm):
         self._ik = DifferentialIk(chain, config.joint_limits.settings())
         self._setpoint = JointSetpoint(chain, self._ik, self.limits)
         self._thread: threading.Thread | None = None
+        self._lost_bus: DeviceGone | None = None
         self._closing = threading.Event()
         # Held by the loop for one cycle, and by any code that needs the bus or changes what the loop sends.
         self._lock = threading.RLock()
@@ -147,6 +149,7 @@ class BusArm(JointArm):
     def _reset_state(self) -> None:
         """Discard samples and faults of an earlier connection."""
         self._latched_fault: DeviceError | None = None
+        self._lost_bus = None
         self._enabled = [False] * self._chain.joint_count
         self._joints: Stamped[JointState] | None = None
         self._seq = 0
@@ -193,6 +196,9 @@ class BusArm(JointArm):
     def _switch_off(self) -> None:
         """Switch all motors off."""
 
+    def _repeat_commands(self) -> None:
+        """Keep the motors where they are after a cycle that failed, where silence would disable them."""
+
     def _hold(self) -> None:
         """Let the motors hold their position by themselves, where supported."""
 
@@ -217,7 +223,7 @@ class BusArm(JointArm):
         self._close_bus()
 
     def _require_loop(self) -> None:
-        if self._thread is None or not self._thread.is_alive():
+        if self._thread is None or not self._thread.is_alive() or self._lost_bus is not None:
             raise DeviceGone(self.name, "lost connection to the bus", hint="disconnect and connect again")
 
     def _after_rest(self, policy: DeactivatePolicy) -> None:
@@ -273,20 +279,9 @@ class BusArm(JointArm):
         last_ns = self._clock.now_ns() - period_ns
         next_ns = self._clock.now_ns()
         while not self._closing.is_set():
-            try:
-                with self._lock:
-                    now_ns = self._clock.now_ns()
-                    if self._latched_fault is not None:
-                        self._latch(self._latched_fault)
-                    self._cycle(now_ns, min(now_ns - last_ns, 2 * period_ns) * 1e-9, now_ns + period_ns * 3 // 4)
-            except DeviceGone as error:
-                self._latch(error)
-                return
-            except DeviceError as error:
-                self._latch(error)
-            except Exception as error:
-                self._latch(DeviceFault(self.name, f"control loop failed: {error!r}", needs=Remedy.SERVICE))
-                return
+            with self._lock:
+                now_ns = self._clock.now_ns()
+                self._run_cycle(now_ns, min(now_ns - last_ns, 2 * period_ns) * 1e-9, now_ns + period_ns * 3 // 4)
             last_ns = now_ns
             next_ns += period_ns
             late_ns = self._clock.now_ns() - next_ns
@@ -296,6 +291,29 @@ class BusArm(JointArm):
                 self._delays.warning("overrun", "%s: bus cycle %.1f ms late", self.name, late_ns * 1e-6)
                 next_ns += late_ns
             self._clock.sleep_until_ns(next_ns)
+
+    def _run_cycle(self, now_ns: int, dt_s: float, until_ns: int) -> None:
+        """Run one cycle. No failure may end the loop: an arm without brakes falls when its motors hear nothing."""
+        try:
+            if self._latched_fault is not None:
+                self._latch(self._latched_fault)
+            self._cycle(now_ns, dt_s, until_ns)
+            self._lost_bus = None
+        except DeviceGone as error:
+            # An interface that was taken down and up again carries frames again.
+            self._lost_bus = error
+            self._latch(error)
+        except DeviceError as error:
+            self._latch(error)
+            self._keep_holding()
+        except Exception as error:
+            self._latch(DeviceFault(self.name, f"control loop failed: {error!r}", needs=Remedy.SERVICE))
+            self._keep_holding()
+
+    def _keep_holding(self) -> None:
+        # The first failure is latched already; a second one must not end the loop either.
+        with suppress(Exception):
+            self._repeat_commands()
 
     def _check_missed(self) -> None:
         """Latch a fault when too many of the latest cycles ended without all replies."""

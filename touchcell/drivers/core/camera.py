@@ -14,10 +14,20 @@ from typing import Literal, Self, final
 import numpy as np
 from pydantic import Field, model_validator
 
+from touchcell.drivers.core.behaviour import CameraBehaviour
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device, Lifecycle, OperatorToken
-from touchcell.drivers.core.errors import CorruptMessage, DeviceError, StaleData, TransportTimeout
+from touchcell.drivers.core.errors import (
+    CorruptMessage,
+    DeviceError,
+    DeviceFault,
+    FaultClass,
+    Remedy,
+    StaleData,
+    TransportTimeout,
+)
 from touchcell.drivers.core.frame_monitor import FrameMonitor
+from touchcell.drivers.core.frame_rate import FrameRate
 from touchcell.drivers.core.samples import Frame, Quality, Stamped
 from touchcell.drivers.core.spec import DriverConfig
 from touchcell.errors import ConfigError
@@ -38,8 +48,8 @@ class CameraConfig(DriverConfig):
         pixel_format: MJPG saves USB bandwidth; YUYV and GREY are not compressed.
         rate_hz: frames per second.
         color: what ``Frame.image`` holds, grey (height, width) or BGR (height, width, 3).
-        exposure_us: exposure time in steps of 100 us, or None to keep the camera's own. Automatic exposure is switched
-            off either way.
+        exposure_us: exposure time in steps of 100 us, at most one frame, or None to keep the camera's own. Automatic
+            exposure is switched off either way.
         gain: gain in the camera's own units, or None to keep its own.
         stall_s: silence after which the camera counts as failed; at least three periods.
     """
@@ -59,6 +69,22 @@ class CameraConfig(DriverConfig):
         if self.stall_s * self.rate_hz < _STALL_PERIODS:
             raise ValueError(f"stall_s must be at least {_STALL_PERIODS} periods, {_STALL_PERIODS / self.rate_hz:g} s")
         return self
+
+    @model_validator(mode="after")
+    def _exposure_fits_into_a_frame(self) -> Self:
+        if self.exposure_us is not None and self.exposure_us * self.rate_hz > 1e6:
+            raise ValueError(
+                f"exposure_us {self.exposure_us} is longer than a frame at {self.rate_hz:g} Hz, "
+                f"{1e6 / self.rate_hz:.0f} us: the camera would deliver fewer frames"
+            )
+        return self
+
+
+def camera_behaviour(config: CameraConfig) -> CameraBehaviour:
+    """Return how a USB camera behaves: a frame arrives about one period after its exposure."""
+    return CameraBehaviour(
+        config.rate_hz, 1.0 / config.rate_hz, config.width_px, config.height_px, color=config.color == "bgr"
+    )
 
 
 class UnsupportedSetting(ConfigError):
@@ -108,7 +134,8 @@ class Camera(Device):
     """Base class of live cameras; use an instance from one thread.
 
     Frames flow from READY on; ACTIVE adds nothing, because a camera moves nothing. ``configure`` applies the settings.
-    The camera is FAULTED when it is disconnected, silent for ``stall_s``, or sends more than 10 bad frames in 30.
+    The camera is FAULTED when it is disconnected, silent for ``stall_s``, sends more than 10 bad frames in 30, or makes
+    frames at a rate that differs from ``rate_hz`` by more than 10 %.
 
     Args:
         name: the device's name in the cell.
@@ -120,6 +147,7 @@ class Camera(Device):
         super().__init__(name, clock)
         self._config = config
         self._monitor = FrameMonitor(name)
+        self._rate = FrameRate(config.rate_hz)
         self._newest: RawFrame | None = None
         self._last_seq = -1
         self._decoded: Stamped[Frame] | None = None
@@ -170,11 +198,13 @@ class Camera(Device):
         if self._state in (Lifecycle.READY, Lifecycle.ACTIVE):
             try:
                 self._refresh()
+                self._verify()
             except DeviceError as error:
                 self._to_faulted(error)
         return {
             "state": self._state.value,
             "frame_age_s": self._age_s(),
+            "frame_rate_hz": self._rate.measured_hz,
             **self._monitor.readings(),
             **self._settings(),
         }
@@ -182,6 +212,7 @@ class Camera(Device):
     def _begin_stream(self) -> None:
         """Wait for the first good frame; call once the stream runs. Raises TransportTimeout, DeviceGone."""
         self._monitor.reset_errors()
+        self._rate = FrameRate(self._config.rate_hz)
         self._overflowed = False
         self._since_ns = self._clock.now_ns()
         before = self._last_seq
@@ -236,6 +267,15 @@ class Camera(Device):
             raise CorruptMessage(
                 self.name, f"too many bad frames, most of them {worst}", hint="check the cable and the USB bandwidth"
             )
+        if self._rate.is_broken:
+            raise DeviceFault(
+                self.name,
+                f"makes {self._rate.measured_hz:.1f} frames/s, not {self._config.rate_hz:g}",
+                vendor_code="frame rate",
+                fault_class=FaultClass.CONFIGURATION,
+                needs=Remedy.OPERATOR,
+                hint="in the dark cameras expose longer than a frame: set exposure_us, or rate_hz to what it delivers",
+            )
         if self._silence_s() > stall_s:
             raise TransportTimeout(self.name, "good frame", stall_s, hint="unplug the camera and plug it in again")
 
@@ -280,6 +320,9 @@ class Camera(Device):
         except BaseException:
             self._close()
             raise
+
+    def _verify(self) -> None:
+        """Raise DeviceFault if a setting no longer holds; called by ``health``."""
 
     @abstractmethod
     def _collect(self) -> bool:

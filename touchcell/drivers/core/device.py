@@ -2,6 +2,7 @@
 
     DISCONNECTED -connect-> PASSIVE -configure-> READY -activate-> ACTIVE -deactivate-> READY
     any -(fault)-> FAULTED -recover-> READY          any -disconnect-> DISCONNECTED
+    DISCONNECTED -connect-> FAULTED, where the device has a fault from before
 
 PASSIVE only reads: nothing that changes power, mode or zero has been sent. ``activate`` alone energises.
 """
@@ -19,7 +20,14 @@ from types import TracebackType
 from typing import Self, final
 
 from touchcell.drivers.core.clock import Clock
-from touchcell.drivers.core.errors import CommandRejected, DeviceError, LifecycleError, TransportError
+from touchcell.drivers.core.errors import (
+    CommandRejected,
+    DeviceError,
+    DeviceFault,
+    LifecycleError,
+    Remedy,
+    TransportError,
+)
 
 _logger = logging.getLogger(__name__)
 
@@ -69,6 +77,8 @@ class Device(ABC):
         self._state_lock = threading.RLock()
         self._state = Lifecycle.DISCONNECTED
         self._fault_error: DeviceError | None = None
+        self._configured = False
+        self._faults_while_faulted: list[DeviceError] = []
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name!r}: {self._state.value}>"
@@ -85,11 +95,19 @@ class Device(ABC):
 
     @final
     def connect(self) -> None:
-        """DISCONNECTED -> PASSIVE: open the transport and read. Never changes power, mode or zero."""
+        """DISCONNECTED -> PASSIVE: open the transport and read. Never changes power, mode or zero.
+
+        A device that has a fault already, such as an arm whose last run was killed, is FAULTED afterwards: ``recover``.
+        """
         self._require("connect", Lifecycle.DISCONNECTED)
+        self._configured = False
         try:
             self._open()
-            self._enter(Lifecycle.PASSIVE)
+            found = self._present_fault()
+            if found is None:
+                self._enter(Lifecycle.PASSIVE)
+            else:
+                self._to_faulted(found)
         except BaseException:
             self._close()
             self._forget_state()
@@ -100,14 +118,15 @@ class Device(ABC):
     def configure(self) -> None:
         """PASSIVE -> READY: check and set parameters; nothing is energised."""
         self._require("configure", Lifecycle.PASSIVE)
-        self._configure()
+        self._latching(self._configure)
+        self._configured = True
         self._enter(Lifecycle.READY)
 
     @final
     def activate(self) -> None:
         """READY -> ACTIVE: the only call that energises; the setpoint starts at the present state."""
         self._require("activate", Lifecycle.READY)
-        self._activate()
+        self._latching(self._activate)
         self._enter(Lifecycle.ACTIVE)
 
     @final
@@ -121,11 +140,25 @@ class Device(ABC):
 
     @final
     def recover(self, token: OperatorToken) -> None:
-        """FAULTED -> READY, on a person's request; never on to ACTIVE. Raises if the cause is still there."""
-        self._require("recover", Lifecycle.FAULTED)
-        self._recover(token)
+        """FAULTED -> READY, on a person's request; never on to ACTIVE.
+
+        Raises:
+            DeviceError: the cause is still there, or a thread of the driver has latched another fault meanwhile, which
+                is then the device's fault.
+        """
         with self._state_lock:
             self._require("recover", Lifecycle.FAULTED)
+            self._faults_while_faulted.clear()
+        self._recover(token)
+        if not self._configured:
+            # It had its fault before it was configured.
+            self._configure()
+            self._configured = True
+        with self._state_lock:
+            self._require("recover", Lifecycle.FAULTED)
+            if self._faults_while_faulted:
+                self._fault_error = self._faults_while_faulted[0]
+                raise self._fault_error
             self._fault_error = None
             self._state = Lifecycle.READY
         _logger.info("%s: recovered on request of %s", self.name, token.operator)
@@ -183,15 +216,30 @@ class Device(ABC):
             self._fault_error = None
 
     def _to_faulted(self, error: DeviceError) -> DeviceError:
-        """Latch the first fault; returns it so that callers can raise it."""
+        """Latch the first fault; returns ``error`` so that callers can raise it.
+
+        A fault latched while the device is FAULTED makes a recovery in progress fail, so a driver's thread reports a
+        condition that lasts once only, or only while the device is not FAULTED.
+        """
         with self._state_lock:
             if self._state is Lifecycle.FAULTED:
+                if not self._faults_while_faulted:
+                    self._faults_while_faulted.append(error)
                 return error
             # The error first: who reads the state from another thread finds it.
             self._fault_error = error
             self._state = Lifecycle.FAULTED
         _logger.error("faulted: %s", error)
         return error
+
+    def _latching(self, step: Callable[[], None]) -> None:
+        """Run a step of a transition; a fault in it that a person can clear by ``recover`` is latched."""
+        try:
+            step()
+        except DeviceFault as error:
+            if error.needs is Remedy.RECOVER:
+                self._to_faulted(error)
+            raise
 
     def _attempt(self, step: Callable[[], None]) -> None:
         """Run a step and latch FAULTED if the device fails in it; a refused command is no failure."""
@@ -209,6 +257,10 @@ class Device(ABC):
     @abstractmethod
     def _close(self) -> None:
         """Release everything; called also after a failed ``_open``; must not raise for what was never opened."""
+
+    def _present_fault(self) -> DeviceError | None:
+        """Return the fault that the device, just opened, has already and that ``recover`` may clear, or None."""
+        return None
 
     def _configure(self) -> None:
         """Check and set parameters."""

@@ -111,7 +111,9 @@ class TwistGate:
             self._last, self._last_accel = np.zeros(6), np.zeros(6)
             dt_s = min(command.ttl_s, FIRST_STEP_S)
         else:
-            dt_s = max(min(command.ttl_s, (now_ns - self._last_ns) * 1e-9), _SHORTEST_STEP_S)
+            dt_s = min(command.ttl_s, (now_ns - self._last_ns) * 1e-9)
+        # A time-to-live may be as short as the smallest positive number, and is divided by.
+        dt_s = max(dt_s, _SHORTEST_STEP_S)
         limits, local = self._limits, joints()
         wanted = _limited(wanted, limits.speed_m_s, limits.rot_speed_rad_s, adjustments)
         if local is not None:

@@ -61,11 +61,15 @@ class JointArm(Arm):
     def _local_ik(self) -> LocalIk:
         return self._ik_at(self._ik, self.joints(self._max_state_age_s).value.q)
 
+    def _present_fault(self) -> DeviceError | None:
+        return self._latched_fault
+
     def _latch(self, error: DeviceError) -> None:
         """Store the first fault, stop the setpoint, and set FAULTED."""
+        new = self._latched_fault is None
         if self._latched_fault is None:
             self._latched_fault = error
             self._setpoint.stop()
-        # A concurrent transition in another thread may have overwritten the state, so every cycle sets it again.
-        if self.state not in (Lifecycle.DISCONNECTED, Lifecycle.FAULTED):
+        # While it connects the state is DISCONNECTED, so every cycle sets it again; in FAULTED, only what is new.
+        if self.state is not Lifecycle.DISCONNECTED and (new or self.state is not Lifecycle.FAULTED):
             self._to_faulted(self._latched_fault)

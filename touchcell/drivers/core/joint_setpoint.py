@@ -38,6 +38,7 @@ class JointSetpoint:
         chain: kinematic chain of the arm.
         ik: converts twists into joint velocities within joint limits.
         limits: speed and acceleration limits of the tool centre point, for twists and for joint goals.
+        stopping: the limits while a twist ends by a stop or by expiry; ``limits`` if None.
 
     Attributes:
         q, dq: the setpoint (n,) rad and its velocity (n,) rad/s.
@@ -45,7 +46,10 @@ class JointSetpoint:
         adjustments: limits that are active now.
     """
 
-    def __init__(self, chain: SerialChain, ik: DifferentialIk, limits: TwistLimits) -> None:
+    def __init__(
+        self, chain: SerialChain, ik: DifferentialIk, limits: TwistLimits, stopping: TwistLimits | None = None
+    ) -> None:
+        self._stopping = stopping or limits
         self._chain = chain
         self._ik = ik
         self._limits = limits
@@ -104,7 +108,7 @@ class JointSetpoint:
         return self.q, self.dq
 
     def _step_by_twist(self, wanted: Array, dt_s: float) -> None:
-        limits = self._limits
+        limits = self._limits if wanted.any() else self._stopping
         twist = np.concatenate(
             [
                 _towards(self.twist[:3], wanted[:3], limits.accel_m_s2 * dt_s),

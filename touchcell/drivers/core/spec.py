@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
+from touchcell.drivers.core.behaviour import Behaviour
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.protocols import require_protocols
@@ -107,6 +108,7 @@ class DriverSpec(Generic[ConfigT, DeviceT_co]):
         capabilities: static capabilities.
         build: creates a DISCONNECTED device from name, configuration and context.
         extra: optional dependency group that installs the SDK, or None.
+        behaviour: of the device with a configuration, for its simulated stand-in; None for what has none.
     """
 
     name: str
@@ -115,6 +117,7 @@ class DriverSpec(Generic[ConfigT, DeviceT_co]):
     capabilities: Capabilities
     build: Callable[[str, ConfigT, DriverContext], DeviceT_co]
     extra: str | None = None
+    behaviour: Callable[[ConfigT], Behaviour] | None = None
 
 
 AnyDriver: TypeAlias = DriverSpec[Any, Device]

@@ -33,9 +33,13 @@ from touchcell.drivers.core.errors import (
 from touchcell.drivers.damiao import codec
 from touchcell.drivers.damiao.codec import Feedback, Ranges, Register
 
-_ANSWER_S = 0.1
-_TRIES = 3
+TRIES = 5
 _SETTLE_NS = 20_000_000
+# The adapter or its interface no longer exists. Any other failure may pass, such as a full transmit queue, which
+# python-can's adapters report by various errors, with and without a code (python-can issues 1495, 2004).
+_GONE = frozenset(
+    (errno.ENODEV, errno.ENXIO, errno.EBADF, errno.ESHUTDOWN, errno.ENOTCONN, errno.EPIPE, errno.ECONNRESET)
+)
 _FENCES = (Register.TIMEOUT, Register.CTRL_MODE, Register.MST_ID, Register.ESC_ID)
 
 
@@ -49,9 +53,10 @@ class Address:
 
 @dataclass(slots=True)
 class Counters(BusCounters):
-    """Message statistics, with the error frames of the CAN controller."""
+    """Message statistics, with the error frames of the CAN controller and failed reads of the adapter."""
 
     error_frames: int = 0
+    not_received: int = 0
 
 
 @dataclass(slots=True, eq=False)
@@ -71,11 +76,12 @@ class MotorBus:
         connect: opens the python-can bus.
         clock: injected time.
         max_silence_s: silence after which the caller considers a motor lost; requests twice as old are discarded.
+        answer_s: how long to await the reply to a single request before it is repeated.
         fd: send CAN FD frames with bit rate switching.
 
     Attributes:
         counters: message statistics.
-        last_error: text of the newest error frame, or "".
+        last_error: text of the newest error frame or failure of the adapter, or "".
         timeout_ticks: the motors' timeout as last read after a loss, or None; it reveals a motor that lost power.
     """
 
@@ -87,6 +93,7 @@ class MotorBus:
         clock: Clock,
         *,
         max_silence_s: float,
+        answer_s: float = 0.1,
         fd: bool = False,
     ) -> None:
         self._device = device
@@ -96,6 +103,7 @@ class MotorBus:
         self._clock = clock
         self._forget_after_ns = round(2e9 * max_silence_s)
         self._fence_lost_after_ns = round(0.5e9 * max_silence_s)
+        self._answer_s = answer_s
         self._fd = fd
         self._bus: Any = None
         self._reset_state()
@@ -167,9 +175,9 @@ class MotorBus:
     def command(self, index: int, data: bytes) -> Feedback:
         """Send one frame to one motor until it replies, a few times. Raises TransportTimeout, DeviceGone."""
         self._settle()
-        for _ in range(_TRIES):
+        for _ in range(TRIES):
             self._send(index, self._addresses[index].esc_id, data)
-            until_ns = self._clock.now_ns() + round(_ANSWER_S * 1e9)
+            until_ns = self._clock.now_ns() + round(self._answer_s * 1e9)
             while (answer := self._newest[index]) is None and self._receive(until_ns):
                 pass
             if answer is not None:
@@ -223,9 +231,9 @@ class MotorBus:
         self._replies.clear()
         self._wanted_register = (index, register, written)
         try:
-            for _ in range(_TRIES):
+            for _ in range(TRIES):
                 self._put(codec.PARAMETER_ID, request)
-                until_ns = self._clock.now_ns() + round(_ANSWER_S * 1e9)
+                until_ns = self._clock.now_ns() + round(self._answer_s * 1e9)
                 while not self._replies and self._receive(until_ns):
                     pass
                 if self._replies:
@@ -236,7 +244,7 @@ class MotorBus:
 
     def _no_answer(self, index: int) -> TransportTimeout:
         what = f"reply of motor {self._addresses[index].esc_id}"
-        return TransportTimeout(self._device, what, _TRIES * _ANSWER_S)
+        return TransportTimeout(self._device, what, TRIES * self._answer_s)
 
     def _settle(self) -> None:
         """Receive pending replies, so that the next reply belongs to the next request."""
@@ -279,25 +287,26 @@ class MotorBus:
         )
         try:
             self._bus.send(message)
-        except can.CanOperationError as error:
-            if error.error_code == errno.ENOBUFS:
-                self.counters.not_sent += 1
-                return False
-            raise self._gone(error) from None
-        except (can.CanError, OSError, ValueError) as error:
-            raise self._gone(error) from None
+        except Exception as error:
+            if _code(error) in _GONE:
+                raise self._gone(error) from None
+            self.counters.not_sent += 1
+            self.last_error = str(error)
+            return False
         self.counters.sent += 1
         return True
 
     def _receive(self, until_ns: int) -> bool:
         """Process one frame; False if none arrived in time."""
-        import can
-
         left_s = (until_ns - self._clock.now_ns()) * 1e-9
         try:
             message = self._bus.recv(max(left_s, 0.0))
-        except (can.CanError, OSError, ValueError) as error:
-            raise self._gone(error) from None
+        except Exception as error:
+            if _code(error) in _GONE:
+                raise self._gone(error) from None
+            self.counters.not_received += 1
+            self.last_error = str(error)
+            return False
         if message is None:
             return False
         if message.is_error_frame:
@@ -374,3 +383,12 @@ class MotorBus:
         return DeviceGone(
             self._device, f"lost connection to the CAN bus: {error}", hint="check the adapter, then reconnect"
         )
+
+
+def _code(error: BaseException) -> int | None:
+    """Return the error number of an adapter's exception, or of the one that caused it."""
+    for found in (error, error.__cause__):
+        code = getattr(found, "error_code", None) or getattr(found, "errno", None)
+        if isinstance(code, int):
+            return code
+    return None

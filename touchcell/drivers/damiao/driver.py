@@ -10,13 +10,15 @@ position and disables itself after its own timeout. **An arm without brakes sink
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from functools import partial
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from touchcell.drivers.core.behaviour import ArmBehaviour
 from touchcell.drivers.core.bus_arm import BusArm, BusArmConfig
 from touchcell.drivers.core.bus_reply import Reply
 from touchcell.drivers.core.clock import Clock
@@ -42,14 +44,19 @@ from touchcell.drivers.core.protocols import (
 from touchcell.drivers.core.samples import JointState, Stamped
 from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.damiao import codec
-from touchcell.drivers.damiao.bus import Address, MotorBus
+from touchcell.drivers.damiao.bus import TRIES, Address, MotorBus
 from touchcell.drivers.damiao.codec import Feedback, MitCommand, Register
 from touchcell.drivers.kinematics.chain import GRAVITY_M_S2, ChainDescription, ChainFile, SerialChain, Vector3
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 
+_logger = logging.getLogger(__name__)
+
+_TURN_RAD = 2.0 * np.pi
 _MAX_BUS_LOAD = 0.8
 _PLAUSIBLE_JUMP_RAD = 0.1
+# While one motor is asked, the others hear nothing: all tries together must not last as long as their watchdog.
+_ASKING_FRACTION = 0.75
 
 _DOES_NOT_ENABLE = codec.StatusCode(
     "does not enable", FaultClass.INTERNAL, Remedy.OPERATOR, "check power and emergency stop"
@@ -164,20 +171,24 @@ class DamiaoCanArm(BusArm):
         super().__init__(name, config, clock, SerialChain(config.describe(), config.tool, config.gravity_m_s2))
         motors = config.motors
         self._direction = np.array([motor.direction for motor in motors], dtype=np.float64)
-        self._offset = np.deg2rad([motor.offset_deg for motor in motors])
+        self._zero = np.deg2rad([motor.offset_deg for motor in motors])
+        self._offset = self._zero
         addresses = [Address(motor.esc_id, motor.mst_id) for motor in motors]
         self._bus = MotorBus(
             name,
             addresses,
-            partial(_open_bus, name, config),
+            partial(open_bus, name, config),
             clock,
             max_silence_s=config.max_silence_s,
+            answer_s=config.watchdog_s * _ASKING_FRACTION / TRIES,
             fd=config.fd,
         )
 
     def _reset_state(self) -> None:
         super()._reset_state()
         self._answers: list[Reply[Feedback] | None] = [None] * len(self._config.motors)
+        self._held: tuple[Array, Array] | None = None
+        self._turns: Array | None = None
 
     def watchdog_s(self) -> float:
         """Return the timeout after which the motors disable themselves, as read back; the longest of them."""
@@ -193,6 +204,7 @@ class DamiaoCanArm(BusArm):
             "bus_state": self._bus.state,
             "bus_error": self._bus.last_error,
             "bus_load": self._config.bus_load,
+            "turns_added": "" if self._turns is None else " ".join(f"{turn / _TURN_RAD:.0f}" for turn in self._turns),
         }
         readings |= super().health()
         for joint, answer in zip(self._chain.joint_names, self._answers, strict=True):
@@ -235,7 +247,7 @@ class DamiaoCanArm(BusArm):
                     f"joint {joint} is outside its limits",
                     fault_class=FaultClass.MOTION,
                     needs=Remedy.OPERATOR,
-                    hint="move it back by hand, or correct offset_deg and direction",
+                    hint="move it back by hand; only if its angle is wrong, correct offset_deg and direction",
                 )
             for index in range(len(self._enabled)):
                 self._check_watchdog(index, int(self._bus.read(index, Register.TIMEOUT)))
@@ -351,9 +363,20 @@ class DamiaoCanArm(BusArm):
             frames = [command if on else None for command, on in zip(commands, self._enabled, strict=True)]
         self._take(self._bus.exchange(frames, until_ns))
 
+    def _repeat_commands(self) -> None:
+        if self._held is not None:
+            q, tau = self._held
+            frames = self._encode(q, np.zeros_like(q), tau)
+            self._bus.exchange([frame if on else None for frame, on in zip(frames, self._enabled, strict=True)], 0)
+
     def _frames(self, q: Array, dq: Array) -> list[bytes]:
         strongest = np.minimum(self._chain.torque, [self._bus.ranges(i).torque_n_m for i in range(len(q))])
         tau = np.clip(self._chain.gravity_torques(q), -strongest, strongest)
+        frames = self._encode(q, dq, tau)
+        self._held = q, tau
+        return frames
+
+    def _encode(self, q: Array, dq: Array, tau: Array) -> list[bytes]:
         motor_q = self._direction * (q - self._offset)
         motor_dq, motor_tau = self._direction * dq, self._direction * tau
         return [
@@ -393,6 +416,9 @@ class DamiaoCanArm(BusArm):
 
     def _publish(self, answers: list[Reply[Feedback]]) -> None:
         feedback = np.array([(a.state.q, a.state.dq, a.state.tau) for a in answers])
+        if self._turns is None:
+            self._turns = self._count_turns(self._direction * feedback[:, 0] + self._zero)
+            self._offset = self._zero + self._turns
         state = JointState(
             self._direction * feedback[:, 0] + self._offset,
             self._direction * feedback[:, 1],
@@ -400,6 +426,25 @@ class DamiaoCanArm(BusArm):
         )
         self._seq += 1
         self._joints = Stamped(state, min(answer.t_ns for answer in answers), self._seq)
+
+    def _count_turns(self, q: Array) -> Array:
+        """Return whole turns (n,) rad to add to joint angles, where a motor has powered up one turn off.
+
+        Only where its angle is outside the joint's range and one turn leads into it, which is unique.
+        """
+        turns = np.zeros_like(q)
+        for index, (angle, lower, upper) in enumerate(zip(q, self._chain.lower, self._chain.upper, strict=True)):
+            fits = [turn for turn in (-_TURN_RAD, 0.0, _TURN_RAD) if lower <= angle + turn <= upper]
+            if len(fits) == 1 and fits[0]:
+                turns[index] = fits[0]
+                _logger.warning(
+                    "%s: joint %s powered up one turn off, at %.1f deg; taken as %.1f deg",
+                    self.name,
+                    self._chain.joint_names[index],
+                    np.rad2deg(angle),
+                    np.rad2deg(angle + fits[0]),
+                )
+        return turns
 
     def _check_status(self, index: int, status: int) -> None:
         esc_id = self._config.motors[index].esc_id
@@ -415,7 +460,8 @@ class DamiaoCanArm(BusArm):
         limit_s = self._config.max_silence_s
         for motor, answer in zip(self._config.motors, self._answers, strict=True):
             if answer is not None and (now_ns - answer.t_ns) * 1e-9 > limit_s:
-                self._latch(TransportTimeout(self.name, f"reply of motor {motor.esc_id}", limit_s))
+                hint = f"the adapter reported: {self._bus.last_error}" if self._bus.last_error else ""
+                self._latch(TransportTimeout(self.name, f"reply of motor {motor.esc_id}", limit_s, hint=hint))
         self._check_missed()
 
     def _check_fences(self) -> None:
@@ -425,17 +471,32 @@ class DamiaoCanArm(BusArm):
                     self._check_watchdog(index, ticks)
 
 
-def _open_bus(device: str, config: DamiaoCanConfig) -> Any:
+def open_bus(device: str, config: DamiaoCanConfig) -> Any:
+    """Open the python-can bus of ``config`` at its bit rates. Raises ConnectError."""
     import can
 
+    is_kernels = config.interface == "socketcan"
+    # Adapters that python-can opens itself start at a rate of their own (slcan, gs_usb and pcan at 500 kbit/s or none).
+    rates = {} if is_kernels else {"bitrate": config.bitrate}
+    if config.fd and not is_kernels:
+        rates["data_bitrate"] = config.data_bitrate
+    options: dict[str, Any] = rates | config.bus_options
     try:
-        return can.Bus(interface=config.interface, channel=config.channel, fd=config.fd, **config.bus_options)
-    except (can.CanError, OSError, ValueError) as error:
+        bus = can.Bus(interface=config.interface, channel=config.channel, fd=config.fd, **options)
+    except (can.CanError, OSError, ValueError, TypeError) as error:
         raise ConnectError(
             device,
             f"cannot open CAN {config.interface} {config.channel}: {error}",
-            hint="is the interface up? `ip link set can0 up type can bitrate 1000000`",
+            hint="is the interface up? `ip link set can0 up type can bitrate 1000000`"
+            if is_kernels
+            else f"is the adapter plugged in, and does it support {config.bitrate} bit/s?",
         ) from None
+    if config.fd and bus.protocol is can.CanProtocol.CAN_20:
+        bus.shutdown()
+        raise ConnectError(
+            device, f"{config.interface} does not send CAN FD frames", hint="set fd: false, or use another adapter"
+        )
+    return bus
 
 
 def _motor_fault(device: str, esc_id: int, status: int, code: codec.StatusCode) -> DeviceFault:
@@ -451,6 +512,22 @@ def _motor_fault(device: str, esc_id: int, status: int, code: codec.StatusCode) 
 
 def _build(name: str, config: DamiaoCanConfig, context: DriverContext) -> DamiaoCanArm:
     return DamiaoCanArm(name, config, context.clock)
+
+
+HOME_DEG: Final = (0.0, 40.0, 90.0, 0.0, 50.0, 0.0)
+"""Tool in front of the base, pointing down, of a ``generic_6r`` arm."""
+
+
+def behaviour(config: DamiaoCanConfig) -> ArmBehaviour:
+    """Return how the arm behaves: one cycle of the bus until a setpoint is sent, one until it acts."""
+    home_deg = HOME_DEG if config.joint_count == len(HOME_DEG) else config.park_deg or (0.0,) * config.joint_count
+    return ArmBehaviour(
+        state_rate_hz=config.rate_hz,
+        latency_s=2.0 / config.rate_hz,
+        home_deg=home_deg,
+        max_state_age_s=config.max_silence_s,
+        watchdog_s=config.watchdog_s,
+    )
 
 
 SPEC = DriverSpec(
@@ -469,4 +546,5 @@ SPEC = DriverSpec(
         falls_on_power_loss=True,
     ),
     build=_build,
+    behaviour=behaviour,
 )

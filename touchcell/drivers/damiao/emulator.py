@@ -12,6 +12,7 @@ import asyncio
 import math
 import struct
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -106,8 +107,10 @@ class DamiaoArm(Emulator):
         "error_frames": "report this many bus errors",
         "fault_bits": "[motor index, status nibble]: the motor reports it and disables itself",
         "hot": "[motor index, degrees Celsius] of the winding; at 100 the motor disables itself",
+        "tx_full": "the adapter's transmit queue refuses this many frames of the host",
         "push": "[motor index, N m]: external torque on that joint",
         "refuse": "this motor (index from 0) does not enable",
+        "turn_off": "[motor index, turns]: the motor powered up with its angle that many whole turns off",
         "nan": "the full-scale registers read as NaN",
         "restart": "the motors lose power for a moment",
         "reset": "return to the state at the start of the emulator",
@@ -204,6 +207,9 @@ class DamiaoArm(Emulator):
         elif fault == "error_frames":
             while self.spend(fault):
                 self._hub.send(_error_frame(can_errors.BUS_ERROR))
+        elif fault == "tx_full":
+            self._hub.fill_transmit_queues(int(value))
+            del self.active[fault]
         elif fault == "fault_bits":
             index, status = value
             self._let_go(self.motors[index], status)
@@ -304,7 +310,8 @@ class DamiaoArm(Emulator):
             self._energising += 1
             self._on_special(index, data)
         elif motor.status == codec.ENABLED:
-            motor.command = codec.decode_mit(data, motor.ranges)
+            command = codec.decode_mit(data, motor.ranges)
+            motor.command = replace(command, q=command.q - self._turned(index))
             self._onset.note(index, data[:5])
         return self._feedback(index)
 
@@ -350,13 +357,17 @@ class DamiaoArm(Emulator):
         shown = codec.Feedback(
             motor=motor.esc_id & 0xF,
             status=motor.status,
-            q=_within(self._q[index], ranges.position_rad),
+            q=_within(self._q[index] + self._turned(index), ranges.position_rad),
             dq=_within(self._dq[index], ranges.velocity_rad_s),
             tau=_within(self._tau[index], ranges.torque_n_m),
             mos_c=33,
             rotor_c=round(motor.rotor_c),
         )
         return codec.encode_feedback(shown, ranges)
+
+    def _turned(self, index: int) -> float:
+        motor, turns = self.active.get("turn_off", (-1, 0))
+        return 2.0 * math.pi * turns if motor == index else 0.0
 
     def _reply(self, index: int, data: bytes, request: can.Message) -> None:
         if self.spend("drop"):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from touchcell.drivers.damiao import driver as damiao_can
+from touchcell.testing.emulation.in_cell import EmulatedDriver, start_arguments, tcp_of_state
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
@@ -55,6 +58,7 @@ def rig(folder: Path, address: int) -> DeviceFixture:
             "foreign": (3, "transient"),
             "out_of_order": (3, "transient"),
             "error_frames": (3, "transient"),
+            "tx_full": (20, "transient"),
             "delay": (1.0, "fault"),
             "pause": (True, "fault"),
             "silent": (2, "fault"),
@@ -70,3 +74,26 @@ def rig(folder: Path, address: int) -> DeviceFixture:
             "registers can be read while a motor is enabled",
         ),
     )
+
+
+def _settings(config: damiao_can.DamiaoCanConfig, folder: Path, number: int) -> Mapping[str, Any]:
+    settings: dict[str, Any] = {
+        "interface": "touchcell_hub",
+        "channel": str(folder / f"can-{number}"),
+        "bus_options": {},
+    }
+    for index in range(config.joint_count):
+        # The emulated motors are mounted straight and have ids of their own.
+        motor = {"esc_id": index + 1, "mst_id": index + 0x11, "direction": 1, "offset_deg": 0.0}
+        settings |= {f"motors.{index}.{key}": value for key, value in motor.items()}
+    return settings
+
+
+def _start(config: damiao_can.DamiaoCanConfig, start_deg: Sequence[float] | None) -> EmulatorProcess:
+    tool = config.tool.model_dump_json()
+    return EmulatorProcess(
+        "damiao", config.channel, "--chain", str(config.chain), "--tool", tool, *start_arguments(start_deg)
+    )
+
+
+EMULATED = EmulatedDriver("damiao_can", _settings, _start, tcp_of_state)

@@ -320,7 +320,7 @@ def decode_state(data: bytes) -> ServoState:
     """Decode a state block of any start address.
 
     Raises:
-        CodecError: wrong length, or a position outside one turn of a single-turn servo.
+        CodecError: wrong length, or a position more than one turn outside 0 to 4095.
     """
     start = _STATE_END - len(data)
     if start not in STATE_STARTS:
@@ -330,8 +330,9 @@ def decode_state(data: bytes) -> ServoState:
         return data[register - start : register - start + length]
 
     position = from_signed_word(at(Register.POSITION))
-    if not 0 <= position < TICKS_PER_TURN:
-        raise CodecError("position", position, "is not within one turn")
+    # A homing offset moves the count: a single-turn servo may report from -4095 to 8190.
+    if not -TICKS_PER_TURN < position < 2 * TICKS_PER_TURN:
+        raise CodecError("position", position, "is more than one turn out of range")
     return ServoState(
         torque_enable=at(Register.TORQUE_ENABLE)[0],
         goal=from_signed_word(at(Register.GOAL_POSITION)),

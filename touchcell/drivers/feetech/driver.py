@@ -18,11 +18,12 @@ import hashlib
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from touchcell.drivers.core.behaviour import ArmBehaviour
 from touchcell.drivers.core.bus_arm import BusArm, BusArmConfig
 from touchcell.drivers.core.bus_reply import Reply
 from touchcell.drivers.core.clock import Clock
@@ -334,6 +335,15 @@ class FeetechSerialArm(BusArm):
             raise _servo_fault(self.name, servo, state.status, found[0])
         if state.torque_limit != self._torque_limit:
             raise _lost_power(self.name, servo)
+        if not 0 <= state.position < codec.TICKS_PER_TURN:
+            raise DeviceFault(
+                self.name,
+                f"servo {servo} is at {state.position} ticks, outside 0 to 4095 by its homing offset",
+                vendor_code="position",
+                fault_class=FaultClass.MOTION,
+                needs=Remedy.OPERATOR,
+                hint="move the joint to the middle of its range by hand; if that does not help, calibrate again",
+            )
         angle = self._angle(index, state.position)
         if not self._chain.lower[index] <= angle <= self._chain.upper[index]:
             raise DeviceFault(
@@ -347,6 +357,9 @@ class FeetechSerialArm(BusArm):
     def _angle(self, index: int, position: int) -> float:
         """Return the joint angle; the count continues beyond 4095 and 0 where that is nearer to the joint's range."""
         servo = self._config.servos[index]
+        if not 0 <= position < codec.TICKS_PER_TURN:
+            # The servo continues the count itself.
+            return servo.angle(position)
         return servo.angle(codec.unwrap(position, (servo.min_ticks + servo.max_ticks) / 2))
 
     def _enable(self, goals: list[int]) -> None:
@@ -509,6 +522,21 @@ def _build(name: str, config: FeetechSerialConfig, context: DriverContext) -> Fe
     return FeetechSerialArm(name, config, context.clock)
 
 
+HOME_DEG: Final = (0.0, 10.0, 90.0, 80.0, 0.0)
+"""Tool in front of the base, pointing down, of an ``so101_5r`` arm."""
+
+
+def behaviour(config: FeetechSerialConfig) -> ArmBehaviour:
+    """Return how the arm behaves: one cycle of the bus until a goal is sent, one until it acts."""
+    home_deg = HOME_DEG if config.joint_count == len(HOME_DEG) else config.park_deg or (0.0,) * config.joint_count
+    return ArmBehaviour(
+        state_rate_hz=config.rate_hz,
+        latency_s=2.0 / config.rate_hz,
+        home_deg=home_deg,
+        max_state_age_s=config.max_silence_s,
+    )
+
+
 SPEC = DriverSpec(
     name="feetech_serial",
     summary="arm of Feetech STS3215 bus servos on a serial port (SO-100, SO-101 class)",
@@ -525,4 +553,5 @@ SPEC = DriverSpec(
         falls_on_power_loss=True,
     ),
     build=_build,
+    behaviour=behaviour,
 )

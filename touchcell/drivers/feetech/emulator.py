@@ -61,6 +61,7 @@ class Servo:
         self.encoder = ticks
         self.velocity = 0.0
         self.blocked = False
+        self.reported_turns = 0
         self._strained_s = 0.0
         self.prepared: tuple[int, bytes] | None = None
         self._table = bytearray(_TABLE_LENGTH)
@@ -170,7 +171,8 @@ class Servo:
         self._measure()
 
     def _measure(self) -> None:
-        self.put(Register.POSITION, codec.word(round(self.position) % codec.TICKS_PER_TURN))
+        ticks = round(self.position) % codec.TICKS_PER_TURN + self.reported_turns * codec.TICKS_PER_TURN
+        self.put(Register.POSITION, codec.signed_word(ticks))
         self.put(Register.SPEED, codec.signed_word(round(self.velocity)))
 
 
@@ -200,6 +202,7 @@ class FeetechArm(Emulator):
         "foreign": "this many replies carry an id that was not requested",
         "unplug": "the adapter vanishes",
         "fault_bits": "[servo index, status bits]: the servo reports them; bits 3 and 5 until its torque is off",
+        "turn_off": "this servo (index) reports its position one turn lower, below 0, as after a homing offset",
         "block": "this servo (index) cannot turn",
         "carry": "[servo index, ticks]: turn that servo's shaft by hand by so much at once",
         "registers": "[servo index, address, hexadecimal bytes]: overwrite that servo's registers",
@@ -291,6 +294,8 @@ class FeetechArm(Emulator):
         elif fault == "fault_bits":
             index, bits = value
             self.servos[index].status |= bits
+        elif fault == "turn_off":
+            self.servos[value].reported_turns = -1
         elif fault == "block":
             self.servos[value].blocked = True
         elif fault == "carry":
@@ -317,6 +322,9 @@ class FeetechArm(Emulator):
         elif fault == "block":
             for servo in self.servos:
                 servo.blocked = False
+        elif fault == "turn_off":
+            for servo in self.servos:
+                servo.reported_turns = 0
         elif fault == "fault_bits":
             for servo in self.servos:
                 servo.status &= _LATCHED
@@ -451,7 +459,7 @@ class FeetechArm(Emulator):
         at = len(packet.data) - (end - Register.POSITION)
         ticks = codec.from_signed_word(packet.data[at : at + 2]) if at >= 0 else 0
         if at >= 0 and self.spend("wild"):
-            ticks += codec.TICKS_PER_TURN
+            ticks += 2 * codec.TICKS_PER_TURN
         elif at >= 0 and self.spend("jump"):
             ticks = (ticks + codec.TICKS_PER_TURN // 2) % codec.TICKS_PER_TURN
         elif self.spend("foreign"):

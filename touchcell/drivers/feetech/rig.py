@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from touchcell.drivers.feetech import driver as feetech_serial
+from touchcell.testing.emulation.in_cell import EmulatedDriver, start_arguments, tcp_of_state
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
@@ -73,3 +76,22 @@ def rig(folder: Path, address: int) -> DeviceFixture:
             "reading further registers in the same sync read is harmless",
         ),
     )
+
+
+def _settings(config: feetech_serial.FeetechSerialConfig, folder: Path, number: int) -> Mapping[str, Any]:
+    settings: dict[str, Any] = {"port": str(folder / f"servos-{number}"), "echo": False}
+    # The emulated servos are numbered from the base.
+    return settings | {f"servos.{index}.id": index + 1 for index in range(config.joint_count)}
+
+
+def _start(config: feetech_serial.FeetechSerialConfig, start_deg: Sequence[float] | None) -> EmulatorProcess:
+    return EmulatorProcess(
+        "feetech",
+        *("--link", config.port, "--chain", str(config.chain), "--tool", config.tool.model_dump_json()),
+        *("--zero-ticks", *(str(servo.zero_ticks) for servo in config.servos)),
+        *("--direction", *(str(servo.direction) for servo in config.servos)),
+        *start_arguments(start_deg),
+    )
+
+
+EMULATED = EmulatedDriver("feetech_serial", _settings, _start, tcp_of_state)

@@ -16,13 +16,14 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Final
 from xml.etree import ElementTree
 
 import numpy as np
 from pydantic import Field
 
 from touchcell.drivers.core.arm import Arm, JointLimitsConfig, LimitsConfig
+from touchcell.drivers.core.behaviour import ArmBehaviour
 from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.command_checks import finite_array
@@ -73,7 +74,6 @@ CAPABILITIES = Capabilities(
 
 _WATCHDOG_S = 0.02
 _FIRST_STATE_S = 2.0
-_SILENCE_S = 0.5
 _FRESH_S = 0.25
 _RECOVERY_S = 5.0
 # franky's motions are smooth already, and libfranka's filter assumes that no state is ever lost: after a loss it jumps.
@@ -103,6 +103,7 @@ class FrankaConfig(DriverConfig):
         contact_torque_limit_nm: external torque at which the controller itself stops the arm with a reflex.
         flange_to_tcp_mm_deg: tool centre point in the flange frame, [x y z alpha beta gamma]; None leaves the end
             effector as it is set in Desk.
+        state_timeout_s: oldest state with which a twist is followed; an older one is a fault.
     """
 
     host: str = Field(min_length=1)
@@ -114,6 +115,7 @@ class FrankaConfig(DriverConfig):
     contact_force_limit_n: float = Field(default=20.0, gt=0.0, le=100.0)
     contact_torque_limit_nm: float = Field(default=10.0, gt=0.0, le=50.0)
     flange_to_tcp_mm_deg: tuple[float, float, float, float, float, float] | None = None
+    state_timeout_s: float = Field(default=0.5, ge=0.02, le=1.0)
 
     def described_chain(self) -> SerialChain:
         """Return the chain of an FR3 with the configured tool, or with none where Desk has set it."""
@@ -145,7 +147,13 @@ class FrankaArm(Arm):
     """
 
     def __init__(self, name: str, config: FrankaConfig, clock: Clock) -> None:
-        super().__init__(name, clock, config.limits.build(), stop_categories=CAPABILITIES.stop_categories)
+        super().__init__(
+            name,
+            clock,
+            config.limits.build(),
+            stop_categories=CAPABILITIES.stop_categories,
+            max_state_age_s=config.state_timeout_s,
+        )
         self._config = config
         self._franky: Any = None
         self._robot: Any = None
@@ -287,6 +295,13 @@ class FrankaArm(Arm):
             self._reader.close()
         self._reader = None
         self._robot = None
+
+    def _present_fault(self) -> DeviceError | None:
+        reading = self._newest()
+        if reading.mode in _OBEYS and not reading.errors:
+            return None
+        fault = self._fault(reading)
+        return fault if fault.needs is Remedy.RECOVER else None
 
     def _configure(self) -> None:
         config = self._config
@@ -494,8 +509,8 @@ class FrankaArm(Arm):
         reader, reading = self._open_reader(), self._newest()
         if reader.failure is not None:
             raise self._to_faulted(reader.failure)
-        if self._age_s(reading) > _SILENCE_S:
-            raise self._to_faulted(TransportTimeout(self.name, "state", _SILENCE_S))
+        if self._age_s(reading) > self._config.state_timeout_s:
+            raise self._to_faulted(TransportTimeout(self.name, "state", self._config.state_timeout_s))
         if self.state is not Lifecycle.ACTIVE:
             return
         if reading.mode not in _OBEYS or reader.aborted is not None:
@@ -603,11 +618,31 @@ def _build(name: str, config: FrankaConfig, context: DriverContext) -> FrankaArm
     return FrankaArm(name, config, context.clock)
 
 
+HOME_DEG: Final = (0.0, -45.0, 0.0, -135.0, 0.0, 90.0, 45.0)
+"""Ready pose of Franka's own examples."""
+
+_ACCEL_M_S2, _ROT_ACCEL_RAD_S2 = 9.0, 17.0
+"""Largest Cartesian accelerations of an FR3 (Franka, "Robot and interface specifications")."""
+
+
+def behaviour(config: FrankaConfig) -> ArmBehaviour:
+    """Return how the arm behaves: it stops with a fraction of its largest accelerations."""
+    return ArmBehaviour(
+        state_rate_hz=CAPABILITIES.state_rate_hz,
+        latency_s=0.003,
+        home_deg=HOME_DEG,
+        stop_accel_m_s2=config.stop_dynamics_factor * _ACCEL_M_S2,
+        stop_rot_accel_rad_s2=config.stop_dynamics_factor * _ROT_ACCEL_RAD_S2,
+        watchdog_s=_WATCHDOG_S,
+    )
+
+
 SPEC = DriverSpec(
     name="franka",
     summary="Franka FR3 and Research 3 over franky: velocity streaming with a native time-to-live, contact backstop",
     config=FrankaConfig,
     capabilities=CAPABILITIES,
     build=_build,
+    behaviour=behaviour,
     extra="franka",
 )

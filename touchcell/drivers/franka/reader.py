@@ -101,7 +101,7 @@ class StateReader:
 
     @property
     def failure(self) -> DeviceError | None:
-        """The error that ended the thread, or None."""
+        """The lost connection that ended the thread, or why no state has been readable of late; else None."""
         return self._failure
 
     @property
@@ -145,16 +145,18 @@ class StateReader:
         self._aborted = None
 
     def _run(self) -> None:
-        try:
-            while not self._halt.is_set():
+        while not self._halt.is_set():
+            try:
                 self._read()
-                self._halt.wait(PERIOD_S)
-        except DeviceError as error:
-            self._failure = error
-        except Exception as error:
-            self._failure = DeviceGone(
-                self._device, f"reader thread failed: {error!r}", hint="disconnect and connect again"
-            )
+            except self._franky.NetworkException as error:
+                # libfranka never reconnects.
+                self._failure = DeviceGone(
+                    self._device, f"lost the controller: {error}", hint="disconnect and connect again"
+                )
+                return
+            except Exception as error:
+                self._count_bad(repr(error))
+            self._halt.wait(PERIOD_S)
 
     def _read(self) -> None:
         last_ns, self._read_ns = self._read_ns, self._clock.now_ns()
@@ -187,6 +189,7 @@ class StateReader:
             return
         if self._bad_in_a_row:
             self._bad_in_a_row = 0
+            self._failure = None
             self._losses.forget()
         self._newest = reading
 
@@ -215,7 +218,7 @@ class StateReader:
         self._bad_in_a_row += 1
         self._losses.warning("bad", "%s: dropped a bad state: %s", self._device, what)
         if self._bad_in_a_row >= _BAD_IN_A_ROW:
-            raise CorruptMessage(self._device, f"{_BAD_IN_A_ROW} consecutive bad states, the last: {what}")
+            self._failure = CorruptMessage(self._device, f"{_BAD_IN_A_ROW} consecutive bad states, the last: {what}")
 
 
 def _present(errors: Any) -> tuple[str, ...]:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from ipaddress import IPv4Address
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.franka.driver import SPEC, FrankaArm, FrankaConfig
+from touchcell.testing.emulation.in_cell import EmulatedDriver, TcpOfState, free_host, start_arguments, tcp_of_joints
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
@@ -20,7 +25,7 @@ def rig(folder: Path, address: int) -> DeviceFixture:
     """Build an arm at a loopback address of its own; it stores nothing in ``folder``."""
     host = host_of(address)
     # Emulators also run without a real-time kernel.
-    config = FrankaConfig(host=host, enforce_realtime=False)
+    config = FrankaConfig(host=host, enforce_realtime=False, state_timeout_s=0.5)
 
     def start() -> EmulatorProcess:
         return EmulatorProcess("franka", "--host", host).start()
@@ -51,3 +56,25 @@ def rig(folder: Path, address: int) -> DeviceFixture:
             "20 lost command packets stop the arm, as Franka documents it",
         ),
     )
+
+
+def _settings(config: FrankaConfig, folder: Path, number: int) -> Mapping[str, Any]:
+    settings: dict[str, Any] = {"host": free_host(1337, number), "enforce_realtime": False}
+    if config.flange_to_tcp_mm_deg is None:
+        # What is set in Desk is not known here; simulated cells assume the flange too.
+        settings["flange_to_tcp_mm_deg"] = [0, 0, 0, 0, 0, 0]
+    return settings
+
+
+def _start(config: FrankaConfig, start_deg: Sequence[float] | None) -> EmulatorProcess:
+    return EmulatorProcess("franka", "--host", config.host, *start_arguments(start_deg))
+
+
+def _tcp(config: FrankaConfig) -> TcpOfState:
+    if config.flange_to_tcp_mm_deg is not None:
+        return tcp_of_joints(config)
+    # The end effector is as it is set in Desk.
+    return lambda state: np.array(state["T_base_ee"], dtype=np.float64)
+
+
+EMULATED = EmulatedDriver("franka", _settings, _start, _tcp)

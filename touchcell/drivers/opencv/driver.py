@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING
 
-from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting
+from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting, camera_behaviour
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import ConnectError, DeviceGone
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _QUEUE_FRAMES = 32
 _PLAUSIBLE_AGE_NS = 2_000_000_000
 _RATE_TOLERANCE = 0.01
+# The kernel may report an error for one frame (EIO, signal lost) and deliver the next.
+_FAILED_GRABS = 3
 
 
 class OpencvCameraConfig(CameraConfig):
@@ -43,18 +45,31 @@ class _Reader(threading.Thread):
 
     def run(self) -> None:
         """Read until stopped or until the camera fails."""
-        import cv2
-
-        while not self._stop_asked.is_set() and self._capture.grab():
-            received_ns = self._clock.now_ns()
-            stamp_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-            whole, data = self._capture.retrieve()
-            with self.arrived:
-                self.frames.append((data.tobytes() if whole else b"", stamp_ns, received_ns))
-                self.arrived.notify_all()
+        failed = 0
+        while not self._stop_asked.is_set() and failed < _FAILED_GRABS:
+            frame = self._grab()
+            failed = 0 if frame is not None else failed + 1
+            if frame is not None:
+                with self.arrived:
+                    self.frames.append(frame)
+                    self.arrived.notify_all()
         with self.arrived:
             self.ended = True
             self.arrived.notify_all()
+
+    def _grab(self) -> tuple[bytes, int, int] | None:
+        """Return the next frame's bytes, stamp and time of arrival; None if OpenCV could not read one."""
+        import cv2
+
+        try:
+            if not self._capture.grab():
+                return None
+            received_ns = self._clock.now_ns()
+            stamp_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+            whole, data = self._capture.retrieve()
+        except cv2.error:
+            return None
+        return data.tobytes() if whole else b"", stamp_ns, received_ns
 
     def finish(self) -> None:
         """Stop and join the thread: takes at most OpenCV's own timeout for a frame, 10 s."""
@@ -141,8 +156,13 @@ class OpencvCamera(Camera):
             capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, codec.EXPOSURE_MANUAL)
             given = int(capture.get(cv2.CAP_PROP_AUTO_EXPOSURE))
             self._expect("automatic exposure", codec.EXPOSURE_MANUAL, given)
+        if capture.get(cv2.CAP_PROP_AUTO_WB) > 0.0:
+            capture.set(cv2.CAP_PROP_AUTO_WB, 0.0)
+            self._expect("automatic white balance", 0, int(capture.get(cv2.CAP_PROP_AUTO_WB)))
         unit = codec.EXPOSURE_UNIT_US
         self._exposure_us = self._set_value(capture, cv2.CAP_PROP_EXPOSURE, "exposure_us", config.exposure_us, unit)
+        if self._exposure_us is not None and self._exposure_us * config.rate_hz > 1e6:
+            raise UnsupportedSetting(self.name, "exposure_us", f"at most {1e6 / config.rate_hz:.0f}", self._exposure_us)
         self._gain = self._set_value(capture, cv2.CAP_PROP_GAIN, "gain", config.gain, 1)
 
     def _set_value(
@@ -183,6 +203,8 @@ class OpencvCamera(Camera):
         if previous_ns is not None:
             periods = round((t_ns - previous_ns) * 1e-9 * self._config.rate_hz)
             self._monitor.count_lost(max(0, periods - 1), overrun=overrun)
+            if not overrun:
+                self._rate.note((t_ns - previous_ns) * 1e-9, 1)
         if codec.damage(data, self._config.pixel_format, self._config.width_px, self._config.height_px):
             self._monitor.count_bad("damaged")
             return
@@ -225,4 +247,5 @@ SPEC = DriverSpec(
     config=OpencvCameraConfig,
     capabilities=Capabilities(kind="camera", provides=frozenset({FrameSource, HealthSource}), state_rate_hz=30.0),
     build=build,
+    behaviour=camera_behaviour,
 )

@@ -21,7 +21,7 @@ from touchcell.drivers.core.errors import (
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
-from touchcell.drivers.replay.dataset import IMAGE_FOLDER, natural_order
+from touchcell.drivers.replay.dataset import IMAGE_FOLDER, natural_order, split_folder
 from touchcell.geometry.types import ImageArray
 from touchcell.input_file import InputFile
 
@@ -65,7 +65,7 @@ class ReplayCamera(Device):
 
     def __init__(self, name: str, config: ReplayCameraConfig, clock: Clock) -> None:
         super().__init__(name, clock)
-        self._folder = config.data / config.split / IMAGE_FOLDER if config.split else config.data
+        self._folder = split_folder(config.data, config.split) / IMAGE_FOLDER if config.split else config.data
         self._period_ns = round(1e9 / config.rate_hz)
         self._files: list[Path] = []
         self._start_ns = 0

@@ -1,13 +1,16 @@
-"""Labelled tactile images on disk, in the layout of the public TacTip releases.
+"""Labelled tactile images on disk, in the layouts of the public TacTip releases.
 
-``ROOT/SPLIT/processed_images/*.png`` and ``ROOT/SPLIT/targets_images.csv`` (or ``targets.csv``), SPLIT one of train,
-val, test. The six labels are found by column name; other columns, and images without a row, are ignored.
+``ROOT/SPLIT/processed_images/*`` and ``ROOT/SPLIT/targets_images.csv`` (or ``targets.csv``). SPLIT is one of train, val
+and test, or the same with ``_data`` at its end. Images are PNG or JPEG; a video stands for its last frame. The six
+labels are found by column name; other columns, and images without a row, are ignored. Where the images were cropped
+from the camera's frame, a JSON file beside them holds the rectangle.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 import re
 import struct
@@ -23,11 +26,18 @@ from touchcell.geometry.types import Array, ImageArray
 
 LABEL_FILES = ("targets_images.csv", "targets.csv")
 IMAGE_FOLDER = "processed_images"
+PARAMETER_FILES = ("processed_image_params.json", "process_image_params.json")
+"""Files beside the labels, or beside the splits, that hold ``bbox``: left, top, right, bottom of the crop, px."""
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", *VIDEO_SUFFIXES)
 IMAGE_COLUMN = "sensor_image"
 REST_IMAGE = "rest.png"
 """File beside the splits, if present: the image out of contact."""
 LABEL_COLUMNS = ("shear_x", "shear_y", "pose_z", "pose_Rx", "pose_Ry", "shear_Rz")
 """Columns that hold x, y, z, alpha, beta, gamma of ``T_f_s``, mm and degrees."""
+
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+_LEAST_OF_16_BITS = 4096
 
 
 @dataclass(frozen=True)
@@ -39,12 +49,14 @@ class Split:
         images: n image files in the order of the label file.
         contact_mm_deg: (n, 6) labels x, y, z, alpha, beta, gamma of ``T_f_s``, mm and degrees.
         unlabelled: images in the folder that have no row.
+        crop: (left, top, right, bottom) px of the images in the camera's frame; None where it is not recorded.
     """
 
     folder: Path
     images: tuple[Path, ...]
     contact_mm_deg: Array
     unlabelled: int
+    crop: tuple[int, int, int, int] | None = None
 
     def read(self) -> Iterator[ImageArray]:
         """Yield the images in order, decoded one by one, uint8 grey (height, width).
@@ -80,7 +92,7 @@ def read_split(root: Path, split: str) -> Split:
         DataError: the folder, the split, the label file, a column or an image is missing; the split is empty; a label
             is not a finite number; two rows name one image.
     """
-    folder = root / split
+    folder = split_folder(root, split)
     if not folder.is_dir():
         found = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
         hint = f"splits there: {', '.join(found)}" if found else "give the folder that holds train, val and test"
@@ -91,7 +103,7 @@ def read_split(root: Path, split: str) -> Split:
     image_folder = folder / IMAGE_FOLDER
     if not image_folder.is_dir():
         raise DataError(image_folder, "no such folder", hint="this folder holds the images of a split")
-    present = {path.name for path in image_folder.iterdir() if path.suffix.lower() == ".png"}
+    present = {path.name for path in image_folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES}
 
     names: list[str] = []
     labels: list[list[float]] = []
@@ -119,7 +131,34 @@ def read_split(root: Path, split: str) -> Split:
         images=tuple(image_folder / name for name in names),
         contact_mm_deg=np.array(labels, dtype=np.float64),
         unlabelled=len(present - seen),
+        crop=_crop(folder),
     )
+
+
+def split_folder(root: Path, split: str) -> Path:
+    """Return the folder of a split: ``ROOT/SPLIT``, or ``ROOT/SPLIT_data`` where only that exists."""
+    folder, other = root / split, root / f"{split}_data"
+    return other if other.is_dir() and not folder.is_dir() else folder
+
+
+def _crop(folder: Path) -> tuple[int, int, int, int] | None:
+    """Return the crop that a split's parameter file records. Raises DataError where it is not a rectangle."""
+    files = [place / name for place in (folder, folder.parent) for name in PARAMETER_FILES]
+    file = next((each for each in files if each.is_file()), None)
+    if file is None:
+        return None
+    try:
+        fields = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(file, f"cannot be read: {error}") from error
+    box = fields.get("bbox") if isinstance(fields, dict) else None
+    if box is None:
+        return None
+    whole = isinstance(box, list) and len(box) == 4 and all(type(each) is int for each in box)
+    if not whole or not (0 <= box[0] < box[2] and 0 <= box[1] < box[3]):
+        raise DataError(file, f"bbox {box} is not [left, top, right, bottom] in whole pixels", column="bbox")
+    left, top, right, bottom = box
+    return left, top, right, bottom
 
 
 def read_rest(root: Path) -> ImageArray | None:
@@ -129,25 +168,56 @@ def read_rest(root: Path) -> ImageArray | None:
 
 
 def read_image(path: Path) -> ImageArray:
-    """Read a PNG as uint8 grey (height, width).
+    """Read a PNG or JPEG image, or the last frame of a video, as uint8 grey (height, width).
+
+    Of 16 bits per pixel the upper eight are kept, which hold nothing where a camera of 10 or 12 bits wrote its values
+    unscaled: such an image is refused.
 
     Raises:
-        DataError: the file is missing, not an image, or truncated.
+        DataError: the file is missing, not an image, truncated, or of 16 bits with unscaled values.
     """
     import cv2
 
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return _last_frame(path)
     try:
         encoded = path.read_bytes()
     except OSError as error:
         raise DataError(path, f"cannot be read: {error.strerror}") from error
-    # OpenCV decodes the part of a truncated PNG that exists and leaves the rest black, so the end is checked first.
-    if not encoded.startswith(b"\x89PNG\r\n\x1a\n") or encoded[-8:-4] != b"IEND":
-        raise DataError(path, "not a complete PNG image", hint="copy the data set again")
-    image = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
-    width, height = struct.unpack(">II", encoded[16:24])
-    if image is None or image.shape != (height, width):
-        raise DataError(path, "corrupt PNG image", hint="copy the data set again")
+    # OpenCV decodes the part of a truncated image that exists and leaves the rest black, so the end is checked first.
+    png = encoded.startswith(_PNG) and encoded[-8:-4] == b"IEND"
+    jpeg = encoded.startswith(_JPEG) and encoded.rstrip(b"\0").endswith(b"\xff\xd9")
+    if not (png or jpeg):
+        raise DataError(path, "not a complete PNG or JPEG image", hint="copy the data set again")
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+    image = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
+    if image is None or (png and image.shape != struct.unpack(">II", encoded[16:24])[::-1]):
+        raise DataError(path, "corrupt image", hint="copy the data set again")
+    if image.dtype == np.uint16:
+        if 0 < image.max() < _LEAST_OF_16_BITS:
+            raise DataError(
+                path,
+                f"16 bits per pixel with values up to {image.max()} only",
+                hint="values of a 10 or 12 bit camera: multiply them by 64 or 16, or save 8 bits",
+            )
+        return cast(ImageArray, (image >> 8).astype(np.uint8))
     return cast(ImageArray, image)
+
+
+def _last_frame(path: Path) -> ImageArray:
+    if not path.is_file():
+        raise DataError(path, "cannot be read: no such file")
+    import cv2
+
+    video, last = cv2.VideoCapture(str(path)), None
+    try:
+        while (step := video.read())[0]:
+            last = step[1]
+    finally:
+        video.release()
+    if last is None:
+        raise DataError(path, "not a video that can be decoded", hint="copy the data set again, or save images")
+    return cast(ImageArray, cv2.cvtColor(last, cv2.COLOR_BGR2GRAY) if last.ndim == 3 else last)
 
 
 def natural_order(path: Path) -> list[tuple[int, str]]:

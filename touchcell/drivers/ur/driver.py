@@ -11,12 +11,13 @@ import math
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Final, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from touchcell.drivers.core.arm import Arm, JointLimitsConfig, LimitsConfig
+from touchcell.drivers.core.behaviour import ArmBehaviour
 from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
@@ -47,6 +48,7 @@ from touchcell.drivers.core.protocols import (
 )
 from touchcell.drivers.core.samples import JointState, Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
+from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.drivers.kinematics.chain import ChainDescription, ChainFile, DifferentialIk, LocalIk, SerialChain, Tool
 from touchcell.drivers.ur import codec as ur_codec
 from touchcell.drivers.ur.control import ControlLink
@@ -70,7 +72,7 @@ _POLL_NS = 2_000_000
 _EXPLANATION_NS = 20_000_000
 _STILL_TARGET_RAD_S = 1e-6
 _STILL_ACTUAL_RAD_S = 0.01
-_MAX_JOINT_GOAL_RAD = 2.0 * math.pi
+_BEYOND_LIMIT_RAD = 0.1
 
 _STOPS = frozenset(StopCategory)
 
@@ -148,6 +150,9 @@ class UrArm(Arm):
         self._flange_to_tcp = _pose_vector(se3.from_euler_mm_deg(np.array(config.flange_to_tcp_mm_deg)))
         self._chain = config.described_chain()
         self._ik = DifferentialIk(self._chain, config.joint_limits.settings(own_controller=True))
+        # All UR joints but a UR3e's endless wrist turn by a full turn; a little beyond where software limits are wider.
+        ends = np.maximum(np.abs(self._chain.lower), np.abs(self._chain.upper))
+        self._max_joint_rad = np.maximum(ends, 2.0 * math.pi) + _BEYOND_LIMIT_RAD
         self._receive: Any = None
         self._reader: StateReader | None = None
         self._link: ControlLink | None = None
@@ -199,7 +204,7 @@ class UrArm(Arm):
         Raises:
             CommandRejected: the goal was rejected; nothing was sent.
         """
-        target = self._admitted_joint_goal(q, lease, speed_fraction, -_MAX_JOINT_GOAL_RAD, _MAX_JOINT_GOAL_RAD, JOINTS)
+        target = self._admitted_joint_goal(q, lease, speed_fraction, self._chain.lower, self._chain.upper, JOINTS)
         link = self._link
         if link is None:
             raise CommandRejected(self.name, Rejection.MODE, "the control program is not running")
@@ -276,6 +281,11 @@ class UrArm(Arm):
         self._power_off_by = None
         self._stop_receiving()
 
+    def _present_fault(self) -> DeviceError | None:
+        snapshot = self._fresh()
+        fault = safety_fault(self.name, snapshot.safety_mode, snapshot.safety_bits)
+        return fault if fault is not None and fault.needs is Remedy.RECOVER else None
+
     def _configure(self) -> None:
         self._require_safe()
 
@@ -341,6 +351,11 @@ class UrArm(Arm):
         except DeviceError as error:
             raise self._to_faulted(self._explain(error)) from None
 
+    def _project_to_feasible(self, twist_base: Array) -> tuple[Array, tuple[Adjustment, ...]]:
+        # The controller scales every motion by the slider on the pendant.
+        fraction = self._newest(None).speed_fraction
+        return twist_base, () if fraction >= 1.0 else (Adjustment("speed slider", 1.0, fraction),)
+
     def _local_ik(self) -> LocalIk:
         return self._ik_at(self._ik, self.joints(self._max_state_age_s).value.q)
 
@@ -353,19 +368,22 @@ class UrArm(Arm):
             self._attempt(lambda: link.halt(self._config.stop_accel_m_s2))
 
     def _supervise(self) -> None:
-        try:
-            while not self._ending.wait(_KEEPER_PERIOD_S):
+        while not self._ending.wait(_KEEPER_PERIOD_S):
+            try:
                 self._supervise_once()
-        except BaseException as error:
-            self._to_faulted(
-                DeviceFault(
-                    self.name,
-                    f"supervision thread failed: {error!r}",
-                    fault_class=FaultClass.INTERNAL,
-                    needs=Remedy.POWER_CYCLE,
-                    hint="the watchdog stops the arm; disconnect and report this",
+            except DeviceError as error:
+                self._report(error)
+            except Exception as error:
+                # The thread must live on: it alone ends expired twists, drops the program and removes power.
+                self._report(
+                    DeviceFault(
+                        self.name,
+                        f"supervision failed: {error!r}",
+                        fault_class=FaultClass.INTERNAL,
+                        needs=Remedy.SERVICE,
+                        hint="the arm has been stopped; disconnect and report this",
+                    )
                 )
-            )
 
     def _supervise_once(self) -> None:
         # Read the state before the flag: a program seen stopped after the flag was raised is a fault.
@@ -378,12 +396,17 @@ class UrArm(Arm):
                 link.tick()
             except DeviceError as error:
                 trouble = self._explain(error) if self._supervised_from_seq is not None else None
-        if trouble is not None and self.state is not Lifecycle.DISCONNECTED:
-            self._to_faulted(trouble)
+        if trouble is not None:
+            self._report(trouble)
         if self.state is Lifecycle.FAULTED:
             self._drop_program()
         if self._power_off_by is not None:
             self._react_to_power_off()
+
+    def _report(self, trouble: DeviceError) -> None:
+        # What lasts is found again after a recovery: reported while it goes on, it would make the recovery fail.
+        if self.state not in (Lifecycle.DISCONNECTED, Lifecycle.FAULTED):
+            self._to_faulted(trouble)
 
     def _find_fault(self, snapshot: Snapshot, supervised_from_seq: int | None) -> DeviceError | None:
         reader = self._opened()
@@ -399,7 +422,11 @@ class UrArm(Arm):
             if fault is not None:
                 return fault
         if self.state is Lifecycle.ACTIVE and supervised_from_seq is not None and snapshot.seq >= supervised_from_seq:
-            return power_fault(self.name, snapshot.robot_mode) or program_fault(self.name, snapshot.runtime_state)
+            return (
+                power_fault(self.name, snapshot.robot_mode)
+                or program_fault(self.name, snapshot.runtime_state)
+                or self._slider_fault(snapshot)
+            )
         return None
 
     def _explain(self, error: DeviceError) -> DeviceError:
@@ -447,12 +474,13 @@ class UrArm(Arm):
             self._receive = RTDEReceiveInterface(self._config.host, RATE_HZ, list(VARIABLES))
         except RuntimeError as error:
             raise DeviceGone(self.name, f"RTDE state of {self._config.host}: {error}") from error
-        reader = StateReader(self._receive, self._clock)
+        reader = StateReader(self._receive, self._clock, self._max_joint_rad)
         deadline_ns = self._clock.now_ns() + round(_FIRST_STATE_S * 1e9)
         warm_ns = self._clock.now_ns() + round(_CLOCK_WARM_UP_S * 1e9)
         while reader.poll() is None or self._clock.now_ns() < warm_ns:
             if self._clock.now_ns() > deadline_ns:
-                raise TransportTimeout(self.name, "good state", _FIRST_STATE_S)
+                hint = f"{reader.last_corrupt}: is `chain` this arm's model?" if reader.last_corrupt else ""
+                raise TransportTimeout(self.name, "good state", _FIRST_STATE_S, hint=hint)
             self._clock.sleep_until_ns(self._clock.now_ns() + _POLL_NS // 4)
         self._reader = reader
 
@@ -487,14 +515,21 @@ class UrArm(Arm):
         fault = safety_fault(self.name, snapshot.safety_mode, snapshot.safety_bits)
         if fault is not None:
             raise fault
-        if snapshot.speed_fraction <= 0.0:
-            raise DeviceFault(
-                self.name,
-                "the speed slider is at zero",
-                fault_class=FaultClass.CONFIGURATION,
-                needs=Remedy.OPERATOR,
-                hint="move the slider on the pendant; twists are scaled by it",
-            )
+        fault = self._slider_fault(snapshot)
+        if fault is not None:
+            raise fault
+
+    def _slider_fault(self, snapshot: Snapshot) -> DeviceFault | None:
+        if snapshot.speed_fraction > 0.0:
+            return None
+        return DeviceFault(
+            self.name,
+            "the speed slider is at zero",
+            vendor_code="speed slider",
+            fault_class=FaultClass.CONFIGURATION,
+            needs=Remedy.OPERATOR,
+            hint="move the slider on the pendant; twists are scaled by it",
+        )
 
     def _require_remote_control(self) -> None:
         with dashboard(self.name, self._config.host) as client:
@@ -604,6 +639,24 @@ def _build(name: str, config: UrConfig, context: DriverContext) -> UrArm:
     return UrArm(name, config, context.clock)
 
 
+HOME_DEG: Final = (0.0, -90.0, -90.0, -90.0, 90.0, 0.0)
+"""Home of a new e-Series arm: upper arm upright, tool down (Universal Robots, user manual, "Home")."""
+
+
+def behaviour(config: UrConfig) -> ArmBehaviour:
+    """Return how the arm behaves: speedL with the configured deceleration, a watchdog in the controller."""
+    return ArmBehaviour(
+        state_rate_hz=RATE_HZ,
+        # One control period until the program reads its registers, one until the arm moves.
+        latency_s=2.0 / RATE_HZ,
+        home_deg=HOME_DEG,
+        stop_accel_m_s2=config.stop_accel_m_s2,
+        stop_rot_accel_rad_s2=config.stop_accel_m_s2,
+        max_state_age_s=config.state_timeout_s,
+        watchdog_s=1.0 / config.watchdog_hz,
+    )
+
+
 SPEC = DriverSpec(
     name="ur",
     summary="Universal Robots e-Series (PolyScope 5) over ur-rtde",
@@ -620,5 +673,6 @@ SPEC = DriverSpec(
         falls_on_power_loss=False,
     ),
     build=_build,
+    behaviour=behaviour,
     extra="ur",
 )

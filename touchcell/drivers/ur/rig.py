@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.spec import DriverContext
 from touchcell.drivers.ur.driver import SPEC, UrConfig
+from touchcell.testing.emulation.in_cell import EmulatedDriver, free_host, start_arguments, tcp_of_joints
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
@@ -71,3 +74,14 @@ def rig(folder: Path, address: int) -> DeviceFixture:
             "that registers keep their values when a program or a client ends",
         ),
     )
+
+
+def _settings(config: UrConfig, folder: Path, number: int) -> Mapping[str, Any]:
+    return {"host": free_host(30004, number)}
+
+
+def _start(config: UrConfig, start_deg: Sequence[float] | None) -> EmulatorProcess:
+    return EmulatorProcess("ur", "--host", config.host, *start_arguments(start_deg))
+
+
+EMULATED = EmulatedDriver("ur", _settings, _start, tcp_of_joints)

@@ -51,11 +51,13 @@ _BOUNDS = np.array(
         *[20.0] * 6,  # speed of the tool, m/s and rad/s
         *[2000.0] * 6,  # wrench, N and N m
         1.0,  # speed slider
-        *[2.0 * math.pi + 0.1] * 6,  # joints, rad
+        *[math.inf] * 6,  # joints: those of the model, see StateReader
         *[_MAX_JOINT_SPEED_RAD_S] * 12,  # actual and target joint speeds
         *[200.0] * 6,  # temperatures, Celsius
     ]
 )
+_JOINTS = slice(20, 26)
+_ONE_TURN_RAD = 2.0 * math.pi + 0.1
 _JUMP_SLACK_RAD = 0.02
 _ATTEMPTS = 3
 # Two quartz clocks differ by less; see _place.
@@ -107,15 +109,19 @@ class StateReader:
     Args:
         receive: ``RTDEReceiveInterface`` that streams ``VARIABLES``.
         clock: the host's clock.
+        max_joint_rad: largest plausible angles, of all joints or each (6,).
 
     Attributes:
+        last_corrupt: why the newest dropped packet was implausible, or "".
         corrupt: packets dropped because of implausible values.
         out_of_order: packets dropped because a newer one had been received.
     """
 
-    def __init__(self, receive: Any, clock: Clock) -> None:
+    def __init__(self, receive: Any, clock: Clock, max_joint_rad: Array | float = _ONE_TURN_RAD) -> None:
         self._receive = receive
         self._clock = clock
+        self._bounds = _BOUNDS.copy()
+        self._bounds[_JOINTS] = max_joint_rad
         self._lock = threading.Lock()
         self._newest: Snapshot | None = None
         self._seen_s = math.nan
@@ -123,6 +129,7 @@ class StateReader:
         self._offset_at_ns = 0
         self._misses: deque[bool] = deque(maxlen=_BUDGET_WINDOW)
         self._losses = OncePerCause(_logger)
+        self.last_corrupt = ""
         self.corrupt = 0
         self.out_of_order = 0
 
@@ -151,7 +158,7 @@ class StateReader:
                 if timestamp_s == self._seen_s:
                     break
                 if not math.isfinite(timestamp_s):
-                    self._miss_corrupt()
+                    self._miss_corrupt("time is not finite")
                     break
                 values = self._values()
                 if self._receive.getTimestamp() == timestamp_s:
@@ -181,10 +188,11 @@ class StateReader:
         tool, joints, (robot_mode, safety_mode, safety_bits, runtime_state) = values
         numbers = np.array([timestamp_s, *tool, *joints])
         # Written so that NaN fails.
-        if not (np.abs(numbers) <= _BOUNDS).all() or timestamp_s < 0.0:
-            return self._miss_corrupt()
+        plausible = np.abs(numbers) <= self._bounds
+        if not plausible.all() or timestamp_s < 0.0:
+            return self._miss_corrupt(self._implausible(numbers, plausible))
         t_device_ns = round(timestamp_s * 1e9)
-        q = numbers[20:26]
+        q = numbers[_JOINTS]
         newest = self._newest
         if newest is not None:
             passed_ns = t_device_ns - newest.t_device_ns
@@ -195,11 +203,11 @@ class StateReader:
                 return None
             reach = _MAX_JOINT_SPEED_RAD_S * passed_ns * 1e-9 + _JUMP_SLACK_RAD
             if not (np.abs(q - newest.q) <= reach).all():
-                return self._miss_corrupt()
+                return self._miss_corrupt("joints jump")
         try:
             modes = RobotMode(robot_mode), SafetyMode(safety_mode), RuntimeState(runtime_state)
         except ValueError:
-            return self._miss_corrupt()
+            return self._miss_corrupt(f"unknown mode among {robot_mode}, {safety_mode}, {runtime_state}")
         self._misses.append(False)
         self._newest = Snapshot(
             t_ns=self._place(t_device_ns),
@@ -220,7 +228,16 @@ class StateReader:
         )
         return None
 
-    def _miss_corrupt(self) -> None:
+    def _implausible(self, numbers: Array, plausible: Array) -> str:
+        outside = np.flatnonzero(np.logical_not(plausible[_JOINTS]))
+        if outside.size:
+            joint = int(outside[0])
+            angle, limit = np.rad2deg([numbers[_JOINTS][joint], self._bounds[_JOINTS][joint]])
+            return f"joint {joint + 1} is at {angle:.0f} deg, its model ends at {limit:.0f} deg"
+        return "a value is out of any range"
+
+    def _miss_corrupt(self, why: str) -> None:
+        self.last_corrupt = why
         self.corrupt += 1
         self._losses.warning("corrupt", "dropped a packet whose values cannot be true")
         self._misses.append(True)

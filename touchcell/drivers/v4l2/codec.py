@@ -11,6 +11,8 @@ import ctypes
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from touchcell.drivers.v4l2 import jpeg
+
 U8, U32, S32, U64, S64 = ctypes.c_uint8, ctypes.c_uint32, ctypes.c_int32, ctypes.c_uint64, ctypes.c_int64
 
 VIDEO_CAPTURE = 1
@@ -41,6 +43,7 @@ CTRL_INACTIVE = 0x10
 CTRL_NEXT = 0x80000000
 CTRL_NEXT_COMPOUND = 0x40000000
 
+CID_AUTO_WHITE_BALANCE = 0x0098090C
 CID_GAIN = 0x00980913
 CID_AUTOGAIN = 0x00980912
 CID_EXPOSURE_AUTO = 0x009A0901
@@ -400,37 +403,9 @@ def sequence_step(before: int, now: int) -> int:
 def damage(data: bytes, pixel_format: str, width: int, height: int) -> str:
     """Return why ``data`` is not a complete frame, or "" if it looks complete.
 
-    Raw formats can only be checked by their length. For MJPG the markers are walked up to the scan (ITU-T T.81 part B):
-    start of image, a frame header with the expected size, and an end of image at the end. Corruption inside the scan is
-    not detectable, as JPEG has no checksum.
+    Raw formats can only be checked by their length.
     """
     if pixel_format == "MJPG":
-        return _jpeg_damage(data, width, height)
+        return jpeg.damage(data, width, height)
     whole = width * height * (2 if pixel_format == "YUYV" else 1)
     return "" if len(data) == whole else f"{len(data)} bytes instead of {whole}"
-
-
-def _jpeg_damage(data: bytes, width: int, height: int) -> str:
-    if data[:2] != b"\xff\xd8":
-        return "no start of image"
-    # Cameras pad the last USB packet with zeros.
-    if data[-2:] != b"\xff\xd9" and not data.rstrip(b"\0").endswith(b"\xff\xd9"):
-        return f"truncated at {len(data)} bytes"
-    at = 2
-    size: tuple[int, int] | None = None
-    while at + 4 <= len(data):
-        if data[at] != 0xFF:
-            return f"no marker at byte {at}"
-        marker = data[at + 1]
-        if marker == 0xFF:
-            at += 1
-            continue
-        length = int.from_bytes(data[at + 2 : at + 4], "big")
-        if marker == 0xDA:
-            return "" if size == (width, height) else f"size in frame header is {size} instead of {(width, height)}"
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            size = (int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big"))
-        if length < 2:
-            return f"segment of length {length} at byte {at}"
-        at += 2 + length
-    return "no scan"

@@ -6,27 +6,44 @@ Source: the kernel's "Video for Linux API", chapters "Streaming I/O (Memory Mapp
 from __future__ import annotations
 
 import math
+import os
 import time
+from pathlib import Path
 
-from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting
+from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting, camera_behaviour
 from touchcell.drivers.core.clock import Clock
-from touchcell.drivers.core.errors import ConnectError, DeviceGone, TransportError
+from touchcell.drivers.core.device import Lifecycle
+from touchcell.drivers.core.errors import ConnectError, DeviceFault, DeviceGone, FaultClass, Remedy, TransportError
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.drivers.core.samples import Quality
 from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.v4l2 import codec
 from touchcell.drivers.v4l2.node import KernelCalls, SystemCalls, VideoNode
+from touchcell.drivers.v4l2.shim import EMULATED_CAMERAS, ShimCalls
 
 _LONGEST_PAUSE_S = 0.5
 _FEWEST_BUFFERS = 4
 _RATE_TOLERANCE = 0.01
 _FUTURE_NS = 1_000_000
 _CLOCK_TOLERANCE_NS = 1_000_000_000
+_AUTOMATICS = (
+    (codec.CID_EXPOSURE_AUTO, "automatic exposure", codec.EXPOSURE_MANUAL),
+    (codec.CID_EXPOSURE_AUTO_PRIORITY, "dynamic frame rate", 0),
+    (codec.CID_AUTOGAIN, "automatic gain", 0),
+    (codec.CID_AUTO_WHITE_BALANCE, "automatic white balance", 0),
+)
 _BYTES_PER_PIXEL = {"YUYV": 2, "GREY": 1}
 
 
 class V4l2Config(CameraConfig):
-    """Settings of a V4L2 camera; see ``CameraConfig``."""
+    """Settings of a V4L2 camera; see ``CameraConfig``.
+
+    Attributes:
+        expect_bus: USB address that the camera must have, as ``touchcell devices`` shows it; None accepts any. For
+            cameras with equal names and serial numbers, which the system may exchange.
+    """
+
+    expect_bus: str | None = None
 
 
 class V4l2Camera(Camera):
@@ -42,11 +59,14 @@ class V4l2Camera(Camera):
         calls: system calls; the kernel's by default.
     """
 
+    _config: V4l2Config
+
     def __init__(self, name: str, clock: Clock, config: V4l2Config, calls: SystemCalls | None = None) -> None:
         super().__init__(name, clock, config)
         self._calls = calls or KernelCalls()
         self._node: VideoNode | None = None
-        self._identity = ("", "")
+        self._identity: tuple[str, str, str] | None = None
+        self._fixed: dict[int, tuple[str, int]] = {}
         self._buffers = 0
         self._overrun = False
         self._previous: codec.Arrival | None = None
@@ -62,8 +82,22 @@ class V4l2Camera(Camera):
                 "the kernel stamps frames on CLOCK_MONOTONIC, but the cell's clock is another",
                 hint="use a simulated or replayed camera with a virtual clock",
             )
-        self._node = VideoNode(self.name, self._config.device, self._calls)
-        self._identity = (self._node.card, self._node.bus)
+        node = self._node = VideoNode(self.name, self._config.device, self._calls)
+        expected = self._config.expect_bus
+        if expected is not None and node.bus != expected:
+            raise ConnectError(
+                self.name,
+                f"{self._config.device} is the camera at {node.bus}, not at {expected}",
+                hint="has it moved to another socket, or were two cameras exchanged?",
+            )
+        found = (node.card, node.bus, node.serial)
+        if self.state is Lifecycle.FAULTED and self._identity is not None and found != self._identity:
+            raise ConnectError(
+                self.name,
+                f"another camera answers: {_described(found)}, it was {_described(self._identity)}",
+                hint="plug the same camera into the same socket; disconnect and connect if this one is right",
+            )
+        self._identity = found
 
     def _close(self) -> None:
         if self._node is not None:
@@ -85,6 +119,7 @@ class V4l2Camera(Camera):
             self._overrun = False
             self._queue_empty_ns = self._clock.now_ns()
             self._begin_stream()
+            self._check_settings(node)
         except BaseException:
             node.stop()
             raise
@@ -105,21 +140,23 @@ class V4l2Camera(Camera):
                 self.name, "pixel_format", config.pixel_format, f"lines of {applied.bytes_per_line} bytes"
             )
         rate_hz = node.set_rate(config.rate_hz)
-        if not math.isclose(rate_hz, config.rate_hz, rel_tol=_RATE_TOLERANCE):
+        # A camera of one fixed rate has no such setting: whether it delivers this rate is measured.
+        if rate_hz is not None and not math.isclose(rate_hz, config.rate_hz, rel_tol=_RATE_TOLERANCE):
             raise UnsupportedSetting(self.name, "rate_hz", config.rate_hz, rate_hz)
 
     def _set_controls(self, node: VideoNode) -> None:
-        for identity, setting, value in (
-            (codec.CID_EXPOSURE_AUTO, "automatic exposure", codec.EXPOSURE_MANUAL),
-            (codec.CID_AUTOGAIN, "automatic gain", 0),
-        ):
+        self._fixed = {}
+        for identity, setting, value in _AUTOMATICS:
             if node.has_control(identity):
                 self._expect(setting, value, node.set_control(identity, value))
+                self._fixed[identity] = setting, value
         config = self._config
         unit = codec.EXPOSURE_UNIT_US
         steps = None if config.exposure_us is None else config.exposure_us // unit
         steps = self._set_value(node, codec.CID_EXPOSURE_ABSOLUTE, "exposure_us", steps, unit)
         self._exposure_us = None if steps is None else steps * unit
+        if self._exposure_us is not None and self._exposure_us * config.rate_hz > 1e6:
+            raise UnsupportedSetting(self.name, "exposure_us", f"at most {1e6 / config.rate_hz:.0f}", self._exposure_us)
         self._gain = self._set_value(node, codec.CID_GAIN, "gain", config.gain, 1)
 
     def _set_value(self, node: VideoNode, identity: int, setting: str, value: int | None, unit: int) -> int | None:
@@ -127,11 +164,24 @@ class V4l2Camera(Camera):
             if value is not None:
                 raise UnsupportedSetting(self.name, setting, value * unit, None)
             return None
-        if value is None:
-            return node.control(identity)
-        given = node.set_control(identity, value)
-        self._expect(setting, value * unit, given * unit)
+        given = node.control(identity) if value is None else node.set_control(identity, value)
+        if value is not None:
+            self._expect(setting, value * unit, given * unit)
+        self._fixed[identity] = setting, given
         return given
+
+    def _check_settings(self, node: VideoNode) -> None:
+        """Read every control back while the stream runs: some cameras reset them when it starts, or later."""
+        for identity, (setting, value) in self._fixed.items():
+            if (found := node.control(identity)) != value:
+                raise DeviceFault(
+                    self.name,
+                    f"{setting} has changed from {value} to {found} by itself",
+                    vendor_code=setting,
+                    fault_class=FaultClass.CONFIGURATION,
+                    needs=Remedy.OPERATOR,
+                    hint="does another program use the camera? a camera that forgets its settings cannot be used",
+                )
 
     def _expect(self, setting: str, requested: int, given: int) -> None:
         if requested != given:
@@ -164,6 +214,7 @@ class V4l2Camera(Camera):
     def _examine(self, arrival: codec.Arrival, data: bytes) -> None:
         previous = self._previous
         step = 1 if previous is None else codec.sequence_step(previous.sequence, arrival.sequence)
+        was_overrun = self._overrun
         if step <= 0 or (previous is not None and arrival.stamp_ns <= previous.stamp_ns):
             self._monitor.count_bad("out_of_order")
             return
@@ -174,6 +225,8 @@ class V4l2Camera(Camera):
         self._number += step
         self._monitor.count_lost(step - 1, overrun=self._overrun)
         self._overrun = False
+        if previous is not None and not was_overrun:
+            self._rate.note((arrival.stamp_ns - previous.stamp_ns) * 1e-9, step)
         if arrival.damaged:
             self._monitor.count_bad("marked_damaged")
         elif codec.damage(data, self._config.pixel_format, self._config.width_px, self._config.height_px):
@@ -198,9 +251,11 @@ class V4l2Camera(Camera):
         )
 
     def _settings(self) -> dict[str, float | int | str | bool]:
+        card, bus, serial = self._identity or ("", "", "")
         readings: dict[str, float | int | str | bool] = {
-            "card": self._identity[0],
-            "bus": self._identity[1],
+            "card": card,
+            "bus": bus,
+            "serial": serial,
             "buffers": self._buffers,
             "stable_name": is_stable_name(self._config.device),
         }
@@ -215,9 +270,17 @@ class V4l2Camera(Camera):
             readings["warning"] = f"{self._config.device} may be another camera after a restart, use /dev/v4l/by-id"
         return readings
 
+    def _verify(self) -> None:
+        self._check_settings(self._opened())
+
     def _opened(self) -> VideoNode:
         assert self._node is not None, "the lifecycle prevents reading a closed camera"
         return self._node
+
+
+def _described(identity: tuple[str, str, str]) -> str:
+    card, bus, serial = identity
+    return f"{card} at {bus}" + (f", serial number {serial}" if serial else "")
 
 
 def is_stable_name(path: str) -> bool:
@@ -226,8 +289,9 @@ def is_stable_name(path: str) -> bool:
 
 
 def build(name: str, config: V4l2Config, context: DriverContext) -> V4l2Camera:
-    """Build a DISCONNECTED camera."""
-    return V4l2Camera(name, context.clock, config)
+    """Build a DISCONNECTED camera; an emulated one where the variable of emulated cameras names their folder."""
+    folder = os.environ.get(EMULATED_CAMERAS)
+    return V4l2Camera(name, context.clock, config, ShimCalls(Path(folder)) if folder else None)
 
 
 SPEC = DriverSpec(
@@ -236,4 +300,5 @@ SPEC = DriverSpec(
     config=V4l2Config,
     capabilities=Capabilities(kind="camera", provides=frozenset({FrameSource, HealthSource}), state_rate_hz=30.0),
     build=build,
+    behaviour=camera_behaviour,
 )

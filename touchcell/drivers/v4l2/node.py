@@ -105,6 +105,7 @@ class VideoNode:
             ) from None
         try:
             self._capability = self._query_capability(path)
+            self._serial = _usb_serial(path)
         except BaseException:
             calls.close(self._fd)
             raise
@@ -118,6 +119,11 @@ class VideoNode:
     def bus(self) -> str:
         """Bus address reported by the kernel driver."""
         return bytes(self._capability.bus_info).decode("utf-8", "replace")
+
+    @property
+    def serial(self) -> str:
+        """USB serial number, or "" if the device has none."""
+        return self._serial
 
     def pixel_formats(self) -> list[str]:
         """Return the four-character names of supported formats. Raises TransportError, DeviceGone."""
@@ -141,12 +147,23 @@ class VideoNode:
         pix = request.pix
         return AppliedFormat(codec.fourcc_text(pix.pixelformat), pix.width, pix.height, pix.bytesperline)
 
-    def set_rate(self, rate_hz: float) -> float:
-        """Request a frame rate and return the one that the device chose, Hz. Raises TransportError, DeviceGone."""
+    def set_rate(self, rate_hz: float) -> float | None:
+        """Request a frame rate and return the one that the device chose, Hz; None if it has no such setting.
+
+        Raises:
+            TransportError, DeviceGone: the device failed.
+        """
         request = codec.StreamParameters(type=codec.VIDEO_CAPTURE)
         request.timeperframe = codec.Fraction(1000, round(rate_hz * 1000))
-        self._ask(codec.S_PARM, request, "set the frame rate")
+        try:
+            self._calls.ioctl(self._fd, codec.S_PARM, request)
+        except OSError as error:
+            if error.errno in (errno.ENOTTY, errno.EINVAL):
+                return None
+            raise self._error(error, "set the frame rate") from None
         period = request.timeperframe
+        if not request.capability & codec.CAP_TIMEPERFRAME:
+            return None
         return period.denominator / period.numerator if period.numerator else 0.0
 
     def has_control(self, identity: int) -> bool:
@@ -273,7 +290,26 @@ class VideoNode:
             )
         if error.errno == errno.EBUSY:
             return ConnectError(self._device, f"cannot {what}: busy", [error], hint="close the program that uses it")
+        if error.errno == errno.ENOSPC:
+            return ConnectError(
+                self._device,
+                f"cannot {what}: the USB bus has no bandwidth left for it",
+                [error],
+                hint="plug the cameras into different USB controllers (`lsusb -t`), or use MJPG, a smaller picture or "
+                "a lower rate",
+            )
+        if error.errno == errno.ENOMEM:
+            return ConnectError(self._device, f"cannot {what}: the kernel has no memory for it", [error])
         return TransportError(self._device, f"cannot {what}: {error.strerror}")
+
+
+def _usb_serial(path: str) -> str:
+    name = os.path.basename(os.path.realpath(path))
+    try:
+        with open(f"/sys/class/video4linux/{name}/device/../serial", encoding="utf-8", errors="replace") as file:
+            return file.read().strip()
+    except OSError:
+        return ""
 
 
 def _open_hint(error: OSError, path: str) -> str:

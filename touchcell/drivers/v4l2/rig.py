@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from touchcell.drivers.core.camera import CameraConfig
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.v4l2.driver import SPEC, V4l2Camera, V4l2Config
 from touchcell.drivers.v4l2.shim import ShimCalls
+from touchcell.testing.emulation.in_cell import EmulatedDriver
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
 _RATE_HZ = 60.0
+_PATIENCE_S = 2.0
 
 
 def rig(folder: Path, address: int) -> DeviceFixture:
@@ -48,3 +53,12 @@ def rig(folder: Path, address: int) -> DeviceFixture:
             "stamps of the emulated camera have no transport delay; a USB camera delivers about one frame time later",
         ),
     )
+
+
+def _settings(config: CameraConfig, folder: Path, number: int) -> Mapping[str, Any]:
+    # Emulators share this machine's cores with the cell: a pause is no failure of theirs.
+    stall_s = max(config.stall_s, _PATIENCE_S)
+    return {"device": f"/dev/v4l/by-id/usb-TacTip_{number:04d}-video-index0", "stall_s": stall_s}
+
+
+EMULATED = EmulatedDriver("v4l2", _settings)

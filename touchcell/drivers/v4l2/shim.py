@@ -10,9 +10,13 @@ import shutil
 import subprocess
 import tempfile
 from pathlib import Path
+from typing import Final
 
 from touchcell.drivers.core.errors import ConnectError
 from touchcell.drivers.v4l2.node import KernelCalls
+
+EMULATED_CAMERAS: Final = "TOUCHCELL_V4L2"
+"""Variable that names the folder of emulated cameras."""
 
 _SOURCE = Path(__file__).with_name("shim.c")
 
@@ -48,7 +52,7 @@ def library() -> Path:
 
 def environment(folder: Path) -> dict[str, str]:
     """Return the variables that make the cameras of ``folder`` visible to any program. Raises ConnectError."""
-    return {"LD_PRELOAD": str(library()), "TOUCHCELL_V4L2": str(folder)}
+    return {"LD_PRELOAD": str(library()), EMULATED_CAMERAS: str(folder)}
 
 
 class ShimCalls(KernelCalls):

@@ -1,114 +1,136 @@
 """Few-shot adaptation of a marker estimator to another sensor of its kind. Needs the extra ``train``.
 
-Two such sensors differ mostly in the pose of the camera and in the orientation of the label axes: six numbers that are
-estimated first, so that the old networks see markers and labels as in their training. The rest - mounts, stiffness,
-skin - is left to a short training regularised towards the old weights.
+Two such sensors differ in camera, mount, skin and in the convention of their labels: rotation, mirror, sign of the
+shear. The camera is estimated from the markers alone. Then outputs are mapped rather than weights changed: Gaussian
+processes take the old networks' outputs to the new labels (``markers.transfer``). Contacts that were left out judge
+them beside three rivals: the mean of the labels, an affine map of the old outputs, and networks trained from scratch on
+the new contacts alone. The better of the processes and the new networks is written, unless one of the simple rivals
+beats both.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
-from torch.nn import functional
 
 from touchcell.drivers.replay.dataset import read_image, read_split
 from touchcell.geometry.types import Array
-from touchcell.perception.calibration.least_squares import robust_fit
 from touchcell.perception.calibration.marked_data import evenly
-from touchcell.perception.calibration.zero_frame import lattice_turns, similarity
+from touchcell.perception.calibration.transfer_fit import (
+    Convention,
+    OldSensor,
+    Transfer,
+    find_convention,
+    fit_transfer,
+    old_sensor,
+    with_sigma,
+)
+from touchcell.perception.calibration.zero_frame import similarity
 from touchcell.perception.errors import ModelError, TrainingError
 from touchcell.perception.markers.detection import Discs, detect_markers, typical_size
-from touchcell.perception.markers.estimator import displacement_model_of, matcher_of, mixed
+from touchcell.perception.markers.estimator import displacement_model_of, matcher_of
+from touchcell.perception.markers.layers import layers_of, mixed
 from touchcell.perception.markers.matching import DisplacementModel, MarkerMatcher
 from touchcell.perception.models.camera_change import CameraChange
-from touchcell.perception.models.labels import xi_from_contact
-from touchcell.perception.models.marker_architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture, MarkerSize
+from touchcell.perception.models.labels import CONTACT_NAMES, contact_from_xi, shear_direction, xi_from_contact
+from touchcell.perception.models.marker_architecture import MarkerArchitecture, MarkerSize
 from touchcell.perception.models.model_file import Header, Labels, Model, load_model, save_model, touchcell_version
 from touchcell.perception.models.preprocessing import Preprocessing
-from touchcell.perception.networks.displacement_network import Jitter, features_of
+from touchcell.perception.networks.contact_network import Alignment
+from touchcell.perception.networks.displacement_network import DisplacementNetwork, Jitter, displacement_loss
 from touchcell.perception.networks.marker_learning import fit_lattice
 from touchcell.perception.networks.marker_training import LabelledDiscs, preprocessing_for
+from touchcell.perception.networks.sigma_scaling import calibrate
 
-_FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
-_REFINED_WITH = 60
-_TYPICAL_ERROR = 0.05
-_SHALLOW = 5
-_TRIED = 30
+_SHALLOW = 10
 _FEWEST = 10
 _MATCHED = 0.5
+_MOST_PROCESS_CONTACTS = 400
+_FOLDS, _FEW = 4, 120
+_RIDGE = 0.01
+_SECTORS = 8
+
+Method = Literal["transfer", "scratch"]
 
 
 @dataclass(frozen=True)
 class AdaptSettings:
-    """Settings of the adaptation of the networks.
+    """Settings of the training from scratch that the transfer is compared with.
 
     Attributes:
-        steps: of the training.
+        steps: of the training on sixty images or more; a quarter of them on fewer.
+        most_steps: upper bound of the steps, which grow with the number of images.
         batch_size: contacts per step and network.
         learning_rate: at its peak; it falls as a half cosine.
-        hold: strength of the regularisation towards the old weights: the loss of one weight that is off by its layer's
-            typical magnitude, times the number of weights.
-        dropout: after each hidden layer.
+        weight_decay: of AdamW.
+        noise: standard deviation added to scaled inputs.
         shift_px, turn_rad, zoom: standard deviations of the jitter.
         seed: of everything random.
     """
 
-    steps: int = 150
-    batch_size: int = 32
+    steps: int = 1200
+    most_steps: int = 6000
+    batch_size: int = 64
     learning_rate: float = 1e-3
-    hold: float = 0.3
-    dropout: float = 0.1
-    shift_px: float = 0.3
-    turn_rad: float = 0.001
-    zoom: float = 0.0006
+    weight_decay: float = 0.01
+    noise: float = 0.02
+    shift_px: float = 0.5
+    turn_rad: float = 0.0022
+    zoom: float = 0.00125
     seed: int = 0
 
 
 @dataclass(frozen=True)
-class CameraAlignment:
-    """Mapping of a new sensor's images and labels to those of the old.
+class Adapted:
+    """Result of an adaptation.
 
     Attributes:
-        camera: from its pixels to the old sensor's.
-        turn_rad: rotation of its label axes about the sensor's axis, to the old sensor's.
-        gain: of its displacements.
-        offset: (6,) of the old networks' outputs, in label half-ranges.
-        displacements: (n, 2 m) px, as the old sensor would have seen them.
-        matched: (n,) contacts whose markers could be matched.
+        model: for the new sensor.
+        method: of the better candidate, which the model holds.
+        left_out_mae: (6,) errors of each candidate on contacts that it was not fitted to, mm and degrees, named as
+            ``CONTACT_NAMES``.
+        convention: of the new labels.
+        images, matched: number of images, and of those with reliable markers.
+        missing: one sentence for each region of contacts without images.
+        no_better: components that are estimated no better than by their mean.
     """
 
-    camera: CameraChange
-    turn_rad: float
-    gain: float
-    offset: Array
-    displacements: NDArray[np.float32]
-    matched: NDArray[np.bool_]
+    model: Model
+    method: Method
+    left_out_mae: dict[str, Array]
+    convention: Convention
+    images: int
+    matched: int
+    missing: tuple[str, ...]
+    no_better: tuple[str, ...]
 
 
 def adapt(
     model: Path, data: Path, out: Path, *, frames: int | None = None, settings: AdaptSettings | None = None
-) -> Model:
+) -> Adapted:
     """Write ``out``, a model for the sensor that took ``data/train``.
 
     Args:
         model: model file of kind markers.
         data: data set; ``train`` is used.
         out: ``NAME.safetensors``.
-        frames: number of images, evenly chosen; None for all.
+        frames: number of images, chosen evenly over the depths; None for all.
         settings: None for the defaults.
 
     Raises:
         ModelError: the model is of another kind, or was adapted already.
         DataError: the data set is damaged.
-        TrainingError: fewer than ten images can be matched to the old sensor's markers.
+        TrainingError: fewer than ten images can be matched to the old sensor's markers, or no candidate is better than
+            the mean of the labels and an affine map; nothing is written.
     """
-
     old = load_model(model)
     if not isinstance(old.header.architecture, MarkerArchitecture):
         raise ModelError(
@@ -120,7 +142,8 @@ def adapt(
     if old.header.camera is not None:
         raise ModelError(model, "was adapted already", key="camera", hint="adapt the original model")
     split = read_split(data, "train")
-    chosen = evenly(len(split.images), len(split.images) if frames is None else frames)
+    by_depth = np.argsort(split.contact_mm_deg[:, 2], kind="stable")
+    chosen = by_depth[evenly(len(by_depth), len(by_depth) if frames is None else frames)]
     images = [read_image(split.images[i]) for i in chosen]
     preprocessing = preprocessing_for(images[0])
     size = typical_size(preprocessing.reduce(images[0]))
@@ -129,7 +152,7 @@ def adapt(
         xi_from_contact(split.contact_mm_deg[chosen]),
     )
     adapted = adapt_to(old, dataset, preprocessing=preprocessing, size=size, settings=settings)
-    save_model(adapted, out)
+    save_model(adapted.model, out)
     return adapted
 
 
@@ -140,163 +163,107 @@ def adapt_to(
     preprocessing: Preprocessing,
     size: MarkerSize,
     settings: AdaptSettings | None = None,
-) -> Model:
+) -> Adapted:
     """Return the model for another sensor, from discs in memory. Arguments as of the model; raises as ``adapt``."""
     settings = settings or AdaptSettings()
+    camera, displacements, matched = align_camera(old, dataset)
+    if matched.sum() < _FEWEST:
+        raise TrainingError(f"{int(matched.sum())} images could be matched, {_FEWEST} are needed", hint="give more")
+    contacts = contact_from_xi(dataset.xi[matched])
+    candidates = _Candidates(old, displacements[matched], contacts, settings)
+    method, left_out = candidates.judged()
+    update = {"input_size": preprocessing.output_size, "size": size}
     architecture = old.header.architecture
     assert isinstance(architecture, MarkerArchitecture)
-    alignment = align_to_sensor(old, dataset)
-    xi, displacements = dataset.xi[alignment.matched], alignment.displacements[alignment.matched]
-    layers, labels = _aligned(layers_of(old), alignment), old.header.labels
-    target = labels.targets(about_z(alignment.turn_rad, xi))
-    # Held-out contacts decide the step away from the old weights and the scale of the sigmas.
-    even = np.arange(len(xi)) % 2 == 0
-    halves = [tune(old, layers, displacements[half], target[half], settings) for half in (even, ~even)]
-    errors, standardised = [], []
-    for fraction in _FRACTIONS:
-        off, by_sigma = [], []
-        for half, trained in zip((~even, even), halves, strict=True):
-            mean, sigma = outputs_of(_interpolated(layers, trained, fraction), displacements[half], labels)
-            off.append(np.abs(target[half] - mean))
-            by_sigma.append(labels.aligned(target[half] - mean, mean) / sigma ** np.array(old.header.sigma_power))
-        errors.append(float(np.concatenate(off).mean()))
-        standardised.append(np.concatenate(by_sigma))
-    best = int(np.argmin(errors))
-    scale = np.sqrt(np.mean(standardised[best] ** 2, axis=0))
-    tuned = (
-        _interpolated(layers, tune(old, layers, displacements, target, settings), _FRACTIONS[best]) if best else layers
-    )
-    tensors = dict(old.tensors)
-    for i, (weight, bias) in enumerate(tuned):
-        tensors[f"layer{i}.weight"] = np.ascontiguousarray(weight, dtype=np.float32)
-        tensors[f"layer{i}.bias"] = np.ascontiguousarray(bias, dtype=np.float32)
-    header = old.header
-    return Model(
+    labels, tensors = candidates.labels, dict(old.tensors)
+    sigma_scale, sigma_power, transfer = (1.0,) * 6, (1.0,) * 6, None
+    if method == "transfer":
+        fitted = candidates.transfer()
+        transfer = fitted.spec
+        tensors |= {name: np.ascontiguousarray(each, dtype=np.float32) for name, each in fitted.tensors.items()}
+    else:
+        trained, scale, power = candidates.scratch()
+        tensors |= trained
+        sigma_scale, sigma_power = tuple(scale.tolist()), tuple(power.tolist())
+    model = Model(
         Header(
             touchcell_version=touchcell_version(),
-            architecture=architecture.model_copy(update={"input_size": preprocessing.output_size, "size": size}),
+            architecture=architecture.model_copy(update=update),
             preprocessing=preprocessing,
             labels=labels,
-            sigma_scale=tuple(scale.tolist()),
-            sigma_power=header.sigma_power,
-            camera=alignment.camera,
-            label_turn_deg=math.degrees(alignment.turn_rad),
-            training_data=header.training_data,
+            sigma_scale=sigma_scale,
+            sigma_power=sigma_power,
+            camera=camera,
+            transfer=transfer,
+            network_labels=None if transfer is None else old.header.labels,
+            training_data=old.header.training_data,
             training={
-                **header.training,
+                **old.header.training,
                 "adapted_images": len(dataset.frames),
-                "adapted_images_matched": int(alignment.matched.sum()),
-                "adapted_fraction": _FRACTIONS[best],
+                "adapted_images_matched": int(matched.sum()),
+                "adapted_by": method,
+                **{f"left_out_mae_{name}": each.tolist() for name, each in left_out.items()},
                 **{f"adapted_{key}": value for key, value in asdict(settings).items()},
             },
         ),
         tensors,
     )
+    mean = left_out["mean"]
+    return Adapted(
+        model=model,
+        method=method,
+        left_out_mae=left_out,
+        convention=find_convention(candidates.outputs, contacts),
+        images=len(dataset.frames),
+        matched=int(matched.sum()),
+        missing=missing_contacts(contacts),
+        no_better=tuple(
+            name for name, error, limit in zip(CONTACT_NAMES, left_out[method], mean, strict=True) if error >= limit
+        ),
+    )
 
 
-def align_to_sensor(old: Model, dataset: LabelledDiscs) -> CameraAlignment:
-    """Estimate the camera and the label axes.
+def align_camera(old: Model, dataset: LabelledDiscs) -> tuple[CameraChange, NDArray[np.float32], NDArray[np.bool_]]:
+    """Estimate the camera from the markers alone, and match all images as the old camera would have seen them.
 
-    A lattice is symmetric under rotation by 60 degrees: of the six possible cameras the right one, together with its
-    rotation of the label axes, is that with which the old networks err least.
+    Which of the lattice's six directions is the first makes no difference: the networks are evaluated for all.
+
+    Returns:
+        The camera, displacements (n, 2 m) px and reliable matches (n,).
+
+    Raises:
+        TrainingError: no lattice is found, or the markers of half of the images cannot be matched.
     """
     architecture = old.header.architecture
     assert isinstance(architecture, MarkerArchitecture)
     matcher = matcher_of(old, architecture)
     old_lattice = matcher.model.reference
-    # |log| stands in for the depth: the least deformed are the shallowest.
-    depth = np.abs(dataset.xi[:, 2])
+    depth = contact_from_xi(dataset.xi)[:, 2]
     fits = [fit_lattice(dataset.frames[i], architecture.rings) for i in np.argsort(depth)[:_SHALLOW]]
-    new_lattice, rms = min(fits, key=lambda each: each[1])
+    lattice, rms = min(fits, key=lambda each: each[1])
     if not np.isfinite(rms):
         raise TrainingError(
             f"no lattice of {architecture.rings} rings found in the shallowest images",
             hint="only a sensor of the same kind can be adapted to; give an image of hardly any contact",
         )
-    layers = layers_of(old)
-    some = np.linspace(0, len(dataset.frames) - 1, min(_TRIED, len(dataset.frames))).round().astype(int)
-    best: tuple[float, CameraChange, float] | None = None
-    for order in lattice_turns(architecture.rings):
-        linear, off = similarity(new_lattice[order], old_lattice)
-        centre = new_lattice.mean(axis=0)
-        du, dv = old_lattice.mean(axis=0) - centre
-        camera = CameraChange(
-            zoom=abs(linear),
-            turn_deg=float(np.degrees(np.angle(linear))),
-            centre_px=(float(centre[0]), float(centre[1])),
-            shift_px=(float(du), float(dv)),
-            frames=1,
-            rms_px=off,
-        )
-        displacements, matched = _seen_by(camera, matcher, [dataset.frames[i] for i in some])
-        if matched.mean() < _MATCHED or matched.sum() < min(_FEWEST, len(some)):
-            continue
-        mean, _ = outputs_of(layers, displacements[matched], old.header.labels)
-        predicted = xi_from_contact(old.header.labels.contacts(mean))
-        turn, error = _label_turn(dataset.xi[some][matched], predicted)
-        if best is None or error < best[0]:
-            best = (error, camera, turn)
-    if best is None:
+    linear, off = similarity(lattice, old_lattice)
+    centre = lattice.mean(axis=0)
+    du, dv = old_lattice.mean(axis=0) - centre
+    camera = CameraChange(
+        zoom=abs(linear),
+        turn_deg=float(np.degrees(np.angle(linear))),
+        centre_px=(float(centre[0]), float(centre[1])),
+        shift_px=(float(du), float(dv)),
+        frames=1,
+        rms_px=off,
+    )
+    displacements, matched = _seen_by(camera, matcher, dataset.frames)
+    if matched.mean() < _MATCHED:
         raise TrainingError(
-            "the markers of too few images can be matched to the old sensor's",
+            f"the markers of {int(matched.sum())} of {len(matched)} images can be matched to the old sensor's",
             hint="only a sensor of the same kind can be adapted to; check threshold and crop",
         )
-    _, camera, turn = best
-    displacements, matched = _seen_by(camera, matcher, dataset.frames)
-    if matched.sum() < _FEWEST:
-        raise TrainingError(f"{int(matched.sum())} images could be matched, {_FEWEST} are needed", hint="give more")
-    refined = _refined(old, layers, old_lattice, displacements[matched], dataset.xi[matched], turn)
-    camera, turn = _composed(camera, refined), turn + float(refined[4])
-    displacements, matched = _seen_by(camera, matcher, dataset.frames)
-    return CameraAlignment(camera, turn, float(refined[5]), refined[6:], displacements, matched)
-
-
-def _refined(
-    old: Model, layers: Layers, old_lattice: Array, displacements: NDArray[np.float32], xi: Array, turn: float
-) -> Array:
-    """Return the (12,) parameters with which the old networks err least.
-
-    They are log zoom, rotation and shift (2) px of the camera, rotation of the label axes, gain of the displacements,
-    and offset (6) of the outputs in label half-ranges. One light contact determines the camera to 0.3 % only, which
-    would bias depth.
-    """
-    some = np.linspace(0, len(xi) - 1, min(_REFINED_WITH, len(xi))).round().astype(int)
-    centre = old_lattice.mean(axis=0)
-    labels = old.header.labels
-    moved = displacements[some].astype(np.float64).reshape(len(some), -1, 2)
-
-    def residuals(x: Array) -> Array:
-        linear = np.exp(x[0]) * np.array([[np.cos(x[1]), -np.sin(x[1])], [np.sin(x[1]), np.cos(x[1])]])
-        seen = (old_lattice + moved - centre) @ linear.T + centre + x[2:4] - old_lattice
-        mean, _ = outputs_of(layers, (x[5] * seen).reshape(len(some), -1).astype(np.float32), labels)
-        aim = labels.targets(about_z(turn + x[4], xi[some]))
-        flat: Array = (mean + x[6:] - aim).ravel() / _TYPICAL_ERROR
-        return flat
-
-    start = np.concatenate([np.zeros(5), [1.0], np.zeros(6)])
-    scale = np.array([0.003, 0.005, 1.0, 1.0, 0.05, 0.05, *[0.05] * 6])
-    return robust_fit(
-        residuals, start, scale, low=start - 20 * scale, high=start + 20 * scale, prior=3.0, soft=1.0, turns=6
-    )
-
-
-def _composed(camera: CameraChange, refined: Array) -> CameraChange:
-    return camera.model_copy(
-        update={
-            "zoom": camera.zoom * float(np.exp(refined[0])),
-            "turn_deg": camera.turn_deg + float(np.degrees(refined[1])),
-            "shift_px": (camera.shift_px[0] + float(refined[2]), camera.shift_px[1] + float(refined[3])),
-        }
-    )
-
-
-def about_z(turn_rad: float, xi: Array) -> Array:
-    """Return labels (n, 6) with axes rotated about the sensor's z axis."""
-    turned = xi.copy()
-    for first in (0, 3):
-        plane = _plane(xi, first) * np.exp(1j * turn_rad)
-        turned[:, first], turned[:, first + 1] = plane.real, plane.imag
-    return turned
+    return camera, displacements, matched
 
 
 def _seen_by(
@@ -307,132 +274,165 @@ def _seen_by(
     return displacements, np.array([each.valid for each in fields])
 
 
-def _label_turn(xi: Array, predicted: Array) -> tuple[float, float]:
-    """Return the angle about z that maps labels xi (n, 6) to predictions, and the mean residual, mm or degrees."""
-    a, b = (np.concatenate([_plane(each, 0) / 1e-3, _plane(each, 3) / np.radians(1.0)]) for each in (xi, predicted))
-    turn = float(np.angle(np.vdot(a, b)))
-    return turn, float(np.abs(a * np.exp(1j * turn) - b).mean())
+def missing_contacts(contacts: Array) -> tuple[str, ...]:
+    """Describe the regions without contacts, of contacts (n, 6), mm and degrees: depths, directions of shear and tilt.
 
-
-def _plane(xi: Array, first: int) -> NDArray[np.complex128]:
-    return (xi[:, first] + 1j * xi[:, first + 1]).astype(np.complex128)
-
-
-Layers = list[tuple[Array, Array]]
-"""Weights (networks, before, units) and biases (networks, 1, units) of a model's networks, in order."""
-
-
-def layers_of(model: Model) -> Layers:
-    """Return the weights and biases of a marker model's networks."""
-    architecture = model.header.architecture
-    assert isinstance(architecture, MarkerArchitecture)
-    return [
-        (model.tensors[f"layer{i}.weight"].astype(np.float64), model.tensors[f"layer{i}.bias"].astype(np.float64))
-        for i in range(len(architecture.hidden) + 1)
-    ]
-
-
-def _aligned(layers: Layers, alignment: CameraAlignment) -> Layers:
-    first, last = layers[0], layers[-1]
-    shifted = (last[0], last[1] + np.concatenate([alignment.offset, np.zeros(6)]))
-    return [(alignment.gain * first[0], first[1]), *layers[1:-1], shifted]
-
-
-def _interpolated(one: Layers, other: Layers, fraction: float) -> Layers:
-    """Return weights interpolated by ``fraction`` from one to the other."""
-    return [
-        (weight + fraction * (to - weight), bias + fraction * (shift - bias))
-        for (weight, bias), (to, shift) in zip(one, other, strict=True)
-    ]
-
-
-def outputs_of(layers: Layers, displacements: NDArray[np.float32], labels: Labels) -> tuple[Array, Array]:
-    """Return means (n, 6) in label half-ranges and uncalibrated sigmas of the mixture, of displacements (n, 2 m) px."""
-    x: Array = np.broadcast_to(displacements.astype(np.float64), (len(layers[0][0]), *displacements.shape))
-    for i, (weight, bias) in enumerate(layers):
-        x = x @ weight + bias
-        if i + 1 < len(layers):
-            x = x / (1.0 + np.exp(-np.maximum(x, -80.0)))
-    return mixed(x[..., :6], np.clip(x[..., 6:], *LOG_PRECISION_BOUNDS), labels)
-
-
-def tune(
-    old: Model, layers: Layers, displacements: NDArray[np.float32], target: Array, settings: AdaptSettings
-) -> Layers:
-    """Fine-tune layers to labelled displacements, regularised towards the given ones.
-
-    Args:
-        old: its displacement model scales the inputs.
-        layers: initial layers.
-        displacements: (n, 2 m) px.
-        target: (n, 6) in label half-ranges.
-        settings: of the training.
-
-    Raises:
-        TrainingError: the loss is not finite.
+    A gap counts where so many uniformly drawn contacts would rarely leave one.
     """
-    model = displacement_model_of(old)
-    features = features_of(model)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(settings.seed)
-        tuner = _Tuner(layers, features, model, settings)
-        tuner.fit(torch.from_numpy(displacements), torch.from_numpy(target.astype(np.float32)))
-    return tuner.layers()
+    n, found = len(contacts), []
+    for column, name, unit in ((2, "depths", "mm"), (5, "torsions", "deg")):
+        values = np.sort(contacts[:, column])
+        usual = np.ptp(values) * min(0.5, (np.log(n) + 3.0) / n)
+        found += [
+            f"{name} between {low:.1f} and {high:.1f} {unit}" for low, high in pairwise(values) if high - low > usual
+        ]
+    for first, name in ((0, "shear"), (3, "tilt")):
+        angle = np.degrees(np.arctan2(contacts[:, first + 1], contacts[:, first])) % 360.0
+        empty = np.flatnonzero(np.bincount((angle * _SECTORS / 360.0).astype(int) % _SECTORS, minlength=_SECTORS) == 0)
+        side = 360.0 / _SECTORS
+        if n >= 2 * _SECTORS:
+            found += [f"{name} towards {side * i:.0f} to {side * (i + 1):.0f} deg" for i in empty]
+    return tuple(found)
 
 
-class _Tuner:
-    """Trainable changes of weights, initially zero."""
+class _Candidates:
+    """Candidates for the new estimator, and their errors on contacts that they were not fitted to."""
 
-    def __init__(self, layers: Layers, features: Array, model: DisplacementModel, settings: AdaptSettings) -> None:
-        self.settings = settings
-        self.old = [(torch.from_numpy(w).float(), torch.from_numpy(b).float()) for w, b in layers]
-        self.features = torch.from_numpy(features).float()
-        self.mean = torch.from_numpy(model.mean).float()
-        self.jitter = Jitter(model.reference, settings.shift_px, settings.turn_rad, settings.zoom)
-        networks, _, units = layers[0][0].shape
-        shapes = [(networks, features.shape[1], units), *(w.shape for w, _ in layers[1:])]
-        self.weights = [torch.zeros(shape, requires_grad=True) for shape in shapes]
-        self.biases = [torch.zeros(b.shape, requires_grad=True) for _, b in layers]
-        # Typical magnitude of a layer's weights, by which changes are scaled.
-        self.usual = [1.0 / math.sqrt(shape[1]) for shape in shapes]
+    def __init__(
+        self, old: Model, displacements: NDArray[np.float32], contacts: Array, settings: AdaptSettings
+    ) -> None:
+        architecture = old.header.architecture
+        assert isinstance(architecture, MarkerArchitecture)
+        self._architecture, self._settings = architecture, settings
+        self._model = displacement_model_of(old)
+        self._displacements, self._contacts = displacements, contacts
+        self._old: OldSensor = old_sensor(
+            layers_of(old), old.header.labels, self._model, old.tensors["bank"].astype(np.float64), architecture.rings
+        )
+        self.outputs, self._network_sigma = self._old.outputs(displacements)
+        self.labels = _range(contacts)
+        self._residual = np.full(contacts.shape, np.nan)
+        self._process_sigma = np.full(contacts.shape, np.nan)
+        self._scratch_mean = np.full(contacts.shape, np.nan)
+        self._scratch_sigma = np.full(contacts.shape, np.nan)
 
-    def fit(self, inputs: Tensor, targets: Tensor) -> None:
-        settings = self.settings
-        optimizer = torch.optim.Adam([*self.weights, *self.biases], lr=settings.learning_rate)
-        networks = len(self.old[0][0])
-        for step in range(settings.steps):
-            for group in optimizer.param_groups:
-                rise = min(1.0, (step + 1) / (0.1 * settings.steps))
-                group["lr"] = settings.learning_rate * rise * 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
-            chosen = torch.randint(len(inputs), (networks, min(settings.batch_size, len(inputs))))
-            outputs = self._outputs(self.jitter(inputs[chosen]))
-            off = functional.smooth_l1_loss(outputs[..., :6], targets[chosen], beta=0.02, reduction="none")
-            held = sum(((w / usual) ** 2).mean() for w, usual in zip(self.weights, self.usual, strict=True))
-            loss = off.sum(-1).mean() + settings.hold * held
-            if not torch.isfinite(loss):
-                raise TrainingError("the loss is not finite", hint="check the labels of the new images")
-            optimizer.zero_grad(set_to_none=True)
-            (loss * networks).backward()  # type: ignore[no-untyped-call]
-            optimizer.step()
+    def judged(self) -> tuple[Method, dict[str, Array]]:
+        """Return the better candidate and the (6,) errors of all. Raises TrainingError where neither is better."""
+        n = len(self._contacts)
+        folds = _FOLDS if n <= _FEW else 2
+        part = np.random.default_rng(self._settings.seed).permutation(np.arange(n) % folds)
+        off = {name: np.empty((n, 6)) for name in ("mean", "affine", "transfer", "scratch")}
+        for fold in range(folds):
+            left, kept = part == fold, part != fold
+            truth = self._contacts[left]
+            off["mean"][left] = np.median(self._contacts[kept], axis=0) - truth
+            off["affine"][left] = _affine(self.outputs[kept], self._contacts[kept])(self.outputs[left]) - truth
+            predicted = self._transferred(kept, left)
+            off["transfer"][left] = predicted - truth
+            off["scratch"][left] = self._trained(kept, left) - truth
+        errors = {name: np.abs(each).mean(axis=0) for name, each in off.items()}
+        relative = {name: float((each / errors["mean"]).mean()) for name, each in errors.items()}
+        method: Method = "transfer" if relative["transfer"] <= relative["scratch"] else "scratch"
+        simple = min(("mean", "affine"), key=lambda name: relative[name])
+        if relative[method] >= relative[simple]:
+            what = "predicting the mean of the labels" if simple == "mean" else "an affine map of the old outputs"
+            raise TrainingError(
+                f"nothing that was fitted is better on left-out contacts than {what}",
+                hint="check the labels (columns, order, which image belongs to which row), or give more images",
+            )
+        return method, errors
 
-    def layers(self) -> Layers:
-        """Return the old weights plus the changes, in the format of a model file."""
-        found: Layers = []
-        for i, ((weight, bias), change, shift) in enumerate(zip(self.old, self.weights, self.biases, strict=True)):
-            moved = self.features @ change if i == 0 else change
-            found.append((_doubles(weight + moved), _doubles(bias + shift)))
-        return found
+    def transfer(self) -> Transfer:
+        """Return the processes fitted to all contacts, with sigmas from the left-out ones."""
+        chosen = _spread_out(self._contacts, _MOST_PROCESS_CONTACTS)
+        fitted = fit_transfer(self._old, self.outputs[chosen], self._displacements[chosen], self._contacts[chosen])
+        predicted = self._contacts - self._residual
+        along = shear_direction(predicted)
+        residual = self._residual.copy()
+        residual[:, 0] = (along * self._residual[:, :2]).sum(axis=1)
+        residual[:, 1] = along[:, 0] * self._residual[:, 1] - along[:, 1] * self._residual[:, 0]
+        return with_sigma(fitted, residual, self._network_sigma, self._process_sigma)
 
-    def _outputs(self, displacements: Tensor) -> Tensor:
-        x = torch.baddbmm(self.old[0][1] + self.biases[0], displacements, self.old[0][0])
-        x = x + torch.bmm((displacements - self.mean) @ self.features, self.weights[0])
-        rest = zip(self.old[1:], self.weights[1:], self.biases[1:], strict=True)
-        for (weight, bias), change, shift in rest:
-            x = functional.dropout(functional.silu(x), self.settings.dropout)
-            x = torch.baddbmm(bias + shift, x, weight + change)
-        return x
+    def scratch(self) -> tuple[dict[str, NDArray[np.float32]], Array, Array]:
+        """Return tensors of networks trained on all contacts, and scale and power of their sigmas."""
+        network = self._train(np.ones(len(self._contacts), bool))
+        target = (self._contacts - self.labels.centre) / self.labels.half_range
+        residual = self.labels.aligned(target - self._scratch_mean, self._scratch_mean)
+        return network.folded(), *calibrate(residual, self._scratch_sigma)
+
+    def _transferred(self, kept: NDArray[np.bool_], left: NDArray[np.bool_]) -> Array:
+        chosen = np.flatnonzero(kept)[_spread_out(self._contacts[kept], _MOST_PROCESS_CONTACTS)]
+        fitted = fit_transfer(self._old, self.outputs[chosen], self._displacements[chosen], self._contacts[chosen])
+        predicted, self._process_sigma[left] = fitted(self.outputs[left], self._displacements[left])
+        self._residual[left] = self._contacts[left] - predicted
+        return predicted
+
+    def _trained(self, kept: NDArray[np.bool_], left: NDArray[np.bool_]) -> Array:
+        network = self._train(kept)
+        with torch.inference_mode():
+            inputs = torch.from_numpy(self._displacements[left]).expand(self._architecture.networks, -1, -1)
+            outputs = network(inputs).numpy().astype(np.float64)
+        mean, sigma = mixed(outputs[..., :6], outputs[..., 12:], self.labels)
+        self._scratch_mean[left], self._scratch_sigma[left] = mean, sigma
+        return self.labels.contacts(mean)
+
+    def _train(self, kept: NDArray[np.bool_]) -> DisplacementNetwork:
+        """Train networks on some contacts alone."""
+        target = (self._contacts[kept] - self.labels.centre) / self.labels.half_range
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self._settings.seed)
+            network = DisplacementNetwork(self._model, self._architecture.hidden, self._architecture.networks)
+            _fit(network, self._displacements[kept], target, self._model, Alignment(self.labels), self._settings)
+        return network.eval()
 
 
-def _doubles(tensor: Tensor) -> Array:
-    doubles: Array = tensor.detach().numpy().astype(np.float64)
-    return doubles
+def _fit(
+    network: DisplacementNetwork,
+    displacements: NDArray[np.float32],
+    target: Array,
+    model: DisplacementModel,
+    alignment: Alignment,
+    settings: AdaptSettings,
+) -> None:
+    inputs, targets = torch.from_numpy(displacements), torch.from_numpy(target.astype(np.float32))
+    n, networks = len(inputs), len(network.weights[0])
+    steps = settings.steps if n >= 45 else settings.steps // 4
+    steps = max(steps, min(settings.most_steps, 60 * n // settings.batch_size))
+    jitter = Jitter(model.reference, settings.shift_px, settings.turn_rad, settings.zoom)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
+    for step in range(steps):
+        for group in optimizer.param_groups:
+            rise = min(1.0, (step + 1) / (0.05 * steps))
+            group["lr"] = settings.learning_rate * rise * 0.5 * (1.0 + math.cos(math.pi * step / steps))
+        chosen = torch.randint(n, (networks, min(settings.batch_size, n)))
+        loss = displacement_loss(network(jitter(inputs[chosen]), settings.noise), targets[chosen], alignment)
+        if not torch.isfinite(loss):
+            raise TrainingError("the loss is not finite", hint="check the labels of the new images")
+        optimizer.zero_grad(set_to_none=True)
+        (loss * networks).backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+
+
+def _affine(outputs: Array, contacts: Array) -> Callable[[Array], Array]:
+    """Fit an affine map by ridge regression."""
+    mean, sd, middle = outputs.mean(axis=0), outputs.std(axis=0) + 1e-9, contacts.mean(axis=0)
+    x = (outputs - mean) / sd
+    matrix = np.linalg.solve(x.T @ x + _RIDGE * len(x) * np.eye(6), x.T @ (contacts - middle))
+    return lambda other: (other - mean) / sd @ matrix + middle
+
+
+def _range(contacts: Array) -> Labels:
+    """Return labels that span contacts (n, 6), and beyond by twice the mean distance of n uniformly drawn ones."""
+    low, high = contacts.min(axis=0), contacts.max(axis=0)
+    if (high - low < 1e-6).any():
+        name = CONTACT_NAMES[int(np.argmin(high - low))]
+        raise TrainingError(f"all labels have the same {name}", hint="collect contacts with varied values of it")
+    margin = 2.0 * (high - low) / (len(contacts) - 1)
+    return Labels.of_contacts(tuple((low - margin).tolist()), tuple((high + margin).tolist()))
+
+
+def _spread_out(contacts: Array, most: int) -> NDArray[np.intp]:
+    """Return the indices of at most so many contacts, evenly over the depths."""
+    order = np.argsort(contacts[:, 2], kind="stable")
+    chosen: NDArray[np.intp] = order[np.array(evenly(len(order), most))]
+    return chosen

@@ -81,18 +81,25 @@ class SensorMarkers:
         return MarkedContacts(labels, np.array(pixels), np.array(seen, bool)), np.array(kept)
 
 
-def frame_origin(size: tuple[int, int]) -> Array:
+def frame_origin(size: tuple[int, int], crop: tuple[int, int, int, int] | None = None) -> Array:
     """Return (2,) px, the position of the first pixel of images of this (height, width) in the 640x480 frame.
 
+    Args:
+        size: of the images.
+        crop: (left, top, right, bottom) px that is recorded beside them.
+
     Raises:
-        ImageError: they are neither whole frames nor the public crop.
+        ImageError: they are neither whole frames nor the recorded or the public crop.
     """
-    left, top, right, bottom = PUBLIC_CROP
     if size == FRAME_SIZE[::-1]:
         return np.zeros(2)
-    if size == (bottom - top, right - left):
-        return np.array([left, top], dtype=np.float64)
-    expected = f"{FRAME_SIZE[::-1]} or the public crop {(bottom - top, right - left)}"
+    for left, top, right, bottom in (PUBLIC_CROP,) if crop is None else (crop, PUBLIC_CROP):
+        if size == (bottom - top, right - left):
+            return np.array([left, top], dtype=np.float64)
+    left, top, right, bottom = crop or PUBLIC_CROP
+    expected = (
+        f"{FRAME_SIZE[::-1]} or the {'public' if crop is None else 'recorded'} crop {(bottom - top, right - left)}"
+    )
     raise ImageError("size", expected, size, hint="record whole 640x480 frames")
 
 
@@ -117,7 +124,7 @@ def learn_sensor(
     split = read_split(data, "train")
     chosen = [split.images[i] for i in evenly(len(split.images), images)]
     first = read_image(chosen[0])
-    origin = frame_origin((first.shape[0], first.shape[1]))
+    origin = frame_origin((first.shape[0], first.shape[1]), split.crop)
     preprocessing = preprocessing_for(first)
     size = typical_size(preprocessing.reduce(first))
     discs = []

@@ -12,9 +12,11 @@ from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception import kernels
 from touchcell.perception.errors import ModelError
 from touchcell.perception.markers.detection import Discs, detect_markers
+from touchcell.perception.markers.layers import layers_of, mixed
 from touchcell.perception.markers.matching import DisplacementModel, FirstGuess, MarkerField, MarkerMatcher
+from touchcell.perception.markers.transfer import TransferredNetworks
 from touchcell.perception.models.marker_architecture import LOG_PRECISION_BOUNDS, MarkerArchitecture
-from touchcell.perception.models.model_file import Header, Labels, Model, load_model
+from touchcell.perception.models.model_file import Header, Model, load_model
 from touchcell.perception.models.prediction import RANGE_TOLERANCE, Prediction
 
 if TYPE_CHECKING:
@@ -50,6 +52,10 @@ class MarkerEstimator:
         self._size = architecture.size
         self._matcher = matcher_of(model, architecture)
         self._networks = architecture.networks
+        self._transferred: TransferredNetworks | None = None
+        if model.header.transfer is not None:
+            layers = [(weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in layers_of(model)]
+            self._transferred = TransferredNetworks(model, layers, self._matcher.model.reference)
         self._layers = [
             (model.tensors[f"layer{i}.weight"], model.tensors[f"layer{i}.bias"][:, 0])
             for i in range(len(architecture.hidden) + 1)
@@ -109,6 +115,9 @@ class MarkerEstimator:
         """
         if not field.seen.any():
             return np.zeros(6), np.ones(6)
+        if self._transferred is not None:
+            means, sigmas = self._transferred(field.displacements.reshape(1, -1))
+            return means[0], sigmas[0]
         x = kernels.affine(self._first, self._first_bias, field.displacements.ravel().astype(np.float32))
         x = x.reshape(self._networks, -1)
         for weight, bias in self._layers:
@@ -135,23 +144,6 @@ class MarkerEstimator:
         return Stamped(
             self.predict(sample.value.image), sample.t_ns, sample.seq, sample.t_device_ns, quality=sample.quality
         )
-
-
-def mixed(means: Array, log_precisions: Array, labels: Labels) -> tuple[Array, Array]:
-    """Return mean and standard deviations of a mixture of Gaussians with equal weights.
-
-    Args:
-        means: (networks, ..., 6) in label half-ranges.
-        log_precisions: (networks, ..., 6) logarithms of inverse standard deviations, along ``labels.aligned``.
-        labels: of the model.
-
-    Returns:
-        (..., 6) and (..., 6).
-    """
-    mean = means.mean(axis=0)
-    apart = labels.aligned(means - mean, mean)
-    variance = np.exp(-2.0 * log_precisions).mean(axis=0) + np.square(apart).mean(axis=0)
-    return mean, np.sqrt(variance)
 
 
 def displacement_model_of(model: Model) -> DisplacementModel:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,9 @@ _TURNS = 12
 _SETTLED_PX = 0.1
 _CONVINCING = 0.965
 _COMPLETE = 0.985
+_EXPLAINED = 0.985
+_DEAD_PINS = 0.8  # Of the least score: a fifth of the pins may be missing.
+_DEAD_RMS = 0.5
 _STILL_THERE = 0.6
 _BANKED_AT_ONCE = 32
 _NEAR = 0.3  # Largest accepted error of a first guess, in spacings; failed ones are off by more.
@@ -108,6 +111,7 @@ class MarkerField:
         coefficients: (k,) px, of the displacement model.
         score: markers seen over those expected in view, or over the discs among them where these are more; 1 is best.
         rms_px: of the seen markers from the displacement model.
+        explained: fraction of the discs among the markers that belong to one.
         valid: the match is reliable.
     """
 
@@ -117,6 +121,7 @@ class MarkerField:
     coefficients: Array
     score: float
     rms_px: float
+    explained: float
     valid: bool
 
 
@@ -237,7 +242,17 @@ class MarkerMatcher:
             # Of 2000 real images 21 scored between this and _CONVINCING; other starts gained none of them 0.01.
             if tried[-1].valid:
                 break
-        return max(tried, key=quality)
+        best = max(tried, key=quality)
+        return replace(best, valid=True) if not best.valid and self._lacks_pins(best) else best
+
+    def _lacks_pins(self, field: MarkerField) -> bool:
+        """Return True if all discs belong to markers, and only some markers have no disc: pins that broke off.
+
+        A wrong match leaves discs without a marker.
+        """
+        found = float(field.seen.mean())
+        explained = field.explained >= _EXPLAINED and field.rms_px <= _DEAD_RMS * self._most_rms_px
+        return explained and field.score >= _DEAD_PINS * self._least_score and found >= 0.5
 
     def _is_near(self, previous: MarkerField, centres: Array) -> bool:
         """Return True if most markers of the previous frame still have a disc close by."""
@@ -344,6 +359,7 @@ class MarkerMatcher:
             coefficients=coefficients,
             score=score,
             rms_px=rms,
+            explained=found / max(found + among, 1),
             valid=score >= self._least_score and rms <= self._most_rms_px and found >= len(positions) // 2,
         )
 
@@ -351,7 +367,7 @@ class MarkerMatcher:
         positions = self._base.reshape(-1, 2)
         coefficients = np.zeros(len(self.model.sd))
         shift = positions - self.model.reference
-        return MarkerField(positions.copy(), shift, np.zeros(len(shift), bool), coefficients, 0.0, np.inf, False)
+        return MarkerField(positions.copy(), shift, np.zeros(len(shift), bool), coefficients, 0.0, np.inf, 0.0, False)
 
 
 def _in_bytes(density: NDArray[np.float32]) -> NDArray[np.uint8]:

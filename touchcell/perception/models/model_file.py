@@ -21,6 +21,7 @@ from touchcell.perception.models.architecture_spec import ArchitectureSection
 from touchcell.perception.models.camera_change import CameraChange
 from touchcell.perception.models.labels import CONTACT_NAMES, contact_from_xi, shear_direction, xi_gaussian
 from touchcell.perception.models.preprocessing import Preprocessing
+from touchcell.perception.models.transfer_spec import TransferSpec
 
 FORMAT_VERSION = 1
 _METADATA_KEY = "touchcell"
@@ -152,6 +153,8 @@ class Header(BaseModel):
         camera: from the pixels of this model's sensor to those of the one its networks were trained on, where it was
             adapted (``touchcell adapt``).
         label_turn_deg: rotation of its contacts' axes about the sensor's z axis, to those of the networks' training.
+        transfer: from the networks' outputs to this sensor's contacts, where it was adapted so.
+        network_labels: labels of the networks' training, where ``labels`` are those of the transfer.
         training_data: digest of the training set (``LabelledImages.digest``).
         training: settings and results of the training, for information.
     """
@@ -167,6 +170,8 @@ class Header(BaseModel):
     sigma_power: SixPositive = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
     camera: CameraChange | None = None
     label_turn_deg: Finite = 0.0
+    transfer: TransferSpec | None = None
+    network_labels: Labels | None = None
     training_data: str
     training: dict[str, str | int | float | list[float] | None] = {}
 
@@ -179,6 +184,10 @@ class Header(BaseModel):
     def _preprocessing_feeds_network(self) -> Header:
         if self.preprocessing.output_size != self.architecture.input_size:
             raise ValueError("the preprocessing's output_size is not the architecture's input_size")
+        if (self.transfer is None) != (self.network_labels is None):
+            raise ValueError("transfer and network_labels belong together")
+        if self.transfer is not None and self.architecture.kind != "markers":
+            raise ValueError("only a marker model can be transferred")
         return self
 
 
@@ -293,7 +302,10 @@ def _key(error: str, location: tuple[int | str, ...]) -> str:
 
 
 def _check_tensors(model: Model, path: Path) -> None:
-    shapes = model.header.architecture.tensor_shapes()
+    architecture, transfer = model.header.architecture, model.header.transfer
+    shapes = architecture.tensor_shapes()
+    if transfer is not None:
+        shapes |= transfer.tensor_shapes()
     for name in shapes.keys() | model.tensors.keys():
         if name not in model.tensors:
             raise ModelError(path, "missing tensor", key=name)

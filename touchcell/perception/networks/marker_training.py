@@ -25,8 +25,8 @@ from touchcell.drivers.replay.dataset import Split, read_rest, read_split
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.errors import TrainingError
 from touchcell.perception.markers.detection import Discs, detect_markers, typical_size
-from touchcell.perception.markers.estimator import mixed
 from touchcell.perception.markers.figures import write_markers
+from touchcell.perception.markers.layers import mixed
 from touchcell.perception.markers.matching import DisplacementModel
 from touchcell.perception.models.labels import CONTACT_NAMES, contact_from_xi, xi_from_contact
 from touchcell.perception.models.marker_architecture import MarkerArchitecture, MarkerSize

@@ -28,9 +28,11 @@ class MarkerTraining(Section):
     Attributes:
         epochs: passes over the images.
         networks: trained side by side; their mixture is the estimate.
+        rings: of the sensor's marker lattice around its centre; ring k holds 6 k markers.
     """
 
     epochs: PositiveInt = 80
+    rings: PositiveInt = 10
     networks: PositiveInt = 2
 
 
@@ -49,7 +51,7 @@ def _train_cnn(settings: ImageNetworkTraining, job: TrainingJob) -> None:
 def _train_markers(settings: MarkerTraining, job: TrainingJob) -> None:
     from touchcell.perception.networks.marker_training import MarkerSettings, train_markers
 
-    chosen = MarkerSettings(seed=job.seed, epochs=settings.epochs, networks=settings.networks)
+    chosen = MarkerSettings(seed=job.seed, epochs=settings.epochs, networks=settings.networks, rings=settings.rings)
     train_markers(job.data, job.out, settings=chosen, resume=job.resume, cache=job.cache, observer=job.observer)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from touchcell.perception.models.graph import IMAGES, OUTPUTS, onnx_model
 from touchcell.perception.models.model_file import Header, Model, load_model
 from touchcell.perception.models.prediction import RANGE_TOLERANCE, Prediction
 from touchcell.perception.models.preprocessing import scale
+from touchcell.perception.runtime.marker_texture import MarkerTexture
 
 Runner = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 """Network evaluation: float32 (n, 1, height, width) in [0, 1] to its outputs (n, outputs)."""
@@ -59,6 +61,8 @@ class ContactModel:
         self.header: Header = model.header
         self.reference: ImageArray | None = model.reference
         self._preprocessing = model.header.preprocessing
+        texture = None if model.reference is None else MarkerTexture(model.reference)
+        self._texture = texture if texture is not None and texture.usable else None
 
     @classmethod
     def load(cls, path: Path) -> ContactModel:
@@ -84,9 +88,13 @@ class ContactModel:
     def predict_reduced(self, reduced: ImageArray) -> Prediction:
         """Estimate the contact in an image returned by ``reduce``.
 
-        A gate and a prediction can share the preprocessing.
+        A gate and a prediction can share the preprocessing. Where the model holds an image out of contact, an image
+        without the texture of its markers is not ``in_range``, whatever the network's output.
         """
-        return self.decode(self.infer(reduced))
+        prediction = self.decode(self.infer(reduced))
+        if self._texture is not None and not self._texture.plausible(reduced):
+            return replace(prediction, in_range=False)
+        return prediction
 
     def infer(self, reduced: ImageArray) -> NDArray[np.float32]:
         """First step of ``predict_reduced``: return the network's outputs."""
@@ -97,7 +105,15 @@ class ContactModel:
         """Apply ``predict`` to several images in one run; faster per image, and the whole batch is held in memory."""
         if not images:
             return []
-        return [self.decode(row) for row in self._run(np.stack([self._preprocessing.apply(i) for i in images]))]
+        reduced = [self.reduce(image) for image in images]
+        rows = self._run(np.stack([scale(each)[None] for each in reduced]))
+        predictions = [self.decode(row) for row in rows]
+        if self._texture is None:
+            return predictions
+        plausible = map(self._texture.plausible, reduced)
+        return [
+            each if good else replace(each, in_range=False) for each, good in zip(predictions, plausible, strict=True)
+        ]
 
     def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:
         """Apply ``predict`` to a camera's sample; the prediction keeps the stamp, number and quality of the frame."""

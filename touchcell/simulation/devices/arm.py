@@ -47,6 +47,7 @@ class SimArmConfig(DriverConfig):
         limits: limits of the tool centre point.
         latency_ms: delay of twists; stops are not delayed.
         max_ttl_s: longest time-to-live of a command that is accepted.
+        state_timeout_s: oldest pose with which a twist may be followed.
     """
 
     start_pose_mm_deg: tuple[float, float, float, float, float, float]
@@ -54,6 +55,7 @@ class SimArmConfig(DriverConfig):
     limits: LimitsConfig = LimitsConfig()
     latency_ms: float = Field(default=0.0, ge=0.0, le=500.0)
     max_ttl_s: float = Field(default=1.0, gt=0.0, le=10.0)
+    state_timeout_s: float = Field(default=0.1, gt=0.0, le=1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +89,7 @@ class SimArm(Arm):
             config.limits.build(),
             stop_categories=CAPABILITIES.stop_categories,
             max_ttl_s=config.max_ttl_s,
+            max_state_age_s=config.state_timeout_s,
         )
         self.faults = ArmFaults()
         self.T_world_base = se3.from_euler_mm_deg(config.base_pose_mm_deg)

@@ -77,6 +77,7 @@ class SimJointArmConfig(DriverConfig):
         limits: limits of the tool centre point.
         joint_limits: how joints are kept within their ranges.
         max_ttl_s: longest time-to-live of a command that is accepted.
+        state_timeout_s: oldest pose with which a twist may be followed.
         physics_step_ms: step of the dynamics.
     """
 
@@ -90,6 +91,7 @@ class SimJointArmConfig(DriverConfig):
     limits: LimitsConfig = LimitsConfig()
     joint_limits: JointLimitsConfig = JointLimitsConfig()
     max_ttl_s: float = Field(default=1.0, gt=0.0, le=10.0)
+    state_timeout_s: float = Field(default=0.1, gt=0.0, le=1.0)
     physics_step_ms: float = Field(default=1.0, ge=0.05, le=2.0)
     menagerie: Annotated[str | None, InputFile("a checkout of MuJoCo Menagerie", folder=True)] = Field(
         default=None,
@@ -128,6 +130,7 @@ class SimJointArm(JointArm):
             config.limits.build(),
             stop_categories=CAPABILITIES.stop_categories,
             max_ttl_s=config.max_ttl_s,
+            max_state_age_s=config.state_timeout_s,
         )
         self._chain = config.described_chain()
         self._ik = DifferentialIk(self._chain, config.joint_limits.settings())

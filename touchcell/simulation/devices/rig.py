@@ -13,15 +13,17 @@ import numpy as np
 from touchcell.drivers.core.clock import Clock, VirtualClock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.spec import ConfigT, DriverContext, DriverSpec
+from touchcell.drivers.core.stand_in import Placement
 from touchcell.drivers.replay import camera as replay_camera
 from touchcell.simulation.devices import arm as sim_arm
 from touchcell.simulation.devices import joint_arm as sim_joint_arm
+from touchcell.simulation.devices import stand_in_arm
 from touchcell.simulation.devices import tactip as sim_tactip
 from touchcell.simulation.devices.arm import SimArm
 from touchcell.simulation.devices.joint_arm import SimJointArm
 from touchcell.simulation.faults import FrameFaults
 from touchcell.simulation.scene import SceneConfig
-from touchcell.testing.emulation.rig import DeviceFixture
+from touchcell.testing.emulation.rig import DeviceFixture, FixtureFactory
 
 _START = (400.0, 0.0, 300.0, 180.0, 0.0, 30.0)
 _IMAGES = 90
@@ -159,4 +161,34 @@ def replay_camera_rig(folder: Path, address: int) -> DeviceFixture:
         position=None,
         clock=VirtualClock,
         process=False,
+    )
+
+
+def stand_in_of(rig: FixtureFactory) -> DeviceFixture:
+    """Build the simulated stand-in for the arm of another driver's fixture, with its configuration."""
+    real = rig(Path(), 0)
+    assert real.config is not None
+    spec = stand_in_arm.stand_in(real.spec, Placement())
+    arms: list[stand_in_arm.StandInArm] = []
+
+    def build(clock: Clock) -> Device:
+        arm = spec.build("arm", real.config, DriverContext(clock))
+        assert isinstance(arm, stand_in_arm.StandInArm)
+        arms.append(arm)
+        return arm
+
+    def truth() -> dict[str, Any]:
+        arms[-1].health()
+        T = arms[-1].T_world_tcp()
+        return {"T_base_tcp": T.tolist(), "position_m": T[:3, 3].tolist()}
+
+    return DeviceFixture(
+        spec=spec,
+        start=lambda: StandIn(truth),
+        build=build,
+        energising=None,
+        pose="T_base_tcp",
+        clock=VirtualClock,
+        process=False,
+        state_rate_hz=real.state_rate_hz,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -34,6 +34,9 @@ CAPABILITIES = Capabilities(
 )
 
 _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE)
+
+
+SensorT = TypeVar("SensorT", bound="SimTactip")
 
 
 class SimTactipConfig(DriverConfig):
@@ -209,6 +212,11 @@ class SimTactip(Device):
 
 
 def _build(name: str, config: SimTactipConfig, context: DriverContext) -> SimTactip:
+    return build(name, config, context, SimTactip)
+
+
+def build(name: str, config: SimTactipConfig, context: DriverContext, sensor_type: type[SensorT]) -> SensorT:
+    """Return a DISCONNECTED sensor of ``sensor_type``. Raises ConfigError without a scene or an arm that carries it."""
     scene: object = context.scene
     arm: object = context.devices.get(config.mounted_on)
     mount: object = arm
@@ -223,7 +231,7 @@ def _build(name: str, config: SimTactipConfig, context: DriverContext) -> SimTac
             value=config.mounted_on,
             hint=f"devices so far: {', '.join(context.devices) or 'none'}",
         )
-    return SimTactip(name, config, context.clock, scene, mount, context.seed)
+    return sensor_type(name, config, context.clock, scene, mount, context.seed)
 
 
 SPEC = DriverSpec(

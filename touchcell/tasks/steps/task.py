@@ -39,6 +39,10 @@ class _Steady:
         """Return False: it never finishes by itself."""
         return False
 
+    def shortfall(self) -> str:
+        """Return nothing: the step has its own conditions."""
+        return ""
+
     def telemetry(self) -> Mapping[str, float]:
         """Return no further telemetry."""
         return {}

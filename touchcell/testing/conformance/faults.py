@@ -21,6 +21,7 @@ _RECONNECTED_S = 5.0
 _SLOW_M_S = 0.01
 _BEYOND_ANY_BUDGET = 2000
 _BUDGETED = ("drop", "drop_states", "corrupt", "nan", "error_flag", "out_of_order")
+_FROM_BEFORE = ("fault_bits", "hot", "reflex", "user_stop", "protective_stop", "emergency_stop", "bus_off")
 _LASTING = ("pause", "unplug")
 
 
@@ -30,6 +31,11 @@ def _every(fault: str, value: Any, answer: str) -> bool:
 
 def _counted(fault: str, value: Any, answer: str) -> bool:
     return answer == "transient" and fault in _BUDGETED
+
+
+def _latching(fault: str, value: Any, answer: str) -> bool:
+    # Those that a device still has when the next program connects.
+    return answer == "fault" and fault in _FROM_BEFORE
 
 
 @check("truth", of_faults=_every)
@@ -44,6 +50,39 @@ def fault_triggers_expected_reaction(context: ConformanceContext, fault: str) ->
         _becomes_stale(context, fault, value)
     else:
         _is_latched(context, lease, fault, value)
+
+
+@check("truth", "process", of_faults=_latching)
+def starts_beside_a_latched_fault(context: ConformanceContext, fault: str) -> None:
+    """A fault from before the connection is an error or FAULTED, never ACTIVE unnoticed; it is recovered from."""
+    value, _ = context.rig.faults[fault]
+    context.changed = True
+    context.ready()
+    context.device.disconnect()
+    context.begin(fault, value)
+    context.sleep(0.2)
+    noticed: list[DeviceError] = []
+
+    def notices() -> bool:
+        with suppress(DeviceError):
+            context.device.disconnect()
+        try:
+            context.device.connect()
+            if context.device.state is Lifecycle.PASSIVE:
+                context.device.configure()
+                context.device.activate()
+                context.sleep(0.2)
+                context.read()
+        except DeviceError as error:
+            noticed.append(error)
+        return context.device.state is Lifecycle.FAULTED or bool(noticed)
+
+    context.until(notices, _NOTICED_S, "an error or FAULTED")
+    context.end(fault)
+    if context.is_in(Lifecycle.FAULTED):
+        _serves_again(context)
+    else:
+        context.reconnect(_RECONNECTED_S)
 
 
 @check("truth", of_faults=_counted)

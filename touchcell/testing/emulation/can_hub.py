@@ -26,6 +26,7 @@ from touchcell.drivers.core import can_errors
 _CLASSIC = struct.Struct("=IB3x8s")
 _FD = struct.Struct("=IBB2x64s")
 _EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
+_REFUSED_SENDS = struct.Struct("=I")
 _BIT_RATE_SWITCH, _FD_FRAME = 0x01, 0x04
 
 
@@ -88,10 +89,15 @@ class HubBus(can.BusABC):  # type: ignore[misc]
         self.channel_info = f"touchcell_hub {channel}"
         self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         self._bus_state = can.BusState.ACTIVE
+        self._refused_sends = 0
         super().__init__(channel=channel, can_filters=can_filters)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send a frame. Raises CanOperationError when the adapter is disconnected or its queue is full."""
+        if self._refused_sends:
+            self._refused_sends -= 1
+            # As python-can's socketcan interface reports a queue that select() finds full: without an error number.
+            raise can.CanOperationError("Transmit buffer full")
         try:
             self._socket.settimeout(timeout or 0.0)
             self._socket.send(pack(msg))
@@ -112,6 +118,9 @@ class HubBus(can.BusABC):  # type: ignore[misc]
             raise can.CanOperationError(f"adapter is disconnected: {error}", error.errno) from error
         if not packet:
             raise can.CanOperationError("adapter is disconnected", errno.ENODEV)
+        if len(packet) == _REFUSED_SENDS.size:
+            (self._refused_sends,) = _REFUSED_SENDS.unpack(packet)
+            return None, False
         message = unpack(packet, time.time())
         if message.is_error_frame:
             self._note_error(message)
@@ -190,6 +199,13 @@ class Hub:
                 continue
             except OSError:
                 self._leave(client)
+
+    def fill_transmit_queues(self, sends: int) -> None:
+        """Make the adapter of every client refuse that many frames, as if nothing drained its transmit queue."""
+        packet = _REFUSED_SENDS.pack(sends)
+        for client in list(self._clients):
+            with contextlib.suppress(OSError):
+                client.send(packet)
 
     def drain(self) -> None:
         """Read pending frames of clients before the simulated time advances."""

@@ -13,7 +13,7 @@ import argparse
 import asyncio
 import socket
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any, ClassVar
 
@@ -77,10 +77,10 @@ class FrankaEmulator(Emulator):
         "restart": "drop the client and return after a fifth of a second with the clock at zero",
     }
 
-    def __init__(self, host: str) -> None:
+    def __init__(self, host: str, start_deg: Sequence[float] | None = None) -> None:
         super().__init__()
         self._host = host
-        self._arm = EmulatedArm()
+        self._arm = EmulatedArm() if start_deg is None else EmulatedArm(q=np.radians(start_deg))
         self._state = RobotState(message_id=1000)
         self._counts = dict.fromkeys(
             ("requests", "energising", "commands", "states", "bad_messages", "late", "reflexes"), 0
@@ -448,8 +448,9 @@ class FrankaEmulator(Emulator):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command-line arguments."""
     parser.add_argument("--host", default="127.0.0.1", help="address to bind; the port is 1337")
+    parser.add_argument("--start-deg", type=float, nargs=7, metavar="DEG", help="joint angles at which it begins")
 
 
 def build(arguments: argparse.Namespace) -> FrankaEmulator:
     """Build the emulator; it is not started yet."""
-    return FrankaEmulator(arguments.host)
+    return FrankaEmulator(arguments.host, arguments.start_deg)

@@ -42,9 +42,10 @@ class Controller:
 
     Args:
         unlock_after_s: time after a protective stop before it can be unlocked (5 s on the real controller).
+        q: (6,) rad joint angles at which it begins.
     """
 
-    def __init__(self, unlock_after_s: float = 5.0) -> None:
+    def __init__(self, unlock_after_s: float = 5.0, q: Array = HOME_Q) -> None:
         self._unlock_after_s = unlock_after_s
         self.energising = 0
         self.commands: Counter[str] = Counter()
@@ -54,7 +55,7 @@ class Controller:
         self.remote_control = True
         self.speed_slider = 1.0
         self.wrench = np.zeros(6)
-        self.arm = ArmState(HOME_Q)
+        self.arm = ArmState(q)
         self.inputs: dict[str, Value] = {}
         self._boot(RobotMode.RUNNING)
 

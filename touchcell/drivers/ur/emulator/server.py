@@ -10,7 +10,7 @@ import argparse
 import asyncio
 import contextlib
 import math
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,7 +19,7 @@ from touchcell.drivers.core.errors import CorruptMessage
 from touchcell.drivers.ur import codec as ur_codec
 from touchcell.drivers.ur.codec import IN_USE, NOT_FOUND, Packet, PacketType, Recipe, Value
 from touchcell.drivers.ur.emulator import kinematics as ur_model
-from touchcell.drivers.ur.emulator.controller import Controller
+from touchcell.drivers.ur.emulator.controller import HOME_Q, Controller
 from touchcell.drivers.ur.emulator.program import PERIOD_S
 from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyMode
 from touchcell.testing.emulation.base import Emulator
@@ -154,11 +154,11 @@ class UrEmulator(Emulator):
         "wrench": "[fx fy fz tx ty tz] N and N m act on the tool",
     }
 
-    def __init__(self, host: str, unlock_after_s: float = 5.0) -> None:
+    def __init__(self, host: str, unlock_after_s: float = 5.0, start_deg: Sequence[float] | None = None) -> None:
         super().__init__()
         self._host = host
         self._unlock_after_s = unlock_after_s
-        self._controller = Controller(unlock_after_s)
+        self._controller = Controller(unlock_after_s, HOME_Q if start_deg is None else np.radians(start_deg))
         self._servers: list[asyncio.Server] = []
         self._clients: list[_RtdeClient] = []
         self._writers: set[asyncio.StreamWriter] = set()
@@ -493,8 +493,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--unlock-after", type=float, default=5.0, metavar="S", help="seconds before a protective stop can be unlocked"
     )
+    parser.add_argument("--start-deg", type=float, nargs=6, metavar="DEG", help="joint angles at which it begins")
 
 
 def build(arguments: argparse.Namespace) -> UrEmulator:
     """Build the emulator."""
-    return UrEmulator(arguments.host, arguments.unlock_after)
+    return UrEmulator(arguments.host, arguments.unlock_after, arguments.start_deg)

@@ -79,13 +79,14 @@ def controls() -> dict[int, ControlState]:
         0x00980001: ControlState("User Controls", _CLASS),
         0x00980900: ControlState("Brightness", _INTEGER, -64, 64, 1, 0),
         0x00980901: ControlState("Contrast", _INTEGER, 0, 64, 1, 32),
+        codec.CID_AUTO_WHITE_BALANCE: ControlState("White Balance, Automatic", _BOOLEAN, 0, 1, 1, 1),
         codec.CID_GAIN: ControlState("Gain", _INTEGER, 0, 100, 1, 0),
         0x009A0001: ControlState("Camera Controls", _CLASS),
         codec.CID_EXPOSURE_AUTO: ControlState(
             "Auto Exposure", _MENU, 0, 3, 1, 3, {1: "Manual Mode", 3: "Aperture Priority Mode"}
         ),
         codec.CID_EXPOSURE_ABSOLUTE: ControlState("Exposure Time, Absolute", _INTEGER, 1, 5000, 1, 157),
-        codec.CID_EXPOSURE_AUTO_PRIORITY: ControlState("Exposure, Dynamic Framerate", _BOOLEAN, 0, 1, 1, 0),
+        codec.CID_EXPOSURE_AUTO_PRIORITY: ControlState("Exposure, Dynamic Framerate", _BOOLEAN, 0, 1, 1, 1),
         _FOCUS_ABSOLUTE: ControlState("Focus, Absolute", _INTEGER, 0, 250, 5, 0),
     }
     for control in table.values():
@@ -116,6 +117,7 @@ class CameraModel:
 
     Args:
         card: product name.
+        bus: USB address.
         on_stream: called with True when streaming starts and False when it ends.
 
     Attributes:
@@ -123,8 +125,9 @@ class CameraModel:
         energising: settings of a control with an actuator, which on this camera is the focus.
     """
 
-    def __init__(self, card: str, on_stream: Callable[[bool], None]) -> None:
+    def __init__(self, card: str, bus: str, on_stream: Callable[[bool], None]) -> None:
         self.card = card
+        self.bus = bus
         self._on_stream = on_stream
         self.pixel_format, self.width, self.height, self.rate_hz = "YUYV", 640, 480, 30
         self.controls = controls()
@@ -134,11 +137,26 @@ class CameraModel:
         self.queued: deque[int] = deque()
         self.streaming = False
         self.stuck_controls = False
+        self.forgetful = False
+        self.fixed_rate = False
+        self.no_bandwidth = False
         self.stamp_flags = codec.BUF_TIMESTAMP_MONOTONIC | codec.BUF_STAMP_START_OF_EXPOSURE
         self.requests: Counter[str] = Counter()
         self.settings_changed = 0
         self.energising = 0
         self.last_command_ns = 0
+
+    @property
+    def exposure_s(self) -> float:
+        """Exposure time: 0 while it is automatic, in good light."""
+        if self.controls[codec.CID_EXPOSURE_AUTO].value != codec.EXPOSURE_MANUAL:
+            return 0.0
+        return self.controls[codec.CID_EXPOSURE_ABSOLUTE].value * codec.EXPOSURE_UNIT_US * 1e-6
+
+    def reset_controls(self) -> None:
+        """Return every control to its default."""
+        for control in self.controls.values():
+            control.value = control.default
 
     @property
     def frame_bytes(self) -> int:
@@ -183,7 +201,7 @@ class CameraModel:
 
     def _query_capability(self, handle: Handle, body: bytearray) -> None:
         reply = _fresh(codec.Capability, body)
-        reply.driver, reply.card, reply.bus_info = b"touchcell", self.card.encode(), b"usb-0000:00:14.0-1"
+        reply.driver, reply.card, reply.bus_info = b"touchcell", self.card.encode(), self.bus.encode()
         reply.version = 0x00060100
         reply.device_caps = codec.CAP_VIDEO_CAPTURE | codec.CAP_STREAMING | codec.CAP_EXT_PIX_FORMAT
         reply.capabilities = reply.device_caps | codec.CAP_DEVICE_CAPS
@@ -244,6 +262,8 @@ class CameraModel:
 
     def _set_parameters(self, handle: Handle, body: bytearray) -> None:
         request_body = codec.StreamParameters.from_buffer_copy(body)
+        if self.fixed_rate:
+            raise Refused(errno.ENOTTY)
         if request_body.type == codec.VIDEO_CAPTURE:
             if self.streaming:
                 raise Refused(errno.EBUSY)
@@ -309,8 +329,12 @@ class CameraModel:
             raise Refused(errno.EINVAL)
         if handle is not self.owner:
             raise Refused(errno.EBUSY)
+        if self.no_bandwidth:
+            raise Refused(errno.ENOSPC)
         if not self.streaming:
             self.streaming = True
+            if self.forgetful:
+                self.reset_controls()
             self._on_stream(True)
 
     def _stream_off(self, handle: Handle, body: bytearray) -> None:

@@ -31,6 +31,7 @@ from touchcell.testing.emulation.base import Emulator
 
 _MAX_MESSAGE = 8192
 _LATE_PERIODS = 10
+_PACKET_BYTES = 512
 _OLDER_FRAMES = 100
 _FOREIGN_CLOCK_NS = 1_000_000_000_000
 _EXPOSURE_FOR_FULL_LIGHT = 157
@@ -82,6 +83,14 @@ class V4l2Emulator(Emulator):
         "no_monotonic": "timestamps on an unknown clock",
         "out_of_order": "number of frames with the number and timestamp of 100 frames ago",
         "unplug": "the camera is disconnected until this is cleared",
+        "padding": "number of frames with bytes after the end of the picture that are not zero",
+        "hole": "number of frames that miss a packet in the middle and still have an end",
+        "true_rate": "frames per second that are really made, numbered without gaps",
+        "no_s_parm": "the camera has one fixed frame rate and no setting for it",
+        "no_bandwidth": "the USB bus has no room: streaming cannot start",
+        "forgets": "every control returns to its default when the stream starts",
+        "reset_controls": "every control returns to its default now",
+        "other_camera": "another camera of the same make, at another socket, has this name",
         "restart": "seconds for which the camera is disconnected before it returns by itself",
     }
 
@@ -97,7 +106,7 @@ class V4l2Emulator(Emulator):
         self._folder = folder
         self._minor = minor
         self._files: Sequence[Path] = picture.files(images) if images else ()
-        self.model = CameraModel("TacTip emulated", self._on_stream)
+        self.model = CameraModel("TacTip emulated", self._bus, self._on_stream)
         self._clients: dict[Handle, _Client] = {}
         self._listener: socket.socket | None = None
         self._stream: asyncio.Task[None] | None = None
@@ -106,6 +115,10 @@ class V4l2Emulator(Emulator):
         self._counts = {"delivered": 0, "dropped": 0, "overruns": 0}
         self._last_stamp_ns = 0
         self._drift_since_s = 0.0
+
+    @property
+    def _bus(self) -> str:
+        return f"usb-0000:00:14.0-{self._minor + 1}"
 
     @property
     def name(self) -> str:
@@ -147,6 +160,7 @@ class V4l2Emulator(Emulator):
             "requests": dict(model.requests),
             "settings_changed": model.settings_changed,
             "energising": model.energising,
+            "faults": sorted(self.active),
             "energised": False,
             "watchdog": None,
             "last_command_ns": model.last_command_ns,
@@ -161,14 +175,25 @@ class V4l2Emulator(Emulator):
             self._drift_since_s = time.monotonic()
         if fault == "no_monotonic":
             self.model.stamp_flags &= ~codec.BUF_TIMESTAMP_MASK
-        self.model.stuck_controls = "stuck_controls" in self.active
+        if fault == "reset_controls":
+            self.model.reset_controls()
+            del self.active[fault]
+        self._adapt_model()
+
+    def _adapt_model(self) -> None:
+        model, active = self.model, self.active
+        model.stuck_controls = "stuck_controls" in active
+        model.forgetful = "forgets" in active
+        model.fixed_rate = "no_s_parm" in active
+        model.no_bandwidth = "no_bandwidth" in active
+        model.bus = f"{self._bus}.4" if "other_camera" in active else self._bus
 
     def on_clear(self, fault: str) -> None:
         if fault in ("unplug", "restart") and self._listener is None:
             self._plug()
         if fault == "no_monotonic":
             self.model.stamp_flags |= codec.BUF_TIMESTAMP_MONOTONIC
-        self.model.stuck_controls = "stuck_controls" in self.active
+        self._adapt_model()
 
     def _plug(self) -> None:
         # The path of a socket is limited to 107 characters; that of the folder is not.
@@ -246,7 +271,7 @@ class V4l2Emulator(Emulator):
         loop = asyncio.get_running_loop()
         next_s = loop.time()
         while True:
-            period_s = 1.0 / self.model.rate_hz
+            period_s = max(1.0 / float(self.active.get("true_rate", self.model.rate_hz)), self.model.exposure_s)
             next_s += period_s
             if loop.time() - next_s > _LATE_PERIODS * period_s:
                 next_s = loop.time()
@@ -263,6 +288,10 @@ class V4l2Emulator(Emulator):
         data, flags, sequence = self._picture(), 0, self._sequence
         if self.spend("corrupt"):
             data = data[: len(data) // 2]
+        if self.spend("padding"):
+            data += b"\x13\xff\xd8\x07" * 8
+        if self.spend("hole"):
+            data = data[: len(data) // 2] + data[len(data) // 2 + _PACKET_BYTES :]
         if self.spend("error_flag"):
             flags |= codec.BUF_ERROR
         if self.spend("out_of_order"):

@@ -1,0 +1,125 @@
+"""``python -m benchmarks executors``: what an executor adds to each trial, and whether an interruption loses any.
+
+``no-op`` is the time for each of many pieces of work that do nothing, without the start of the workers; ``sweep`` is
+the time of a real sweep over the time of its trials shared among the workers; ``killed`` ends the command of a sweep by
+SIGKILL at random moments and counts trials that were lost, or run twice after they had finished.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from touchcell.cell.analysis.provenance import provenance
+from touchcell.cell.experiments.executors import EXECUTORS, Workers
+from touchcell.cell.experiments.remote_work import send_by_value
+
+MODULES = {"local": "pebble", "dask": "distributed", "ray": "ray", "slurm:local": "submitit"}
+SHORT = {"sensors.sensor.estimator": "{kind: true_contact}", "task.distance_mm": "10"}
+
+
+def nothing(item: int) -> int:
+    """Return ``item``."""
+    return item
+
+
+def no_op_s(executor: str, items: int, jobs: int) -> tuple[float, float]:
+    """Return the seconds until the first result, and those for each of the others."""
+    name, _, address = executor.partition(":")
+    send_by_value(nothing)
+    started = time.perf_counter()
+    first = None
+    for _ in EXECUTORS.load(name).run(nothing, range(items), Workers(jobs, 3600.0, None, address)):
+        first = time.perf_counter() if first is None else first
+    assert first is not None
+    ended = time.perf_counter()
+    return first - started, (ended - first) / max(items - 1, 1)
+
+
+def sweep_command(folder: Path, trials: int, jobs: int) -> list[str]:
+    """Return the command of a sweep of ``trials`` short runs."""
+    settings = [part for key, value in SHORT.items() for part in ("--set", f"{key}={value}")]
+    command = [sys.executable, "-m", "touchcell", "sweep", "surface_follow_sim.yaml", *settings]
+    return [*command, "--sample", f"seed=1..{trials}", "--jobs", str(jobs), "--out", str(folder)]
+
+
+def sweep_ratio(trials: int, jobs: int) -> dict[str, float]:
+    """Return the wall-clock time of a sweep, the CPU time of all its processes, and their ratio on ``jobs`` cores."""
+    with tempfile.TemporaryDirectory() as name:
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        started = time.perf_counter()
+        subprocess.run(sweep_command(Path(name), trials, jobs), check=True, stdout=subprocess.DEVNULL)
+        wall_s = time.perf_counter() - started
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        walls = [json.loads(path.read_text())["wall_s"] for path in Path(name).glob("trials/*/trial.json")]
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {"wall_s": wall_s, "cpu_s": cpu_s, "trials_s": sum(walls), "ratio": wall_s * jobs / sum(walls)}
+
+
+def killed(times: int, trials: int, jobs: int, seed: int) -> dict[str, int]:
+    """Kill the command of a sweep ``times`` times; return how many finished trials were lost or run twice."""
+    rng = random.Random(seed)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        known: dict[str, int] = {}
+        lost = repeated = 0
+        for attempt in range(times + 1):
+            process = subprocess.Popen(
+                sweep_command(folder, trials, jobs), stdout=subprocess.DEVNULL, start_new_session=True
+            )
+            if attempt < times:
+                try:
+                    process.wait(rng.uniform(1.0, 6.0))
+                except subprocess.TimeoutExpired:
+                    os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            now = {
+                path.parent.name: path.stat().st_mtime_ns
+                for path in folder.glob("trials/*/trial.json")
+                if json.loads(path.read_text())["outcome"] == "done"
+            }
+            lost += len(set(known) - set(now))
+            repeated += sum(now[trial] != stamp for trial, stamp in known.items() if trial in now)
+            known = now
+    return {"kills": times, "trials": trials, "finished": len(known), "lost": lost, "repeated": repeated}
+
+
+def run(arguments: list[str], out: Path) -> None:
+    """Print the table, and leave it in ``out/executors.json``."""
+    parser = argparse.ArgumentParser("executors", description=__doc__)
+    parser.add_argument("--items", type=int, default=1000, help="pieces of work that do nothing")
+    parser.add_argument("--trials", type=int, default=60, help="of the real sweep")
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    options = parser.parse_args(arguments)
+    found: dict[str, Any] = {**provenance(), "no_op": {}}
+    print(f"{'executor':12} {'start s':>8} {'ms each':>8}")
+    for executor, module in MODULES.items():
+        if importlib.util.find_spec(module) is None:
+            print(f"{executor:12} {module} is not installed")
+            continue
+        # Each Slurm job is a process with an interpreter of its own.
+        items = min(options.items, 10) if executor == "slurm:local" else options.items
+        start_s, each_s = no_op_s(executor, items, options.jobs)
+        found["no_op"][executor] = {"items": items, "start_s": start_s, "each_ms": 1e3 * each_s}
+        print(f"{executor:12} {start_s:8.2f} {1e3 * each_s:8.2f}", flush=True)
+    found["sweep"] = sweep_ratio(options.trials, options.jobs)
+    ratio = found["sweep"]
+    print(
+        f"sweep of {options.trials}: {ratio['wall_s']:.1f} s on {options.jobs} workers, {ratio['trials_s']:.1f} s of "
+        f"trials: {ratio['ratio']:.2f} times their share"
+    )
+    found["killed"] = killed(options.kills, options.trials, options.jobs, seed=1)
+    print("killed: " + ", ".join(f"{name} {value}" for name, value in found["killed"].items()))
+    (out / "executors.json").write_text(json.dumps(found, indent=1) + "\n")

@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+import pytest
+
+from touchcell.cell.bench import zoo
+from touchcell.errors import ConfigError
+from touchcell.testing.emulation.rig import RIGS
+
+
+def test_every_report_is_of_a_driver_with_an_emulator_and_none_is_there_twice() -> None:
+    rows = zoo.rows()
+    assert {row.driver for row in rows} <= set(RIGS.names())
+    assert len({(row.source, row.failure) for row in rows}) == len(rows) >= 42
+
+
+def test_every_injection_is_a_fault_that_the_emulator_knows() -> None:
+    from touchcell.drivers.damiao.emulator import DamiaoArm
+    from touchcell.drivers.feetech.emulator import FeetechArm
+    from touchcell.drivers.franka.emulator.server import FrankaEmulator
+    from touchcell.drivers.ur.emulator.server import UrEmulator
+    from touchcell.drivers.v4l2.emulator.server import V4l2Emulator
+
+    emulators = {
+        "damiao_can": DamiaoArm,
+        "feetech_serial": FeetechArm,
+        "franka": FrankaEmulator,
+        "ur": UrEmulator,
+        "v4l2": V4l2Emulator,
+    }
+    for row in zoo.rows():
+        assert set(row.inject) <= set(emulators[row.driver].faults), row.source
+
+
+def test_an_unknown_driver_is_named(tmp_path: object) -> None:
+    with pytest.raises(ConfigError, match="no report is of"):
+        zoo.run(["toaster"], tmp_path)  # type: ignore[arg-type]

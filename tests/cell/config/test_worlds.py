@@ -1,0 +1,134 @@
+"""One cell file in three worlds: what each puts in place of what, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from touchcell.cell.config.layers import explain, load_layers
+from touchcell.cell.config.schema import EMULATED_CAMERAS, plan_cell, plan_in_world
+from touchcell.drivers.core.spec import DRIVERS
+from touchcell.errors import ConfigError
+from touchcell.paths import CONFIGS
+
+BENCH = CONFIGS / "surface_follow_bench.yaml"
+CELLS = sorted(path.name for path in CONFIGS.glob("*_bench.yaml"))
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Path:
+    path = tmp_path / "bench.yaml"
+    path.write_text(BENCH.read_text())
+    return path
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_every_shipped_bench_cell_can_be_simulated_with_its_drivers_own_abilities(cell: str) -> None:
+    plan = plan_in_world(CONFIGS / cell, "sim")
+    assert plan.cell.time == "simulated"
+    for device in plan.built.values():
+        real = DRIVERS.load(device.spec.name).capabilities
+        able = device.spec.capabilities
+        assert able.virtual_time
+        assert (able.provides, able.stop_categories, able.twist_axes) == (
+            real.provides,
+            real.stop_categories,
+            real.twist_axes,
+        )
+        assert able.command_latency_s == real.command_latency_s
+
+
+def test_what_a_world_changes_is_explained_as_its_own(bench: Path) -> None:
+    plan = plan_in_world(bench, "sim", settings={"task.depth_mm": 2})
+    text = explain(load_layers(bench, plan.settings, plan.world_settings))
+    rows = {row.split(":")[0].strip(): row for row in text.splitlines()}
+    assert rows["time"].endswith("# --on sim")
+    assert rows["depth_mm"].endswith("# --set")
+    assert rows["host"].split("#")[1].strip().startswith(f"{bench}:")
+    assert any("default for surface_following" in note for note in plan.notes)
+
+
+def test_the_file_of_a_simulated_run_plans_as_it_ran(bench: Path, tmp_path: Path) -> None:
+    plan = plan_in_world(bench, "sim")
+    copy = tmp_path / "copy.yaml"
+    copy.write_text(plan.text())
+    again = plan_cell(copy, to_run=False)
+    assert again.cell == plan.cell
+    assert again.arms["arm"].spec.capabilities.virtual_time
+
+
+@pytest.mark.parametrize("cell", ["surface_follow_sim.yaml", "dual_push_sim.yaml"])
+def test_nothing_simulated_is_on_a_bench(cell: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        plan_in_world(CONFIGS / cell, "bench")
+    assert "is no device of a bench" in str(caught.value)
+    assert caught.value.key.endswith(".driver")
+
+
+def test_emulated_cameras_are_refused_on_a_bench(bench: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert plan_in_world(bench, "bench").cell.world == "bench"
+    monkeypatch.setenv(EMULATED_CAMERAS, "/tmp/cameras")
+    with pytest.raises(ConfigError, match="emulated cameras"):
+        plan_in_world(bench, "bench")
+
+
+def test_a_simulated_cell_has_no_emulators() -> None:
+    with pytest.raises(ConfigError, match="simulated already"):
+        plan_in_world(CONFIGS / "surface_follow_sim.yaml", "emulated")
+
+
+def test_settings_go_before_the_world(bench: Path) -> None:
+    pose = [480, -150, 400, 180, 0, 0]
+    plan = plan_in_world(bench, "sim", settings={"arms.arm.start_pose_mm_deg": pose})
+    assert plan.cell.arms["arm"].start_pose_mm_deg == tuple(pose)
+    surfaces = plan.cell.model_dump()["scene"]["surfaces"]
+    # The tip starts 5 mm in front of the default plate.
+    assert surfaces["sensor_plate"]["pose_mm_deg"][2] == pytest.approx(400 - 25)
+
+
+def test_a_start_pose_out_of_reach_is_named(bench: Path) -> None:
+    with pytest.raises(ConfigError, match="no joint angles reach") as caught:
+        plan_in_world(bench, "sim", settings={"arms.arm.start_pose_mm_deg": [3000, 0, 0, 180, 0, 0]})
+    assert caught.value.key == "arms.arm.start_pose_mm_deg"
+
+
+def test_a_scene_beside_the_file_is_used(bench: Path) -> None:
+    scene = {"surfaces": {"dome": {"kind": "dome", "radius_mm": 80, "pose_mm_deg": [490, -150, 300, 0, 0, 0]}}}
+    bench.with_name("bench.scene.yaml").write_text(
+        yaml.safe_dump({"start_pose_mm_deg": {"arm": [490, -150, 405, 180, 0, 0]}, **scene})
+    )
+    plan = plan_in_world(bench, "sim")
+    assert plan.cell.scene is not None
+    assert list(plan.cell.scene["surfaces"]) == ["dome"]
+    start = plan.cell.arms["arm"].start_pose_mm_deg
+    assert start is not None
+    assert np.allclose(start[:3], [490, -150, 405])
+
+
+def test_labels_and_models_of_the_bench_are_not_mixed_with_simulated_ones(bench: Path, tmp_path: Path) -> None:
+    plan = plan_in_world(CONFIGS / "collect_bench.yaml", "sim")
+    assert plan.cell.collect is not None
+    assert str(plan.cell.collect.data).endswith("collected-sim")
+    (tmp_path / "mine.safetensors").write_bytes((CONFIGS.parent / "perception/models/sim_gdn.safetensors").read_bytes())
+    model = {"sensors.sensor.estimator.model": str(tmp_path / "mine.safetensors")}
+    data = yaml.safe_load(bench.read_text())
+    data["sensors"]["sensor"]["estimator"]["model"] = "mine.safetensors"
+    bench.write_text(yaml.safe_dump(data))
+    simulated = plan_in_world(bench, "sim")
+    assert "sensors.sensor.estimator.model" in simulated.world_settings
+    assert any("mine.safetensors" in note for note in simulated.notes)
+    assert plan_in_world(bench, "sim", settings=model).settings == model
+
+
+def test_a_driver_without_behaviour_is_named_where_it_would_be_simulated(
+    bench: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dataclasses import replace
+
+    real = DRIVERS.load("ur")
+    monkeypatch.setattr("touchcell.drivers.ur.driver.SPEC", replace(real, behaviour=None))
+    with pytest.raises(ConfigError, match="does not describe how its device behaves"):
+        plan_in_world(bench, "sim", settings={"arms.arm.start_pose_mm_deg": [490, -150, 400, 180, 0, 0]})

@@ -1,0 +1,79 @@
+"""Run the missing ones of many trials on an executor."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+from touchcell.cell.experiments.elsewhere import RunElsewhere, parcel, unpack
+from touchcell.cell.experiments.executors import EXECUTORS, Lost, Workers
+from touchcell.cell.experiments.remote_work import send_by_value
+from touchcell.cell.experiments.trials import INVALID, LOST, Finished, Perform, Trial
+from touchcell.errors import ConfigError
+
+_logger: Final = logging.getLogger(__name__)
+
+
+def perform_all(
+    perform: Perform,
+    trials: Sequence[Trial],
+    *,
+    workers: Workers | None = None,
+    executor: str = "local",
+    live: bool = False,
+    title: str = "",
+) -> list[Finished]:
+    """Run the missing ones of ``trials``; return all of them in order.
+
+    Args:
+        perform: runs one.
+        trials: all trials.
+        workers: how many at a time, and their limits; one without limits runs in this process.
+        executor: name of what runs them, with ``:ADDRESS`` where it takes one.
+        live: show a progress bar.
+        title: on it.
+
+    Raises:
+        ConfigError: there is no such executor.
+        WorkerDiffers: a worker elsewhere has other code.
+        KeyboardInterrupt: running trials are ended; finished ones are kept.
+    """
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    name, _, address = executor.partition(":")
+    spec = EXECUTORS.load(name)
+    workers = replace(workers or Workers(), address=address)
+    found: dict[str, Finished] = {}
+    missing: list[Trial] = []
+    for trial in trials:
+        try:
+            kept = perform.kept(trial)
+        except ConfigError as error:
+            kept = perform.record_broken(trial, INVALID, str(error))
+        if kept is None:
+            missing.append(trial)
+        else:
+            found[trial.name] = kept
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, transient=True, disable=not live) as progress:
+        bar = progress.add_task(title, total=len(trials), completed=len(found))
+        if spec.shares_files:
+            results = spec.run(perform, missing, workers)
+        else:
+            send_by_value(perform.measure)
+            results = spec.run(RunElsewhere(perform.measure, perform.code), [parcel(each) for each in missing], workers)
+        for index, result in results:
+            trial = missing[index]
+            if isinstance(result, Lost):
+                finished = perform.record_broken(trial, LOST, result.reason)
+            elif isinstance(result, Finished):
+                finished = result
+            else:
+                finished = unpack(perform, trial, result)
+            found[trial.name] = finished
+            if finished.broken:
+                _logger.warning("%s: %s: %s", trial.name, finished.outcome, finished.reason)
+            progress.update(bar, advance=1, description=f"{title}: {trial.name} {finished.outcome}")
+    return [found[trial.name] for trial in trials]

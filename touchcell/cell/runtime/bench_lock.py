@@ -1,0 +1,90 @@
+"""A lock on the devices of a bench, so that two people or two CI jobs cannot have one bench at once.
+
+Each device is locked by its address (host, port, bus, camera), so that two cell files that share an arm exclude each
+other. The kernel gives a lock back when its process ends, for whatever reason. It holds on one machine only.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import getpass
+import hashlib
+import os
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Final, TextIO
+
+from touchcell.cell.config.cell_plan import CellPlan
+from touchcell.errors import TouchcellError
+
+_ADDRESSES: Final = ("host", "port", "channel", "device")
+"""Keys of drivers that say where a device is."""
+
+
+class BenchTaken(TouchcellError):
+    """Somebody else uses a device of the bench.
+
+    Attributes:
+        device: its name in the cell.
+        address: where it is.
+        holder: who has it, since when, by which process.
+    """
+
+    def __init__(self, device: str, address: str, holder: str) -> None:
+        super().__init__(f"the bench is taken: {device} at {address} is in use by {holder or 'another process'}")
+        self.device = device
+        self.address = address
+        self.holder = holder
+
+
+def addresses(plan: CellPlan) -> Mapping[str, str]:
+    """Return the address of each device that the plan builds, by name; a device without one has none."""
+    found = {}
+    for name, device in plan.built.items():
+        parts = [str(value) for key in _ADDRESSES if (value := getattr(device.config, key, None)) is not None]
+        if parts:
+            found[name] = f"{device.spec.name}:{','.join(parts)}"
+    return found
+
+
+@contextmanager
+def bench_lock(plan: CellPlan, folder: Path | None = None) -> Iterator[None]:
+    """Hold the devices of a cell within the context.
+
+    Args:
+        plan: the cell.
+        folder: where locks are kept; None for the machine's own, which all its users share.
+
+    Raises:
+        BenchTaken: somebody else holds one of them.
+    """
+    folder = folder or Path(tempfile.gettempdir()) / "touchcell-bench"
+    folder.mkdir(mode=0o1777, parents=True, exist_ok=True)
+    with ExitStack() as held:
+        for name, address in sorted(addresses(plan).items()):
+            digest = hashlib.sha256(address.encode()).hexdigest()[:16]
+            held.enter_context(_locked(folder / f"{digest}.lock", name, address))
+        yield
+
+
+@contextmanager
+def _locked(path: Path, device: str, address: str) -> Iterator[None]:
+    with _opened(path) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BenchTaken(device, address, file.read().strip()) from None
+        file.seek(0)
+        file.truncate()
+        file.write(f"{getpass.getuser()}, process {os.getpid()}, since {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
+        file.flush()
+        yield
+
+
+def _opened(path: Path) -> TextIO:
+    # Of whoever came first, and for everybody to lock.
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    return os.fdopen(descriptor, "r+")

@@ -1,0 +1,92 @@
+"""Emulators that take the place of a cell's devices: what changes in the device's section, and how it is started."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from ipaddress import IPv4Address
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+
+from touchcell.drivers.core.errors import ConnectError
+from touchcell.drivers.core.spec import DriverConfig
+from touchcell.geometry.types import Array
+from touchcell.registry import Registry
+from touchcell.testing.emulation.process import EmulatorProcess
+
+_FIRST: Final = IPv4Address("127.1.0.0")
+_HOSTS_PER_PROCESS: Final = 16
+_DEVICES: Final = 4
+_PROCESSES: Final = 1_000_000
+
+
+TcpOfState: TypeAlias = Callable[[Mapping[str, Any]], Array]
+
+
+@dataclass(frozen=True, slots=True)
+class EmulatedDriver:
+    """How a driver's device is emulated within a cell.
+
+    Attributes:
+        name: of the driver.
+        settings: keys of the device's section that lead its driver to the emulator, from its configuration, the folder
+            for sockets and links, and the number of the device in the cell.
+        start: makes the emulator of an arm, not started yet, from that configuration and the joint angles in degrees at
+            which it begins (None for its home); None for a camera, whose picture the scene draws.
+        T_base_tcp: returns for a configuration what computes the pose (4, 4) of an arm's tool in its base from the
+            emulator's state.
+    """
+
+    name: str
+    settings: Callable[[Any, Path, int], Mapping[str, Any]]
+    start: Callable[[Any, Sequence[float] | None], EmulatorProcess] | None = None
+    T_base_tcp: Callable[[Any], TcpOfState] | None = None
+
+
+EMULATED: Final = Registry("touchcell.emulated_devices", "emulated device", EmulatedDriver)
+"""Drivers whose devices are emulated within a cell."""
+
+
+def free_host(port: int, number: int) -> str:
+    """Return a loopback address of this process's own, for its device ``number``, on which ``port`` is free.
+
+    Raises:
+        ConnectError: something else listens on all of them.
+    """
+    first = _FIRST + os.getpid() % _PROCESSES * _HOSTS_PER_PROCESS + number
+    for step in range(0, _HOSTS_PER_PROCESS - number, _DEVICES):
+        host = str(first + step)
+        with suppress(OSError), socket.socket() as wire:
+            wire.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            wire.bind((host, port))
+            return host
+    raise ConnectError("emulator", f"port {port} is taken on {first} and its neighbours")
+
+
+def tcp_of_joints(config: DriverConfig) -> TcpOfState:
+    """Return what computes the tool's pose (4, 4) from the joint angles ``q`` of a state, by the configured chain.
+
+    A controller has the configured tool only once its arm is active; the chain has it from the start.
+    """
+    chain = config.described_chain()
+    assert chain is not None
+
+    def T_base_tcp(state: Mapping[str, Any]) -> Array:  # noqa: N802  standard notation for transforms
+        return chain.forward_and_jacobian(np.array(state["q"], dtype=np.float64))[0]
+
+    return T_base_tcp
+
+
+def tcp_of_state(config: DriverConfig) -> TcpOfState:
+    """Return what takes the tool's pose (4, 4) from a state, of an emulator that was started with the tool."""
+    return lambda state: np.array(state["T_base_tcp"], dtype=np.float64)
+
+
+def start_arguments(start_deg: Sequence[float] | None) -> list[str]:
+    """Return the option that starts an emulated arm at these joint angles."""
+    return [] if start_deg is None else ["--start-deg", *(f"{angle:.6f}" for angle in start_deg)]
