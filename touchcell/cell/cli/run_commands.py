@@ -1,4 +1,4 @@
-"""``why``, ``report``, ``view``: what runs left behind; ``stop``, ``reset``, ``resume``: runs that are in progress."""
+"""``why``, ``report``, ``view``, ``compare``: ended runs; ``stop``, ``reset``, ``resume``: runs in progress."""
 
 from __future__ import annotations
 
@@ -22,6 +22,12 @@ def add_parser(commands: Subparsers) -> None:
     view = add_command(commands, "view", _view, "show in a browser what a run's sensors feel, live or recorded")
     add_run_folder(view)
     view.add_argument("--port", type=port, default=8177, help="of the page on this machine (default: %(default)s)")
+
+    compare = add_command(
+        commands, "compare", _compare, "compare two recordings bit for bit, and name where they first differ"
+    )
+    for name in ("first", "second"):
+        compare.add_argument(name, type=Path, metavar="RUN", help="run folder, or its recording")
 
     stop = add_command(commands, "stop", _stop, "stop a run from another shell")
     add_run_folder(stop, "every run in progress below runs/")
@@ -67,6 +73,23 @@ def _report(options: argparse.Namespace) -> int:
         from touchcell.cell.experiments.animation import animate
 
         print(animate(folder))
+    return EXIT_OK
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from touchcell.cell.recording.compare import compare_recordings
+    from touchcell.cell.recording.mcap import RECORDING
+
+    first, second = (path / RECORDING if path.is_dir() else path for path in (options.first, options.second))
+    topics = compare_recordings(first, second)
+    different = [topic for topic in topics if not topic.identical]
+    for topic in different:
+        print(f"{topic.topic}: {topic.difference}")
+    messages = sum(topic.counts[0] for topic in topics)
+    if different:
+        print(f"{len(different)} of {len(topics)} topics differ")
+        return EXIT_TASK_FAILED
+    print(f"identical bit for bit: {messages} messages of {len(topics)} topics, durations on this machine aside")
     return EXIT_OK
 
 
