@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import json
 import os
 import struct
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from tests.fault_injection.fuzz_recordings import lz4_bomb, original, try_mutants
 from touchcell.cell.errors import RecordingError
@@ -179,3 +181,24 @@ def test_a_length_beyond_all_memory_is_damage(tmp_path: Path) -> None:
     kept, named = damaged(path)
     assert named
     assert kept[-1] == 999
+
+
+def test_the_schema_of_a_channel_has_the_typed_fields_of_its_first_message(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path) as recorder:
+        recorder.write("/a/b", 1, {"x_mm": 1.5, "on": True, "name": "n", "gone": float("nan"), "twist": [None, 2.0]})
+        recorder.write("/a/b", 2, {"x_mm": 2.5})
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    (schema,) = summary.schemas.values()
+    assert (schema.name, schema.encoding) == ("a.b", "jsonschema")
+    assert json.loads(schema.data) == {
+        "type": "object",
+        "properties": {
+            "x_mm": {"type": "number"},
+            "on": {"type": "boolean"},
+            "name": {"type": "string"},
+            "twist": {"type": "array", "items": {"type": "number"}},
+        },
+    }

@@ -148,7 +148,7 @@ class Recorder:
         try:
             channel = self._channels.get(topic)
             if channel is None:
-                channel = self._register(topic)
+                channel = self._register(topic, data)
             # A chunk that is complete leaves the process at once.
             self._writer.add_message(channel, t_ns, data, t_ns)
         except OSError as error:
@@ -182,8 +182,8 @@ class Recorder:
     ) -> None:
         self.close()
 
-    def _register(self, topic: str) -> int:
-        schema = self._writer.register_schema(topic.strip("/").replace("/", "."), "jsonschema", b'{"type":"object"}')
+    def _register(self, topic: str, first: bytes) -> int:
+        schema = self._writer.register_schema(topic.strip("/").replace("/", "."), "jsonschema", _schema(first))
         self._channels[topic] = self._writer.register_channel(topic, "json", schema)
         return self._channels[topic]
 
@@ -435,6 +435,30 @@ def encode(data: Mapping[str, Any]) -> bytes:
     except ValueError:
         text = json.dumps(_finite(data), default=_plain, separators=(",", ":"))
     return text.encode()
+
+
+def _schema(message: bytes) -> bytes:
+    """JSON schema of a topic with the fields of its first message, which viewers need to complete field names.
+
+    Fields that are null in it are left out, since their type is unknown; later messages may have others.
+    """
+    try:
+        described = _described(json.loads(message))
+    except ValueError:
+        described = None
+    return json.dumps(described or {"type": "object"}, separators=(",", ":")).encode()
+
+
+def _described(value: Any) -> dict[str, Any] | None:
+    if isinstance(value, dict):
+        fields = {key: described for key, item in value.items() if (described := _described(item)) is not None}
+        return {"type": "object", "properties": fields}
+    if isinstance(value, list):
+        items = next((described for item in value if (described := _described(item)) is not None), None)
+        return {"type": "array"} if items is None else {"type": "array", "items": items}
+    if value is None:
+        return None
+    return {"type": "boolean" if isinstance(value, bool) else "string" if isinstance(value, str) else "number"}
 
 
 def _plain(value: Any) -> Any:
