@@ -31,10 +31,11 @@ SETTABLE = {
     "date.today",
 }
 FOR_PEOPLE = {
+    ROOT / "touchcell" / "cell" / "runtime" / "bench_lock.py",
     ROOT / "touchcell" / "cell" / "runtime" / "run_directory.py",
     ROOT / "touchcell" / "cell" / "analysis" / "provenance.py",
 }
-"""They name the run folder and date a figure."""
+"""They say since when a bench is taken, name the run folder, and date a figure."""
 
 
 def reads(source: str) -> Iterator[str]:
