@@ -64,11 +64,13 @@ MORE_FAULTS: Final[Mapping[str, Mapping[str, tuple[Any, str]]]] = {
         "push": ([0, 5.0], "unseen"),
         "refuse": (1, "unseen"),
         "nan": (True, "unseen"),
+        "turn_off": ([0, 1], "unseen"),
     },
     "feetech_serial": {
         "block": (0, "unseen"),
         "carry": ([0, 300], "fault"),
         "registers": ([0, 7, "fa"], "unseen"),
+        "turn_off": (0, "unseen"),
     },
     "v4l2": {
         "delay": (0.4, "stale"),
@@ -76,6 +78,14 @@ MORE_FAULTS: Final[Mapping[str, Mapping[str, tuple[Any, str]]]] = {
         "exposure_drift": (0.5, "fault"),
         "stuck_controls": (True, "unseen"),
         "no_monotonic": (True, "transient"),
+        "forgets": (True, "unseen"),
+        "hole": (3, "transient"),
+        "no_bandwidth": (True, "unseen"),
+        "no_s_parm": (True, "unseen"),
+        "other_camera": (True, "unseen"),
+        "padding": (3, "unseen"),
+        "reset_controls": (True, "fault"),
+        "true_rate": (10.0, "fault"),
     },
 }
 """Faults that the conformance suite lacks or tests differently, with a value and the reaction in a running task."""

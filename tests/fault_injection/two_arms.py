@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
-from touchcell.cell.config.cell_plan import CellFile, CellPlan, DevicePlan
+from touchcell.cell.config.cell_plan import ArmSection, CellFile, CellPlan, DevicePlan
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.true_contact import answerable
@@ -78,6 +78,10 @@ SPEC: Final = TaskSpec(
 )
 
 
+def _settings(section: ArmSection) -> dict[str, Any]:
+    return {**(section.model_extra or {}), "start_pose_mm_deg": section.start_pose_mm_deg}
+
+
 def two_arm_plan(
     folder: Path,
     rate_hz: float,
@@ -112,7 +116,7 @@ def two_arm_plan(
         }
     )
     devices = {
-        name: DevicePlan(name, driver, driver.config.model_validate(section.model_extra))
+        name: DevicePlan(name, driver, driver.config.model_validate(_settings(section)))
         for name, section in cell.arms.items()
     }
     roles = {name: name for name in devices}
