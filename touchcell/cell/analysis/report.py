@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell import compiled
-from touchcell.cell.analysis.run_data import STAGES, Run, Series, load_run
+from touchcell.cell.analysis.run_data import STAGES, Run, Series
+from touchcell.cell.analysis.run_folder import RunFolder
+from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.recording.messages import COMPONENTS
 from touchcell.errors import ConfigError
@@ -24,30 +26,36 @@ def write_report(folder: Path) -> str:
     Raises:
         RecordingError: the folder holds no recording.
     """
-    run = load_run(folder / RECORDING)
+    source = RunFolder(folder)
+    run = source.recording
     result_file = folder / "result.json"
     result = json.loads(result_file.read_text()) if result_file.exists() else {}
-    summary = {**_push_errors(folder), **summarise(run)}
+    summary = {**_push_errors(source), **summarise(run)}
     (folder / "summary.json").write_text(json.dumps({**result, **summary}, indent=1) + "\n")
-    text = _text(folder, result, summary, _pictures(run, folder), run)
+    text = _text(folder, result, summary, _pictures(source), run)
     (folder / "summary.txt").write_text(text + "\n")
     return text
 
 
-def _push_errors(folder: Path) -> dict[str, float]:
+def _push_errors(source: RunFolder) -> Mapping[str, float]:
     from touchcell.cell.analysis.push_errors import push_errors
-    from touchcell.cell.analysis.run_folder import RunFolder
 
+    return push_errors(source) if _plan(source) is not None else {}
+
+
+def _plan(source: RunFolder) -> CellPlan | None:
+    """Return the cell of a run; None for a recording without a cell file that can be read."""
     try:
-        return dict(push_errors(RunFolder(folder)))
+        return source.plan
     except (ConfigError, OSError):
-        return {}
+        return None
 
 
-def _pictures(run: Run, folder: Path) -> list[Path]:
+def _pictures(source: RunFolder) -> list[Path]:
     from touchcell.cell.analysis.contact_images import write_strip
     from touchcell.cell.analysis.plots import plot_agreement, plot_budget, plot_contact, plot_trajectory
 
+    run, folder = source.recording, source.path
     moved = bool(run.roles("arms", "command"))
     pictures = []
     for sensor in run.roles("sensors", "contact"):
@@ -55,7 +63,7 @@ def _pictures(run: Run, folder: Path) -> list[Path]:
         if not moved and run.series(f"/sensors/{sensor}/truth") is not None:
             pictures.append(plot_agreement(run, sensor, folder / f"agreement_{sensor}.png"))
     if moved:
-        pictures.append(plot_trajectory(run, folder / "trajectory.png", _mounts(folder)))
+        pictures.append(plot_trajectory(run, folder / "trajectory.png", _mounts(source)))
     for sensor in run.roles("sensors", "preprocessing"):
         strip = write_strip(folder / RECORDING, run, sensor, folder / f"markers_{sensor}.png")
         pictures += [strip] if strip is not None else []
@@ -65,13 +73,10 @@ def _pictures(run: Run, folder: Path) -> list[Path]:
     return pictures
 
 
-def _mounts(folder: Path) -> dict[str, tuple[Array, Array]]:
+def _mounts(source: RunFolder) -> dict[str, tuple[Array, Array]]:
     """Return the poses of each arm's base in the world and of its sensor in its tool, where the cell file has them."""
-    from touchcell.cell.analysis.run_folder import RunFolder
-
-    try:
-        plan = RunFolder(folder).plan
-    except (ConfigError, OSError):
+    plan = _plan(source)
+    if plan is None:
         return {}
     sits = {section.mounted_on: section.T_tcp_sensor for section in plan.cell.sensors.values()}
     return {
