@@ -143,15 +143,46 @@ def test_workers_that_share_no_files_give_the_same_recordings(executor, module, 
     assert written_at(tmp_path / "there", "first") == before
 
 
+def test_an_invalid_trial_for_another_machine_is_named_here_and_not_sent(tmp_path, monkeypatch):
+    pytest.importorskip("submitit")
+    monkeypatch.chdir(tmp_path)
+    wrong = trial("wrong", **{"tusk.depth_mm": 1})
+    (finished,) = perform_all(Perform(cycles, tmp_path / "there"), [wrong], executor="slurm:local")
+    assert finished.outcome == "invalid"
+    assert "tusk.depth_mm" in finished.reason
+
+
+def test_a_record_names_the_files_of_this_machine_wherever_the_trial_ran(tmp_path):
+    from touchcell.cell.experiments.elsewhere import RunElsewhere, parcel, unpack
+
+    perform = Perform(cycles, tmp_path / "there")
+    it = trial("it", str(follow_file(tmp_path)))
+    unpack(perform, sent := parcel(it), RunElsewhere(cycles, perform.code)(sent))
+    record = json.loads((tmp_path / "there" / "it" / "trial.json").read_text())
+    assert list(record["files"]) == [str(tmp_path / "my_tip.yaml")]
+    assert perform.kept(it) is not None
+
+
+@pytest.mark.parametrize("keep_stale", [False, True])
+def test_a_trial_of_version_0_1_is_run_again(tmp_path, keep_stale):
+    it = trial("it")
+    perform = Perform(cycles, tmp_path, keep_stale=keep_stale)
+    perform_all(perform, [it])
+    record = json.loads((tmp_path / "it" / "trial.json").read_text())
+    del record["code"], record["files"]
+    (tmp_path / "it" / "trial.json").write_text(json.dumps(record))
+    assert perform.kept(it) is None
+
+
 def test_a_worker_with_other_code_is_refused(tmp_path):
     from touchcell.cell.experiments.elsewhere import RunElsewhere, parcel, unpack
 
     mine = replace(code_identity(), digest="1" * 16, versions={**code_identity().versions, "numpy": "1.0"})
     perform = Perform(cycles, tmp_path, code=mine)
-    it = trial("it")
-    delivery = RunElsewhere(cycles, mine)(parcel(it))
+    sent = parcel(trial("it"))
+    delivery = RunElsewhere(cycles, mine)(sent)
     with pytest.raises(WorkerDiffers, match="numpy") as caught:
-        unpack(perform, it, delivery)
+        unpack(perform, sent, delivery)
     assert caught.value.there == code_identity()
     assert not (tmp_path / "it").exists()
 

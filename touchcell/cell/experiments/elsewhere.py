@@ -15,8 +15,8 @@ from typing import Any
 
 from touchcell.cell.analysis.code_identity import CodeIdentity, code_identity
 from touchcell.cell.analysis.run_folder import RunFolder
-from touchcell.cell.experiments.trials import INVALID, Finished, Perform, Trial, files_named, settings_digest
-from touchcell.errors import ConfigError, TouchcellError
+from touchcell.cell.experiments.trials import Finished, Perform, Trial, file_digests, files_named, settings_digest
+from touchcell.errors import TouchcellError
 
 
 class WorkerDiffers(TouchcellError):
@@ -43,17 +43,15 @@ class Parcel:
 
     Attributes:
         trial: the trial.
-        data: content of its cell file; empty if that is invalid.
-        settings: its digest.
+        data: content of its cell file.
         files: tar archives of the files and folders that it names, by path on the machine that sends them.
-        problem: why the cell file is invalid.
+        digests: of these files.
     """
 
     trial: Trial
     data: Mapping[str, Any]
-    settings: str
     files: Mapping[str, bytes]
-    problem: str = ""
+    digests: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,16 +92,13 @@ class RunElsewhere:
 
 
 def parcel(trial: Trial) -> Parcel:
-    """Return a trial with the bytes of all files that it names."""
-    try:
-        data = trial.cell_data()
-    except ConfigError as error:
-        return Parcel(trial, {}, "", {}, str(error))
+    """Return a trial with the bytes of all files that it names. Raises ConfigError if its cell file is invalid."""
+    data = trial.cell_data()
     files = {str(path): _archive(path, path.name) for path in files_named(data)}
-    return Parcel(trial, data, settings_digest(data), files)
+    return Parcel(trial, data, files, file_digests(data))
 
 
-def unpack(perform: Perform, trial: Trial, delivery: Delivery) -> Finished:
+def unpack(perform: Perform, sent: Parcel, delivery: Delivery) -> Finished:
     """Put a trial's folder where it belongs, and return its result.
 
     Raises:
@@ -111,24 +106,14 @@ def unpack(perform: Perform, trial: Trial, delivery: Delivery) -> Finished:
     """
     if delivery.code.digest != perform.code.digest:
         raise WorkerDiffers(perform.code, delivery.code)
-    folder = perform.root / trial.name
+    folder = perform.root / sent.trial.name
     shutil.rmtree(folder, ignore_errors=True)
     _extract(delivery.folder, folder)
     record = json.loads((folder / "trial.json").read_text())
-    if record["outcome"] == INVALID:
-        return perform.record_broken(trial, INVALID, record["reason"])
-    # The digest is of the files' bytes and of their paths on this machine.
-    record["settings"] = settings_digest(trial.cell_data())
+    # The worker's paths are gone with its temporary folder; files are found again by those of this machine.
+    record |= {"settings": settings_digest(sent.data, sent.digests), "files": dict(sent.digests)}
     (folder / "trial.json").write_text(json.dumps(record, indent=1) + "\n")
-    return Finished(
-        trial,
-        RunFolder(folder),
-        record["outcome"],
-        record["reason"],
-        record["measures"],
-        delivery.code.commit,
-        delivery.code.digest,
-    )
+    return Finished.of(sent.trial, RunFolder(folder), record)
 
 
 def _archive(path: Path, name: str = ".") -> bytes:

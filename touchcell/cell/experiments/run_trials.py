@@ -4,16 +4,34 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
-from touchcell.cell.experiments.elsewhere import RunElsewhere, parcel, unpack
+from touchcell.cell.experiments.elsewhere import Parcel, RunElsewhere, parcel, unpack
 from touchcell.cell.experiments.executors import EXECUTORS, Lost, Workers
 from touchcell.cell.experiments.remote_work import send_by_value
 from touchcell.cell.experiments.trials import INVALID, LOST, Finished, Perform, Trial
 from touchcell.errors import ConfigError
 
 _logger: Final = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class TrialsResult:
+    """What many trials showed.
+
+    Attributes:
+        text: the summary, for people.
+        finished: all trials, in order.
+    """
+
+    text: str
+    finished: tuple[Finished, ...]
+
+    @property
+    def complete(self) -> bool:
+        """True if every trial came to an outcome of its cell."""
+        return not any(each.broken for each in self.finished)
 
 
 def perform_all(
@@ -47,9 +65,12 @@ def perform_all(
     workers = replace(workers or Workers(), address=address)
     found: dict[str, Finished] = {}
     missing: list[Trial] = []
+    parcels: list[Parcel] = []
     for trial in trials:
         try:
             kept = perform.kept(trial)
+            if kept is None and not spec.shares_files:
+                parcels.append(parcel(trial))
         except ConfigError as error:
             kept = perform.record_broken(trial, INVALID, str(error))
         if kept is None:
@@ -63,7 +84,7 @@ def perform_all(
             results = spec.run(perform, missing, workers)
         else:
             send_by_value(perform.measure)
-            results = spec.run(RunElsewhere(perform.measure, perform.code), [parcel(each) for each in missing], workers)
+            results = spec.run(RunElsewhere(perform.measure, perform.code), parcels, workers)
         for index, result in results:
             trial = missing[index]
             if isinstance(result, Lost):
@@ -71,7 +92,7 @@ def perform_all(
             elif isinstance(result, Finished):
                 finished = result
             else:
-                finished = unpack(perform, trial, result)
+                finished = unpack(perform, parcels[index], result)
             found[trial.name] = finished
             if finished.broken:
                 _logger.warning("%s: %s: %s", trial.name, finished.outcome, finished.reason)

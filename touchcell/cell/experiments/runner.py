@@ -16,7 +16,7 @@ from typing import Any, Final
 from touchcell.cell.analysis.provenance import provenance
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.experiments.executors import Workers
-from touchcell.cell.experiments.run_trials import perform_all
+from touchcell.cell.experiments.run_trials import TrialsResult, perform_all
 from touchcell.cell.experiments.table import Column, Row, table, to_json
 from touchcell.cell.experiments.trials import Finished, Perform, Trial
 from touchcell.registry import Registry
@@ -66,19 +66,6 @@ class ExperimentSpec:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class ExperimentResult:
-    """What an experiment showed: its table, and all trials."""
-
-    text: str
-    finished: tuple[Finished, ...]
-
-    @property
-    def complete(self) -> bool:
-        """True if every trial came to an outcome of its cell."""
-        return not any(each.broken for each in self.finished)
-
-
 EXPERIMENTS: Final = Registry("touchcell.experiments", "experiment", ExperimentSpec)
 """All installed experiments."""
 
@@ -92,7 +79,7 @@ def run_experiment(
     executor: str = "local",
     keep_stale: bool = False,
     live: bool = False,
-) -> ExperimentResult:
+) -> TrialsResult:
     """Run missing trials, then write table and figures into ``folder``.
 
     The table says so if trials that are kept were run by other code.
@@ -130,7 +117,7 @@ def run_experiment(
     whole = "\n".join(lines)
     (folder / "summary.txt").write_text(whole + "\n")
     (folder / "summary.json").write_text(json.dumps(_summary(experiment, scale, rows, finished), indent=1) + "\n")
-    return ExperimentResult(whole, tuple(finished))
+    return TrialsResult(whole, tuple(finished))
 
 
 def stale_note(finished: Sequence[Finished], perform: Perform) -> list[str]:

@@ -110,6 +110,14 @@ class Finished:
     commit: str = ""
     digest: str = ""
 
+    @classmethod
+    def of(cls, trial: Trial, folder: RunFolder, record: Mapping[str, Any]) -> Finished:
+        """Return the result that the content of a ``trial.json`` describes."""
+        code = record["code"]
+        return cls(
+            trial, folder, record["outcome"], record["reason"], record["measures"], code["commit"], code["digest"]
+        )
+
     @property
     def done(self) -> bool:
         """True if the task finished."""
@@ -159,7 +167,7 @@ class Perform:
             reason = str(error) if isinstance(error, TouchcellError) else f"{type(error).__name__}: {error}"
             return self.record_broken(trial, CRASHED, f"{reason} (see {LOG})")
         # A new RunFolder: the measured one holds its whole recording in memory.
-        return _finished(trial, RunFolder(folder), record)
+        return Finished.of(trial, RunFolder(folder), record)
 
     def record_broken(self, trial: Trial, outcome: str, reason: str) -> Finished:
         """Leave a record of a trial that has no result, and return it."""
@@ -167,7 +175,7 @@ class Perform:
         folder.mkdir(parents=True, exist_ok=True)
         record = {"outcome": outcome, "reason": reason, "measures": {}, "code": asdict(self.code)}
         _write_whole(folder / "trial.json", json.dumps(record, indent=1))
-        return _finished(trial, RunFolder(folder), record)
+        return Finished.of(trial, RunFolder(folder), record)
 
     def kept(self, trial: Trial) -> Finished | None:
         """Return the trial's result from an earlier call, if nothing that it depends on has changed since.
@@ -180,15 +188,20 @@ class Perform:
             record = json.loads((folder / "trial.json").read_text())
         except (OSError, ValueError):
             return None
-        if record.get("outcome") in BROKEN or record.get("settings") != settings_digest(trial.cell_data()):
+        # Version 0.1.0 did not record which code ran a trial.
+        if record.get("outcome") in BROKEN or "code" not in record:
             return None
         if record["code"]["digest"] != self.code.digest and not self.keep_stale:
             return None
-        return _finished(trial, RunFolder(folder), record)
+        data = trial.cell_data()
+        if record["settings"] != settings_digest(data, file_digests(data)):
+            return None
+        return Finished.of(trial, RunFolder(folder), record)
 
     def _record(self, trial: Trial, data: dict[str, Any], folder: Path) -> dict[str, Any]:
         started = time.perf_counter()
-        settings, files = settings_digest(data), {str(path): digest_of(path) for path in files_named(data)}
+        digests = file_digests(data)
+        settings = settings_digest(data, digests)
         if "collect" in data:
             data = {**data, "collect": {**data["collect"], "data": str(folder / COLLECTED)}}
         (folder / "cell.yaml").write_text(yaml.safe_dump(data, sort_keys=False))
@@ -199,7 +212,7 @@ class Perform:
         record = {
             "settings": settings,
             "code": asdict(self.code),
-            "files": files,
+            "files": digests,
             "outcome": result.outcome.value,
             "reason": result.reason,
             "duration_s": result.duration_s,
@@ -211,11 +224,16 @@ class Perform:
         return record
 
 
-def settings_digest(data: Mapping[str, Any]) -> str:
-    """Return the digest of a cell file's content and of the bytes of all files that it names."""
+def file_digests(data: Mapping[str, Any]) -> dict[str, str]:
+    """Return the digest of each file and folder that a cell file's content names, by its path."""
+    return {str(path): digest_of(path) for path in files_named(data)}
+
+
+def settings_digest(data: Mapping[str, Any], digests: Mapping[str, str]) -> str:
+    """Return the digest of a cell file's content and of the files that it names; see ``file_digests``."""
     settings = hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode())
-    for path in files_named(data):
-        settings.update(digest_of(path).encode())
+    for digest in digests.values():
+        settings.update(digest.encode())
     return settings.hexdigest()[:16]
 
 
@@ -253,13 +271,6 @@ def _with_absolute_paths(file: YamlFile | None, value: Any, at: tuple[str | int,
         if os.path.exists(path):
             return str(path.absolute())
     return value
-
-
-def _finished(trial: Trial, folder: RunFolder, record: Mapping[str, Any]) -> Finished:
-    code = record["code"]
-    return Finished(
-        trial, folder, record["outcome"], record["reason"], record["measures"], code["commit"], code["digest"]
-    )
 
 
 def _write_whole(path: Path, text: str) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from touchcell.cell.analysis.provenance import provenance
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.experiments.executors import Workers
-from touchcell.cell.experiments.run_trials import perform_all
+from touchcell.cell.experiments.run_trials import TrialsResult, perform_all
 from touchcell.cell.experiments.runner import stale_note, table_rows
 from touchcell.cell.experiments.table import Column, table
 from touchcell.cell.experiments.trials import Finished, Perform, Trial
@@ -61,38 +61,6 @@ class Sweep:
         ]
 
 
-@dataclass(frozen=True, slots=True)
-class SweepResult:
-    """What a sweep showed.
-
-    Attributes:
-        text: its summary.
-        finished: all trials, in order.
-    """
-
-    text: str
-    finished: tuple[Finished, ...]
-
-    @property
-    def complete(self) -> bool:
-        """True if every trial came to an outcome of its cell."""
-        return not any(each.broken for each in self.finished)
-
-    def rows(self, keys: Sequence[str]) -> list[dict[str, Any]]:
-        """Return one flat row for each trial: name, the values of ``keys``, outcome, reason, and all measures."""
-        return [
-            {
-                "trial": each.trial.name,
-                **{key: each.trial.changes.get(key) for key in keys},
-                "outcome": each.outcome,
-                "reason": each.reason,
-                "commit": each.commit,
-                **each.measures,
-            }
-            for each in self.finished
-        ]
-
-
 def run_sweep(
     sweep: Sweep,
     folder: Path,
@@ -101,7 +69,7 @@ def run_sweep(
     executor: str = "local",
     keep_stale: bool = False,
     live: bool = False,
-) -> SweepResult:
+) -> TrialsResult:
     """Run the missing trials of a sweep, then write its tables and plots into ``folder``.
 
     ``sweep.csv`` has a row for each trial, ``sweep.parquet`` the same where pyarrow is installed, ``summary.txt``
@@ -126,8 +94,7 @@ def run_sweep(
     finished = perform_all(
         perform, sweep.trials(), workers=workers, executor=executor, live=live, title=sweep.cell.stem
     )
-    result = SweepResult("", tuple(finished))
-    rows = result.rows(sweep.factors.keys)
+    rows = _rows(finished, sweep.factors.keys)
     shown = _shown(sweep.measures, finished)
     written = [_write_csv(folder / "sweep.csv", rows), *_write_parquet(folder / "sweep.parquet", rows)]
     pictures = draw_factors(rows, sweep.factors.keys, shown, folder)
@@ -144,7 +111,22 @@ def run_sweep(
     text = "\n".join(lines)
     (folder / "summary.txt").write_text(text + "\n")
     (folder / "summary.json").write_text(json.dumps(_summary(sweep, finished), indent=1, default=str) + "\n")
-    return SweepResult(text, tuple(finished))
+    return TrialsResult(text, tuple(finished))
+
+
+def _rows(finished: Sequence[Finished], keys: Sequence[str]) -> list[dict[str, Any]]:
+    """Return one flat row for each trial: name, the values of ``keys``, outcome, reason, commit, and all measures."""
+    return [
+        {
+            "trial": each.trial.name,
+            **{key: each.trial.changes.get(key) for key in keys},
+            "outcome": each.outcome,
+            "reason": each.reason,
+            "commit": each.commit,
+            **each.measures,
+        }
+        for each in finished
+    ]
 
 
 def _shown(asked: Sequence[str], finished: Sequence[Finished]) -> list[str]:
