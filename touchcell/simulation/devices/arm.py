@@ -5,9 +5,7 @@ It has no joints, no singularities and no tracking error beyond those limits; it
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
@@ -21,6 +19,7 @@ from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.simulation.devices.delayed_twists import DelayedTwists
 from touchcell.simulation.faults import ArmFaults
 from touchcell.simulation.kinematics import TwistFollower
 from touchcell.simulation.scene import Scene
@@ -58,18 +57,6 @@ class SimArmConfig(DriverConfig):
     state_timeout_s: float = Field(default=0.1, gt=0.0, le=1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class _Late:
-    """A twist delayed by the latency."""
-
-    due_ns: int
-    twist_base: Array
-    expires_ns: int
-
-    def postponed(self, by_ns: int) -> _Late:
-        return replace(self, due_ns=self.due_ns + by_ns, expires_ns=self.expires_ns + by_ns)
-
-
 class SimArm(Arm):
     """Driver of a simulated arm.
 
@@ -96,7 +83,7 @@ class SimArm(Arm):
         self._timeline = timeline or Timeline(clock)
         self._body = TwistFollower(se3.from_euler_mm_deg(config.start_pose_mm_deg), self.limits, self._timeline.step_ns)
         self._latency_ns = round(config.latency_ms * 1e6)
-        self._on_the_way: deque[_Late] = deque()
+        self._on_the_way = DelayedTwists()
         self._powered = False
         self._last_reported: Stamped[TcpState] | None = None
         self._timeline.add(Phase.MOTION, self._step)
@@ -141,7 +128,7 @@ class SimArm(Arm):
         self._timeline.advance()
         expires_ns = now_ns + round(ttl_s * 1e9)
         if self._latency_ns:
-            self._on_the_way.append(_Late(now_ns + self._latency_ns, twist_base.copy(), expires_ns + self._latency_ns))
+            self._on_the_way.add(twist_base, now_ns + self._latency_ns, expires_ns + self._latency_ns)
         else:
             self._body.follow(twist_base, expires_ns)
 
@@ -155,8 +142,7 @@ class SimArm(Arm):
             self._body.halt()
 
     def _step(self, t_ns: int) -> None:
-        while self._on_the_way and self._on_the_way[0].due_ns <= t_ns - self._timeline.step_ns:
-            late = self._on_the_way.popleft()
+        for late in self._on_the_way.arrived(t_ns - self._timeline.step_ns):
             self._body.follow(late.twist_base, late.expires_ns)
         if self.faults.ignores_expiry and self._powered:
             self._body.prolong(t_ns)
@@ -169,11 +155,11 @@ class SimArm(Arm):
 
     def _snapshot(self) -> Callable[[int], None]:
         """Snapshot the body only: leases are not part of the simulation."""
-        powered, body, on_the_way = self._powered, self._body.snapshot(), tuple(self._on_the_way)
+        powered, body, on_the_way = self._powered, self._body.snapshot(), self._on_the_way.snapshot()
 
         def restore(later_ns: int) -> None:
             self._powered = powered
-            self._on_the_way = deque(late.postponed(later_ns) for late in on_the_way)
+            on_the_way(later_ns)
             body(later_ns)
 
         return restore

@@ -12,15 +12,15 @@ import numpy as np
 
 from touchcell.drivers.core.clock import Clock, VirtualClock
 from touchcell.drivers.core.device import Device
-from touchcell.drivers.core.spec import ConfigT, DriverContext, DriverSpec
+from touchcell.drivers.core.spec import AnyDriver, DriverConfig, DriverContext
 from touchcell.drivers.core.stand_in import Placement
 from touchcell.drivers.replay import camera as replay_camera
 from touchcell.simulation.devices import arm as sim_arm
 from touchcell.simulation.devices import joint_arm as sim_joint_arm
-from touchcell.simulation.devices import stand_in_arm
 from touchcell.simulation.devices import tactip as sim_tactip
 from touchcell.simulation.devices.arm import SimArm
 from touchcell.simulation.devices.joint_arm import SimJointArm
+from touchcell.simulation.devices.stand_in_arm import StandInArm, stand_in
 from touchcell.simulation.faults import FrameFaults
 from touchcell.simulation.scene import SceneConfig
 from touchcell.testing.emulation.rig import DeviceFixture, FixtureFactory
@@ -82,11 +82,12 @@ def sim_joint_arm_rig(folder: Path, address: int) -> DeviceFixture:
     return _arm_rig(sim_joint_arm.SPEC, sim_joint_arm.SimJointArmConfig(model="panda", start_pose_mm_deg=_START))
 
 
-def _arm_rig(spec: DriverSpec[ConfigT, SimArm | SimJointArm], config: ConfigT) -> DeviceFixture:
-    arms: list[SimArm | SimJointArm] = []
+def _arm_rig(spec: AnyDriver, config: DriverConfig, state_rate_hz: float | None = None) -> DeviceFixture:
+    arms: list[SimArm | SimJointArm | StandInArm] = []
 
     def build(clock: Clock) -> Device:
         arm = spec.build("arm", config, DriverContext(clock))
+        assert isinstance(arm, SimArm | SimJointArm | StandInArm)
         arms.append(arm)
         return arm
 
@@ -104,6 +105,7 @@ def _arm_rig(spec: DriverSpec[ConfigT, SimArm | SimJointArm], config: ConfigT) -
         pose="T_base_tcp",
         clock=VirtualClock,
         process=False,
+        state_rate_hz=state_rate_hz,
     )
 
 
@@ -168,27 +170,4 @@ def stand_in_of(rig: FixtureFactory) -> DeviceFixture:
     """Build the simulated stand-in for the arm of another driver's fixture, with its configuration."""
     real = rig(Path(), 0)
     assert real.config is not None
-    spec = stand_in_arm.stand_in(real.spec, Placement())
-    arms: list[stand_in_arm.StandInArm] = []
-
-    def build(clock: Clock) -> Device:
-        arm = spec.build("arm", real.config, DriverContext(clock))
-        assert isinstance(arm, stand_in_arm.StandInArm)
-        arms.append(arm)
-        return arm
-
-    def truth() -> dict[str, Any]:
-        arms[-1].health()
-        T = arms[-1].T_world_tcp()
-        return {"T_base_tcp": T.tolist(), "position_m": T[:3, 3].tolist()}
-
-    return DeviceFixture(
-        spec=spec,
-        start=lambda: StandIn(truth),
-        build=build,
-        energising=None,
-        pose="T_base_tcp",
-        clock=VirtualClock,
-        process=False,
-        state_rate_hz=real.state_rate_hz,
-    )
+    return _arm_rig(stand_in(real.spec, Placement()), real.config, real.state_rate_hz)

@@ -5,9 +5,8 @@ Joints follow their setpoint exactly: there is no dynamics, no friction and no s
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,23 +27,12 @@ from touchcell.drivers.kinematics.inverse import joints_for_pose
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.simulation.devices.delayed_twists import DelayedTwists
 from touchcell.simulation.faults import ArmFaults
 from touchcell.simulation.scene import Scene
 from touchcell.simulation.timeline import DEFAULT_STEP_S, Phase, Timeline
 
 _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE, Lifecycle.FAULTED)
-
-
-@dataclass(frozen=True, slots=True)
-class _Late:
-    """A twist on its way to the arm."""
-
-    due_ns: int
-    twist_base: Array
-    expires_ns: int
-
-    def postponed(self, by_ns: int) -> _Late:
-        return replace(self, due_ns=self.due_ns + by_ns, expires_ns=self.expires_ns + by_ns)
 
 
 class StandInArm(JointArm):
@@ -105,7 +93,7 @@ class StandInArm(JointArm):
         self._timeline = timeline or Timeline(clock)
         self._period_ns = max(round(1e9 / behaviour.state_rate_hz), self._timeline.step_ns)
         self._latency_ns = round(behaviour.latency_s * 1e9)
-        self._on_the_way: deque[_Late] = deque()
+        self._on_the_way = DelayedTwists()
         self._powered = False
         self._load = np.zeros(3), np.zeros(3)
         self._reported: Stamped[JointState] | None = None
@@ -173,7 +161,7 @@ class StandInArm(JointArm):
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
         self._timeline.advance()
         expires_ns = now_ns + round(ttl_s * 1e9)
-        self._on_the_way.append(_Late(now_ns + self._latency_ns, twist_base.copy(), expires_ns))
+        self._on_the_way.add(twist_base, now_ns + self._latency_ns, expires_ns)
 
     def _begin_stop(self, category: StopCategory) -> None:
         self._timeline.advance()
@@ -186,16 +174,13 @@ class StandInArm(JointArm):
 
     def _step(self, t_ns: int) -> None:
         step_ns = self._timeline.step_ns
-        while self._on_the_way and self._on_the_way[0].due_ns <= t_ns - step_ns:
-            late = self._on_the_way.popleft()
+        for late in self._on_the_way.arrived(t_ns - step_ns):
             self._setpoint.follow(late.twist_base, late.expires_ns)
         if self.faults.ignores_expiry and self._powered and self._setpoint.twist.any():
             self._setpoint.follow(self._setpoint.twist, t_ns + step_ns)
         self._setpoint.step(t_ns - step_ns, step_ns * 1e-9)
-        if drift_m_s := self._drift_m_s():
-            J = self._chain.jacobian(self._setpoint.q)
-            sinks = np.array([0.0, 0.0, -drift_m_s, 0.0, 0.0, 0.0])
-            self._setpoint.q = self._setpoint.q + np.linalg.lstsq(J, sinks, rcond=None)[0] * (step_ns * 1e-9)
+        if self._drift_m_s():
+            self._setpoint.q = self._setpoint.q + self._sinking() * (step_ns * 1e-9)
         if t_ns // self._period_ns != self._joints_t_ns // self._period_ns:
             self._joints = self._sample()
 
@@ -206,18 +191,23 @@ class StandInArm(JointArm):
     def _sample(self) -> Stamped[JointState]:
         t_ns = self._timeline.t_ns
         dq = self._setpoint.dq
-        if drift_m_s := self._drift_m_s():
-            J = self._chain.jacobian(self._setpoint.q)
-            dq = dq + np.linalg.lstsq(J, np.array([0.0, 0.0, -drift_m_s, 0.0, 0.0, 0.0]), rcond=None)[0]
+        if self._drift_m_s():
+            dq = dq + self._sinking()
         state = JointState(self._setpoint.q, dq, np.zeros_like(dq))
         return Stamped(state, t_ns, t_ns // self._period_ns)
 
+    def _sinking(self) -> Array:
+        """Return joint speeds (n,) at which the tool sinks by the fault's drift."""
+        sinks = np.array([0.0, 0.0, -self._drift_m_s(), 0.0, 0.0, 0.0])
+        speeds: Array = np.linalg.lstsq(self._chain.jacobian(self._setpoint.q), sinks, rcond=None)[0]
+        return speeds
+
     def _snapshot(self) -> Callable[[int], None]:
-        powered, setpoint, on_the_way = self._powered, self._setpoint.snapshot(), tuple(self._on_the_way)
+        powered, setpoint, on_the_way = self._powered, self._setpoint.snapshot(), self._on_the_way.snapshot()
 
         def restore(later_ns: int) -> None:
             self._powered = powered
-            self._on_the_way = deque(late.postponed(later_ns) for late in on_the_way)
+            on_the_way(later_ns)
             setpoint(later_ns)
 
         return restore
