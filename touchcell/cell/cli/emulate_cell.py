@@ -14,9 +14,7 @@ import re
 import shlex
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +25,6 @@ from touchcell.cell.config.default_scene import start_of
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_cell
 from touchcell.drivers.core.clock import MonotonicClock
-from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.v4l2.emulator.server import V4l2Emulator
 from touchcell.drivers.v4l2.shim import environment
 from touchcell.errors import ConfigError
@@ -36,47 +33,35 @@ from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.scene import Scene, SceneConfig
 from touchcell.simulation.tip import Tip
 from touchcell.testing.emulation.base import Emulator
-from touchcell.testing.emulation.in_cell import EMULATED
+from touchcell.testing.emulation.in_cell import EMULATED, TcpOfJoints
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.ticker import Ticker
 
 _CAMERA = re.compile(r"/dev/(?:video|v4l/by-id/usb-TacTip_)(\d+)(?:-video-index0)?")
-# What an arm was asked less long ago than this is not asked again: scenes take their steps in bursts.
-_FRESH_NS = 2_000_000
 
 
 class EmulatedArm:
-    """An emulated arm as what carries a sensor through a scene; once it is gone, it is where it was last.
+    """An emulated arm that carries a sensor through a scene; once it is gone, it is where it was last.
 
     Args:
         process: its emulator, running.
-        T_base_tcp: (4, 4) where its tool is, from its state.
+        T_base_tcp: returns the pose (4, 4) of its tool for its joint angles (n,) rad.
         T_world_base: (4, 4) where its base stands.
     """
 
     def __init__(
         self,
         process: EmulatorProcess,
-        T_base_tcp: Callable[[Mapping[str, Any]], Array],
+        T_base_tcp: TcpOfJoints,
         T_world_base: Array,
     ) -> None:
         self._process = process
         self._T_base_tcp = T_base_tcp
         self._T_world_base = T_world_base
-        self._T_world_tcp = self._ask()
-        self._asked_ns = time.monotonic_ns()
 
     def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
         """(4, 4) where its tool truly is."""
-        now_ns = time.monotonic_ns()
-        if now_ns - self._asked_ns > _FRESH_NS:
-            self._asked_ns = now_ns
-            with suppress(DeviceError, OSError):
-                self._T_world_tcp = self._ask()
-        return self._T_world_tcp
-
-    def _ask(self) -> Array:
-        T: Array = self._T_world_base @ self._T_base_tcp(self._process.state())
+        T: Array = self._T_world_base @ self._T_base_tcp(self._process.joints())
         return T
 
 
@@ -150,7 +135,8 @@ class CellEmulator(Emulator):
         device = self._plan.arms[name]
         where = EMULATED.load(device.spec.name).T_base_tcp
         assert where is not None
-        return EmulatedArm(self._arm_processes[name], where(device.config), self._plan.cell.arms[name].T_world_base)
+        process = self._arm_processes[name]
+        return EmulatedArm(process, where(device.config, process.state()), self._plan.cell.arms[name].T_world_base)
 
     def _camera(self, name: str, folder: Path) -> V4l2Emulator:
         device = self._plan.sensors[name]

@@ -163,6 +163,7 @@ class DamiaoArm(Emulator):
         """Open the hub and start the simulated time."""
         self._start_s = self._now_s()
         self._hub.open()
+        self.publish_joints(self._q)
         self._ticker = asyncio.create_task(self._tick())
 
     async def stop(self) -> None:
@@ -244,6 +245,7 @@ class DamiaoArm(Emulator):
             self._hub.drain()
             self._check_timeouts()
             self._integrate()
+            self.publish_joints(self._q)
 
     def _check_timeouts(self) -> None:
         now_s = self._now_s()

@@ -11,7 +11,7 @@ import numpy as np
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.franka.driver import SPEC, FrankaArm, FrankaConfig
-from touchcell.testing.emulation.in_cell import EmulatedDriver, TcpOfState, free_host, start_arguments, tcp_of_joints
+from touchcell.testing.emulation.in_cell import EmulatedDriver, TcpOfJoints, free_host, start_arguments, tcp_of_joints
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
@@ -70,11 +70,12 @@ def _start(config: FrankaConfig, start_deg: Sequence[float] | None) -> EmulatorP
     return EmulatorProcess("franka", "--host", config.host, *start_arguments(start_deg))
 
 
-def _tcp(config: FrankaConfig) -> TcpOfState:
+def _tcp(config: FrankaConfig, state: Mapping[str, Any]) -> TcpOfJoints:
     if config.flange_to_tcp_mm_deg is not None:
-        return tcp_of_joints(config)
+        return tcp_of_joints(config, state)
     # The end effector is as it is set in Desk.
-    return lambda state: np.array(state["T_base_ee"], dtype=np.float64)
+    chain, F_T_EE = config.described_chain(), np.array(state["F_T_EE"], dtype=np.float64)
+    return lambda q: chain.forward(q) @ F_T_EE
 
 
 EMULATED = EmulatedDriver("franka", _settings, _start, _tcp)

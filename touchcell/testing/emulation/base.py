@@ -28,6 +28,8 @@ from typing import Any, ClassVar
 import yaml
 
 from touchcell.errors import ConfigError
+from touchcell.geometry.types import Array
+from touchcell.testing.emulation.shared_joints import JointsWriter
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +75,12 @@ class Emulator(ABC):
 
     def __init__(self) -> None:
         self.active: dict[str, Any] = {}
+        self.joints: JointsWriter | None = None
+
+    def publish_joints(self, q: Array) -> None:
+        """Publish the true joint angles (n,) rad, for a scene that reads them; arms call it at start and each step."""
+        if self.joints is not None:
+            self.joints.publish(q)
 
     @abstractmethod
     async def start(self) -> None:

@@ -108,6 +108,7 @@ class FrankaEmulator(Emulator):
         self._udp.bind((self._host, 0))
         self._udp.setblocking(False)
         self._describe_tool()
+        self.publish_joints(self._arm.q)
         self._ticker = Ticker(_PERIOD_NS, self._tick)
 
     async def stop(self) -> None:
@@ -229,6 +230,7 @@ class FrankaEmulator(Emulator):
         command = self._read_command()
         if self._move_id is not None:
             self._advance(command)
+        self.publish_joints(self._arm.q)
         self._send_state()
 
     def _read_requests(self) -> None:
