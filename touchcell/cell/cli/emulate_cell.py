@@ -24,7 +24,7 @@ from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.default_scene import start_of
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_cell
-from touchcell.drivers.core.clock import MonotonicClock
+from touchcell.drivers.core.paced_clock import emulated_clock
 from touchcell.drivers.v4l2.emulator.server import V4l2Emulator
 from touchcell.drivers.v4l2.shim import environment
 from touchcell.errors import ConfigError
@@ -99,7 +99,7 @@ class CellEmulator(Emulator):
         for process in self._arm_processes.values():
             process.start()
         self._arms = {name: self._arm(name) for name in self._arm_processes}
-        scene = self._scene = self._scene_config.build(MonotonicClock())
+        scene = self._scene = self._scene_config.build(emulated_clock())
         for name in self._cameras:
             scene.mount(name, self._sensor_pose(name))
         self._ticker = Ticker(scene.timeline.step_ns, lambda late: _advance(scene))

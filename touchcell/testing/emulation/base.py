@@ -18,7 +18,6 @@ import json
 import os
 import signal
 import sys
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +26,7 @@ from typing import Any, ClassVar
 
 import yaml
 
+from touchcell.drivers.core.paced_clock import emulated_clock
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 from touchcell.testing.emulation.shared_joints import JointsWriter
@@ -46,7 +46,7 @@ class CommandOnset:
     """Time of the last change of motion commands at the emulator, for measuring command latency.
 
     Attributes:
-        t_ns: CLOCK_MONOTONIC time of the last change that followed at least 50 ms without one; 0 before the first.
+        t_ns: time in the emulated world of the last change that followed at least 50 ms without one; 0 before the first.
     """
 
     _CALM_NS = 50_000_000
@@ -60,7 +60,7 @@ class CommandOnset:
         """Record a motion command; call for each one that arrives."""
         if self._content.get(addressee) == content:
             return
-        now_ns = time.monotonic_ns()
+        now_ns = emulated_clock().now_ns()
         if now_ns - self._changed_ns >= self._CALM_NS:
             self.t_ns = now_ns
         self._content[addressee] = content

@@ -14,6 +14,7 @@ from typing import Final, Protocol, runtime_checkable
 from touchcell.errors import ConfigError, suggest
 from touchcell.registry import Registry
 from touchcell.testing.emulation.base import Emulator, read_fault_script, serve
+from touchcell.testing.emulation.paced_loop import PacedLoop
 from touchcell.testing.emulation.shared_joints import JointsWriter
 
 
@@ -60,7 +61,8 @@ def main(arguments: Sequence[str]) -> int:
     if options.joints is not None:
         emulator.joints = JointsWriter(options.joints)
     try:
-        asyncio.run(serve(emulator, options.control, script, lifeline=options.lifeline))
+        with asyncio.Runner(loop_factory=PacedLoop) as runner:
+            runner.run(serve(emulator, options.control, script, lifeline=options.lifeline))
     except OSError as error:
         raise ConfigError(
             f"the emulator {options.name!r} cannot open its wire: {error.strerror or error}",

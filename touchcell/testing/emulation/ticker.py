@@ -11,6 +11,8 @@ import os
 import time
 from collections.abc import Callable
 
+from touchcell.drivers.core.paced_clock import emulated_clock, emulated_pace
+
 _MADE_UP_FOR = 50
 
 
@@ -39,7 +41,7 @@ class Ticker:
     """Call ``on_tick(late)`` from the running loop each period.
 
     Two ticks are never closer than three quarters of a period. Late ticks are made up for at four thirds of the rate,
-    unless there are more than fifty of them: then the missed ones are skipped.
+    unless there are more than fifty of them: then the missed ones are skipped. Periods are in the emulated world's time.
 
     Args:
         period_ns: below one second.
@@ -53,7 +55,8 @@ class Ticker:
         self._fd: int = self._libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if self._fd < 0:
             raise OSError(ctypes.get_errno(), "timerfd_create")
-        self._due_ns = time.monotonic_ns() + period_ns
+        self._clock, self._pace = emulated_clock(), emulated_pace()
+        self._due_ns = self._clock.now_ns() + period_ns
         self._arm(period_ns)
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._fd, self._expired)
@@ -64,7 +67,7 @@ class Ticker:
         os.close(self._fd)
 
     def _arm(self, in_ns: int) -> None:
-        once = _Itimerspec(_Timespec(0, 0), _Timespec(0, in_ns))
+        once = _Itimerspec(_Timespec(0, 0), _Timespec(*divmod(round(in_ns / self._pace), 1_000_000_000)))
         if self._libc.timerfd_settime(self._fd, 0, ctypes.byref(once), None):
             raise OSError(ctypes.get_errno(), "timerfd_settime")
 
@@ -73,6 +76,6 @@ class Ticker:
             os.read(self._fd, 8)
         except BlockingIOError:
             return
-        self._due_ns, in_ns, late = following_tick(self._due_ns, time.monotonic_ns(), self._period_ns)
+        self._due_ns, in_ns, late = following_tick(self._due_ns, self._clock.now_ns(), self._period_ns)
         self._arm(in_ns)
         self._on_tick(late)

@@ -12,6 +12,7 @@ from typing import Any, Final
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.schema import EMULATED_CAMERAS, plan_cell, plan_in_world
 from touchcell.cell.runtime.worlds import Emulation
+from touchcell.drivers.core.paced_clock import pace_variables
 from touchcell.errors import ConfigError
 from touchcell.testing.emulation.in_cell import EMULATED
 from touchcell.testing.emulation.process import EmulatorProcess
@@ -42,16 +43,25 @@ def emulated(
         plan = plan_emulated(path, folder, overrides, model=model, settings=settings)
         file = folder / "cell.yaml"
         file.write_text(plan.text())
-        with EmulatorProcess("cell", str(file), "--folder", str(folder), timeout_s=_START_S):
-            before = os.environ.get(EMULATED_CAMERAS)
-            os.environ[EMULATED_CAMERAS] = str(folder)
-            try:
-                yield plan
-            finally:
-                if before is None:
-                    del os.environ[EMULATED_CAMERAS]
-                else:
-                    os.environ[EMULATED_CAMERAS] = before
+        variables = {EMULATED_CAMERAS: str(folder), **pace_variables(plan.cell.emulated_pace)}
+        arguments = ("cell", str(file), "--folder", str(folder))
+        with _environment(variables), EmulatorProcess(*arguments, timeout_s=_START_S):
+            yield plan
+
+
+@contextmanager
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables within the context, for drivers in this process and for emulators in theirs."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def plan_emulated(

@@ -16,12 +16,12 @@ import os
 import socket
 import struct
 import sys
-import time
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
+from touchcell.drivers.core.paced_clock import emulated_clock
 from touchcell.drivers.v4l2 import codec
 from touchcell.drivers.v4l2.emulator import picture
 from touchcell.drivers.v4l2.emulator.device import SLOT_BYTES, CameraModel, Handle
@@ -172,7 +172,7 @@ class V4l2Emulator(Emulator):
         if fault == "restart":
             asyncio.get_running_loop().call_later(float(value), self.end, "restart")
         if fault == "exposure_drift":
-            self._drift_since_s = time.monotonic()
+            self._drift_since_s = 1e-9 * emulated_clock().now_ns()
         if fault == "no_monotonic":
             self.model.stamp_flags &= ~codec.BUF_TIMESTAMP_MASK
         if fault == "reset_controls":
@@ -280,7 +280,7 @@ class V4l2Emulator(Emulator):
                 self._expose()
 
     def _expose(self) -> None:
-        stamp_ns = time.monotonic_ns()
+        stamp_ns = emulated_clock().now_ns()
         self._sequence += 1
         if self.spend("drop"):
             self._counts["dropped"] += 1
@@ -346,7 +346,7 @@ class V4l2Emulator(Emulator):
         if controls[codec.CID_EXPOSURE_AUTO].value == codec.EXPOSURE_MANUAL:
             light *= math.sqrt(controls[codec.CID_EXPOSURE_ABSOLUTE].value / _EXPOSURE_FOR_FULL_LIGHT)
         drift_per_s = float(self.active.get("exposure_drift", 0.0))
-        return light * max(0.0, 1.0 + drift_per_s * (time.monotonic() - self._drift_since_s))
+        return light * max(0.0, 1.0 + drift_per_s * (1e-9 * emulated_clock().now_ns() - self._drift_since_s))
 
 
 @lru_cache(maxsize=96)
