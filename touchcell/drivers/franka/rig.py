@@ -5,13 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from ipaddress import IPv4Address
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.franka.driver import SPEC, FrankaArm, FrankaConfig
-from touchcell.testing.emulation.in_cell import EmulatedDriver, TcpOfJoints, free_host, start_arguments, tcp_of_joints
+from touchcell.testing.emulation.in_cell import (
+    FOR_EVER_PACKETS,
+    FOR_EVER_S,
+    EmulatedDriver,
+    TcpOfJoints,
+    free_host,
+    start_arguments,
+    tcp_of_joints,
+)
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
@@ -78,4 +86,10 @@ def _tcp(config: FrankaConfig, state: Mapping[str, Any]) -> TcpOfJoints:
     return lambda q: chain.forward(q) @ F_T_EE
 
 
-EMULATED = EmulatedDriver("franka", _settings, _start, _tcp)
+_FAULTS: Final = {
+    # A state that never comes leaves the one before it.
+    "stale": ("delay", lambda _: FOR_EVER_S),
+    "nan_state": ("nan", lambda _: FOR_EVER_PACKETS),
+}
+
+EMULATED = EmulatedDriver("franka", _settings, _start, _tcp, _FAULTS)

@@ -27,7 +27,7 @@ from typing import Any, ClassVar
 import yaml
 
 from touchcell.drivers.core.paced_clock import emulated_clock
-from touchcell.errors import ConfigError
+from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry.types import Array
 from touchcell.testing.emulation.shared_joints import JointsWriter
 
@@ -46,7 +46,7 @@ class CommandOnset:
     """Time of the last change of motion commands at the emulator, for measuring command latency.
 
     Attributes:
-        t_ns: time in the emulated world of the last change that followed at least 50 ms without one; 0 before the first.
+        t_ns: time in the emulated world of the last change after at least 50 ms without one; 0 before the first.
     """
 
     _CALM_NS = 50_000_000
@@ -211,7 +211,7 @@ def _answer(emulator: Emulator, done: asyncio.Event, line: bytes) -> dict[str, A
         elif "quit" in request:
             done.set()
         return {"ok": True, "state": emulator.state()}
-    except (ConfigError, ValueError, TypeError) as error:
+    except (TouchcellError, ValueError, TypeError) as error:
         return {"ok": False, "error": str(error)}
 
 

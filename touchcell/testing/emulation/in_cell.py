@@ -6,7 +6,7 @@ import os
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -38,12 +38,15 @@ class EmulatedDriver:
             which it begins (None for its home); None for a camera, whose picture the scene draws.
         T_base_tcp: returns for a configuration and the state of the emulator at its start what computes the pose (4, 4)
             of an arm's tool in its base from the joint angles (n,) rad that the emulator publishes.
+        faults: by a fault of simulated devices (``touchcell.simulation.faults``) the emulator's own that does the same,
+            and its value for a value of the simulated one.
     """
 
     name: str
     settings: Callable[[Any, Path, int], Mapping[str, Any]]
     start: Callable[[Any, Sequence[float] | None], EmulatorProcess] | None = None
     T_base_tcp: Callable[[Any, Mapping[str, Any]], TcpOfJoints] | None = None
+    faults: Mapping[str, tuple[str, Callable[[Any], Any]]] = field(default_factory=dict)
 
 
 EMULATED: Final = Registry("touchcell.emulated_devices", "emulated device", EmulatedDriver)
@@ -74,6 +77,10 @@ def tcp_of_joints(config: DriverConfig, state: Mapping[str, Any]) -> TcpOfJoints
     chain = config.described_chain()
     assert chain is not None
     return chain.forward
+
+
+FOR_EVER_S: Final = 3600.0
+FOR_EVER_PACKETS: Final = 1_000_000
 
 
 def start_arguments(start_deg: Sequence[float] | None) -> list[str]:

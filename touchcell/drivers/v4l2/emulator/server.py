@@ -69,6 +69,7 @@ class V4l2Emulator(Emulator):
         minor: number N of its /dev/videoN.
         images: folder of images to show instead of the synthetic ones.
         show: function from a frame's number to the grey image (height, width) to show; replaces both.
+        latency_s: time from a frame's exposure to its delivery.
     """
 
     faults: ClassVar = {
@@ -78,6 +79,7 @@ class V4l2Emulator(Emulator):
         "freeze_frame": "the same image for ever, with fresh timestamps and numbers",
         "corrupt": "number of truncated frames",
         "error_flag": "number of frames that the kernel marks as corrupt",
+        "gain": "factor on the brightness, as of a lamp that fails",
         "exposure_drift": "change of brightness per second, as a fraction",
         "stuck_controls": "controls accept every value and change nothing",
         "no_monotonic": "timestamps on an unknown clock",
@@ -100,8 +102,10 @@ class V4l2Emulator(Emulator):
         minor: int = 0,
         images: Path | None = None,
         show: Callable[[int], ImageArray] | None = None,
+        latency_s: float = 0.0,
     ) -> None:
         super().__init__()
+        self._latency_s = latency_s
         self._show = show
         self._folder = folder
         self._minor = minor
@@ -299,7 +303,7 @@ class V4l2Emulator(Emulator):
             stamp_ns -= _OLDER_FRAMES * round(1e9 / self.model.rate_hz)
         if "no_monotonic" in self.active:
             stamp_ns += _FOREIGN_CLOCK_NS
-        stream, delay_s = self._stream, float(self.active.get("delay", 0.0))
+        stream, delay_s = self._stream, self._latency_s + float(self.active.get("delay", 0.0))
         if delay_s > 0.0:
             asyncio.get_running_loop().call_later(delay_s, self._deliver, stream, data, sequence, stamp_ns, flags)
         else:
@@ -345,6 +349,7 @@ class V4l2Emulator(Emulator):
         light = 1.0 + controls[codec.CID_GAIN].value / _GAIN_FOR_DOUBLE_LIGHT
         if controls[codec.CID_EXPOSURE_AUTO].value == codec.EXPOSURE_MANUAL:
             light *= math.sqrt(controls[codec.CID_EXPOSURE_ABSOLUTE].value / _EXPOSURE_FOR_FULL_LIGHT)
+        light *= float(self.active.get("gain", 1.0))
         drift_per_s = float(self.active.get("exposure_drift", 0.0))
         return light * max(0.0, 1.0 + drift_per_s * (1e-9 * emulated_clock().now_ns() - self._drift_since_s))
 
