@@ -50,8 +50,8 @@ class Mutation:
 MUTATIONS = (
     Mutation("surface_follow_sim.yaml", "stale_frame", {"limit_ms": 600}),
     Mutation("surface_follow_dome_sim.yaml", "out_of_range", None),
-    Mutation("surface_follow_bench.yaml", "contact_lost", {"severity": "limit"}),
-    Mutation("object_track_sim.yaml", "tcp_speed", {"limit_m_s": 0.5}),
+    Mutation("surface_follow_bench.yaml", "contact_lost", {"limit_ms": 3000}),
+    Mutation("object_track_sim.yaml", "tcp_speed", {"limit_m_s": 0.3}),
     Mutation("object_track_panda_sim.yaml", "indentation", {"limit_mm": 12}),
     Mutation("single_push_sim.yaml", "stale_arm", {"limit_ms": 400}),
     Mutation("single_push_bench.yaml", "tilt", {"limit_deg": 85}),

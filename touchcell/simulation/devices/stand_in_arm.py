@@ -14,7 +14,7 @@ from touchcell.drivers.core.arm import JointLimitsConfig, LimitsConfig
 from touchcell.drivers.core.behaviour import ArmBehaviour
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle, OperatorToken
-from touchcell.drivers.core.errors import StaleData
+from touchcell.drivers.core.errors import CorruptMessage, StaleData
 from touchcell.drivers.core.joint_arm import JointArm
 from touchcell.drivers.core.joint_setpoint import JointSetpoint
 from touchcell.drivers.core.lease import Lease
@@ -111,8 +111,10 @@ class StandInArm(JointArm):
         self._timeline.advance()
         sample = self._joints
         assert sample is not None
-        # Real drivers drop a state that is not finite: what is left is the one before it.
-        if (self.faults.stale or self.faults.nan_state) and self._reported is not None:
+        if self.faults.nan_state:
+            # As real drivers do after some bad states in a row.
+            raise self._to_faulted(CorruptMessage(self.name, "states with numbers that are not finite"))
+        if self.faults.stale and self._reported is not None:
             sample = self._reported
         self._reported = sample
         age_s = sample.age_s(self._clock.now_ns())
@@ -123,7 +125,7 @@ class StandInArm(JointArm):
     def at_rest(self) -> bool:
         """Return whether it is at rest with no motion pending, as far as the newest state that it has sent shows."""
         self._timeline.advance()
-        if (self.faults.stale or self.faults.nan_state) and self._reported is not None:
+        if self.faults.stale and self._reported is not None:
             return not self._reported.value.dq.any()
         return not (self._setpoint.moving or self._on_the_way or self._drift_m_s())
 
