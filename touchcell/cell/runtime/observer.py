@@ -36,12 +36,14 @@ class Reading:
         states: of the arms, by role.
         contacts: of the sensors that have seen a frame, by role.
         devices: of the other devices that are read, by role.
+        wrenches: (6,) N and N m of the arms of which they are needed, by role.
     """
 
     now_ns: int
     states: Mapping[str, Stamped[TcpState]]
     contacts: Mapping[str, ContactEstimate]
     devices: Mapping[str, Stamped[Mapping[str, float]]] = field(default_factory=dict)
+    wrenches: Mapping[str, Stamped[Array]] = field(default_factory=dict)
 
 
 class Observer:
@@ -75,6 +77,7 @@ class Observer:
         self._times.begin()
         started = time.perf_counter_ns()
         states = {role: call_driver(arm.name, arm.tcp) for role, arm in cell.arms.items()}
+        wrenches = {role: self._wrench(role) for role in cell.watched_wrenches}
         self._times.add("read arms", time.perf_counter_ns() - started)
         contacts = {}
         for role, sensor in cell.sensors.items():
@@ -88,7 +91,7 @@ class Observer:
             if isinstance(device, ReadingSource):
                 devices[role] = call_driver(device.name, device.read)
         # Only now: what a device's own thread brought in the meantime would seem to come from the future.
-        return Reading(cell.clock.now_ns(), states, contacts, devices)
+        return Reading(cell.clock.now_ns(), states, contacts, devices, wrenches)
 
     def view(
         self,
@@ -112,7 +115,7 @@ class Observer:
                     asked.twists.get(role),
                     sent.get(role),
                     self._joints(role),
-                    self._wrench(role),
+                    reading.wrenches.get(role),
                     self._external_torque(role),
                 )
                 for role, state in reading.states.items()
@@ -141,9 +144,9 @@ class Observer:
         arm = self._cell.arms[role]
         return call_driver(arm.name, arm.joints) if role in self._cell.watched_joints else None
 
-    def _wrench(self, role: str) -> Stamped[Array] | None:
+    def _wrench(self, role: str) -> Stamped[Array]:
         arm = self._cell.arms[role]
-        return call_driver(arm.name, arm.wrench) if role in self._cell.watched_wrenches else None
+        return call_driver(arm.name, arm.wrench)
 
     def _external_torque(self, role: str) -> Stamped[Array] | None:
         arm = self._cell.arms[role]
