@@ -142,7 +142,12 @@ def rig_in(file: Path, plan: Callable[[], CellPlan], device: str, world: str) ->
             started = plan()
             return _rig_of(started, started.devices[device])(folder, address).build(clock)
 
-        return replace(found, build=build)
+        def clock() -> Clock:
+            # The emulators' time begins with them.
+            plan()
+            return found.clock()
+
+        return replace(found, build=build, clock=clock)
 
     return rig
 

@@ -334,6 +334,10 @@ class _Planner:
         config = self._validated(spec.config, {**(section.model_extra or {}), **settings}, at)
         if config is None:
             return None
+        if cell.world == "bench" and (key := config.emulated_address()) is not None:
+            reason = "leads to an emulator on this machine, and the cell is to run on the bench"
+            hint = "give the device's own address, or run --on emulated"
+            self._add((*at, key), reason, value=getattr(config, key, None), hint=hint)
         if cell.reduced_speed:
             config = _at_reduced_speed(config)
         return DevicePlan(at[1], spec, self._with_input_files(config, at))
