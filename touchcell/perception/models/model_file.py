@@ -241,7 +241,7 @@ def load_model(path: Path) -> Model:
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
-        raise ModelError(path, "no such file", hint="train one with `touchcell train DATA --out NAME.safetensors`")
+        raise ModelError(path, "no such file", hint="train one with `touchcell train --data DIR --out NAME.safetensors`")
     try:
         with safe_open(path, framework="np") as stored:
             metadata = stored.metadata() or {}
@@ -265,7 +265,7 @@ def load_header(path: Path) -> Header:
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
-        raise ModelError(path, "no such file", hint="train one with `touchcell train DATA --out NAME.safetensors`")
+        raise ModelError(path, "no such file", hint="train one with `touchcell train --data DIR --out NAME.safetensors`")
     try:
         with safe_open(path, framework="np") as stored:
             return _parse_header((stored.metadata() or {}).get(_METADATA_KEY), path)
