@@ -54,7 +54,10 @@ _logger = logging.getLogger(__name__)
 
 _TURN_RAD = 2.0 * np.pi
 _MAX_BUS_LOAD = 0.8
+_PCAN_CLOCK_HZ = 80_000_000
+_SAMPLE_POINT_PERCENT = 80.0
 _PLAUSIBLE_JUMP_RAD = 0.1
+_ENABLE_TRIES = 3
 # While one motor is asked, the others hear nothing: all tries together must not last as long as their watchdog.
 _ASKING_FRACTION = 0.75
 
@@ -327,7 +330,10 @@ class DamiaoCanArm(BusArm):
         try:
             for index in indices:
                 self._enabled[index] = True
-                self._bus.command(index, codec.ENABLE)
+                for _ in range(_ENABLE_TRIES):
+                    # Some motors do not take the first command to enable (openarm issue 471).
+                    if self._bus.command(index, codec.ENABLE).status != codec.DISABLED:
+                        break
                 # A motor enabled without gains is limp: send its setpoint before the next one is enabled.
                 status = self._bus.command(index, frames[index]).status
                 if status != codec.ENABLED:
@@ -481,8 +487,14 @@ def open_bus(device: str, config: DamiaoCanConfig) -> Any:
     if config.fd and not is_kernels:
         rates["data_bitrate"] = config.data_bitrate
     options: dict[str, Any] = rates | config.bus_options
+    channel: str | int = config.channel
+    if config.interface == "gs_usb" and config.channel.isdigit():
+        # python-can takes the number of the adapter.
+        channel = int(config.channel)
+    if config.interface == "pcan":
+        _complete_pcan(device, config, options)
     try:
-        bus = can.Bus(interface=config.interface, channel=config.channel, fd=config.fd, **options)
+        bus = can.Bus(interface=config.interface, channel=channel, fd=config.fd, **options)
     except (can.CanError, OSError, ValueError, TypeError) as error:
         raise ConnectError(
             device,
@@ -497,6 +509,24 @@ def open_bus(device: str, config: DamiaoCanConfig) -> Any:
             device, f"{config.interface} does not send CAN FD frames", hint="set fd: false, or use another adapter"
         )
     return bus
+
+
+def _complete_pcan(device: str, config: DamiaoCanConfig, options: dict[str, Any]) -> None:
+    """Check the bit rate of a PCAN adapter, for which python-can silently takes 500 kbit/s; give FD its timing."""
+    import can
+    from can.interfaces.pcan.basic import PCAN_BITRATES
+
+    if config.fd and not {"timing", "f_clock", "f_clock_mhz"} & options.keys():
+        options["timing"] = can.BitTimingFd.from_sample_point(
+            f_clock=_PCAN_CLOCK_HZ,
+            nom_bitrate=config.bitrate,
+            nom_sample_point=_SAMPLE_POINT_PERCENT,
+            data_bitrate=config.data_bitrate,
+            data_sample_point=_SAMPLE_POINT_PERCENT,
+        )
+    elif not config.fd and config.bitrate not in PCAN_BITRATES:
+        known = ", ".join(map(str, sorted(PCAN_BITRATES)))
+        raise ConnectError(device, f"a PCAN adapter has no bit rate of {config.bitrate}", hint=f"one of {known}")
 
 
 def _motor_fault(device: str, esc_id: int, status: int, code: codec.StatusCode) -> DeviceFault:

@@ -208,6 +208,7 @@ class FeetechSerialArm(BusArm):
         readings: dict[str, float | int | str | bool] = dict(self._bus.counters.as_dict())
         readings |= super().health()
         readings |= {
+            "firmware": self._bus.firmware,
             "calibration": self._config.calibration_hash,
             "not_followed": ", ".join(f"{a.limit} {a.allowed:.3g} for {a.requested:.3g}" for a in self._lost),
         }
