@@ -297,6 +297,7 @@ class Controller:
             "actual_robot_voltage": self.voltage_v,
             "actual_digital_output_bits": self.digital_outputs,
             "payload": 0.0,
+            "tcp_offset": _six(ur_model.pose_vector(arm.T_flange_tcp)),
         }
 
 

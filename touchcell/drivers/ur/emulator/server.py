@@ -52,6 +52,7 @@ _OUTPUT_TYPES = {
             "actual_joint_voltage",
             "ft_raw_wrench",
             "payload_inertia",
+            "tcp_offset",
         ],
         "VECTOR6D",
     ),
