@@ -230,6 +230,11 @@ class FeetechSerialArm(BusArm):
     def _close_bus(self) -> None:
         self._bus.close()
 
+    def _reopen_bus(self) -> None:
+        self._bus.close()
+        self._driving = False
+        self._open_bus()
+
     def _configure(self) -> None:
         with self._lock:
             delay_s = sum(self._bus.identity(servo).return_delay_s for servo in self._ids)

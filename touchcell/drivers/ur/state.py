@@ -178,7 +178,7 @@ class StateStream:
         self._wire.close()
 
     def _granted(self, device: str, host: str) -> Recipe:
-        names = (*VARIABLES, *OPTIONAL)
+        names: tuple[str, ...] = (*VARIABLES, *OPTIONAL)
         types = self._types(names)
         missing = [name for name, kind in zip(names, types, strict=True) if kind == ur_codec.NOT_FOUND]
         if needed := sorted(set(missing) - set(OPTIONAL)):

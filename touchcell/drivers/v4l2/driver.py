@@ -290,7 +290,7 @@ class V4l2Camera(Camera):
         return readings
 
     def _verify(self) -> None:
-        self._check_settings(self._opened())
+        self._check_next_setting()
 
     def _opened(self) -> VideoNode:
         assert self._node is not None, "the lifecycle prevents reading a closed camera"

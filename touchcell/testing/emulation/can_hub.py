@@ -28,8 +28,8 @@ _CLASSIC = struct.Struct("=IB3x8s")
 _FD = struct.Struct("=IBB2x64s")
 _EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
 # What the hub makes the adapter of a client do: refuse sends (count, error number or 0 for none), be down (seconds).
-_REFUSE = struct.Struct("=BIi")
-_DOWN = struct.Struct("=Bd")
+_REFUSE = struct.Struct("=Ii")
+_DOWN = struct.Struct("=4xd")
 _BIT_RATE_SWITCH, _FD_FRAME = 0x01, 0x04
 
 
@@ -131,10 +131,10 @@ class HubBus(can.BusABC):  # type: ignore[misc]
         if not packet:
             raise can.CanOperationError("adapter is disconnected", errno.ENODEV)
         if len(packet) == _REFUSE.size:
-            _, self._refused_sends, self._refusal = _REFUSE.unpack(packet)
+            self._refused_sends, self._refusal = _REFUSE.unpack(packet)
             return None, False
         if len(packet) == _DOWN.size:
-            self._down_until_s = time.monotonic() + _DOWN.unpack(packet)[1]
+            self._down_until_s = time.monotonic() + _DOWN.unpack(packet)[0]
             self._down_reported = False
             return None, False
         if time.monotonic() < self._down_until_s:
@@ -225,11 +225,11 @@ class Hub:
             sends: number of frames.
             code: error number of the refusal; 0 for one without.
         """
-        self._command(_REFUSE.pack(0, sends, code))
+        self._command(_REFUSE.pack(sends, code))
 
     def take_down(self, seconds: float) -> None:
         """Take the interface of every client down for that long, and up again, as ``ip link`` does."""
-        self._command(_DOWN.pack(1, seconds))
+        self._command(_DOWN.pack(seconds))
 
     def _command(self, packet: bytes) -> None:
         for client in list(self._clients):
