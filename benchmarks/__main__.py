@@ -24,6 +24,7 @@ BENCHMARKS = {
     "fuzz-recordings": "tests.fault_injection.fuzz_recordings",
     "gdn-vs-cnn": "benchmarks.gdn_vs_cnn",
     "mutation": "benchmarks.mutation",
+    "hil-mutation": "benchmarks.hil_mutation",
     "kinematics": "benchmarks.kinematics",
     "safety": "tests.fault_injection.safety",
     "safety-against": "benchmarks.safety_against",
@@ -32,6 +33,7 @@ BENCHMARKS = {
     "structure": "benchmarks.structure",
     "soak": "tests.fault_injection.soak",
     "tuning": "benchmarks.tuning",
+    "world-faults": "benchmarks.world_faults",
 }
 
 

@@ -176,6 +176,10 @@ class Scene:
         """
         return self.timeline.snapshot()
 
+    def begin_now(self) -> None:
+        """Let the motions of the scene begin at the present step, not at its construction."""
+        self._start_ns = self.timeline.t_ns
+
     def seconds(self, t_ns: int) -> float:
         """Return the time of the world at ``t_ns``."""
         return (t_ns - self._start_ns) * 1e-9

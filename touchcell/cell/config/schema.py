@@ -35,7 +35,7 @@ from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile
 from touchcell.control.interlocks.boundary import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.drivers.core.arm import LimitsConfig
-from touchcell.drivers.core.protocols import JointSource, ReadingSource, protocol_names
+from touchcell.drivers.core.protocols import JointSource, ReadingSource, WrenchSource, protocol_names
 from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DRIVERS, AnyDriver, DriverConfig
 from touchcell.drivers.core.stand_in import STAND_INS, Placement
@@ -168,6 +168,8 @@ class _Planner:
             self._require_collection(cell, task)
             self._require_protocols(task, "arms", task.arms, arm_roles, arms)
             self._require_protocols(task, "devices", task.devices, auxiliary_roles, others)
+            if task_config is not None:
+                self._require_forces(cell, task, task_config, arm_roles, arms)
             self._require_processes(cell, task, arm_roles)
             self._require_data_is_used(cell, {**arms, **sensors})
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
@@ -332,6 +334,10 @@ class _Planner:
         config = self._validated(spec.config, {**(section.model_extra or {}), **settings}, at)
         if config is None:
             return None
+        if cell.world == "bench" and (key := config.emulated_address()) is not None:
+            reason = "leads to an emulator on this machine, and the cell is to run on the bench"
+            hint = "give the device's own address, or run --on emulated"
+            self._add((*at, key), reason, value=getattr(config, key, None), hint=hint)
         if cell.reduced_speed:
             config = _at_reduced_speed(config)
         return DevicePlan(at[1], spec, self._with_input_files(config, at))
@@ -525,6 +531,29 @@ class _Planner:
                     value=devices[name].spec.name,
                     hint="choose another driver; `touchcell list` names all",
                 )
+
+    def _require_forces(
+        self,
+        cell: CellFile,
+        task: AnyTask,
+        config: TaskConfig,
+        names: Mapping[str, str],
+        arms: Mapping[str, DevicePlan],
+    ) -> None:
+        for role, key in task.needs_wrenches(config).items():
+            if cell.processes == "separate":
+                reason = f"{task.name} waits for {key}, which no other process passes on"
+                self._add(("processes",), reason, value=cell.processes, hint="leave out `processes:`")
+            name = names.get(role)
+            if name is None or name not in arms or WrenchSource in arms[name].spec.capabilities.provides:
+                continue
+            driver = arms[name].spec.name
+            self._add(
+                ("task",),
+                f"a step waits for {key}, but {driver} measures no force",
+                value=driver,
+                hint=f"use depth_mm or contact, or an arm with a force sensor for arms.{name}.driver",
+            )
 
     def _require_use_of_data(self, cell: CellFile, devices: Mapping[str, DevicePlan]) -> None:
         reads = any("data" in device.spec.config.model_fields for device in devices.values())

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import os
-import time
 from pathlib import Path
 
 from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting, camera_behaviour
@@ -79,7 +78,7 @@ class V4l2Camera(Camera):
         self._gain: int | None = None
 
     def _open(self) -> None:
-        if abs(self._clock.now_ns() - time.monotonic_ns()) > _CLOCK_TOLERANCE_NS:
+        if abs(self._clock.now_ns() - self._calls.now_ns()) > _CLOCK_TOLERANCE_NS:
             raise ConnectError(
                 self.name,
                 "the kernel stamps frames on CLOCK_MONOTONIC, but the cell's clock is another",
