@@ -38,7 +38,7 @@ _SHOWN_S = 3.0
 _STEP_S = 0.01
 _SLOW_M_S = 0.002
 _TTL_S = 0.2
-_STILL_M = 1e-3
+_STILL_DEG = 0.2
 _RECOVERY_S = 8.0
 _FIRST_ADDRESS = 20_000
 _TROUBLE = (
@@ -93,7 +93,7 @@ def try_row(row: ZooRow, fixture: DeviceFixture) -> tuple[str, str]:
         if row.when == "before":
             return _before(row, device, emulated)
         return _active(row, device, emulated) if row.when == "active" else _replug(row, device, emulated)
-    except (ConfigError, ValidationError) as error:
+    except (ConfigError, DeviceError, ValidationError) as error:
         return "refused", str(error)
     finally:
         if device is not None:
@@ -161,8 +161,23 @@ def _try_and_print(row: ZooRow, number: int, *, peers: bool) -> dict[str, Any]:
         folder = Path(name)
         rig = RIGS.load(row.driver)
         found, message = try_row(row, rig(folder, _FIRST_ADDRESS + 2 * number))
-        result = {**row.model_dump(), "found": found, "handled": is_handled(row, found), "message": message}
-        verdict = "handled" if result["handled"] else f"NOT HANDLED ({row.expect} expected, {found})"
+        tries = 1
+        if not is_handled(row, found):
+            # A machine that is busy starves emulators and drivers; what is not handled twice is not handled.
+            found, message = try_row(row, rig(folder, _FIRST_ADDRESS + 2 * number))
+            tries = 2
+        result = {
+            **row.model_dump(),
+            "found": found,
+            "handled": is_handled(row, found),
+            "tries": tries,
+            "message": message,
+        }
+        verdict = (
+            ("handled" if tries == 1 else "handled at the second try")
+            if result["handled"]
+            else f"NOT HANDLED ({row.expect} expected, {found})"
+        )
         if peers:
             theirs, why = try_peer(row, rig(folder, _FIRST_ADDRESS + 2 * number + 1), folder)
             result |= {"peer": theirs, "peer_message": why, "peer_handled": _peer_handled(row, theirs)}
@@ -219,7 +234,7 @@ def _inject(faults: Mapping[str, Any], emulated: Emulated) -> None:
 
 def _before(row: ZooRow, device: Device, emulated: Emulated) -> tuple[str, str]:
     _inject(row.inject, emulated)
-    start = _position(emulated)
+    start = _joints(emulated)
     try:
         _activate(device)
     except DeviceError as error:
@@ -269,7 +284,7 @@ def _recovered(row: ZooRow, device: Device, emulated: Emulated, lease: Lease | N
     for fault in row.inject:
         emulated.clear(fault)
     first = str(device.fault or "")
-    stood = _position(emulated)
+    stood = _joints(emulated)
     deadline_s = time.monotonic() + _RECOVERY_S
     while device.state is Lifecycle.FAULTED:
         try:
@@ -317,18 +332,21 @@ def _matches(found: Any, wanted: Any) -> bool:
     return bool(found == wanted)
 
 
-def _position(emulated: Emulated) -> Any:
-    return emulated.state().get("position_m")
+def _joints(emulated: Emulated) -> Any:
+    # Not the tool, which activation may set.
+    state = emulated.state()
+    return state["q"] if "q" in state else state.get("q_rad", ())
 
 
 def _moved(emulated: Emulated, start: Any) -> tuple[str, str]:
     deadline_s = time.monotonic() + _CALM_S
-    farthest_m = 0.0
+    farthest_deg = 0.0
     while time.monotonic() < deadline_s:
-        farthest_m = max(farthest_m, float(np.linalg.norm(np.subtract(_position(emulated), start))))
+        moved = np.rad2deg(np.abs(np.subtract(_joints(emulated), start)))
+        farthest_deg = max(farthest_deg, float(moved.max(initial=0.0)))
         time.sleep(_STEP_S)
-    what = f"moved {1e3 * farthest_m:.2f} mm"
-    return ("still" if farthest_m <= _STILL_M else what), what
+    what = f"a joint moved {farthest_deg:.3f} deg"
+    return ("still" if farthest_deg <= _STILL_DEG else what), what
 
 
 def _activate(device: Device) -> None:

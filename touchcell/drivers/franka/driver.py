@@ -28,6 +28,7 @@ from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.command_checks import finite_array
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
+from touchcell.drivers.core.diagnosis import Finding, finding_of
 from touchcell.drivers.core.errors import (
     CommandRejected,
     ConnectError,
@@ -251,6 +252,21 @@ class FrankaArm(Arm):
             "external_force_n": float(np.linalg.norm(reading.wrench[:3])),
         }
 
+    def diagnose(self) -> Iterator[Finding]:
+        """Yield what is wrong with the controller, the network and this machine."""
+        reading = self._newest()
+        if reading.mode not in _OBEYS or reading.errors:
+            yield finding_of(self._fault(reading), "libfranka 37", "franky 7")
+        for name in reading.errors:
+            entry = BY_NAME[name]
+            yield Finding(name, entry.hint, ("libfranka 23", "frankx 22"))
+        if not _has_realtime_kernel():
+            what = "this kernel is not PREEMPT_RT: communication_constraints_violation is likely"
+            yield Finding(what, "boot a real-time kernel", ("libfranka 60", "franky 7"), self._config.enforce_realtime)
+        if self._open_reader().bad:
+            what = f"{self._open_reader().bad} states were unreadable"
+            yield Finding(what, "use a direct cable to the arm's controller", ("libfranka 174",), is_fault=False)
+
     def kinematics(self) -> DifferentialIk:
         """Return the differential inverse kinematics, with the tool set in the controller by ``configure``."""
         return self._ik
@@ -397,7 +413,7 @@ class FrankaArm(Arm):
         self._contact.clear()
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
-        self._reading("move", _FRESH_S)
+        self._reading("move", self._config.state_timeout_s)
         franky, config = self._franky, self._config
         linear, angular = twist_base[:3], twist_base[3:]
         # For the whole time-to-live, including the ramp to the target; a second waypoint brakes harder than the first.
@@ -472,7 +488,7 @@ class FrankaArm(Arm):
         self._desk.check(lease)
         if self.state is not Lifecycle.ACTIVE:
             raise CommandRejected(self.name, Rejection.MODE, f"device is {self.state.value}, not active")
-        self._reading("move", _FRESH_S)
+        self._reading("move", self._config.state_timeout_s)
         return target
 
     def _goal_factor(self, speed_fraction: float) -> float:
@@ -634,6 +650,7 @@ def behaviour(config: FrankaConfig) -> ArmBehaviour:
         home_deg=HOME_DEG,
         stop_accel_m_s2=config.stop_dynamics_factor * _ACCEL_M_S2,
         stop_rot_accel_rad_s2=config.stop_dynamics_factor * _ROT_ACCEL_RAD_S2,
+        max_state_age_s=config.state_timeout_s,
         watchdog_s=_WATCHDOG_S,
     )
 
