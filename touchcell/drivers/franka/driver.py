@@ -9,8 +9,9 @@ the arm with a communication reflex. The Franka Control Interface cannot release
 from __future__ import annotations
 
 import os
+import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -74,6 +75,7 @@ CAPABILITIES = Capabilities(
 )
 
 _WATCHDOG_S = 0.02
+_CONNECT_S = 5.0
 _FIRST_STATE_S = 2.0
 _FRESH_S = 0.25
 # Recovery has been seen to take 16 s (franka_ros issue 317).
@@ -289,9 +291,9 @@ class FrankaArm(Arm):
             # libfranka makes the connecting thread a real-time thread, where permitted, and its control threads inherit
             # that. Python must not starve the machine, so it keeps its own scheduling and lends real-time only to those
             # threads.
-            with _scheduled():
-                self._robot = franky.Robot(config.host, realtime_config=realtime)
-                self._control_scheduling = _Scheduling.of_this_thread()
+            self._robot, self._control_scheduling = self._connected(
+                lambda: franky.Robot(config.host, realtime_config=realtime)
+            )
         except (franky.Exception, RuntimeError) as error:
             raise ConnectError(
                 self.name,
@@ -306,6 +308,34 @@ class FrankaArm(Arm):
         self._reader = StateReader(self.name, franky, self._robot, self._clock)
         self._reader.start()
         self._await_reading(_FIRST_STATE_S, "state after connecting")
+
+    def _connected(self, connect: Callable[[], Any]) -> tuple[Any, _Scheduling]:
+        """Return the robot and the scheduling that libfranka gave its thread. Raises what ``connect`` raises.
+
+        Raises:
+            ConnectError: the controller accepts the connection and does not reply; libfranka waits a minute for that.
+        """
+        results: queue.SimpleQueue[tuple[Any, _Scheduling] | BaseException] = queue.SimpleQueue()
+
+        def work() -> None:
+            try:
+                with _scheduled():
+                    results.put((connect(), _Scheduling.of_this_thread()))
+            except BaseException as error:
+                results.put(error)
+
+        threading.Thread(target=work, name=f"{self.name} connection", daemon=True).start()
+        try:
+            result = results.get(timeout=_CONNECT_S)
+        except queue.Empty:
+            raise ConnectError(
+                self.name,
+                f"the controller at {self._config.host} does not reply within {_CONNECT_S:g} s",
+                hint="restart it in Desk, and close other clients",
+            ) from None
+        if isinstance(result, BaseException):
+            raise result
+        return result
 
     def _close(self) -> None:
         if self._reader is not None:
