@@ -293,11 +293,13 @@ def _recovered(row: ZooRow, device: Device, emulated: Emulated, lease: Lease | N
             if row.expect == "refused" or time.monotonic() > deadline_s:
                 return "refused", str(error)
             time.sleep(_STEP_S)
-    try:
-        if device.state is Lifecycle.READY:
+    while device.state is Lifecycle.READY:
+        # An arm that loses its power with a delay refuses the first time.
+        try:
             device.activate()
-    except DeviceError as error:
-        return "refused", str(error)
+        except DeviceError as error:
+            if time.monotonic() > deadline_s:
+                return "refused", str(error)
     if row.expect == "still":
         return _moved(emulated, stood)
     if isinstance(device, Arm) and device.owner is None:

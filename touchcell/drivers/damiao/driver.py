@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -48,6 +47,7 @@ from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.damiao import codec
 from touchcell.drivers.damiao.bus import TRIES, Address, MotorBus
 from touchcell.drivers.damiao.codec import Feedback, MitCommand, Register
+from touchcell.drivers.damiao.keeper_bus import KeeperBus
 from touchcell.drivers.kinematics.chain import GRAVITY_M_S2, ChainDescription, ChainFile, SerialChain, Vector3
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
@@ -113,6 +113,9 @@ class DamiaoCanConfig(BusArmConfig):
         gravity_m_s2: gravity along the axes of the arm's base, for compensation.
         motors: one for each joint, from the base.
         watchdog_s: silence after which a motor lets go by itself: the arm sinks.
+        keeper: a process of its own owns the bus; it holds the arm when this process dies, and lowers it slowly.
+        lower_after_s: time from the death of this process until the keeper begins to lower the arm.
+        lower_speed_mm_s: greatest speed of the tool while it does.
     """
 
     interface: str = "socketcan"
@@ -125,6 +128,10 @@ class DamiaoCanConfig(BusArmConfig):
     chain: ChainFile = "generic_6r"
     gravity_m_s2: Vector3 = GRAVITY_M_S2
     motors: tuple[MotorConfig, ...] = Field(min_length=1)
+
+    keeper: bool = False
+    lower_after_s: Annotated[float, Field(ge=0.0, le=60.0)] = 1.0
+    lower_speed_mm_s: Annotated[float, Field(gt=0.0, le=50.0)] = 40.0
 
     rate_hz: Annotated[float, Field(ge=50.0, le=1000.0)] = 250.0
     watchdog_s: Annotated[float, Field(ge=0.02, le=0.4)] = 0.1
@@ -186,15 +193,23 @@ class DamiaoCanArm(BusArm):
         self._bus = MotorBus(
             name,
             addresses,
-            partial(open_bus, name, config),
+            self._connect,
             clock,
             max_silence_s=config.max_silence_s,
             answer_s=config.watchdog_s * _ASKING_FRACTION / TRIES,
             fd=config.fd,
         )
 
+    def _connect(self) -> Any:
+        if not self._config.keeper:
+            return open_bus(self.name, self._config)
+        settings = self._config.model_dump(mode="json")
+        self._keeper = KeeperBus(self.name, self._config.interface, self._config.channel, settings)
+        return self._keeper
+
     def _reset_state(self) -> None:
         super()._reset_state()
+        self._keeper: KeeperBus | None = None
         self._answers: list[Reply[Feedback] | None] = [None] * len(self._config.motors)
         self._held: tuple[Array, Array] | None = None
         self._turns: Array | None = None
@@ -313,6 +328,8 @@ class DamiaoCanArm(BusArm):
                 )
             for index in range(len(self._enabled)):
                 self._check_watchdog(index, int(self._bus.read(index, Register.TIMEOUT)))
+            if self._keeper is not None:
+                self._keeper.tell_offsets(self._offset)
             if all(self._enabled):
                 return
             # Motors that are enabled already keep their setpoint, whatever load makes them sag.
