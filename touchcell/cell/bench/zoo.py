@@ -25,7 +25,7 @@ from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.camera import Camera
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.device import Device, Lifecycle, OperatorToken
-from touchcell.drivers.core.errors import DeviceError
+from touchcell.drivers.core.errors import DeviceError, TransportTimeout
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.protocols import HealthSource
 from touchcell.errors import ConfigError
@@ -36,6 +36,7 @@ _CALM_S = 0.5
 _NOTICED_S = 4.0
 _SHOWN_S = 3.0
 _STEP_S = 0.01
+_STARTS = 2
 _SLOW_M_S = 0.002
 _TTL_S = 0.2
 _STILL_DEG = 0.2
@@ -85,8 +86,7 @@ def rows() -> list[ZooRow]:
 
 def try_row(row: ZooRow, fixture: DeviceFixture) -> tuple[str, str]:
     """Inject one report; return the reaction, in the words of ``ZooRow.expect`` or "not noticed", and its message."""
-    assert fixture.start is not None
-    emulated = fixture.start()
+    emulated = _started(fixture)
     device: Device | None = None
     try:
         device = _build(row, fixture)
@@ -109,9 +109,8 @@ def try_peer(row: ZooRow, fixture: DeviceFixture, folder: Path) -> tuple[str, st
         return "-", ""
     if row.expect not in ("refused", "fault", "counted", "harmless"):
         return "-", ""
-    assert fixture.start is not None
     assert fixture.config is not None
-    emulated = fixture.start()
+    emulated = _started(fixture)
     try:
         if row.when == "before":
             _inject(row.inject, emulated)
@@ -210,6 +209,15 @@ def _print_peers(results: Sequence[Mapping[str, Any]]) -> None:
         if tried:
             theirs, ours = (sum(bool(each[key]) for each in tried) for key in ("peer_handled", "handled"))
             print(f"of the same {len(tried)} reports: {peer.name} {theirs}, {driver} {ours}")
+
+
+def _started(fixture: DeviceFixture) -> Emulated:
+    """Start the emulator; a machine that is busy may need several tries. Raises TransportTimeout."""
+    assert fixture.start is not None
+    for _ in range(_STARTS):
+        with suppress(TransportTimeout):
+            return fixture.start()
+    return fixture.start()
 
 
 def _build(row: ZooRow, fixture: DeviceFixture) -> Device:

@@ -228,6 +228,7 @@ class DamiaoCanArm(BusArm):
             "bus_state": self._bus.state,
             "bus_error": self._bus.last_error,
             "bus_load": self._config.bus_load,
+            "keeper_pid": 0 if self._keeper is None else self._keeper.pid,
             "turns_added": "" if self._turns is None else " ".join(f"{turn / _TURN_RAD:.0f}" for turn in self._turns),
         }
         readings |= super().health()

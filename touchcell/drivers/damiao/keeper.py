@@ -138,7 +138,7 @@ class Keeper:
             client.close()
             self._client = None
             if not self._enabled.any():
-                self._phase = Phase.ENDED
+                self._enter(Phase.ENDED)
             elif self._phase is Phase.PASSING:
                 self._enter(Phase.HOLDING)
             return False
@@ -210,6 +210,8 @@ class Keeper:
     def _enter(self, phase: Phase) -> None:
         self._phase = phase
         self._since_s = time.monotonic()
+        late = f"its latest cycle came {1e3 * self.latest_s:.0f} ms late"
+        print(f"{phase.value}; enabled {self._enabled.tolist()}; {late}", file=sys.stderr, flush=True)
         if phase is Phase.HOLDING:
             self._held = self._setpoint()
 
@@ -254,7 +256,7 @@ class Keeper:
             self._command(self._held, left)
             return
         self._put([codec.DISABLE if on else None for on in self._enabled])
-        self._phase = Phase.ENDED
+        self._enter(Phase.ENDED)
 
     def _command(self, q: Array, share: float) -> None:
         """Command every enabled motor to ``q`` (n,) rad, with a share of its stiffness and of gravity's torque."""

@@ -128,25 +128,27 @@ def _is_alive(path: Path) -> bool:
 
 
 def _start(device: str, settings: Mapping[str, Any], path: Path) -> subprocess.Popen[bytes]:
+    # What it says last must outlive this process.
+    log_path = path.with_suffix(".log")
+    log = log_path.open("wb")
     process = subprocess.Popen(
         [sys.executable, "-m", "touchcell.drivers.damiao.keeper"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        stderr=log,
         # A session of its own: neither a signal to the client's group nor its terminal ends it.
         start_new_session=True,
     )
+    log.close()
     assert process.stdin is not None
     assert process.stdout is not None
-    assert process.stderr is not None
     about = {"socket": str(path), "config": dict(settings)}
     process.stdin.write(json.dumps(about).encode() + b"\n")
     process.stdin.close()
     ready, _, _ = select.select([process.stdout], [], [], _START_S)
     if not ready or process.stdout.readline().strip() != b"ready":
         process.kill()
-        reason = process.stderr.read().decode(errors="replace").strip().rpartition("\n")[2]
+        reason = log_path.read_text(errors="replace").strip().rpartition("\n")[2]
         raise ConnectError(device, f"the keeper did not start: {reason or 'it does not reply'}")
     process.stdout.close()
-    process.stderr.close()
     return process
