@@ -148,9 +148,14 @@ def run(arguments: Sequence[str], out: Path) -> None:
             continue
         if options.match.lower() in f"{row.source} {row.failure}".lower():
             results.append(_try_and_print(row, number, peers=options.peers))
+            # After each, as a run of all takes a quarter of an hour.
+            _write(results, out)
     print(f"\n{sum(bool(result['handled']) for result in results)} of {len(results)} handled, on emulators")
     if options.peers:
         _print_peers(results)
+
+
+def _write(results: Sequence[Mapping[str, Any]], out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     (out / "zoo.json").write_text(json.dumps({"provenance": provenance(), "rows": results}, indent=1) + "\n")
 
