@@ -41,9 +41,9 @@ def test_it_ends_where_nothing_can_go_down_any_more() -> None:
     descent = Descent(CHAIN, np.deg2rad([0.0, 40.0, 90.0, 0.0, 50.0, 0.0]), SPEED_M_S)
     for _ in range(20_000):
         descent.step(descent.q, DT_S)
-        if descent.ended:
+        if descent.rests:
             break
-    assert descent.ended
+    assert descent.rests
     rest = descent.q.copy()
     assert np.array_equal(descent.step(rest, DT_S), rest)
 
@@ -58,3 +58,15 @@ def test_a_joint_that_something_supports_stays_where_it_is(joint: int) -> None:
         measured[joint] = supported[joint]
         descent.step(measured, DT_S)
     assert abs(descent.q[joint] - start[joint]) <= np.deg2rad(3.1)
+
+
+def test_an_arm_that_was_only_late_goes_on() -> None:
+    start = np.deg2rad([0.0, 40.0, 90.0, 0.0, 50.0, 0.0])
+    descent = Descent(CHAIN, start, SPEED_M_S)
+    for _ in range(3000):
+        descent.step(start, DT_S)
+    held = descent.q.copy()
+    assert descent.rests
+    for _ in range(500):
+        descent.step(descent.q, DT_S)
+    assert not np.allclose(descent.q, held, atol=np.deg2rad(2.0))

@@ -41,6 +41,7 @@ FAILED: Final = b"E"
 """First bytes of packets that are no frames: an orderly end, the joints' offsets (rad, JSON), a failed transfer."""
 
 _PERIOD_S = 0.004
+_REST_S = 2.0
 _FADE_S = 2.0
 _LONGEST_DESCENT_S = 30.0
 _PRIORITY = 50
@@ -86,6 +87,7 @@ class Keeper:
         self._commanded_s = time.monotonic()
         self._descent: Descent | None = None
         self._held: Array | None = None
+        self._rested_s = 0.0
         self.latest_s = 0.0
 
     def run(self) -> None:
@@ -245,7 +247,8 @@ class Keeper:
         assert self._descent is not None
         q = self._descent.step(self._q, _PERIOD_S)
         self._command(q, 1.0)
-        if self._descent.ended or now_s - self._since_s > _LONGEST_DESCENT_S:
+        self._rested_s = self._rested_s + _PERIOD_S if self._descent.rests else 0.0
+        if self._rested_s > _REST_S or now_s - self._since_s > _LONGEST_DESCENT_S:
             self._held = q
             self._enter(Phase.FADING)
 
