@@ -40,7 +40,6 @@ OFFSETS: Final = b"O"
 FAILED: Final = b"E"
 """First bytes of packets that are no frames: an orderly end, the joints' offsets (rad, JSON), a failed transfer."""
 
-_PERIOD_S = 0.004
 _REST_S = 2.0
 _FADE_S = 2.0
 _LONGEST_DESCENT_S = 30.0
@@ -69,6 +68,7 @@ class Keeper:
 
     def __init__(self, config: DamiaoCanConfig, bus: Any, listener: socket.socket) -> None:
         self._config = config
+        self._period_s = 1.0 / config.rate_hz
         self._bus = bus
         self._listener = listener
         self._client: socket.socket | None = None
@@ -98,7 +98,7 @@ class Keeper:
             if now_s >= next_s:
                 self.latest_s = max(self.latest_s, now_s - next_s)
                 self._keep(now_s)
-                next_s = max(next_s + _PERIOD_S, now_s)
+                next_s = max(next_s + self._period_s, now_s)
             self._transfer(max(next_s - time.monotonic(), 0.0))
 
     def _transfer(self, timeout_s: float) -> None:
@@ -245,9 +245,9 @@ class Keeper:
 
     def _lower(self, now_s: float) -> None:
         assert self._descent is not None
-        q = self._descent.step(self._q, _PERIOD_S)
+        q = self._descent.step(self._q, self._period_s)
         self._command(q, 1.0)
-        self._rested_s = self._rested_s + _PERIOD_S if self._descent.rests else 0.0
+        self._rested_s = self._rested_s + self._period_s if self._descent.rests else 0.0
         if self._rested_s > _REST_S or now_s - self._since_s > _LONGEST_DESCENT_S:
             self._held = q
             self._enter(Phase.FADING)
@@ -300,7 +300,7 @@ class Keeper:
                 is_fd=self._config.fd,
                 bitrate_switch=self._config.fd,
             )
-            # A frame that is refused now is sent again in 4 ms.
+            # A frame that is refused now is sent again in the next cycle.
             with suppress(can.CanError):
                 self._bus.send(message)
 

@@ -28,6 +28,7 @@ from touchcell.drivers.damiao.can_packets import pack, unpack
 # What the hub makes the adapter of a client do: refuse sends (count, error number or 0 for none), be down (seconds).
 _REFUSE = struct.Struct("=Ii")
 _DOWN = struct.Struct("=4xd")
+_MOST_FRAMES = 256
 
 
 class HubBus(can.BusABC):  # type: ignore[misc]
@@ -207,7 +208,10 @@ class Hub:
         asyncio.get_running_loop().add_reader(client, self._read, client)
 
     def _read(self, client: socket.socket) -> None:
-        while client in self._clients:
+        # Bounded: a client that sends faster than a busy machine reads must not stop everything else.
+        for _ in range(_MOST_FRAMES):
+            if client not in self._clients:
+                return
             try:
                 packet = client.recv(128)
             except BlockingIOError:
