@@ -19,7 +19,7 @@ from touchcell.drivers.core.device import Device, Lifecycle
 from touchcell.drivers.core.enabling import EnablingDevice
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import StopCategory
-from touchcell.errors import ConfigError, suggest
+from touchcell.errors import ConfigError
 from touchcell.tasks.interface import Task
 
 _FIRST_READING_NS = 1_000_000_000
@@ -142,7 +142,7 @@ class Cell:
                         f"{name} reports no {reading!r}",
                         file=str(self.plan.file),
                         key="interlocks",
-                        hint=f"{suggest(reading, sorted(health))}; it reports: {', '.join(sorted(health))}",
+                        hint=f"it reports {', '.join(sorted(health))}",
                     )
                 self.clock.sleep_until_ns(self.clock.now_ns() + _POLL_NS)
 
