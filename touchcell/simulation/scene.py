@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import DeviceError
@@ -18,6 +18,7 @@ from touchcell.drivers.core.scene import ContactState, SceneSection, SceneSpec
 from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry.types import Array
 from touchcell.plugin_section import Section
+from touchcell.simulation.closed_forms import Box, Cylinder, Saddle
 from touchcell.simulation.contact import ContactLaw
 from touchcell.simulation.objects import ObjectConfig, TableConfig
 from touchcell.simulation.quasi_static import QuasiStaticWorld
@@ -272,6 +273,56 @@ class SphereConfig(SurfaceConfig):
         return Sphere(self.radius_mm * 1e-3)
 
 
+class BoxConfig(SurfaceConfig):
+    """A box that stands on z = 0 of its pose, its centre on the z axis.
+
+    Attributes:
+        size_mm: along x, y and z.
+    """
+
+    kind: Literal["box"]
+    size_mm: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+
+    def shape(self) -> Shape:
+        """Return the shape in its own frame."""
+        x, y, z = self.size_mm
+        return Box((1e-3 * x, 1e-3 * y, 1e-3 * z))
+
+
+class CylinderConfig(SurfaceConfig):
+    """A cylinder about z that stands on z = 0 of its pose.
+
+    Attributes:
+        radius_mm: radius of the cylinder.
+        height_mm: its height.
+    """
+
+    kind: Literal["cylinder"]
+    radius_mm: float = Field(gt=0.0)
+    height_mm: float = Field(gt=0.0)
+
+    def shape(self) -> Shape:
+        """Return the shape in its own frame."""
+        return Cylinder(1e-3 * self.radius_mm, 1e-3 * self.height_mm)
+
+
+class SaddleConfig(SurfaceConfig):
+    """A saddle without end: hollow along the pose's x, a ridge along its y; see ``closed_forms.Saddle``.
+
+    Attributes:
+        hollow_radius_mm: radius of the hollow section at the origin.
+        ridge_radius_mm: radius of the other section there.
+    """
+
+    kind: Literal["saddle"]
+    hollow_radius_mm: float = Field(gt=0.0)
+    ridge_radius_mm: float = Field(gt=0.0)
+
+    def shape(self) -> Shape:
+        """Return the shape in its own frame."""
+        return Saddle(1e-3 * self.hollow_radius_mm, 1e-3 * self.ridge_radius_mm)
+
+
 class TipLawConfig(Section):
     """Contact law of every simulated tip of the scene; see ``contact.ContactLaw``.
 
@@ -329,9 +380,19 @@ class SceneConfig(Section, SceneSection):
         """Build the scene; its motions start now."""
         return Scene(self._world(), clock, self.step_ms * 1e-3)
 
-    def modules(self) -> Mapping[str, str]:
-        """Return MuJoCo for dynamic scenes."""
-        return {"mujoco": "physics"} if self.physics == "dynamic" else {}
+    def modules(self) -> Mapping[str, tuple[str, str]]:
+        """Return MuJoCo for dynamic scenes, and what the surfaces need."""
+        found = {"mujoco": ("physics", "pip install 'touchcell[physics]'")} if self.physics == "dynamic" else {}
+        for name, surface in self.surfaces.items():
+            found.update({module: (f"surfaces.{name}", how) for module, how in surface.modules().items()})
+        return found
+
+    def problems(self) -> Iterable[ConfigError]:
+        """Yield what is wrong with the files of the surfaces."""
+        for name, surface in self.surfaces.items():
+            for problem in surface.problems():
+                key = f"surfaces.{name}.{problem.key}"
+                yield ConfigError(problem.reason, key=key, value=problem.value, hint=problem.hint)
 
     def _world(self) -> World:
         surfaces = {name: config.build() for name, config in self.surfaces.items()}
@@ -357,3 +418,6 @@ PLANE = SurfaceSpec("plane", "a flat plate", PlaneConfig)
 RAMP = SurfaceSpec("ramp", "a flat that bends over an arc to an incline", RampConfig)
 DOME = SurfaceSpec("dome", "a hemisphere on a plane", DomeConfig)
 SPHERE = SurfaceSpec("sphere", "a ball", SphereConfig)
+BOX = SurfaceSpec("box", "a box", BoxConfig)
+CYLINDER = SurfaceSpec("cylinder", "a cylinder", CylinderConfig)
+SADDLE = SurfaceSpec("saddle", "a saddle without end", SaddleConfig)

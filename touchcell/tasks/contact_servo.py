@@ -101,6 +101,11 @@ class ContactServoConfig(TaskConfig):
         )
 
 
+_BACK_M = 0.5e-3
+_BACK_RAD = math.radians(1.0)
+_BACK_PER_S = 5.0
+
+
 def _six(linear_mm: float, angular_deg: float) -> Array:
     return np.repeat([1e-3 * linear_mm, np.radians(angular_deg)], 3)
 
@@ -145,6 +150,8 @@ class ContactServo:
         self.contact: ContactEstimate | None = None
         self._before: Array | None = None
         self._start: Array | None = None
+        self._felt: Array | None = None
+        self._back: Array | None = None
 
     @property
     def has_fresh_data(self) -> bool:
@@ -173,6 +180,30 @@ class ContactServo:
         self.contact = observation.contacts.get(self.sensor)
         if self.contact is not None and not 0.0 <= now_ns - self.contact.t_frame_ns <= 1e6 * limits.max_frame_age_ms:
             self.contact = None
+        if self.T_base_sensor is not None and self.in_contact:
+            self._felt = self.T_base_sensor
+
+    def aim_back(self, lift_m: float) -> None:
+        """Aim at the pose in which the contact was last felt, withdrawn along the sensor's axis by ``lift_m``."""
+        felt = self.T_base_sensor if self._felt is None else self._felt
+        self._back = None if felt is None else se3.compose(felt, se3.exp([0.0, 0.0, -lift_m, 0.0, 0.0, 0.0]))
+
+    def is_back(self) -> bool:
+        """Return True at the pose that ``aim_back`` has set."""
+        if self._back is None or self.T_base_sensor is None:
+            return False
+        way = se3.log(se3.compose(se3.inverse(self.T_base_sensor), self._back))
+        return bool(np.linalg.norm(way[:3]) < _BACK_M and np.linalg.norm(way[3:]) < _BACK_RAD)
+
+    def way_back(self, speed_m_s: float) -> Array:
+        """Return the twist (6,) of the tool towards that pose, at most ``speed_m_s`` and the angular rate allowed."""
+        if self._back is None or self.T_base_sensor is None:
+            return np.zeros(6)
+        V = _BACK_PER_S * se3.log(se3.compose(se3.inverse(self.T_base_sensor), self._back))
+        rate = np.radians(self._config.max_turn_deg_s)
+        fastest = max(float(np.linalg.norm(V[:3])) / speed_m_s, float(np.linalg.norm(V[3:])) / rate, 1.0)
+        V_tcp: Array = self._Ad_tcp_sensor @ (V / fastest)
+        return V_tcp
 
     def reset_travel(self) -> None:
         """Measure the travelled distance from the current pose."""

@@ -72,10 +72,15 @@ def _scene(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                 yield file.problem((kind, device.name, "driver"), f"{device.spec.name} needs a scene", hint=hint)
         return
     section = scene_section().model_validate(plan.cell.scene)
-    for module, key in section.modules().items():
+    missing = False
+    for module, (key, hint) in section.modules().items():
         if importlib.util.find_spec(module) is None:
-            hint = "pip install 'touchcell[physics]'"
-            yield file.problem(("scene", key), f"needs {module}, which is not installed", hint=hint)
+            missing = True
+            yield file.problem(("scene", *key.split(".")), f"needs {module}, which is not installed", hint=hint)
+    if not missing:
+        for problem in section.problems():
+            at = ("scene", *problem.key.split("."))
+            yield file.problem(at, problem.reason, value=problem.value, hint=problem.hint)
 
 
 def _interlock_sensors(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
