@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -14,6 +15,11 @@ from touchcell.simulation.meshes.smoothing import TriangleMesh, smooth
 from touchcell.simulation.surfaces import SurfacePoint
 
 _CREASE_RAD = math.radians(30.0)
+
+
+@lru_cache(maxsize=8)
+def _edges(shape: Box | Cylinder) -> Polylines:
+    return creases(smooth(shape.drawn(), _CREASE_RAD))
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +62,7 @@ class Box:
     @property
     def edges(self) -> Polylines:
         """Its twelve edges."""
-        return creases(smooth(self.drawn(), _CREASE_RAD))
+        return _edges(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +97,7 @@ class Cylinder:
     @property
     def edges(self) -> Polylines:
         """Its two rims."""
-        return creases(smooth(self.drawn(), _CREASE_RAD))
+        return _edges(self)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Literal, Protocol, runtime_checkable
 
@@ -16,10 +16,12 @@ from touchcell.drivers.core.protocols import TcpSource
 from touchcell.drivers.core.samples import Stamped
 from touchcell.drivers.core.scene import ContactState, SceneSection, SceneSpec
 from touchcell.errors import ConfigError, TouchcellError
+from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.plugin_section import Section
 from touchcell.simulation.closed_forms import Box, Cylinder, Saddle
 from touchcell.simulation.contact import ContactLaw
+from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.objects import ObjectConfig, TableConfig
 from touchcell.simulation.quasi_static import QuasiStaticWorld
 from touchcell.simulation.shape_spec import SurfaceConfig, SurfaceSection, SurfaceSpec
@@ -102,10 +104,21 @@ class Scene:
         world: physics of the scene; its time counts from the construction of the scene.
         clock: injected clock.
         step_s: step of the simulation grid.
+        surfaces: those of the world, for what only pictures and edges need of them.
+        tip_radius_m: of every tip.
     """
 
-    def __init__(self, world: World, clock: Clock, step_s: float = DEFAULT_STEP_S) -> None:
+    def __init__(
+        self,
+        world: World,
+        clock: Clock,
+        step_s: float = DEFAULT_STEP_S,
+        surfaces: Sequence[Surface] = (),
+        tip_radius_m: float = 0.020,
+    ) -> None:
         self.world = world
+        self.surfaces = tuple(surfaces)
+        self.tip_radius_m = tip_radius_m
         self.timeline = Timeline(clock, step_s)
         self._start_ns = self.timeline.t_ns
         self._poses: dict[str, Callable[[], Array]] = {}
@@ -159,6 +172,19 @@ class Scene:
         state = contacts[at]()
         contacts[at] = computed(state)
         return Stamped(state, seq * step_ns, seq)
+
+    def edge(self, sensor: str, t_ns: int | None = None) -> Stamped[Array] | None:
+        """Return T_s_e (4, 4) of the edge nearest to the tip of ``sensor``, at the time that ``contact`` would.
+
+        None where no surface has edges. See ``SceneTruth.edge`` for its frame.
+        """
+        contact = self.contact(sensor, t_ns)
+        T_world_s = contact.value.T_world_f @ contact.value.T_f_s
+        t_s = self.seconds(contact.t_ns)
+        T_world_e = nearest_edge(self.surfaces, T_world_s, t_s, self.tip_radius_m)
+        if T_world_e is None:
+            return None
+        return Stamped(se3.compose(se3.inverse(T_world_s), T_world_e), contact.t_ns, contact.seq)
 
     def objects(self) -> Stamped[Mapping[str, Array]]:
         """Return the present T_world_object (4, 4) of every free object."""
@@ -378,7 +404,10 @@ class SceneConfig(Section, SceneSection):
 
     def build(self, clock: Clock) -> Scene:
         """Build the scene; its motions start now."""
-        return Scene(self._world(), clock, self.step_ms * 1e-3)
+        surfaces = {name: config.build() for name, config in self.surfaces.items()}
+        return Scene(
+            self._world(surfaces), clock, self.step_ms * 1e-3, list(surfaces.values()), 1e-3 * self.tip.radius_mm
+        )
 
     def modules(self) -> Mapping[str, tuple[str, str]]:
         """Return MuJoCo for dynamic scenes, and what the surfaces need."""
@@ -394,8 +423,7 @@ class SceneConfig(Section, SceneSection):
                 key = f"surfaces.{name}.{problem.key}"
                 yield ConfigError(problem.reason, key=key, value=problem.value, hint=problem.hint)
 
-    def _world(self) -> World:
-        surfaces = {name: config.build() for name, config in self.surfaces.items()}
+    def _world(self, surfaces: Mapping[str, Surface]) -> World:
         if self.physics == "kinematic":
             return KinematicWorld(surfaces, self.tip.build())
         if self.physics == "quasi_static":

@@ -120,6 +120,8 @@ class ContactServo:
         reference_mm_deg: contact to hold, (6,) Euler components of ``T_f_s``.
         run: behavior once settled.
         context: of the cell.
+        running_axes: components x, y, z, alpha, beta, gamma of the sensor's twist that the behavior leaves to the
+            controller; the others are held at rest once the contact has settled.
 
     Attributes:
         T_base_sensor: (4, 4) pose of the sensor; None where it is unknown or too old.
@@ -137,12 +139,14 @@ class ContactServo:
         reference_mm_deg: Six,
         run: Behavior,
         context: TaskContext,
+        running_axes: tuple[bool, bool, bool, bool, bool, bool] = (True, True, True, True, True, True),
     ) -> None:
         self.arm = arm
         self.sensor = sensor
         self.run = run
         self._config = config
         self._T_tcp_sensor = context.T_tcp_sensor[sensor]
+        self._running_axes = None if all(running_axes) else np.array(running_axes, np.float64)
         self._Ad_tcp_sensor = se3.adjoint(self._T_tcp_sensor)
         T_f_sref = se3.from_euler_mm_deg(np.array(reference_mm_deg))
         self.controller = TactileServo(se3.inverse(T_f_sref), self._T_tcp_sensor, config.gains(), 1.0 / context.rate_hz)
@@ -236,9 +240,11 @@ class ContactServo:
         V_tcp: Array = self._Ad_tcp_sensor @ np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0])
         return V_tcp
 
-    def servo_step(self, V_ff: Array) -> Array | None:
+    def servo_step(self, V_ff: Array, *, running: bool = True) -> Array | None:
         """Return the twist (6,) of the tool that holds the contact; None while there is no valid estimate."""
         V_tcp = self.controller.step(self.T_s_f, 0 if self.contact is None else self.contact.t_ns, V_ff)
+        if running and self._running_axes is not None:
+            V_tcp = self._Ad_tcp_sensor @ (self._running_axes * np.linalg.solve(self._Ad_tcp_sensor, V_tcp))
         return None if self.T_s_f is None else V_tcp
 
     def telemetry(self, observation: Observation, *, servoing: bool) -> Mapping[str, float]:

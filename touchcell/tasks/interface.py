@@ -17,6 +17,7 @@ from touchcell.drivers.core.protocols import require_protocols
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.perception.runtime.estimator_spec import Feature
 from touchcell.registry import Registry
 
 
@@ -159,6 +160,7 @@ class TaskSpec(Generic[TaskConfigT]):
         build: builds the task from its parameters and the context.
         labels_frames: True if it labels frames, which the cell has to store.
         devices: roles of other devices, and the Protocols that each driver must provide.
+        feature: what the contacts of its sensors must be of.
     """
 
     name: str
@@ -169,6 +171,7 @@ class TaskSpec(Generic[TaskConfigT]):
     build: Callable[[TaskConfigT, TaskContext], Task]
     labels_frames: bool = False
     devices: Mapping[str, frozenset[type]] = field(default_factory=dict)
+    feature: Feature = "surface"
 
     def __post_init__(self) -> None:
         for protocols in (*self.arms.values(), *self.devices.values()):

@@ -36,8 +36,8 @@ class ServoConfig(ContactServoConfig):
         settle_timeout_s: settling fails when it takes longer.
         retract_mm: distance to withdraw at the end.
         retract_speed_mm_s: speed of that.
-        return_lift_mm: before a contact that was lost while the behavior ran is searched for again, the sensor returns to
-            where it was last felt, less deep by this much; none searches from where the sensor is.
+        return_lift_mm: before a contact that was lost while the behavior ran is searched for again, the sensor returns
+            to where it was last felt, less deep by this much; none searches from where the sensor is.
         max_reapproach: number of times that a lost contact is searched for again.
         stale_timeout_s: the task trips when the arm has been stopped for lack of a valid estimate for this long.
         prepare_timeout_s: longest wait for the first frame and arm state.
@@ -297,7 +297,8 @@ class ServoTask(MachineTask):
             if searching and not servo.in_contact:
                 V_tcp = servo.along_z(1e-3 * self._config.approach_speed_mm_s)
             else:
-                V_tcp = servo.servo_step(servo.run.feedforward if state is ServoState.RUN else np.zeros(6))
+                running = state is ServoState.RUN
+                V_tcp = servo.servo_step(servo.run.feedforward if running else np.zeros(6), running=running)
             if V_tcp is not None:
                 twists.append((servo, V_tcp))
         return twists

@@ -7,6 +7,7 @@ position over the plane follows the path; touch alone decides how far above or b
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -79,7 +80,7 @@ class ThroughConfig(TaskConfig):
     @model_validator(mode="after")
     def _all_different(self) -> ThroughConfig:
         points = [(0.0, 0.0), *self.points_mm]
-        if any(math.dist(a, b) < 0.01 for a, b in zip(points, points[1:], strict=False)):
+        if any(math.dist(a, b) < 0.01 for a, b in pairwise(points)):
             raise ValueError("points_mm has the same point twice in a row, or begins with the first contact")
         return self
 

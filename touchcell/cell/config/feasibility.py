@@ -33,6 +33,7 @@ def unfeasible(file: YamlFile, plan: CellPlan) -> list[ConfigError]:
     return [
         *_models(file, plan),
         *_scene(file, plan),
+        *_features(file, plan),
         *_interlock_sensors(file, plan),
         *_depths(file, plan),
         *_speeds(file, plan),
@@ -81,6 +82,23 @@ def _scene(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
         for problem in section.problems():
             at = ("scene", *problem.key.split("."))
             yield file.problem(at, problem.reason, value=problem.value, hint=problem.hint)
+
+
+def _features(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    for name in plan.sensor_roles.values():
+        estimator, wanted = plan.cell.sensors[name].estimator, plan.task.feature
+        if estimator.feature != wanted:
+            reason = f"{estimator.kind} estimates the pose of {_a(estimator.feature)}, and {plan.task.name} needs it of"
+            yield file.problem(
+                ("sensors", name, "estimator", "kind"),
+                f"{reason} {_a(wanted)}",
+                value=estimator.kind,
+                hint="kind: true_edge in a simulated scene" if wanted == "edge" else "kind: network",
+            )
+
+
+def _a(word: str) -> str:
+    return f"{'an' if word[0] in 'aeiou' else 'a'} {word}"
 
 
 def _interlock_sensors(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:

@@ -66,6 +66,14 @@ class SceneTruth(Protocol):
         """Return T_world_object (4, 4) of every free object."""
         ...
 
+    def edge(self, sensor: str, t_ns: int | None = None) -> Stamped[Array] | None:
+        """Return T_s_e (4, 4) of the edge nearest to the tip of ``sensor``; None where no surface has edges.
+
+        {e} has z along the inward normal of the face that the sensor is over, x away from that face across the edge, y
+        along the edge, and its origin one tip radius outside the edge, as {f} has.
+        """
+        ...
+
 
 class Scene(SceneTruth, Protocol):
     """A scene in this process, in which devices are mounted."""

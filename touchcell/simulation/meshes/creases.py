@@ -17,12 +17,15 @@ class EdgePoint:
     Attributes:
         point: (3,) m.
         tangent: (3,) unit vector along the edge.
-        normals: (2, 3) unit normals of the two faces that meet there; twice the same on a border.
+        normals: (2, 3) unit normals of the two faces that meet there, first that of the face to the left of the
+            tangent; twice the same on a border.
+        at_end: it is the end of a piece, as beyond a convex corner.
     """
 
     point: Array
     tangent: Array
     normals: Array
+    at_end: bool
 
 
 class Polylines:
@@ -39,16 +42,25 @@ class Polylines:
         self._side = ends - starts
         self._squared = np.maximum(np.einsum("kc,kc->k", self._side, self._side), 1e-300)
         self._normals, self._tangents = normals, tangents
+        self._middle_normals = normals.mean(axis=1)
 
     def __len__(self) -> int:
         return len(self.starts)
 
-    def nearest(self, p: Array) -> EdgePoint:
-        """Return the nearest point of any piece to ``p`` (3,) m."""
+    def nearest(self, p: Array, facing: Array | None = None) -> EdgePoint:
+        """Return the nearest point of any piece to ``p`` (3,) m.
+
+        With ``facing`` (3,), a unit vector, only pieces with a face whose outside is towards it count, to 60 deg;
+        all of them where there is none.
+        """
         off = p - self.starts
         t = np.clip(np.einsum("kc,kc->k", off, self._side) / self._squared, 0.0, 1.0)
         away = off - t[:, None] * self._side
-        i = int(np.argmin(np.einsum("kc,kc->k", away, away)))
+        squared = np.einsum("kc,kc->k", away, away)
+        if facing is not None:
+            seen = (self._middle_normals @ facing).max(axis=1) >= _FACING_COS
+            squared = np.where(seen, squared, np.inf) if seen.any() else squared
+        i = int(np.argmin(squared))
         share = t[i]
         tangent = (1.0 - share) * self._tangents[i, 0] + share * self._tangents[i, 1]
         normals = (1.0 - share) * self._normals[i, 0] + share * self._normals[i, 1]
@@ -56,9 +68,11 @@ class Polylines:
             self.starts[i] + share * self._side[i],
             tangent / np.linalg.norm(tangent),
             normals / np.linalg.norm(normals, axis=1, keepdims=True),
+            bool(share <= 0.0 or share >= 1.0),
         )
 
 
+_FACING_COS = 0.5
 _CORNER_COS = np.cos(np.radians(35.0))
 
 
