@@ -55,6 +55,14 @@ class Box:
         flat = (0.0, 0.0) if len(outside) == 1 else None
         return SurfacePoint(distance, np.array(normal), np.array(point), flat)
 
+    def distances(self, points: Array) -> Array:
+        """Return the (k,) signed distances of ``points`` (k, 3) m."""
+        half = 0.5 * np.array(self.size_m)
+        over = np.abs(points - np.array([0.0, 0.0, half[2]])) - half
+        outside = np.maximum(over, 0.0)
+        distances: Array = np.sqrt(np.einsum("kc,kc->k", outside, outside)) + np.minimum(over.max(axis=1), 0.0)
+        return distances
+
     def drawn(self) -> TriangleMesh:
         """Return the box as a mesh."""
         return primitives.box(np.array(self.size_m))
@@ -89,6 +97,14 @@ class Cylinder:
             return SurfacePoint(above, np.array([0.0, 0.0, up]), np.array([x, y, end_z]), (0.0, 0.0))
         point = np.array([self.radius_m * cos, self.radius_m * sin, z])
         return SurfacePoint(aside, np.array([cos, sin, 0.0]), point, (1.0 / self.radius_m, 0.0))
+
+    def distances(self, points: Array) -> Array:
+        """Return the (k,) signed distances of ``points`` (k, 3) m."""
+        aside = np.hypot(points[:, 0], points[:, 1]) - self.radius_m
+        above = np.abs(points[:, 2] - 0.5 * self.height_m) - 0.5 * self.height_m
+        outside = np.hypot(np.maximum(aside, 0.0), np.maximum(above, 0.0))
+        distances: Array = outside + np.minimum(np.maximum(aside, above), 0.0)
+        return distances
 
     def drawn(self) -> TriangleMesh:
         """Return the cylinder as a mesh."""

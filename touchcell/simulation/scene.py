@@ -24,6 +24,7 @@ from touchcell.simulation.contact import ContactLaw
 from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.objects import ObjectConfig, TableConfig
 from touchcell.simulation.quasi_static import QuasiStaticWorld
+from touchcell.simulation.relief import felt_relief
 from touchcell.simulation.shape_spec import SurfaceConfig, SurfaceSection, SurfaceSpec
 from touchcell.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
 from touchcell.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeline
@@ -172,6 +173,22 @@ class Scene:
         state = contacts[at]()
         contacts[at] = computed(state)
         return Stamped(state, seq * step_ns, seq)
+
+    def relief(self, sensor: str, directions: Array, t_ns: int | None = None) -> Array | None:
+        """Return (samples,) m what the tip of ``sensor`` feels besides a tangent plane, at the time of ``contact``.
+
+        None where it touches a plane, an object or nothing. See ``relief.felt_relief``.
+        """
+        contact = self.contact(sensor, t_ns)
+        if not contact.value.in_contact or not self.surfaces:
+            return None
+        T_world_s = contact.value.T_world_f @ contact.value.T_f_s
+        t_s = self.seconds(contact.t_ns)
+        found = [(each.nearest(T_world_s[:3, 3], t_s).distance_m, each) for each in self.surfaces]
+        distance_m, surface = min(found, key=lambda each: each[0])
+        if distance_m >= self.tip_radius_m:
+            return None
+        return felt_relief(surface, T_world_s, t_s, directions, self.tip_radius_m)
 
     def edge(self, sensor: str, t_ns: int | None = None) -> Stamped[Array] | None:
         """Return T_s_e (4, 4) of the edge nearest to the tip of ``sensor``, at the time that ``contact`` would.

@@ -39,6 +39,10 @@ class SurfacePoint:
 _FLAT = (0.0, 0.0)
 
 
+def _lengths(points: Array) -> Array:
+    return np.sqrt(np.einsum("kc,kc->k", points, points))
+
+
 class Shape(Protocol):
     """Outer surface of a rigid body, in the body's own frame."""
 
@@ -69,6 +73,10 @@ class Sphere:
         curvature = 1.0 / self.radius_m
         return SurfacePoint(length - self.radius_m, normal, self.radius_m * normal, (curvature, curvature))
 
+    def distances(self, points: Array) -> Array:
+        """Return the (k,) signed distances of ``points`` (k, 3) m."""
+        return _lengths(points) - self.radius_m
+
     def drawn(self) -> TriangleMesh:
         """Return the ball as a mesh."""
         return primitives.ball(self.radius_m)
@@ -84,6 +92,10 @@ class Dome:
         """Return the nearest surface point to ``p`` (3,) m; exact outside the body, where a tip's centre always is."""
         on_cap = Sphere(self.radius_m).nearest(p)
         return on_cap if on_cap.distance_m < p[2] else Plane().nearest(p)
+
+    def distances(self, points: Array) -> Array:
+        """Return the (k,) signed distances of ``points`` (k, 3) m."""
+        return np.minimum(_lengths(points) - self.radius_m, points[:, 2])
 
 
 @dataclass(frozen=True, slots=True)
