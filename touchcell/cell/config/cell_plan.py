@@ -344,8 +344,12 @@ class CellPlan:
         return {**self.arms, **self.sensors, **self.auxiliaries}
 
     def text(self) -> str:
-        """The cell file as it is planned: the file itself, or YAML of what comes of it and of what it extends."""
+        """The cell file as it is planned: the file itself, or YAML of what comes of it and of what it extends.
+
+        Files of its scene have absolute paths, as a run folder is read from elsewhere.
+        """
         merged = load_layers(self.file, self.settings, self.world_settings)
-        if not merged.sources:
+        if not merged.sources and merged.data.get("scene") == self.cell.scene:
             return self.file.read_text()
-        return yaml.safe_dump(merged.data, sort_keys=False, allow_unicode=True)
+        data = {key: self.cell.scene if key == "scene" else value for key, value in merged.data.items()}
+        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
