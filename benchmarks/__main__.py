@@ -23,6 +23,7 @@ BENCHMARKS = {
     "fuzz-cells": "tests.fault_injection.fuzz_cells",
     "fuzz-recordings": "tests.fault_injection.fuzz_recordings",
     "gdn-vs-cnn": "benchmarks.gdn_vs_cnn",
+    "keeper": "benchmarks.keeper",
     "mutation": "benchmarks.mutation",
     "hil-mutation": "benchmarks.hil_mutation",
     "kinematics": "benchmarks.kinematics",

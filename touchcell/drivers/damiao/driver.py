@@ -187,6 +187,7 @@ class DamiaoCanArm(BusArm):
     """
 
     _config: DamiaoCanConfig
+    _keeper: KeeperBus | None
 
     def __init__(self, name: str, config: DamiaoCanConfig, clock: Clock) -> None:
         super().__init__(name, config, clock, SerialChain(config.describe(), config.tool, config.gravity_m_s2))
@@ -209,12 +210,13 @@ class DamiaoCanArm(BusArm):
         if not self._config.keeper:
             return open_bus(self.name, self._config)
         settings = self._config.model_dump(mode="json")
-        self._keeper = KeeperBus(self.name, self._config.interface, self._config.channel, settings)
-        return self._keeper
+        keeper = KeeperBus(self.name, self._config.interface, self._config.channel, settings)
+        self._keeper = keeper
+        return keeper
 
     def _reset_state(self) -> None:
         super()._reset_state()
-        self._keeper: KeeperBus | None = None
+        self._keeper = None
         self._answers: list[Reply[Feedback] | None] = [None] * len(self._config.motors)
         self._held: tuple[Array, Array] | None = None
         self._turns: Array | None = None

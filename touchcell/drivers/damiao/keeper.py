@@ -41,7 +41,7 @@ FAILED: Final = b"E"
 """First bytes of packets that are no frames: an orderly end, the joints' offsets (rad, JSON), a failed transfer."""
 
 _REST_S = 2.0
-_FADE_S = 2.0
+_FADE_S = 6.0
 _LONGEST_DESCENT_S = 30.0
 _PRIORITY = 50
 _MOST_FRAMES = 64
