@@ -18,7 +18,8 @@ from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_OK, EXIT_TASK_F
 from touchcell.cell.cli.output import say, warn
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.worlds import WorldName
-from touchcell.cell.recording.mcap import RECORDING, Recorder
+from touchcell.cell.recording.mcap import RECORDING
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.recording.reserved_file import ReservedFile
 from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, note_crashes, stop_record
 from touchcell.cell.runtime.cell import Cell

@@ -1,11 +1,12 @@
-"""Messages of a recording, in millimetres and degrees, with the unit in every key."""
+"""Messages of a recording, in millimetres and degrees, with the unit in every key, and the types that declare them."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
+from touchcell.cell.recording.message_types import Kind, MessageType, camel_case
 from touchcell.control.supervisor import Verdict
 from touchcell.drivers.core.commands import Sent, TwistCommand
 from touchcell.drivers.core.samples import Stamped, TcpState
@@ -15,6 +16,51 @@ from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
 
 COMPONENTS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
+
+_POSE: Final = dict.fromkeys(COMPONENTS, Kind.REAL)
+_SIGMA: Final = {f"sigma_{name}": Kind.REAL for name in COMPONENTS}
+_DECLARED: Final = {
+    ("arms", "tcp"): MessageType("Tcp", {"seq": Kind.INTEGER, **_POSE, "speed_mm_s": Kind.REAL}),
+    ("arms", "command"): MessageType(
+        "Command",
+        {
+            "twist": Kind.REALS,
+            "frame": Kind.TEXT,
+            "ttl_s": Kind.REAL,
+            "limited_by": Kind.TEXTS,
+            "asked": Kind.REALS,
+            "allowed": Kind.REALS,
+            "speed_mm_s": Kind.REAL,
+            "sensor_to_command_ms": Kind.REAL,
+        },
+    ),
+    ("sensors", "contact"): MessageType(
+        "Contact",
+        {
+            "seq": Kind.INTEGER,
+            "t_frame_ns": Kind.INTEGER,
+            "in_contact": Kind.FLAG,
+            "in_range": Kind.FLAG,
+            "nis": Kind.REAL,
+            **_POSE,
+            **_SIGMA,
+        },
+    ),
+    ("sensors", "measurement"): MessageType("Measurement", {"seq": Kind.INTEGER, **_POSE, **_SIGMA}),
+    ("sensors", "truth"): MessageType("TrueContact", {"in_contact": Kind.FLAG, **_POSE}),
+    ("objects",): MessageType("ObjectPose", _POSE),
+    ("safety",): MessageType("Verdict", {"allow": Kind.FLAG, "speed": Kind.REAL, "violations": Kind.TEXTS}),
+    ("events",): MessageType("Event", dict.fromkeys(("event", "from", "to", "reason"), Kind.TEXT)),
+    ("task",): MessageType("Task", {"state": Kind.TEXT}),
+    ("timing",): MessageType("Timing", {}),
+}
+
+
+def declared_type(topic: str) -> MessageType:
+    """Return the type of a topic; one without fields, which grows, where none is declared."""
+    kind, *rest = topic.strip("/").split("/")
+    known = _DECLARED.get((kind, *rest[1:]))
+    return known if known is not None else MessageType(camel_case(topic), {})
 
 
 def pose_message(T: Array) -> dict[str, float]:
@@ -37,7 +83,7 @@ def command_message(sent: Sent[TwistCommand]) -> dict[str, Any]:
     """Return the command as sent, and the limits that changed it."""
     command = sent.command
     message: dict[str, Any] = {
-        "twist": command.twist,
+        "twist": command.twist.tolist(),
         "frame": command.frame.value,
         "ttl_s": command.ttl_s,
         "limited_by": [adjustment.limit for adjustment in sent.adjustments],

@@ -56,6 +56,7 @@ def compose(
     """
     role_of = _arm_roles(plan)
     world = build_world(plan, role_of, clock)
+    scene_start_ns = world.clock.now_ns()
     wanted = {name: device for name, device in plan.built.items() if name not in world.hosted}
     devices = build_devices(plan, wanted, world.clock, world.scene, world.hosted)
     arms = {role: cast(Arm, devices[name]) for name, role in role_of.items()}
@@ -101,6 +102,7 @@ def compose(
         watched_torques=_watched(plan, role_of, "external_torque", ExternalTorqueSource),
         enabling_device=_enabling_device(plan, world.clock, enabling_device),
         scene=world.truth,
+        scene_start_ns=scene_start_ns,
         collection=collection,
         watchdog=world.watchdog,
         require_armed=partial(require_armed, plan, configured, planning_scene),

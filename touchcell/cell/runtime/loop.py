@@ -16,7 +16,7 @@ from functools import partial
 from typing import cast
 
 from touchcell.cell.errors import UnexpectedError
-from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.observer import Observer, call_driver
 from touchcell.cell.runtime.operator_channel import OperatorChannel
