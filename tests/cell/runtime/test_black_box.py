@@ -115,13 +115,13 @@ def test_a_disk_without_room_for_a_ring_is_named(tmp_path: Path, monkeypatch: py
 
 def test_a_ring_whose_disk_fails_raises_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ring = RingWriter(tmp_path / "ring", 0, {})
-    ring.add("/x", 0, b"{}")
+    ring.add("/x", 0, ENCODER.encode("/x", {}))
 
     def broken(*_: Any) -> int:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setattr(os, "pwrite", broken)
-    ring.add("/x", 1, b"{}")
+    ring.add("/x", 1, ENCODER.encode("/x", {}))
     assert ring.failed
     assert len(ring.messages()) == 1
     ring.close()

@@ -28,6 +28,7 @@ from touchcell.cell.runtime.heap import trim_heap
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.operator_channel import OperatorChannel
 from touchcell.cell.runtime.operator_input import stop_on_keys, stop_on_signals
+from touchcell.cell.runtime.run_description import describe_run, wall_clock_ns
 from touchcell.cell.runtime.run_directory import RunFolderError, run_directory
 from touchcell.cell.runtime.run_result import Outcome, Progress, RunResult
 from touchcell.cell.runtime.stop_request import StopRequest
@@ -193,7 +194,7 @@ def _running(cell: Cell, folder: Path, live: bool, result_file: ReservedFile) ->
     with (
         note_crashes(folder),
         BlackBox(folder, _about(cell, folder)) as box,
-        Recorder(folder / RECORDING) as recorder,
+        _recorder(folder, cell) as recorder,
         cell,
         stop_on_signals(stop),
         stop_on_keys(stop, channel=channel) as look_at_keys,
@@ -233,6 +234,13 @@ def _running(cell: Cell, folder: Path, live: bool, result_file: ReservedFile) ->
         yield run
     if explained:
         box.discard()
+
+
+@contextlib.contextmanager
+def _recorder(folder: Path, cell: Cell) -> Iterator[Recorder]:
+    with Recorder(folder / RECORDING, wall_offset_ns=wall_clock_ns() - cell.clock.now_ns()) as recorder:
+        describe_run(recorder, cell)
+        yield recorder
 
 
 def _about(cell: Cell, folder: Path) -> dict[str, Any]:

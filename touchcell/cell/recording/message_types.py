@@ -101,7 +101,8 @@ class MessageType:
             struct_pb2.DESCRIPTOR.CopyToProto(value)
             file.dependency.append(value.name)
             files.insert(0, value)
-        return descriptor_pb2.FileDescriptorSet(file=files).SerializeToString(deterministic=True)
+        schema: bytes = descriptor_pb2.FileDescriptorSet(file=files).SerializeToString(deterministic=True)
+        return schema
 
     @cached_property
     def _class(self) -> type[Message]:
@@ -143,7 +144,8 @@ class MessageType:
             else:
                 values[name] = value
         message.MergeFrom(self._class(**values))
-        return message.SerializeToString()
+        encoded: bytes = message.SerializeToString()
+        return encoded
 
     def fitting(self, data: Mapping[str, Any]) -> MessageType:
         """Return the type with room for ``data``, which ``plain`` has made; fields keep their numbers."""
@@ -220,9 +222,10 @@ def message_class(full_name: str, schema: bytes) -> type[Message]:
     try:
         for file in descriptor_pb2.FileDescriptorSet.FromString(schema).file:
             pool.Add(file)
-        return message_factory.GetMessageClass(pool.FindMessageTypeByName(full_name))
+        found: type[Message] = message_factory.GetMessageClass(pool.FindMessageTypeByName(full_name))
     except (DecodeError, TypeError, KeyError, ValueError, RecursionError) as error:
         raise UnreadableType(f"the schema of {full_name} is damaged: {error}") from None
+    return found
 
 
 def camel_case(topic: str) -> str:

@@ -18,7 +18,8 @@ from touchcell.cell.recording.message_types import Encoded, Encoder
 from touchcell.cell.recording.messages import declared_type
 
 if TYPE_CHECKING:
-    from foxglove import BaseChannel, Context
+    from foxglove import Context
+    from foxglove._foxglove_py import BaseChannel
 
 CHUNK_BYTES: Final = 16 * 1024
 """A kill loses at most the open chunk: a fraction of a second of a cell's usual 100 kB/s."""

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from itertools import groupby
 from typing import Any, Final
 
-import numpy as np
-
 from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.recording.well_known import (
     FRAME_TRANSFORM,
@@ -39,8 +37,8 @@ from touchcell.perception.runtime.estimate import ContactEstimate
 
 SCENE_TOPIC: Final = "/scene"
 LOG_TOPIC: Final = "/log"
-# Links are for the eye: a viewer shows no more frames a second than this.
-_LINKS_S: Final = 1.0 / 30.0
+# Joints, links and moved surfaces are for the eye, which sees no more pictures a second.
+_PICTURE_S: Final = 1.0 / 30.0
 _LEVELS: Final[dict[Severity, str]] = {Severity.LIMIT: "WARNING", Severity.TRIP: "ERROR", Severity.FAULT: "FATAL"}
 
 
@@ -60,7 +58,8 @@ class ViewerRecord:
         self._transforms: dict[str, tuple[str, TransformMessage]] = {}
         self._beliefs: dict[str, tuple[str, BeliefMessage]] = {}
         self._joints = {role: JointMessage(chain.joint_names) for role, chain in scene.chains.items()}
-        self._links_ns: dict[str, int] = {}
+        self._joints_ns: dict[str, int] = {}
+        self._moving_ns = -(1 << 62)
 
     def begin(self, t_ns: int) -> None:
         """Write what stands still, and everything that is drawn."""
@@ -78,15 +77,18 @@ class ViewerRecord:
         """Write where an arm's tool is."""
         self._transform(base_frame(role), tcp_frame(role), state.t_ns, state.value.T_base_tcp)
 
+    def wants_joints(self, role: str, t_ns: int) -> bool:
+        """Return whether it is time to write an arm's joints again."""
+        return t_ns >= self._joints_ns.get(role, t_ns)
+
     def joints(self, role: str, state: Stamped[JointState]) -> None:
         """Write the states of an arm's joints, and where its links are."""
-        message = self._joints[role].encode(
-            state.t_ns + self._recorder.wall_offset_ns, state.value.q, state.value.dq, state.value.tau
-        )
+        self._joints_ns[role] = state.t_ns + round(1e9 * _PICTURE_S)
+        t_wall_ns = state.t_ns + self._recorder.wall_offset_ns
+        message = self._joints[role].encode(t_wall_ns, state.value.q, state.value.dq, state.value.tau)
         self._recorder.write_bytes(f"/arms/{role}/joints", state.t_ns, JOINT_STATES, message)
-        if state.t_ns - self._links_ns.get(role, -(10**18)) < 1e9 * _LINKS_S or not np.isfinite(state.value.q).all():
+        if not all_finite(state.value.q):
             return
-        self._links_ns[role] = state.t_ns
         for number, T_base_link in enumerate(self._scene.chains[role].link_poses(state.value.q), start=1):
             self._transform(base_frame(role), link_frame(role, number), state.t_ns, T_base_link)
 
@@ -113,6 +115,9 @@ class ViewerRecord:
 
     def moving(self, t_ns: int) -> None:
         """Write where the surfaces are that a prescribed motion moves."""
+        if t_ns < self._moving_ns:
+            return
+        self._moving_ns = t_ns + round(1e9 * _PICTURE_S)
         for frame in self._scene.moving:
             self._transform(WORLD, frame.name, t_ns, frame.pose((t_ns - self._scene_start_ns) * 1e-9))
 

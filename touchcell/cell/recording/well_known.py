@@ -214,4 +214,5 @@ def _with_covariance(schema: bytes, name: str) -> bytes:
         type=descriptor_pb2.FieldDescriptorProto.TYPE_DOUBLE,
         label=descriptor_pb2.FieldDescriptorProto.LABEL_REPEATED,
     )
-    return files.SerializeToString(deterministic=True)
+    extended: bytes = files.SerializeToString(deterministic=True)
+    return extended

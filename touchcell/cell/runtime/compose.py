@@ -11,6 +11,7 @@ from touchcell.cell.config.armed import require_armed
 from touchcell.cell.config.cell_plan import REDUCED_SPEED_M_S, CellPlan
 from touchcell.cell.config.planning_scene import build_planning_scene
 from touchcell.cell.recording.dataset_writer import Collection
+from touchcell.cell.recording.frame_compressor import require_video
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.devices import build_devices, build_world
 from touchcell.cell.runtime.enabling import SimulatedEnablingDevice
@@ -54,6 +55,8 @@ def compose(
         ModelError: a model file cannot be used.
         RecordingError: the folder for labelled frames cannot be written.
     """
+    if plan.cell.recording.frames == "video":
+        require_video()
     role_of = _arm_roles(plan)
     world = build_world(plan, role_of, clock)
     scene_start_ns = world.clock.now_ns()

@@ -352,6 +352,8 @@ class RunLoop:
             with _logged(f"{role} was not given back"):
                 self._arms[role].release(lease)
         self._final = self._result()
+        with _logged("the last images were not written"):
+            self._record.close()
         self._record.event("end", self._final.reason, to=self._final.outcome.value)
 
     def _result(self) -> RunResult:

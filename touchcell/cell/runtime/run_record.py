@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any, Final, Protocol
 
 from touchcell.cell.errors import RecordingError, UnexpectedError
+from touchcell.cell.recording.frame_compressor import FrameCompressor
 from touchcell.cell.recording.message_types import Encoded, Encoder
 from touchcell.cell.recording.messages import (
     command_message,
@@ -24,6 +25,7 @@ from touchcell.cell.runtime.observer import Reading
 from touchcell.cell.runtime.timing import CycleTimes
 from touchcell.cell.scene.description import describe_scene
 from touchcell.control.supervisor import Verdict
+from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import Sent, TwistCommand
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import JointSource
@@ -62,6 +64,10 @@ class RunRecord:
         self._encoder = recorder.encoder if recorder is not None else Encoder(declared_type)
         self._transitions_written = 0
         self._viewers: ViewerRecord | None = None
+        self._frames: FrameCompressor | None = None
+        kind = cell.plan.cell.recording.frames
+        if recorder is not None and kind != "none":
+            self._frames = FrameCompressor(kind, complete=isinstance(cell.clock, VirtualClock))
         self._jointed: dict[str, JointSource] = {}
         if recorder is not None:
             self._for_viewers(recorder)
@@ -69,6 +75,8 @@ class RunRecord:
 
     def begin(self) -> None:
         """Note what recorded images need to be understood, and what the cell looks like."""
+        if self._frames is not None:
+            self._frames.start()
         if self._viewers is not None:
             self._view(partial(self._viewers.begin, self._cell.clock.now_ns()))
         for role, sensor in self._cell.sensors.items():
@@ -105,13 +113,17 @@ class RunRecord:
         if self._recorder is None and self._box is None:
             return
         cell, now_ns = self._cell, reading.now_ns
+        if self._frames is not None:
+            self._write_frames(self._frames)
         for role, state in reading.states.items():
             self.write(f"/arms/{role}/tcp", state.t_ns, tcp_message(state))
         for role, estimate in reading.contacts.items():
             self.write(f"/sensors/{role}/contact", now_ns, contact_message(estimate))
         for role, sensor in cell.sensors.items():
             for topic, t_ns, message in sensor.extra_messages(now_ns):
-                self.write(f"/sensors/{role}/{topic}", t_ns, message, boxed=topic != "image")
+                self.write(f"/sensors/{role}/{topic}", t_ns, message)
+            if self._frames is not None and (frame := sensor.new_frame()) is not None:
+                self._frames.add(role, frame.t_ns, frame.value.image)
         for role, sample in reading.devices.items():
             self.write(f"/devices/{role}/reading", sample.t_ns, {"seq": sample.seq, **sample.value})
         if verdict.allow:
@@ -153,10 +165,19 @@ class RunRecord:
             if frame is not None:
                 collection.keep(frame.value.image, T_f_s)
 
-    def write(self, topic: str, t_ns: int, message: Mapping[str, Any], *, boxed: bool = True) -> None:
-        """Record one message, in the black box only if ``boxed``."""
-        boxed = boxed and self._box is not None
-        if not boxed and self._recorder is None:
+    def close(self) -> None:
+        """Write the images that still wait; the run has ended."""
+        frames, self._frames = self._frames, None
+        if frames is None:
+            return
+        frames.close()
+        self._write_frames(frames)
+        if frames.left_out:
+            self.event("images left out", f"{frames.left_out}, since compressing them took longer than they last")
+
+    def write(self, topic: str, t_ns: int, message: Mapping[str, Any]) -> None:
+        """Record one message."""
+        if self._box is None and self._recorder is None:
             return
         try:
             encoded = self._encoder.encode(topic, message)
@@ -165,7 +186,7 @@ class RunRecord:
             logger.exception("a message of %s is left out", topic)
             self.error = self.error or UnexpectedError(error)
             return
-        if boxed and self._box is not None:
+        if self._box is not None:
             try:
                 self._box.add(topic, t_ns, encoded)
             except Exception:
@@ -195,13 +216,13 @@ class RunRecord:
             role: arm for role, arm in cell.arms.items() if role in scene.chains and isinstance(arm, JointSource)
         }
 
-    def _draw(
-        self, viewers: ViewerRecord, reading: Reading, objects: Stamped[Mapping[str, Array]] | None
-    ) -> None:
+    def _draw(self, viewers: ViewerRecord, reading: Reading, objects: Stamped[Mapping[str, Array]] | None) -> None:
         """Record for viewers where everything is."""
         for role, state in reading.states.items():
             viewers.arm(role, state)
         for role, arm in self._jointed.items():
+            if not viewers.wants_joints(role, reading.now_ns):
+                continue
             try:
                 joints = arm.joints()
             except DeviceError:
@@ -213,6 +234,16 @@ class RunRecord:
         if objects is not None:
             viewers.objects(objects)
         viewers.moving(reading.now_ns)
+
+    def _write_frames(self, frames: FrameCompressor) -> None:
+        try:
+            if self._recorder is not None:
+                frames.write_to(self._recorder)
+        except RecordingError as error:
+            self._give_up(error)
+        if frames.error is not None:
+            self._frames = None
+            self._give_up(UnexpectedError(frames.error))
 
     def _view(self, record: Callable[[], None]) -> None:
         """Record for viewers; what fails there is no reason to stop."""

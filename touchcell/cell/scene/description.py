@@ -50,6 +50,7 @@ _SENSOR_RADIUS_M, _SENSOR_LENGTH_M = 0.0185, 0.045
 _QUILL_RADIUS_M, _QUILL_LENGTH_M = 0.014, 0.16
 _LINK_RADIUS_M: Final = 0.035
 _TARGET_RADIUS_M: Final = 0.006
+_MARK: Final = np.array([0.0, 0.0, 0.08])
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,9 +150,7 @@ def describe_scene(plan: CellPlan) -> SceneDescription:
     target, path = _target(plan, bodies), _path(plan, bodies)
     if target is not None:
         parts.append(Part("target", WORLD, Cylinder(_TARGET_RADIUS_M, 0.001), _shift(target), TARGET_COLOUR))
-        parts.append(
-            Part("target", WORLD, Polyline(np.array([target, target + [0, 0, 0.08]])), np.eye(4), TARGET_COLOUR)
-        )
+        parts.append(Part("target", WORLD, Polyline(np.array([target, target + _MARK])), np.eye(4), TARGET_COLOUR))
     if path is not None:
         parts.append(Part("path", WORLD, Polyline(path), np.eye(4), TARGET_COLOUR))
     return SceneDescription(tuple(frames), tuple(parts), tuple(moving), chains, target, path)
@@ -184,8 +183,8 @@ def _arm(role: str, section: ArmSection, chain: SerialChain | None, colour: Colo
     for capsule in capsules:
         number = capsule.frames[0]
         frame = base_frame(role) if number == BASE else tcp_frame(role) if number == TOOL else link_frame(role, number)
-        start, end = (np.array(each) for each in capsule.ends_m)
-        for solid, T in capsule_solids(start, end, capsule.radius_m):
+        first, last = (np.array(each) for each in capsule.ends_m)
+        for solid, T in capsule_solids(first, last, capsule.radius_m):
             yield Part(f"{role} arm", frame, solid, T, colour)
 
 
@@ -245,9 +244,7 @@ def _path(plan: CellPlan, bodies: Sequence[SceneBody]) -> Array | None:
     if target is not None:
         T_world_base = _pushing_base(plan)
         start = next((body.pose(0.0)[:3, 3] for body in bodies if body.free), None)
-        way = [
-            (T_world_base @ np.array([1e-3 * x, 1e-3 * y, 0.0, 1.0]))[:3] for x, y in settings.get("path_mm") or ()
-        ]
+        way = [(T_world_base @ np.array([1e-3 * x, 1e-3 * y, 0.0, 1.0]))[:3] for x, y in settings.get("path_mm") or ()]
         for point in way:
             point[2] = target[2]
         points = [*([] if start is None else [start]), *way, target]
