@@ -14,11 +14,12 @@ from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import TcpSource
 from touchcell.drivers.core.samples import Stamped
-from touchcell.drivers.core.scene import ContactState, SceneSection, SceneSpec
+from touchcell.drivers.core.scene import ContactState, SceneBody, SceneSection, SceneSpec
 from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.plugin_section import Section
+from touchcell.simulation.bodies import scene_bodies
 from touchcell.simulation.closed_forms import Box, Cylinder, Saddle
 from touchcell.simulation.contact import ContactLaw
 from touchcell.simulation.edges import nearest_edge
@@ -422,6 +423,10 @@ class SceneConfig(Section, SceneSection):
         if self.physics == "dynamic" and abs(steps - max(round(steps), 1)) > 1e-6:
             raise ValueError(f"step_ms {self.step_ms:g} is not a multiple of physics_step_ms {self.physics_step_ms:g}")
         return self
+
+    def bodies(self) -> Sequence[SceneBody]:
+        """Return the table, surfaces and objects to draw."""
+        return scene_bodies(self.surfaces, self.objects, self.table)
 
     def build(self, clock: Clock) -> Scene:
         """Build the scene; its motions start now."""

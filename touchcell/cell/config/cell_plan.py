@@ -182,10 +182,11 @@ class RecordingSection(_Section):
     """What is kept of a run besides numbers.
 
     Attributes:
-        frames: whether camera images are recorded, and how they are compressed.
+        frames: whether camera images are recorded, and how they are compressed: ``video`` is H.264 (needs the extra
+            ``video``), ``jpeg`` keeps each image by itself, ``png`` loses nothing.
     """
 
-    frames: Literal["none", "jpeg", "png"] = "none"
+    frames: Literal["none", "video", "jpeg", "png"] = "none"
 
 
 class PairSection(_Section):
