@@ -12,6 +12,7 @@ from pathlib import Path
 
 BENCHMARKS = {
     "adapt": "benchmarks.adapt",
+    "against": "benchmarks.against",
     "armed": "benchmarks.armed",
     "calibration": "benchmarks.calibration",
     "emulated-push": "benchmarks.emulated_push",
@@ -22,6 +23,7 @@ BENCHMARKS = {
     "fuzz-cells": "tests.fault_injection.fuzz_cells",
     "fuzz-recordings": "tests.fault_injection.fuzz_recordings",
     "gdn-vs-cnn": "benchmarks.gdn_vs_cnn",
+    "keeper": "benchmarks.keeper",
     "mutation": "benchmarks.mutation",
     "hil-mutation": "benchmarks.hil_mutation",
     "kinematics": "benchmarks.kinematics",

@@ -17,6 +17,7 @@ from touchcell.drivers.core.protocols import require_protocols
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.perception.runtime.estimator_spec import Feature
 from touchcell.registry import Registry
 
 
@@ -163,6 +164,7 @@ class TaskSpec(Generic[TaskConfigT]):
         devices: roles of other devices, and the Protocols that each driver must provide.
         forces: returns roles of arms whose wrench a configuration needs, each with the key that needs it; their drivers
             must provide WrenchSource.
+        feature: what the contacts of its sensors must be of.
     """
 
     name: str
@@ -174,6 +176,7 @@ class TaskSpec(Generic[TaskConfigT]):
     labels_frames: bool = False
     devices: Mapping[str, frozenset[type]] = field(default_factory=dict)
     forces: Callable[[TaskConfigT], Mapping[str, str]] | None = None
+    feature: Feature = "surface"
 
     def needs_wrenches(self, config: TaskConfigT) -> Mapping[str, str]:
         """Return roles of arms whose wrench ``config`` needs, each with the key that needs it."""

@@ -182,10 +182,11 @@ class RecordingSection(_Section):
     """What is kept of a run besides numbers.
 
     Attributes:
-        frames: whether camera images are recorded, and how they are compressed.
+        frames: whether camera images are recorded, and how they are compressed: ``video`` is H.264 (needs the extra
+            ``video``), ``jpeg`` keeps each image by itself, ``png`` loses nothing.
     """
 
-    frames: Literal["none", "jpeg", "png"] = "none"
+    frames: Literal["none", "video", "jpeg", "png"] = "none"
 
 
 class PairSection(_Section):
@@ -344,8 +345,12 @@ class CellPlan:
         return {**self.arms, **self.sensors, **self.auxiliaries}
 
     def text(self) -> str:
-        """The cell file as it is planned: the file itself, or YAML of what comes of it and of what it extends."""
+        """The cell file as it is planned: the file itself, or YAML of what comes of it and of what it extends.
+
+        Files of its scene have absolute paths, as a run folder is read from elsewhere.
+        """
         merged = load_layers(self.file, self.settings, self.world_settings)
-        if not merged.sources:
+        if not merged.sources and merged.data.get("scene") == self.cell.scene:
             return self.file.read_text()
-        return yaml.safe_dump(merged.data, sort_keys=False, allow_unicode=True)
+        data = {key: self.cell.scene if key == "scene" else value for key, value in merged.data.items()}
+        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)

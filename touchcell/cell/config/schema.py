@@ -27,7 +27,7 @@ from touchcell.cell.config.cell_plan import (
     SensorSection,
 )
 from touchcell.cell.config.feasibility import unfeasible
-from touchcell.cell.config.input_files import with_input_files
+from touchcell.cell.config.input_files import with_input_files, with_paths
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
 from touchcell.cell.config.worlds import WorldChanges, WorldName, world_changes
@@ -143,7 +143,7 @@ class _Planner:
         if "data" in self._overrides and isinstance(collect := file.data.get("collect"), dict):
             collect["data"] = self._overrides["data"]
         cell = self._with_input_files(file.validate(CellFile, file.data), ())
-        self._require_scene_fits(cell)
+        cell = self._with_scenes(cell)
         task, task_config = self._task(cell)
         arm_roles = self._roles(cell, "arms", task.arms, cell.arms) if task else {}
         sensor_roles = self._roles(cell, "sensors", task.sensors, cell.sensors) if task else {}
@@ -203,13 +203,17 @@ class _Planner:
             raise InvalidCell(problems)
         return self._require_armed(planned)
 
-    def _require_scene_fits(self, cell: CellFile) -> None:
+    def _with_scenes(self, cell: CellFile) -> CellFile:
+        """Return ``cell`` with its scenes checked, and the files that they name found."""
         if cell.world == "bench":
             self._require_nothing_simulated(cell)
-        if cell.scene is not None:
-            self._validated(scene_section(), cell.scene, ("scene",))
-        if cell.emulated_scene is not None:
-            self._validated(scene_section(), cell.emulated_scene, ("emulated_scene",))
+        found = {}
+        for key in ("scene", "emulated_scene"):
+            data = getattr(cell, key)
+            section = None if data is None else self._validated(scene_section(), data, (key,))
+            if section is not None:
+                found[key] = with_paths(data, section, self._with_input_files(section, (key,)))
+        return cell.model_copy(update=found)
 
     def _require_nothing_simulated(self, cell: CellFile) -> None:
         if cell.enabling_device == "simulated":
