@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import logging
 import math
 import os
 import socket
@@ -418,6 +419,21 @@ def test_activation_proves_the_watchdog_and_sets_the_tool(arm: UrArm, emulator: 
     wait_until(lambda: emulator.state()["t_s"] > state["t_s"] + 0.5, "half a second")
     assert emulator.state()["watchdog_trips"] == 1
     assert arm.state is Lifecycle.ACTIVE
+
+
+def test_before_activation_the_pose_is_that_of_the_configured_tool_whatever_the_pendant_has_set(
+    arm: UrArm, emulator: EmulatorProcess, caplog: pytest.LogCaptureFixture
+) -> None:
+    # The emulated pendant has set no tool; the configured one is 100 mm long.
+    assert emulator.state()["flange_to_tcp"] == [0.0] * 6
+    with caplog.at_level(logging.WARNING, "touchcell"):
+        before = arm.tcp(0.2).value.T_base_tcp
+        arm.tcp(0.2)
+    assert caplog.text.count("100.0 mm and 0.0 deg from flange_to_tcp_mm_deg") == 1
+    assert arm.health()["controller_tool_off_mm"] == pytest.approx(100.0, abs=0.01)
+    arm.activate()
+    np.testing.assert_allclose(before, arm.tcp(0.2).value.T_base_tcp, atol=1e-6)
+    assert arm.health()["controller_tool_off_mm"] == pytest.approx(0.0, abs=0.01)
 
 
 def test_activation_is_refused(arm: UrArm, emulator: EmulatorProcess) -> None:

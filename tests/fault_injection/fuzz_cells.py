@@ -40,10 +40,10 @@ class Tried:
     time_s: float
 
 
-def mutants(seed: int) -> Iterator[bytes]:
+def mutants(seed: int, configs: Path = CONFIGS) -> Iterator[bytes]:
     """Shipped cells with one to four mutations each, for ever."""
     chance = random.Random(seed)
-    shipped = [path.read_text() for path in sorted(CONFIGS.glob("*.yaml"))]
+    shipped = [path.read_text() for path in sorted(configs.glob("*.yaml"))]
     while True:
         text = chance.choice(shipped)
         for _ in range(chance.randint(1, 4)):
@@ -84,6 +84,13 @@ def _mutated(text: str, chance: random.Random) -> str:
         key, colon, _ = lines[at].partition(":")
         lines[at] = f"{key}{colon or ':'} {chance.choice(_VALUES)}"
     return "\n".join(lines) + "\n"
+
+
+def write_mutants(folder: Path, number: int, seed: int, configs: Path) -> None:
+    """Write mutants of the cells in ``configs``, for another version to try."""
+    folder.mkdir()
+    for k, content in zip(range(number), mutants(seed, configs), strict=False):
+        (folder / f"{k:05d}.yaml").write_bytes(content)
 
 
 def try_mutants(number: int, seed: int) -> Iterator[Tried]:

@@ -7,6 +7,7 @@ system and buttons, which alone are safety-rated. ``docs/devices/ur.md`` describ
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from pydantic import Field, model_validator
 
 from touchcell.drivers.core.arm import Arm, JointLimitsConfig, LimitsConfig
 from touchcell.drivers.core.behaviour import ArmBehaviour
-from touchcell.drivers.core.chain_check import require_same_arm
+from touchcell.drivers.core.chain_check import distance, require_same_arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import (
@@ -46,7 +47,7 @@ from touchcell.drivers.core.protocols import (
     StopCategory,
     WrenchSource,
 )
-from touchcell.drivers.core.samples import JointState, Stamped, TcpState
+from touchcell.drivers.core.samples import JointState, Stamped, TcpState, of_other_point
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.drivers.kinematics.chain import ChainDescription, ChainFile, DifferentialIk, LocalIk, SerialChain, Tool
@@ -58,6 +59,9 @@ from touchcell.drivers.ur.sdk import dashboard
 from touchcell.drivers.ur.state import RATE_HZ, VARIABLES, Snapshot, StateReader
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
+from touchcell.logs import OncePerCause
+
+_logger = logging.getLogger(__name__)
 
 JOINTS = 6
 _MIN_WATCHDOG_HZ = 5.0
@@ -73,6 +77,10 @@ _EXPLANATION_NS = 20_000_000
 _STILL_TARGET_RAD_S = 1e-6
 _STILL_ACTUAL_RAD_S = 0.01
 _BEYOND_LIMIT_RAD = 0.1
+# A tool that differs by less cannot be distinguished from an arm that differs from its model's nominal lengths, and
+# then the controller's calibrated pose is the better one.
+_SAME_TOOL_M = 0.002
+_SAME_TOOL_RAD = np.deg2rad(0.5)
 
 _STOPS = frozenset(StopCategory)
 
@@ -129,8 +137,9 @@ class UrConfig(DriverConfig):
 class UrArm(Arm):
     """Driver for a UR arm.
 
-    Before activation, ``tcp`` reports the pose of the tool centre point that is set on the pendant, because only a
-    running program may set another; afterwards that of ``flange_to_tcp_mm_deg``, read back.
+    ``tcp`` is always that of ``flange_to_tcp_mm_deg``. Once active it is the controller's, with the tool read back.
+    Before, only a running program may set the tool: if the one that is set on the pendant is another, the pose is
+    computed from the joint angles and the chain's nominal lengths, with a warning.
 
     One supervision thread, started by ``connect`` and joined by ``disconnect``, checks the state every 4 ms, ends
     expired twists, feeds the watchdog and latches faults. It cannot run while another thread holds the GIL; then the
@@ -164,13 +173,32 @@ class UrArm(Arm):
         self._proven_watchdog_s: float | None = None
         self._ttl_stops = 0
         self._dropping = threading.Lock()
+        self._other_tool = OncePerCause(_logger)
         self._program_is_ours = False
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
         """Return pose and twist of the tool centre point. Raises StaleData if older than ``max_age_s``."""
         snapshot = self._newest(max_age_s)
         state = TcpState(_pose(snapshot.tcp_pose), snapshot.tcp_speed.copy())
+        if self._link is None:
+            state = self._with_own_tool(snapshot, state)
         return Stamped(state, snapshot.t_ns, snapshot.seq, snapshot.t_device_ns)
+
+    def _with_own_tool(self, snapshot: Snapshot, state: TcpState) -> TcpState:
+        """Return the state of the configured tool centre point from that of the one which the pendant has set."""
+        T_base_tcp = self._chain.forward(snapshot.q)
+        away_m, turned_rad = distance(T_base_tcp, state.T_base_tcp)
+        if away_m <= _SAME_TOOL_M and turned_rad <= _SAME_TOOL_RAD:
+            return state
+        self._other_tool.warning(
+            "tool",
+            "%s: the tool set on the pendant is %.1f mm and %.1f deg from flange_to_tcp_mm_deg; until activation the "
+            "pose is computed from the joint angles and nominal lengths (set the same tool on the pendant)",
+            self.name,
+            1e3 * away_m,
+            np.rad2deg(turned_rad),
+        )
+        return of_other_point(state, T_base_tcp)
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
         """Return joint angles and speeds. Raises StaleData if older than ``max_age_s``."""
@@ -229,6 +257,7 @@ class UrArm(Arm):
         snapshot = self._newest(None)
         reader = self._opened()
         link = self._link
+        off_m, _ = distance(self._chain.forward(snapshot.q), _pose(snapshot.tcp_pose))
         return {
             "model": self._model,
             "robot_mode": snapshot.robot_mode.name,
@@ -241,6 +270,7 @@ class UrArm(Arm):
             "max_joint_temperature_c": float(snapshot.temperatures.max()),
             "speed_fraction": snapshot.speed_fraction,
             "tool_set": link is not None,
+            "controller_tool_off_mm": 1e3 * off_m,
             "watchdog_hz": self._config.watchdog_hz,
             "watchdog_trip_s": link.trip_s if link is not None else 0.0,
             "ttl_stops": self._ttl_stops + (link.ttl_stops if link is not None else 0),
