@@ -45,6 +45,7 @@ class Press:
         after_ms: int = 10,
         arm: str | None = "arm",
         state: str = "press",
+        contact: bool = False,
     ) -> Violation | None:
         self.now_ns += 1_000_000 * after_ms
         T_base_sensor = FIRST_TOUCH @ se3.from_euler_mm_deg(np.array([x_mm, y_mm, along_mm, 0, 0, 0]))
@@ -54,7 +55,7 @@ class Press:
             wrench = Stamped(pushed, self.now_ns - wrench_age_ns, 0)
         pose = Stamped(TcpState(T_base_sensor @ se3.inverse(MOUNT), np.zeros(6)), self.now_ns, 0)
         depth_m = None if depth_mm is None else 1e-3 * depth_mm
-        sensor = SensorView(self.now_ns, 0, depth_mm is not None, depth_m, arm=arm)
+        sensor = SensorView(self.now_ns, 0, contact or depth_mm is not None, depth_m, arm=arm)
         view = CellView(self.now_ns, {"arm": ArmView(pose, wrench=wrench)}, {"sensor": sensor}, state)
         assert not hasattr(self.rule, "check")
         found, self.past = self.rule.evaluate(view, self.past)
@@ -98,6 +99,13 @@ def test_after_a_longer_slide_the_reference_is_taken_anew_at_the_estimate(x_mm: 
     assert press(5.5, 2.0, x_mm=x_mm, y_mm=y_mm) is None
     assert press(8.4, 2.0, x_mm=x_mm, y_mm=y_mm) is None
     assert press(8.6, 2.0, x_mm=x_mm, y_mm=y_mm) is not None
+
+
+def test_a_contact_whose_depth_is_not_estimated_counts_as_none_deep() -> None:
+    press = Press()
+    press.touch()
+    assert press(2.9, None, contact=True) is None
+    assert press(3.1, None, contact=True) is not None
 
 
 def test_going_in_is_no_slide() -> None:

@@ -442,3 +442,9 @@ def test_a_checked_array_is_a_copy_unless_nothing_can_change_it() -> None:
     assert np.isfinite(checked).all()
     immutable = read_only(np.zeros(6))
     assert finite_array("arm", "twist", immutable, (6,)) is immutable
+
+
+def test_the_first_command_from_rest_accelerates_for_a_millisecond_at_most() -> None:
+    """The shortest control cycle: 0.5 m/s2 for 1 ms."""
+    speed = float(np.linalg.norm(GateHarness(NO_JERK).send(ttl_s=0.5).command.twist))
+    assert speed == pytest.approx(0.5e-3)
