@@ -23,6 +23,7 @@ BENCHMARKS = {
     "fuzz-recordings": "tests.fault_injection.fuzz_recordings",
     "gdn-vs-cnn": "benchmarks.gdn_vs_cnn",
     "mutation": "benchmarks.mutation",
+    "phantom": "benchmarks.phantom",
     "kinematics": "benchmarks.kinematics",
     "safety": "tests.fault_injection.safety",
     "safety-against": "benchmarks.safety_against",

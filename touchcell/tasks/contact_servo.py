@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Protocol
+from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
@@ -47,6 +47,20 @@ class Behavior(Protocol):
 
     def telemetry(self) -> Mapping[str, float]:
         """Return named numbers for recording and plots, units in the names."""
+        ...
+
+
+@runtime_checkable
+class Sidestepping(Protocol):
+    """Behavior that may ask for its contact to be made anew beside the present one."""
+
+    @property
+    def sidestep_m(self) -> float | None:
+        """Distance to step to the left of the contact normal, as seen from above; None for no step."""
+        ...
+
+    def begin_sidestep(self) -> None:
+        """Take note that the contact is given up for another."""
         ...
 
 
@@ -145,6 +159,9 @@ class ContactServo:
         self.contact: ContactEstimate | None = None
         self._before: Array | None = None
         self._start: Array | None = None
+        self._touched = False
+        self._first_touch: tuple[Array, float] | None = None
+        self._waypoints: list[Array] = []
 
     @property
     def has_fresh_data(self) -> bool:
@@ -155,6 +172,58 @@ class ContactServo:
     def in_contact(self) -> bool:
         """True if the newest frame shows a contact."""
         return self.contact is not None and self.contact.in_contact
+
+    @property
+    def has_zero(self) -> bool:
+        """True if the sensor compares its images with a zero frame."""
+        return self.contact is not None and self.contact.change is not None
+
+    @property
+    def change_since_zero(self) -> float:
+        """Change of the newest image from the zero frame, 0 to 1; 0 where there is none."""
+        return 0.0 if self.contact is None or self.contact.change is None else self.contact.change
+
+    @property
+    def seq(self) -> int:
+        """Number of the newest frame; -1 where there is none."""
+        return -1 if self.contact is None else self.contact.seq
+
+    @property
+    def max_frame_age_ms(self) -> float:
+        """Age of a frame from which the arm stops."""
+        return self._config.max_frame_age_ms
+
+    @property
+    def touches(self) -> bool:
+        """True if the newest frame shows a contact that has changed as the sensor moved on."""
+        return self.in_contact and self._touched
+
+    @property
+    def contact_is_stuck(self) -> bool:
+        """True if a contact has shown since the sensor began to move and has not changed, however far it moved."""
+        return self.in_contact and not self._touched and self._pressed_m() > 1e-3 * _LONGEST_UNCHANGED_MM
+
+    def _pressed_m(self) -> float:
+        """Distance by which the sensor has moved along its axis since the contact first showed."""
+        if self._first_touch is None or self.T_base_sensor is None:
+            return 0.0
+        T, _ = self._first_touch
+        return float((self.T_base_sensor[:3, 3] - T[:3, 3]) @ T[:3, 2])
+
+    def _watch_touch(self) -> None:
+        """A contact is one once its image has changed as the sensor pressed on; one without images is one at once."""
+        if not self.in_contact or self.contact is None:
+            self._touched, self._first_touch = False, None
+        elif self.contact.change is None:
+            self._touched = True
+        elif self._first_touch is None:
+            if self.T_base_sensor is not None:
+                self._first_touch = self.T_base_sensor, self.contact.change
+        elif not self._touched:
+            _, change = self._first_touch
+            self._touched = (
+                self._pressed_m() >= 1e-3 * _SHORTEST_PRESS_MM and self.contact.change - change >= _LEAST_CHANGE
+            )
 
     @property
     def T_s_f(self) -> Array | None:  # noqa: N802  the field's own name
@@ -173,10 +242,42 @@ class ContactServo:
         self.contact = observation.contacts.get(self.sensor)
         if self.contact is not None and not 0.0 <= now_ns - self.contact.t_frame_ns <= 1e6 * limits.max_frame_age_ms:
             self.contact = None
+        if self.contact is not None:
+            self._watch_touch()
 
     def reset_travel(self) -> None:
         """Measure the travelled distance from the current pose."""
         self._start = self.T_base_sensor
+
+    def start_sidestep(self, clear_m: float) -> None:
+        """Plan a step aside: back by ``clear_m`` along the sensor's axis, then as far aside as the behavior asks."""
+        self._waypoints = []
+        if self.T_base_sensor is None or not isinstance(self.run, Sidestepping) or self.run.sidestep_m is None:
+            return
+        R, position = self.T_base_sensor[:3, :3], self.T_base_sensor[:3, 3]
+        left = np.cross([0.0, 0.0, 1.0], R[:, 2])
+        away = position - clear_m * R[:, 2]
+        self._waypoints = [away, away + self.run.sidestep_m * left]
+        self.run.begin_sidestep()
+
+    @property
+    def sidestepping(self) -> bool:
+        """True while a step aside has not ended."""
+        return bool(self._waypoints)
+
+    def step_aside(self, speed_m_s: float) -> Array:
+        """Return the twist (6,) of the tool towards the next waypoint; drop waypoints that are reached."""
+        assert self.T_base_sensor is not None
+        while self._waypoints:
+            to = self._waypoints[0] - self.T_base_sensor[:3, 3]
+            distance_m = float(np.linalg.norm(to))
+            if distance_m > _REACHED_M:
+                # The last stretch is slower, so that it ends there.
+                v = to / distance_m * min(speed_m_s, _APPROACH_PER_S * distance_m)
+                V_s = np.concatenate([self.T_base_sensor[:3, :3].T @ v, np.zeros(3)])
+                return np.asarray(self._Ad_tcp_sensor @ V_s)
+            self._waypoints.pop(0)
+        return np.zeros(6)
 
     def travelled_m(self) -> float:
         """Return the distance of the sensor from its pose at ``reset_travel``, m; 0 while it is unknown."""
@@ -225,5 +326,11 @@ class ContactServo:
         return {**values, **self.run.telemetry()}
 
 
+_SHORTEST_PRESS_MM = 0.3
+_LONGEST_UNCHANGED_MM = 2.5
+# The image changes by about 0.1 per millimetre of depth (``contact_gate``).
+_LEAST_CHANGE = 0.01
+_REACHED_M = 0.5e-3
+_APPROACH_PER_S = 8.0
 _COMPONENTS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 _UNITS = np.repeat([1e3, np.degrees(1.0)], 3)

@@ -30,7 +30,9 @@ def write_report(folder: Path) -> str:
     run = source.recording
     result_file = folder / "result.json"
     result = json.loads(result_file.read_text()) if result_file.exists() else {}
-    summary = {**_push_errors(source), **summarise(run)}
+    plan = _plan(source)
+    truth = {"truth": dict(plan.truth)} if plan is not None and plan.truth else {}
+    summary = {**_push_errors(source), **truth, **summarise(run)}
     (folder / "summary.json").write_text(json.dumps({**result, **summary}, indent=1) + "\n")
     text = _text(folder, result, summary, _pictures(source), run)
     (folder / "summary.txt").write_text(text + "\n")

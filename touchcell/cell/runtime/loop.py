@@ -230,6 +230,9 @@ class RunLoop:
             devices=reading.devices,
         )
         action = cell.task.tick(observation)
+        for role in sorted(action.zero):
+            if (zero := cell.sensors[role].take_zero()) is not None:
+                self._record.write(f"/sensors/{role}/zero", *zero, boxed=False)
         thought = time.perf_counter_ns()
         verdict = cell.supervisor.review(self._observer.view(reading, action, self._sent), self._alarms())
         judged = time.perf_counter_ns()

@@ -56,6 +56,13 @@ class Sensor:
         """Wait for the first frame, so that no control cycle has to. Raises DeviceError."""
         self.source.await_frame()
 
+    def take_zero(self) -> tuple[int, dict[str, Any]] | None:
+        """Take the newest frame for one out of contact; return its time and image for the recording, None if unused."""
+        frame = self.frame
+        if not self.source.take_zero() or frame is None:
+            return None
+        return frame.t_ns, _image_message(frame.value.image, "png", frame.seq, frame.t_ns)
+
     def picture(self) -> tuple[int | None, float | None]:
         """A checksum and the mean grey level of every third pixel of the newest frame; (None, None) if not watched."""
         frame = self.frame if self.watched else None
