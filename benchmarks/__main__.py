@@ -12,6 +12,7 @@ from pathlib import Path
 
 BENCHMARKS = {
     "adapt": "benchmarks.adapt",
+    "against": "benchmarks.against",
     "armed": "benchmarks.armed",
     "calibration": "benchmarks.calibration",
     "emulated-push": "benchmarks.emulated_push",

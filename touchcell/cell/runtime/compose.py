@@ -99,6 +99,7 @@ def compose(
         watched_joints=frozenset(role for role, body in planning_scene.bodies.items() if body.link_count),
         watched_wrenches=_watched(plan, role_of, "wrench", WrenchSource),
         watched_torques=_watched(plan, role_of, "external_torque", ExternalTorqueSource),
+        watched_readings=frozenset(key for entry in plan.cell.interlocks.values() for key in entry.reads),
         enabling_device=_enabling_device(plan, world.clock, enabling_device),
         scene=world.truth,
         collection=collection,

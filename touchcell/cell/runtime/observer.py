@@ -10,13 +10,14 @@ from functools import partial
 from typing import TypeVar
 
 from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.health import HealthMonitor
 from touchcell.cell.runtime.sensor import Sensor
 from touchcell.cell.runtime.timing import CycleTimes
 from touchcell.control.interlocks.snapshot import ArmView, CellView, DeviceView, SensorView
 from touchcell.drivers.core.commands import Sent, TwistCommand
 from touchcell.drivers.core.errors import DeviceFault
 from touchcell.drivers.core.protocols import ReadingSource
-from touchcell.drivers.core.samples import JointState, Stamped, TcpState
+from touchcell.drivers.core.samples import Health, JointState, Stamped, TcpState
 from touchcell.errors import TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.finite import all_finite
@@ -36,12 +37,14 @@ class Reading:
         states: of the arms, by role.
         contacts: of the sensors that have seen a frame, by role.
         devices: of the other devices that are read, by role.
+        health: what devices have just reported about themselves, by name; most cycles have none.
     """
 
     now_ns: int
     states: Mapping[str, Stamped[TcpState]]
     contacts: Mapping[str, ContactEstimate]
     devices: Mapping[str, Stamped[Mapping[str, float]]] = field(default_factory=dict)
+    health: Mapping[str, Stamped[Health]] = field(default_factory=dict)
 
 
 class Observer:
@@ -57,6 +60,8 @@ class Observer:
     def __init__(self, cell: Cell, times: CycleTimes) -> None:
         self._cell = cell
         self._times = times
+        self._watched = {device for device, _ in cell.watched_readings}
+        self._health = HealthMonitor(cell.devices(), cell.clock)
 
     @property
     def exhausted(self) -> bool:
@@ -87,8 +92,12 @@ class Observer:
                 raise device.fault
             if isinstance(device, ReadingSource):
                 devices[role] = call_driver(device.name, device.read)
+        started = time.perf_counter_ns()
+        health = self._health.read()
+        if health:
+            self._times.add("read health", time.perf_counter_ns() - started)
         # Only now: what a device's own thread brought in the meantime would seem to come from the future.
-        return Reading(cell.clock.now_ns(), states, contacts, devices)
+        return Reading(cell.clock.now_ns(), states, contacts, devices, health)
 
     def view(
         self,
@@ -124,6 +133,7 @@ class Observer:
             devices={
                 role: DeviceView(reading.devices.get(role), asked.settings.get(role)) for role in cell.auxiliaries
             },
+            health={name: self._health.newest[name] for name in self._watched if name in self._health.newest},
         )
 
     def _device(self, sensor_role: str) -> str:

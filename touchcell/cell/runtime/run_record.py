@@ -95,6 +95,8 @@ class RunRecord:
         for role, sensor in cell.sensors.items():
             for topic, t_ns, message in sensor.extra_messages(now_ns):
                 self.write(f"/sensors/{role}/{topic}", t_ns, message, boxed=topic != "image")
+        for name, health in reading.health.items():
+            self.write(f"/health/{name}", health.t_ns, {"seq": health.seq, **health.value})
         for role, sample in reading.devices.items():
             self.write(f"/devices/{role}/reading", sample.t_ns, {"seq": sample.seq, **sample.value})
         if verdict.allow:

@@ -54,7 +54,10 @@ _logger = logging.getLogger(__name__)
 
 _TURN_RAD = 2.0 * np.pi
 _MAX_BUS_LOAD = 0.8
+_PCAN_CLOCK_HZ = 80_000_000
+_SAMPLE_POINT_PERCENT = 80.0
 _PLAUSIBLE_JUMP_RAD = 0.1
+_ENABLE_TRIES = 3
 # While one motor is asked, the others hear nothing: all tries together must not last as long as their watchdog.
 _ASKING_FRACTION = 0.75
 
@@ -221,6 +224,15 @@ class DamiaoCanArm(BusArm):
         self._switch_off()
         self._bus.close()
 
+    def _reopen_bus(self) -> None:
+        self._bus.close()
+        self._bus.open()
+        # What they held is over: motors disable themselves when they hear nothing, and may have lost their power.
+        self._answers = [None] * len(self._answers)
+        self._turns = None
+        states = self._exchange([None] * len(self._answers))
+        self._enabled = [each is not None and each.state.status == codec.ENABLED for each in states]
+
     def _configure(self) -> None:
         with self._lock:
             for index, motor in enumerate(self._config.motors):
@@ -322,20 +334,39 @@ class DamiaoCanArm(BusArm):
             )
 
     def _enable(self, indices: list[int]) -> None:
-        """Enable these motors at the setpoint; if one fails, disable all of them."""
+        """Enable these motors at the setpoint, all at once; if one fails, disable all of them."""
         frames = self._frames(self._setpoint.q, np.zeros_like(self._setpoint.q))
+        waiting = list(indices)
         try:
-            for index in indices:
-                self._enabled[index] = True
-                self._bus.command(index, codec.ENABLE)
-                # A motor enabled without gains is limp: send its setpoint before the next one is enabled.
-                status = self._bus.command(index, frames[index]).status
-                if status != codec.ENABLED:
-                    code = codec.fault(status) or _DOES_NOT_ENABLE
-                    raise _motor_fault(self.name, self._config.motors[index].esc_id, status, code)
+            # Some motors do not take the first command to enable (openarm issue 471).
+            for _ in range(_ENABLE_TRIES):
+                self._exchange([codec.ENABLE if i in waiting else self._own(frames, i) for i in range(len(frames))])
+                for index in waiting:
+                    self._enabled[index] = True
+                # A motor enabled without gains is limp until it has its setpoint.
+                answers = self._exchange([self._own(frames, i) for i in range(len(frames))])
+                waiting = [index for index in waiting if not self._is_enabled(index, answers[index])]
+                if not waiting:
+                    return
+            raise _motor_fault(self.name, self._config.motors[waiting[0]].esc_id, codec.DISABLED, _DOES_NOT_ENABLE)
         except DeviceError:
             self._disable(indices)
             raise
+
+    def _own(self, frames: Sequence[bytes], index: int) -> bytes | None:
+        return frames[index] if self._enabled[index] else None
+
+    def _is_enabled(self, index: int, answer: Reply[Feedback] | None) -> bool:
+        """Return whether a motor that was enabled reports so. Raises DeviceFault for one that reports a fault."""
+        status = codec.DISABLED if answer is None else answer.state.status
+        if (code := codec.fault(status)) is not None:
+            raise _motor_fault(self.name, self._config.motors[index].esc_id, status, code)
+        return status == codec.ENABLED
+
+    def _exchange(self, frames: Sequence[bytes | None]) -> list[Reply[Feedback] | None]:
+        """Send every motor a frame, or ask it for its state, and wait for all replies, outside the loop."""
+        wait_s = self._config.watchdog_s * _ASKING_FRACTION / TRIES
+        return self._bus.exchange(frames, self._clock.now_ns() + round(wait_s * 1e9))
 
     def _switch_off(self) -> None:
         self._disable(range(len(self._enabled)))
@@ -481,8 +512,14 @@ def open_bus(device: str, config: DamiaoCanConfig) -> Any:
     if config.fd and not is_kernels:
         rates["data_bitrate"] = config.data_bitrate
     options: dict[str, Any] = rates | config.bus_options
+    channel: str | int = config.channel
+    if config.interface == "gs_usb" and config.channel.isdigit():
+        # python-can takes the number of the adapter.
+        channel = int(config.channel)
+    if config.interface == "pcan":
+        _complete_pcan(device, config, options)
     try:
-        bus = can.Bus(interface=config.interface, channel=config.channel, fd=config.fd, **options)
+        bus = can.Bus(interface=config.interface, channel=channel, fd=config.fd, **options)
     except (can.CanError, OSError, ValueError, TypeError) as error:
         raise ConnectError(
             device,
@@ -497,6 +534,24 @@ def open_bus(device: str, config: DamiaoCanConfig) -> Any:
             device, f"{config.interface} does not send CAN FD frames", hint="set fd: false, or use another adapter"
         )
     return bus
+
+
+def _complete_pcan(device: str, config: DamiaoCanConfig, options: dict[str, Any]) -> None:
+    """Check the bit rate of a PCAN adapter, for which python-can silently takes 500 kbit/s; give FD its timing."""
+    import can
+    from can.interfaces.pcan.basic import PCAN_BITRATES
+
+    if config.fd and not {"timing", "f_clock", "f_clock_mhz"} & options.keys():
+        options["timing"] = can.BitTimingFd.from_sample_point(
+            f_clock=_PCAN_CLOCK_HZ,
+            nom_bitrate=config.bitrate,
+            nom_sample_point=_SAMPLE_POINT_PERCENT,
+            data_bitrate=config.data_bitrate,
+            data_sample_point=_SAMPLE_POINT_PERCENT,
+        )
+    elif not config.fd and config.bitrate not in PCAN_BITRATES:
+        known = ", ".join(map(str, sorted(PCAN_BITRATES)))
+        raise ConnectError(device, f"a PCAN adapter has no bit rate of {config.bitrate}", hint=f"one of {known}")
 
 
 def _motor_fault(device: str, esc_id: int, status: int, code: codec.StatusCode) -> DeviceFault:

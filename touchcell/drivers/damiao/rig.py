@@ -49,6 +49,7 @@ def rig(folder: Path, address: int) -> DeviceFixture:
         start=start,
         build=lambda clock: damiao_can.DamiaoCanArm("arm", config(channel), clock),
         config=config(channel),
+        configured=lambda other, clock: damiao_can.DamiaoCanArm("arm", other, clock),
         state_rate_hz=125.0,
         pose="T_base_tcp",
         reset="reset",

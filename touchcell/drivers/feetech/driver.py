@@ -208,6 +208,7 @@ class FeetechSerialArm(BusArm):
         readings: dict[str, float | int | str | bool] = dict(self._bus.counters.as_dict())
         readings |= super().health()
         readings |= {
+            "firmware": self._bus.firmware,
             "calibration": self._config.calibration_hash,
             "not_followed": ", ".join(f"{a.limit} {a.allowed:.3g} for {a.requested:.3g}" for a in self._lost),
         }
@@ -228,6 +229,11 @@ class FeetechSerialArm(BusArm):
 
     def _close_bus(self) -> None:
         self._bus.close()
+
+    def _reopen_bus(self) -> None:
+        self._bus.close()
+        self._driving = False
+        self._open_bus()
 
     def _configure(self) -> None:
         with self._lock:

@@ -52,6 +52,7 @@ def rig(folder: Path, address: int) -> DeviceFixture:
         start=lambda: emulator(port).start(),
         build=lambda clock: feetech_serial.FeetechSerialArm("arm", config(port), clock),
         config=config(port),
+        configured=lambda other, clock: feetech_serial.FeetechSerialArm("arm", other, clock),
         pose="T_base_tcp",
         reset="reset",
         state_rate_hz=40.0,

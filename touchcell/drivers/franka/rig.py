@@ -38,6 +38,7 @@ def rig(folder: Path, address: int) -> DeviceFixture:
         start=start,
         build=build,
         config=config,
+        configured=lambda other, clock: FrankaArm("arm", other, clock),
         time="t_s",
         pose="T_base_ee",
         faults={

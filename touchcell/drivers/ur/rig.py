@@ -52,6 +52,7 @@ def rig(folder: Path, address: int) -> DeviceFixture:
         start=start,
         build=build,
         config=config_of(address),
+        configured=lambda other, clock: SPEC.build("ur", other, DriverContext(clock)),
         time="t_s",
         pose="T_base_tcp",
         faults={

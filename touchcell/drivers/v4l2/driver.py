@@ -23,6 +23,7 @@ from touchcell.drivers.v4l2.shim import EMULATED_CAMERAS, ShimCalls
 
 _LONGEST_PAUSE_S = 0.5
 _FEWEST_BUFFERS = 4
+_SETTINGS_CHECKED_WITHIN_NS = 2_000_000_000
 _RATE_TOLERANCE = 0.01
 _FUTURE_NS = 1_000_000
 _CLOCK_TOLERANCE_NS = 1_000_000_000
@@ -72,6 +73,8 @@ class V4l2Camera(Camera):
         self._previous: codec.Arrival | None = None
         self._number = -1
         self._queue_empty_ns = 0
+        self._next_check_ns = 0
+        self._checked = 0
         self._exposure_us: int | None = None
         self._gain: int | None = None
 
@@ -166,29 +169,45 @@ class V4l2Camera(Camera):
             return None
         given = node.control(identity) if value is None else node.set_control(identity, value)
         if value is not None:
-            self._expect(setting, value * unit, given * unit)
-        self._fixed[identity] = setting, given
+            self._expect(setting, value * unit, None if given is None else given * unit)
+        if given is not None:
+            self._fixed[identity] = setting, given
         return given
 
     def _check_settings(self, node: VideoNode) -> None:
         """Read every control back while the stream runs: some cameras reset them when it starts, or later."""
-        for identity, (setting, value) in self._fixed.items():
-            if (found := node.control(identity)) != value:
-                raise DeviceFault(
-                    self.name,
-                    f"{setting} has changed from {value} to {found} by itself",
-                    vendor_code=setting,
-                    fault_class=FaultClass.CONFIGURATION,
-                    needs=Remedy.OPERATOR,
-                    hint="does another program use the camera? a camera that forgets its settings cannot be used",
-                )
+        for identity in self._fixed:
+            self._check_setting(node, identity)
 
-    def _expect(self, setting: str, requested: int, given: int) -> None:
+    def _check_setting(self, node: VideoNode, identity: int) -> None:
+        setting, value = self._fixed[identity]
+        found = node.control(identity)
+        if found is not None and found != value:
+            raise DeviceFault(
+                self.name,
+                f"{setting} has changed from {value} to {found} by itself",
+                vendor_code=setting,
+                fault_class=FaultClass.CONFIGURATION,
+                needs=Remedy.OPERATOR,
+                hint="does another program use the camera? a camera that forgets its settings cannot be used",
+            )
+
+    def _check_next_setting(self) -> None:
+        # One at a time: a control request to a USB camera takes some milliseconds.
+        if not self._fixed or self._clock.now_ns() < self._next_check_ns:
+            return
+        self._next_check_ns = self._clock.now_ns() + _SETTINGS_CHECKED_WITHIN_NS // len(self._fixed)
+        self._checked += 1
+        self._check_setting(self._opened(), list(self._fixed)[self._checked % len(self._fixed)])
+
+    def _expect(self, setting: str, requested: int, given: int | None) -> None:
         if requested != given:
             raise UnsupportedSetting(self.name, setting, requested, given)
 
     def _collect(self) -> bool:
         node = self._opened()
+        if self.state is not Lifecycle.PASSIVE:
+            self._check_next_setting()
         taken = 0
         # Bounded: a camera that is faster than this loop must not block the caller for ever.
         while taken < 2 * self._buffers:
@@ -271,7 +290,7 @@ class V4l2Camera(Camera):
         return readings
 
     def _verify(self) -> None:
-        self._check_settings(self._opened())
+        self._check_next_setting()
 
     def _opened(self) -> VideoNode:
         assert self._node is not None, "the lifecycle prevents reading a closed camera"

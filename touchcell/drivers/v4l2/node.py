@@ -16,7 +16,7 @@ from typing import Protocol
 from touchcell.drivers.core.errors import ConnectError, DeviceError, DeviceGone, TransportError
 from touchcell.drivers.v4l2 import codec
 
-_GONE = (errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN, errno.EPIPE)
+_GONE = (errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN)
 
 
 class SystemCalls(Protocol):
@@ -177,22 +177,28 @@ class VideoNode:
             raise self._error(error, "query a control") from None
         return not query.flags & codec.CTRL_DISABLED
 
-    def control(self, identity: int) -> int:
-        """Return the present value of a control. Raises TransportError, DeviceGone."""
+    def control(self, identity: int) -> int | None:
+        """Return the present value of a control, or None if the device does not tell it. Raises DeviceGone."""
         request = codec.Control(id=identity)
-        self._ask(codec.G_CTRL, request, "read a control")
+        try:
+            self._calls.ioctl(self._fd, codec.G_CTRL, request)
+        except OSError as error:
+            # A stalled control request (EPIPE), a transfer error, or whatever else the camera's firmware answers.
+            if error.errno in _GONE:
+                raise self._error(error, "read a control") from None
+            return None
         return int(request.value)
 
-    def set_control(self, identity: int, value: int) -> int:
-        """Set a control and return the value read back; the device may refuse silently.
+    def set_control(self, identity: int, value: int) -> int | None:
+        """Set a control and return the value read back, None if it cannot be read; the device may refuse silently.
 
         Raises:
-            TransportError, DeviceGone: the device failed for a reason other than the value.
+            DeviceGone: the device is disconnected.
         """
         try:
             self._calls.ioctl(self._fd, codec.S_CTRL, codec.Control(id=identity, value=value))
         except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.ERANGE, errno.EACCES, errno.EBUSY):
+            if error.errno in _GONE:
                 raise self._error(error, "set a control") from None
         return self.control(identity)
 

@@ -36,6 +36,7 @@ def rig(folder: Path, address: int) -> DeviceFixture:
         start=start,
         build=build,
         config=config,
+        configured=lambda other, clock: V4l2Camera("tip", clock, other, ShimCalls(folder)),
         position=None,
         state_rate_hz=_RATE_HZ,
         faults={

@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import errno
 import math
+import os
 import select
 import socket
 import struct
@@ -26,7 +27,9 @@ from touchcell.drivers.core import can_errors
 _CLASSIC = struct.Struct("=IB3x8s")
 _FD = struct.Struct("=IBB2x64s")
 _EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
-_REFUSED_SENDS = struct.Struct("=I")
+# What the hub makes the adapter of a client do: refuse sends (count, error number or 0 for none), be down (seconds).
+_REFUSE = struct.Struct("=Ii")
+_DOWN = struct.Struct("=4xd")
 _BIT_RATE_SWITCH, _FD_FRAME = 0x01, 0x04
 
 
@@ -89,15 +92,20 @@ class HubBus(can.BusABC):  # type: ignore[misc]
         self.channel_info = f"touchcell_hub {channel}"
         self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         self._bus_state = can.BusState.ACTIVE
-        self._refused_sends = 0
+        self._refused_sends, self._refusal = 0, 0
+        self._down_until_s, self._down_reported = 0.0, True
         super().__init__(channel=channel, can_filters=can_filters)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send a frame. Raises CanOperationError when the adapter is disconnected or its queue is full."""
         if self._refused_sends:
             self._refused_sends -= 1
-            # As python-can's socketcan interface reports a queue that select() finds full: without an error number.
-            raise can.CanOperationError("Transmit buffer full")
+            if not self._refusal:
+                # As python-can's socketcan interface reports a queue that select() finds full: without an error number.
+                raise can.CanOperationError("Transmit buffer full")
+            raise can.CanOperationError(f"Failed to transmit: {os.strerror(self._refusal)}", self._refusal)
+        if time.monotonic() < self._down_until_s:
+            raise can.CanOperationError(f"Failed to transmit: {os.strerror(errno.ENETDOWN)}", errno.ENETDOWN)
         try:
             self._socket.settimeout(timeout or 0.0)
             self._socket.send(pack(msg))
@@ -107,6 +115,10 @@ class HubBus(can.BusABC):  # type: ignore[misc]
             raise can.CanOperationError(f"adapter is disconnected: {error}", error.errno) from error
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self._down_reported:
+            # A raw socket reports once that its interface went down, and then waits.
+            self._down_reported = True
+            raise can.CanOperationError(f"Failed to receive: {os.strerror(errno.ENETDOWN)}", errno.ENETDOWN)
         # Not select(), which fails for file descriptors beyond 1023.
         poller = select.poll()
         poller.register(self._socket, select.POLLIN)
@@ -118,8 +130,14 @@ class HubBus(can.BusABC):  # type: ignore[misc]
             raise can.CanOperationError(f"adapter is disconnected: {error}", error.errno) from error
         if not packet:
             raise can.CanOperationError("adapter is disconnected", errno.ENODEV)
-        if len(packet) == _REFUSED_SENDS.size:
-            (self._refused_sends,) = _REFUSED_SENDS.unpack(packet)
+        if len(packet) == _REFUSE.size:
+            self._refused_sends, self._refusal = _REFUSE.unpack(packet)
+            return None, False
+        if len(packet) == _DOWN.size:
+            self._down_until_s = time.monotonic() + _DOWN.unpack(packet)[0]
+            self._down_reported = False
+            return None, False
+        if time.monotonic() < self._down_until_s:
             return None, False
         message = unpack(packet, time.time())
         if message.is_error_frame:
@@ -200,9 +218,20 @@ class Hub:
             except OSError:
                 self._leave(client)
 
-    def fill_transmit_queues(self, sends: int) -> None:
-        """Make the adapter of every client refuse that many frames, as if nothing drained its transmit queue."""
-        packet = _REFUSED_SENDS.pack(sends)
+    def fill_transmit_queues(self, sends: int, code: int = 0) -> None:
+        """Make the adapter of every client refuse that many frames, as if nothing drained its transmit queue.
+
+        Args:
+            sends: number of frames.
+            code: error number of the refusal; 0 for one without.
+        """
+        self._command(_REFUSE.pack(sends, code))
+
+    def take_down(self, seconds: float) -> None:
+        """Take the interface of every client down for that long, and up again, as ``ip link`` does."""
+        self._command(_DOWN.pack(seconds))
+
+    def _command(self, packet: bytes) -> None:
         for client in list(self._clients):
             with contextlib.suppress(OSError):
                 client.send(packet)

@@ -74,6 +74,11 @@ class FrankaEmulator(Emulator):
         "user_stop": "the user stop button is pressed",
         "locked": "the joints are locked in Desk",
         "external_wrench": "external wrench VALUE [fx fy fz tx ty tz] N, N m on the end effector along base axes",
+        "fci_off": "the control interface is not activated in Desk: connections are refused",
+        "version": "the controller speaks version VALUE of the interface",
+        "other_client": "another client is connected",
+        "slow_recovery": "error recovery takes VALUE seconds",
+        "guiding": "the arm is guided by hand",
         "restart": "drop the client and return after a fifth of a second with the clock at zero",
     }
 
@@ -164,6 +169,10 @@ class FrankaEmulator(Emulator):
             self._finish_move(MoveStatus.PREEMPTED_BY_SAFETY, Mode.USER_STOPPED)
         elif fault == "locked":
             self._finish_move(MoveStatus.PREEMPTED_BY_SAFETY, Mode.OTHER)
+        elif fault == "guiding":
+            self._finish_move(MoveStatus.PREEMPTED_BY_SAFETY, Mode.GUIDING)
+        elif fault == "fci_off":
+            self._stop_listening()
         elif fault == "external_wrench":
             self._arm.wrench = np.array(value, dtype=np.float64)
         elif fault == "restart":
@@ -171,8 +180,10 @@ class FrankaEmulator(Emulator):
             self._restart()
 
     def on_clear(self, fault: str) -> None:
-        if fault in ("user_stop", "locked"):
+        if fault in ("user_stop", "locked", "guiding"):
             self._state.mode = Mode.IDLE
+        elif fault == "fci_off":
+            self._listen()
         elif fault == "external_wrench":
             self._arm.wrench = np.zeros(6)
 
@@ -205,7 +216,7 @@ class FrankaEmulator(Emulator):
         client, _ = self._listener.accept()
         # The previous client may have disconnected since the last tick.
         self._read_requests()
-        if self._client is not None:
+        if self._client is not None or "other_client" in self.active:
             # The controller serves one client at a time.
             client.close()
             return
@@ -279,7 +290,8 @@ class FrankaEmulator(Emulator):
             version, port = decode_connect(payload)
             assert self._client is not None
             self._client_udp = (self._client.getpeername()[0], port)
-            self._reply(connect_reply(command_id, version == VERSION))
+            spoken = int(self.active.get("version", VERSION))
+            self._reply(connect_reply(command_id, version == spoken, spoken))
         elif request is Request.MOVE:
             self._begin_move(command_id, payload)
         elif request is Request.STOP_MOVE:
@@ -287,7 +299,9 @@ class FrankaEmulator(Emulator):
                 self._finish_move(MoveStatus.PREEMPTED, Mode.IDLE)
             self._reply(encode_reply(request, command_id, SetterStatus.SUCCESS))
         elif request is Request.AUTOMATIC_ERROR_RECOVERY:
-            self._reply(encode_reply(request, command_id, self._recover()))
+            asyncio.get_running_loop().call_later(
+                float(self.active.get("slow_recovery", 0.0)), self._finish_recovery, command_id
+            )
         elif request is Request.GET_ROBOT_MODEL:
             self._reply(encode_reply(request, command_id, SetterStatus.SUCCESS, urdf().encode()))
         else:
@@ -315,6 +329,9 @@ class FrankaEmulator(Emulator):
             self._state.generator, self._state.controller, self._state.mode = generator, controller, Mode.MOVE
             self._state.reflex_reason[:] = bytes(len(ERRORS))
         self._reply(encode_reply(Request.MOVE, command_id, status))
+
+    def _finish_recovery(self, command_id: int) -> None:
+        self._reply(encode_reply(Request.AUTOMATIC_ERROR_RECOVERY, command_id, self._recover()))
 
     def _recover(self) -> RecoveryStatus:
         if self._state.mode in (Mode.USER_STOPPED, Mode.OTHER):

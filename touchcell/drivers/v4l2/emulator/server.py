@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import errno
 import math
 import mmap
 import os
@@ -37,6 +38,7 @@ _FOREIGN_CLOCK_NS = 1_000_000_000_000
 _EXPOSURE_FOR_FULL_LIGHT = 157
 _GAIN_FOR_DOUBLE_LIGHT = 50
 _LIGHT_STEP = 0.01
+_DARKNESS = 0.05
 
 
 class _Client:
@@ -90,6 +92,15 @@ class V4l2Emulator(Emulator):
         "no_bandwidth": "the USB bus has no room: streaming cannot start",
         "forgets": "every control returns to its default when the stream starts",
         "reset_controls": "every control returns to its default now",
+        "unreadable": "number of times that a frame cannot be dequeued (EIO)",
+        "empty": "number of frames without any bytes",
+        "busy": "another program streams from the camera",
+        "metadata_node": "the name is that of the camera's second node, for metadata",
+        "only_format": "[pixel format, width, height]: the camera has no other and substitutes it silently",
+        "granted_rate": "frame rate that the camera grants, and makes, whatever is asked for",
+        "control_errors": "requests for controls fail with this error number",
+        "slow_start": "seconds until the first frame of a stream",
+        "dark": "the light is off",
         "other_camera": "another camera of the same make, at another socket, has this name",
         "restart": "seconds for which the camera is disconnected before it returns by itself",
     }
@@ -186,6 +197,11 @@ class V4l2Emulator(Emulator):
         model.forgetful = "forgets" in active
         model.fixed_rate = "no_s_parm" in active
         model.no_bandwidth = "no_bandwidth" in active
+        model.only_format = tuple(active["only_format"]) if "only_format" in active else None
+        model.granted_rate_hz = float(active["granted_rate"]) if "granted_rate" in active else None
+        model.control_error = int(active.get("control_errors", 0))
+        model.busy = "busy" in active
+        model.is_metadata = "metadata_node" in active
         model.bus = f"{self._bus}.4" if "other_camera" in active else self._bus
 
     def on_clear(self, fault: str) -> None:
@@ -269,9 +285,10 @@ class V4l2Emulator(Emulator):
 
     async def _run_sensor(self) -> None:
         loop = asyncio.get_running_loop()
-        next_s = loop.time()
+        next_s = loop.time() + float(self.active.get("slow_start", 0.0))
         while True:
-            period_s = max(1.0 / float(self.active.get("true_rate", self.model.rate_hz)), self.model.exposure_s)
+            made_hz = self.model.granted_rate_hz or self.model.rate_hz
+            period_s = max(1.0 / float(self.active.get("true_rate", made_hz)), self.model.exposure_s)
             next_s += period_s
             if loop.time() - next_s > _LATE_PERIODS * period_s:
                 next_s = loop.time()
@@ -288,6 +305,10 @@ class V4l2Emulator(Emulator):
         data, flags, sequence = self._picture(), 0, self._sequence
         if self.spend("corrupt"):
             data = data[: len(data) // 2]
+        if self.spend("empty"):
+            data = b""
+        if self.spend("unreadable"):
+            self._fail_dequeue(errno.EIO)
         if self.spend("padding"):
             data += b"\x13\xff\xd8\x07" * 8
         if self.spend("hole"):
@@ -322,6 +343,11 @@ class V4l2Emulator(Emulator):
         self._counts["delivered"] += 1
         self._last_stamp_ns = stamp_ns
 
+    def _fail_dequeue(self, error: int) -> None:
+        if self.model.owner in self._clients:
+            with contextlib.suppress(OSError):
+                self._clients[self.model.owner].frames.send(struct.pack("=2i", 0, error))
+
     def _picture(self) -> bytes:
         if "freeze_frame" in self.active and self._shown:
             return self._shown
@@ -345,6 +371,8 @@ class V4l2Emulator(Emulator):
         light = 1.0 + controls[codec.CID_GAIN].value / _GAIN_FOR_DOUBLE_LIGHT
         if controls[codec.CID_EXPOSURE_AUTO].value == codec.EXPOSURE_MANUAL:
             light *= math.sqrt(controls[codec.CID_EXPOSURE_ABSOLUTE].value / _EXPOSURE_FOR_FULL_LIGHT)
+        if "dark" in self.active:
+            light *= _DARKNESS
         drift_per_s = float(self.active.get("exposure_drift", 0.0))
         return light * max(0.0, 1.0 + drift_per_s * (time.monotonic() - self._drift_since_s))
 
