@@ -63,6 +63,10 @@ class Sidestepping(Protocol):
         """Take note that the contact is given up for another."""
         ...
 
+    def begin_approach(self, T_base_sensor: Array) -> None:
+        """Take note of the pose (4, 4) from which the sensor approaches along its axis."""
+        ...
+
 
 Six = tuple[float, float, float, float, float, float]
 """One number for each of x, y, z, alpha, beta, gamma."""
@@ -83,6 +87,8 @@ class ContactServoConfig(TaskConfig):
         integral_zone_deg: ... nor does turning.
         max_speed_mm_s: largest speed of the sensor along each axis.
         max_turn_deg_s: largest angular rate of the sensor about each axis.
+        max_accel_mm_s2: largest change of the sensor's velocity per second, below what the arm's gate allows ...
+        max_turn_accel_deg_s2: ... and of its angular velocity: noise of single frames is smoothed by them.
         settle_tolerance_mm: the contact is steady when the controlled errors are below these ...
         settle_tolerance_deg: ... two.
         max_frame_age_ms: the arm stops when the newest frame is older.
@@ -98,6 +104,8 @@ class ContactServoConfig(TaskConfig):
     integral_zone_deg: PositiveFloat = 5.0
     max_speed_mm_s: PositiveFloat = 60.0
     max_turn_deg_s: PositiveFloat = 20.0
+    max_accel_mm_s2: PositiveFloat = 450.0
+    max_turn_accel_deg_s2: PositiveFloat = 120.0
     settle_tolerance_mm: PositiveFloat = 0.3
     settle_tolerance_deg: PositiveFloat = 2.0
     max_frame_age_ms: PositiveFloat = 150.0
@@ -159,6 +167,8 @@ class ContactServo:
         self.contact: ContactEstimate | None = None
         self._before: Array | None = None
         self._start: Array | None = None
+        self._period_s = 1.0 / context.rate_hz
+        self._V_tcp = np.zeros(6)
         self._touched = False
         self._first_touch: tuple[Array, float] | None = None
         self._waypoints: list[Array] = []
@@ -245,6 +255,12 @@ class ContactServo:
         if self.contact is not None:
             self._watch_touch()
 
+    def start_approach(self) -> None:
+        """Measure the travelled distance from the current pose, from which the sensor approaches."""
+        self.reset_travel()
+        if isinstance(self.run, Sidestepping) and self.T_base_sensor is not None:
+            self.run.begin_approach(self.T_base_sensor)
+
     def reset_travel(self) -> None:
         """Measure the travelled distance from the current pose."""
         self._start = self.T_base_sensor
@@ -304,12 +320,22 @@ class ContactServo:
     def along_z(self, speed_m_s: float) -> Array:
         """Return the twist (6,) of the tool that moves the sensor along its z axis."""
         V_tcp: Array = self._Ad_tcp_sensor @ np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0])
+        self._V_tcp = V_tcp
         return V_tcp
 
     def servo_step(self, V_ff: Array) -> Array | None:
         """Return the twist (6,) of the tool that holds the contact; None while there is no valid estimate."""
         V_tcp = self.controller.step(self.T_s_f, 0 if self.contact is None else self.contact.t_ns, V_ff)
-        return None if self.T_s_f is None else V_tcp
+        if self.T_s_f is None:
+            self._V_tcp = np.zeros(6)
+            return None
+        self._V_tcp = np.concatenate(
+            [
+                _towards(self._V_tcp[:3], V_tcp[:3], 1e-3 * self._config.max_accel_mm_s2 * self._period_s),
+                _towards(self._V_tcp[3:], V_tcp[3:], math.radians(self._config.max_turn_accel_deg_s2) * self._period_s),
+            ]
+        )
+        return self._V_tcp
 
     def telemetry(self, observation: Observation, *, servoing: bool) -> Mapping[str, float]:
         """Return the age of the newest frame, and while ``servoing`` errors, references and the behavior's values."""
@@ -323,6 +349,7 @@ class ContactServo:
         for name, error, reference in zip(_COMPONENTS, errors, references, strict=True):
             if math.isfinite(reference):
                 values[f"error_{name}"], values[f"reference_{name}"] = error, reference
+        values["servo_clipped"] = float(self.controller.clipped)
         return {**values, **self.run.telemetry()}
 
 
@@ -332,5 +359,14 @@ _LONGEST_UNCHANGED_MM = 2.5
 _LEAST_CHANGE = 0.01
 _REACHED_M = 0.5e-3
 _APPROACH_PER_S = 8.0
+
+
+def _towards(start: Array, goal: Array, longest: float) -> Array:
+    """Return ``start`` (3,) moved towards ``goal`` (3,) by at most ``longest``."""
+    step = goal - start
+    length = math.sqrt(float(step @ step))
+    return goal if length <= longest else start + step * (longest / length)
+
+
 _COMPONENTS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 _UNITS = np.repeat([1e3, np.degrees(1.0)], 3)

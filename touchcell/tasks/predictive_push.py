@@ -20,7 +20,11 @@ _KNOWN_M: Final = 0.003
 """Standard deviation of the object's centre below which it is known well enough to be acted upon."""
 _EXPLORING_M_S: Final = 0.03
 """Speed until the object's centre is known."""
-_MOST_SIDESTEPS: Final = 2
+_MOST_SIDESTEPS: Final = 3
+_EXPECTED_M: Final = 0.012
+"""Standard deviation of the centre beside the line of the approach."""
+_OTHER_SIDE_RAD: Final = math.radians(40.0)
+"""Turn of the normal from the approach beyond which another side than expected is touched."""
 _TOUCHED_AGAIN_M: Final = 0.5e-3
 """Uncertainty of the centre that a further touch adds."""
 _STEERED_M: Final = 0.05
@@ -114,6 +118,7 @@ class PredictivePush:
         self._start_offset_m = 0.0
         self._known_offset_m = 0.0
         self._sidesteps = 0
+        self._approach: float | None = None
         self._latest: Pose | None = None
         self._resting: Pose | None = None
         self._speed_m_s = 0.0
@@ -135,13 +140,31 @@ class PredictivePush:
             motion.turn_rad_s,
         )
 
+    def begin_approach(self, T_base_sensor: Array) -> None:
+        """Take note of the direction of the first approach: along it the object's centre is expected."""
+        if self._approach is None:
+            self._approach = math.atan2(float(T_base_sensor[1, 2]), float(T_base_sensor[0, 2]))
+
+    def _expected_offset_m(self, heading: float) -> float:
+        """Return where the centre is, to the left of a first contact, if it lies on the line of the approach."""
+        if self._approach is None or not self._settings.flat:
+            return 0.0
+        turned = math.remainder(heading - self._approach, 2.0 * math.pi)
+        if abs(turned) > _OTHER_SIDE_RAD:
+            return 0.0
+        reach_m = self._settings.lead_m - self._settings.tip_radius_m
+        return min(max(-self._settings.lead_m * math.tan(turned), -reach_m), reach_m)
+
     @property
     def sidestep_m(self) -> float | None:
         """By how much the contact should be moved to the left, to be opposite the object's centre; None if it is."""
         limit_m = self._settings.recontact_m
-        if limit_m is None or self._sidesteps >= _MOST_SIDESTEPS or not self._known:
+        if limit_m is None or self._sidesteps >= _MOST_SIDESTEPS:
             return None
         offset_m = self._estimator.model.offset_m
+        # The first touch tells only how the side is turned.
+        if not (self._known or (self._sidesteps == 0 and self._speed_m_s < self._settings.slowest_m_s)):
+            return None
         return offset_m if abs(offset_m) > limit_m else None
 
     @property
@@ -232,6 +255,8 @@ class PredictivePush:
             # The path goes on from the same start.
             self._start_offset_m += offset_m - self._known_offset_m
             self._resting = None
+        elif self._latest is None and (offset_m := self._expected_offset_m(heading)):
+            self._estimator.move_contact(offset_m, _EXPECTED_M)
         self._estimator.update(Contact(contact.x, contact.y, heading))
         model = self._estimator.model
         self._known_offset_m = model.offset_m

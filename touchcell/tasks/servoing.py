@@ -215,7 +215,7 @@ class ServoTask(MachineTask):
         """On entry: measure the travelled distance from here."""
         self._reapproaches += record.event == "lost"
         for servo in self._servos:
-            servo.reset_travel()
+            servo.start_approach()
         self._blind_s = 0.0
 
     def start_settle(self, record: TransitionRecord) -> None:

@@ -195,6 +195,11 @@ class Push:
         """Distance to step to the left of the contact normal before the push continues; None for no step."""
         return None if self._predictive is None else self._predictive.sidestep_m
 
+    def begin_approach(self, T_base_sensor: Array) -> None:
+        """Take note of the direction of the approach, in which the object is expected."""
+        if self._predictive is not None:
+            self._predictive.begin_approach(T_base_sensor)
+
     def begin_sidestep(self) -> None:
         """Let go: the object rests where it is until it is touched again."""
         assert self._predictive is not None
@@ -254,7 +259,7 @@ class Push:
 
     def _strayed(self, aim: Aim) -> bool:
         if self._predictive is not None:
-            return self._miss_m > self._max_cross_track_m
+            return self._miss_m > self._max_cross_track_m and self._predictive.sidestep_m is None
         return abs(aim.cross_track_error_m) > self._max_cross_track_m
 
     def _heading_error_deg(self, aim: Aim) -> float | None:

@@ -29,7 +29,8 @@ _ROOM_MM = 15.0
 _TIP_MM = 20.0
 # Placement of an object: by hand where truth and belief match, and anywhere in front of the arm where truth is sampled.
 _OFFSET_MM, _TURN_DEG = 3.0, 2.0
-_SAMPLED_OFFSET_MM, _SAMPLED_TURN_DEG = 20.0, 20.0
+_SAMPLED_STARTS = {1: (20.0, 20.0), 2: (8.0, 5.0)}
+"""Largest offset (mm) and turn (deg) of an object by the number of arms: with two, it is not touched a second time."""
 
 ESTIMATORS: Mapping[str, Mapping[str, Any] | None] = {"learned": None, "true contact": {"kind": "true_contact"}}
 """Estimator sections by their name in rows; None for the cell file's own."""
@@ -69,6 +70,7 @@ def sampled_truth(mass_g: float, friction: float, sensors: Sequence[str], arms: 
         "noise": {"uniform": [1, 4]},
         "exposure": {"uniform": [0.9, 1.1]},
     }
+    offset_mm, turn_deg = _SAMPLED_STARTS[len(arms)]
     arm = {"latency_ms": {"uniform": [0, 15]}, "lag_ms": {"uniform": [2, 15]}, "velocity_step_mm_s": 0.1}
     return {
         "arms": dict.fromkeys(arms, arm),
@@ -85,11 +87,11 @@ def sampled_truth(mass_g: float, friction: float, sensors: Sequence[str], arms: 
                 "center_of_mass_mm": [{"normal": [0, 0.5]}, {"normal": [0, 0.5]}],
                 "pose_offset_mm_deg": [
                     {"uniform": [0, 10]},
-                    {"uniform": [-_SAMPLED_OFFSET_MM, _SAMPLED_OFFSET_MM]},
+                    {"uniform": [-offset_mm, offset_mm]},
                     0,
                     0,
                     0,
-                    {"uniform": [-_SAMPLED_TURN_DEG, _SAMPLED_TURN_DEG]},
+                    {"uniform": [-turn_deg, turn_deg]},
                 ],
             }
         },
