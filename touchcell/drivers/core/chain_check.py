@@ -22,7 +22,8 @@ def require_same_arm(device: str, chain: SerialChain, q: Array, T_base_tcp: Arra
     Raises:
         DeviceFault: the poses differ by more than manufacturing tolerances of one model.
     """
-    away_m, turned_rad = distance(chain.forward(q), T_base_tcp)
+    apart = se3.compose(se3.inverse(chain.forward(q)), T_base_tcp)
+    away_m, turned_rad = float(np.linalg.norm(apart[:3, 3])), float(np.linalg.norm(se3.log(apart)[3:]))
     if away_m > _SAME_ARM_M or turned_rad > _SAME_ARM_RAD:
         raise DeviceFault(
             device,
@@ -31,12 +32,6 @@ def require_same_arm(device: str, chain: SerialChain, q: Array, T_base_tcp: Arra
             needs=Remedy.OPERATOR,
             hint="set `chain` to this arm's model and `tool` to the mounted tool",
         )
-
-
-def distance(T_base_a: Array, T_base_b: Array) -> tuple[float, float]:
-    """Return how far two poses (4, 4) are apart, in m and in rad."""
-    apart = se3.compose(se3.inverse(T_base_a), T_base_b)
-    return float(np.linalg.norm(apart[:3, 3])), float(np.linalg.norm(se3.log(apart)[3:]))
 
 
 _SAME_ARM_M = 0.02
