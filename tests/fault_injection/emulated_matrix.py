@@ -107,6 +107,7 @@ MORE_FAULTS: Final[Mapping[str, Mapping[str, tuple[Any, str]]]] = {
     "v4l2": {
         "delay": (0.4, "stale"),
         "freeze_frame": (True, "fault"),
+        "gain": (1.6, "unseen"),
         "exposure_drift": (0.5, "fault"),
         "stuck_controls": (True, "unseen"),
         "no_monotonic": (True, "transient"),

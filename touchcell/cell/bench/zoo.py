@@ -20,7 +20,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from touchcell.cell.bench.provenance import provenance
-from touchcell.cell.bench.zoo_peers import PEERS, PeerProcess
+from touchcell.cell.bench.zoo_peers import PEER_CLIENTS, PeerProcess
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.camera import Camera
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
@@ -105,7 +105,7 @@ def try_row(row: ZooRow, fixture: DeviceFixture) -> tuple[str, str]:
 
 def try_peer(row: ZooRow, fixture: DeviceFixture, folder: Path) -> tuple[str, str]:
     """Inject one report beside a public client; return its reaction and message, or "-" where it cannot be tried."""
-    peer = PEERS.get(row.driver)
+    peer = PEER_CLIENTS.get(row.driver)
     if peer is None or not peer.installed or row.settings or row.when == "replug":
         return "-", ""
     if row.expect not in ("refused", "fault", "counted", "harmless"):
@@ -210,12 +210,12 @@ def _peer_verdict(row: ZooRow, found: str) -> str:
     handled = _peer_handled(row, found)
     if handled is None:
         return "-"
-    name = PEERS[row.driver].name
+    name = PEER_CLIENTS[row.driver].name
     return f"{name}: handled" if handled else f"{name}: {'ends' if found != 'not noticed' else found}"
 
 
 def _print_peers(results: Sequence[Mapping[str, Any]]) -> None:
-    for driver, peer in PEERS.items():
+    for driver, peer in PEER_CLIENTS.items():
         tried = [result for result in results if result["driver"] == driver and result["peer_handled"] is not None]
         if tried:
             theirs, ours = (sum(bool(each[key]) for each in tried) for key in ("peer_handled", "handled"))

@@ -44,7 +44,7 @@ class Cell:
         stop_categories: by which each arm stops when something is wrong, by role.
         holding: roles of arms that keep their power when another's fault stops them.
         watched_joints: roles of arms whose joint angles an interlock reads.
-        watched_wrenches, watched_torques: roles of arms whose wrench, or external torque, an interlock needs.
+        watched_wrenches, watched_torques: roles of arms whose wrench, or external torque, is needed.
         watched_readings: names of devices and of the readings in their health that interlocks limit.
         enabling_device: operator input of a cell whose file names one.
         scene: what is simulated around the arms, as far as it can be looked into; None in a cell of real devices.

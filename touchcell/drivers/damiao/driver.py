@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from touchcell.drivers.core.behaviour import ArmBehaviour
+from touchcell.drivers.core.bench_address import is_virtual_can
 from touchcell.drivers.core.bus_arm import BusArm, BusArmConfig
 from touchcell.drivers.core.bus_reply import Reply
 from touchcell.drivers.core.clock import Clock
@@ -135,6 +136,10 @@ class DamiaoCanConfig(BusArmConfig):
 
     rate_hz: Annotated[float, Field(ge=50.0, le=1000.0)] = 250.0
     watchdog_s: Annotated[float, Field(ge=0.02, le=0.4)] = 0.1
+
+    def emulated_address(self) -> str | None:
+        """Return ``channel`` if it is a virtual bus of this machine."""
+        return "channel" if is_virtual_can(self.interface, self.channel) else None
 
     @property
     def joint_count(self) -> int:

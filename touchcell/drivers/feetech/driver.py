@@ -25,6 +25,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from touchcell.drivers.core.behaviour import ArmBehaviour
+from touchcell.drivers.core.bench_address import is_pseudo_terminal
 from touchcell.drivers.core.bus_arm import BusArm, BusArmConfig
 from touchcell.drivers.core.bus_reply import Reply
 from touchcell.drivers.core.clock import Clock
@@ -134,6 +135,10 @@ class FeetechSerialConfig(BusArmConfig):
     rate_hz: Annotated[float, Field(ge=10.0, le=200.0)] = 50.0
     tracking_error_deg: Annotated[float, Field(gt=0.0, le=20.0)] = 8.0
     torque_limit_percent: Annotated[float, Field(ge=5.0, le=100.0)] = 60.0
+
+    def emulated_address(self) -> str | None:
+        """Return ``port`` if it is a pseudo-terminal of this machine."""
+        return "port" if is_pseudo_terminal(self.port) else None
 
     @property
     def joint_count(self) -> int:

@@ -25,6 +25,7 @@ from pydantic import Field
 
 from touchcell.drivers.core.arm import Arm, JointLimitsConfig, LimitsConfig
 from touchcell.drivers.core.behaviour import ArmBehaviour
+from touchcell.drivers.core.bench_address import is_this_machine
 from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.command_checks import finite_array
@@ -120,6 +121,10 @@ class FrankaConfig(DriverConfig):
     contact_torque_limit_nm: float = Field(default=10.0, gt=0.0, le=50.0)
     flange_to_tcp_mm_deg: tuple[float, float, float, float, float, float] | None = None
     state_timeout_s: float = Field(default=0.5, ge=0.02, le=1.0)
+
+    def emulated_address(self) -> str | None:
+        """Return ``host`` if it is this machine."""
+        return "host" if is_this_machine(self.host) else None
 
     def described_chain(self) -> SerialChain:
         """Return the chain of an FR3 with the configured tool, or with none where Desk has set it."""

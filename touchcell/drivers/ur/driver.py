@@ -19,6 +19,7 @@ from pydantic import Field, model_validator
 
 from touchcell.drivers.core.arm import Arm, JointLimitsConfig, LimitsConfig
 from touchcell.drivers.core.behaviour import ArmBehaviour
+from touchcell.drivers.core.bench_address import is_this_machine
 from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
@@ -119,6 +120,10 @@ class UrConfig(DriverConfig):
                 f"stop_accel_m_s2 {self.stop_accel_m_s2:g} is less than the acceleration allowed, {self.accel:g}"
             )
         return self
+
+    def emulated_address(self) -> str | None:
+        """Return ``host`` if it is this machine."""
+        return "host" if is_this_machine(self.host) else None
 
     def described_chain(self) -> SerialChain:
         """Return the chain of the named model with the configured tool. Raises ConfigError."""

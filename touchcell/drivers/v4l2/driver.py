@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import os
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -81,7 +80,7 @@ class V4l2Camera(Camera):
         self._gain: int | None = None
 
     def _open(self) -> None:
-        if abs(self._clock.now_ns() - time.monotonic_ns()) > _CLOCK_TOLERANCE_NS:
+        if abs(self._clock.now_ns() - self._calls.now_ns()) > _CLOCK_TOLERANCE_NS:
             raise ConnectError(
                 self.name,
                 "the kernel stamps frames on CLOCK_MONOTONIC, but the cell's clock is another",

@@ -8,6 +8,7 @@ import fcntl
 import mmap
 import os
 import select
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,6 +22,10 @@ _GONE = (errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN)
 
 class SystemCalls(Protocol):
     """System calls that a camera needs. Real cameras use ``KernelCalls``; an emulator may provide its own."""
+
+    def now_ns(self) -> int:
+        """Return the time of the clock that frames are stamped with."""
+        ...
 
     def open(self, path: str) -> int:
         """Return a file descriptor, read-write and non-blocking."""
@@ -45,6 +50,9 @@ class SystemCalls(Protocol):
 
 class KernelCalls:
     """System calls of the kernel."""
+
+    def now_ns(self) -> int:
+        return time.monotonic_ns()
 
     def open(self, path: str) -> int:
         return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
