@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from os import PathLike
@@ -17,6 +16,7 @@ from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_in_world
 from touchcell.cell.config.worlds import WorldName
+from touchcell.cell.recording.message_types import Encoded
 from touchcell.cell.runtime.compose import AnyInterlock, compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest
@@ -45,17 +45,17 @@ class Message:
     Attributes:
         topic: e.g. "/arms/arm/command".
         t_ns: time on the cell's clock.
-        encoded: content as JSON.
+        encoded: content as it is recorded.
     """
 
     topic: str
     t_ns: int
-    encoded: bytes
+    encoded: Encoded
 
     @property
     def data(self) -> Mapping[str, Any]:
         """Content, units in the keys."""
-        content: Mapping[str, Any] = json.loads(self.encoded)
+        content: Mapping[str, Any] = self.encoded.decode()
         return content
 
 
@@ -128,9 +128,9 @@ class CellUnderTest:
     def __repr__(self) -> str:
         return f"<CellUnderTest {self.plan.cell.name!r}: {self.state} after {self.t_s:.3f} s>"
 
-    def add(self, topic: str, t_ns: int, data: bytes) -> None:
+    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
         """Keep one message; called by the run loop."""
-        self.messages.append(Message(topic, t_ns, data))
+        self.messages.append(Message(topic, t_ns, message))
 
     # What is the case.
 

@@ -50,6 +50,7 @@ class Cell:
         scene: what is simulated around the arms, as far as it can be looked into; None in a cell of real devices.
         collection: where labelled frames go, None where the task labels none.
         watchdog: stops the arms when the loop falls silent.
+        scene_start_ns: when the scene's own time began.
         require_armed: raises ConfigError unless every interlock trips on the faults that it guards against; called when
             all devices have answered and none is energised.
     """
@@ -74,6 +75,7 @@ class Cell:
     collection: Collection | None = None
     watchdog: Watchdog = field(default_factory=NullWatchdog)
     require_armed: Callable[[], None] = lambda: None
+    scene_start_ns: int = 0
     start_ns: int = 0
     _exit: ExitStack = field(default_factory=ExitStack, init=False)
 

@@ -11,6 +11,7 @@ from touchcell.cell.config.armed import require_armed
 from touchcell.cell.config.cell_plan import REDUCED_SPEED_M_S, CellPlan
 from touchcell.cell.config.planning_scene import build_planning_scene
 from touchcell.cell.recording.dataset_writer import Collection
+from touchcell.cell.recording.frame_compressor import require_video
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.devices import build_devices, build_world
 from touchcell.cell.runtime.enabling import SimulatedEnablingDevice
@@ -54,8 +55,11 @@ def compose(
         ModelError: a model file cannot be used.
         RecordingError: the folder for labelled frames cannot be written.
     """
+    if plan.cell.recording.frames == "video":
+        require_video()
     role_of = _arm_roles(plan)
     world = build_world(plan, role_of, clock)
+    scene_start_ns = world.clock.now_ns()
     wanted = {name: device for name, device in plan.built.items() if name not in world.hosted}
     devices = build_devices(plan, wanted, world.clock, world.scene, world.hosted)
     arms = {role: cast(Arm, devices[name]) for name, role in role_of.items()}
@@ -102,6 +106,7 @@ def compose(
         watched_readings=frozenset(key for entry in plan.cell.interlocks.values() for key in entry.reads),
         enabling_device=_enabling_device(plan, world.clock, enabling_device),
         scene=world.truth,
+        scene_start_ns=scene_start_ns,
         collection=collection,
         watchdog=world.watchdog,
         require_armed=partial(require_armed, plan, configured, planning_scene),
