@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -58,6 +57,11 @@ class Sensor:
         """Wait for the first frame, so that no control cycle has to. Raises DeviceError."""
         self.source.await_frame()
 
+    def take_zero(self) -> Stamped[Frame] | None:
+        """Take the newest frame for one out of contact, and return it; None from a source that uses none."""
+        frame = self.frame
+        return frame if self.source.take_zero() else None
+
     def picture(self) -> tuple[int | None, float | None]:
         """A checksum and the mean grey level of every third pixel of the newest frame; (None, None) if not watched."""
         frame = self.frame if self.watched else None
@@ -85,16 +89,20 @@ class Sensor:
             return None
         return self.source.preprocessing.model_dump(mode="json")
 
+    def new_frame(self) -> Stamped[Frame] | None:
+        """Return the newest frame, once, where images are recorded."""
+        frame = self.frame if self.frames != "none" else None
+        if frame is None or frame.seq == self._recorded_seq:
+            return None
+        self._recorded_seq = frame.seq
+        return frame
+
     def extra_messages(self, now_ns: int) -> Iterator[tuple[str, int, dict[str, Any]]]:
-        """What else is recorded of this sensor in this cycle: the frame's own measurement, its image, the truth."""
+        """What else is recorded of this sensor in this cycle: the frame's own measurement, the truth."""
         if isinstance(self.source, ContactPipeline):
             measured = self.source.measurement
             if measured is not None and measured.belief is not None:
                 yield "measurement", measured.t_ns, {"seq": measured.seq, **belief_message(measured.belief)}
-        frame = self.frame
-        if self.frames != "none" and frame is not None and frame.seq != self._recorded_seq:
-            self._recorded_seq = frame.seq
-            yield "image", frame.t_ns, _image_message(frame.value.image, self.frames, frame.seq, frame.t_ns)
         for topic, source in (("truth", self.truth), ("true_edge", self.true_edge)):
             true = None if source is None else source.update(now_ns)
             if true is not None:
@@ -149,15 +157,3 @@ def _true_edge(name: str, scene: SceneTruth | None) -> ContactSource | None:
     from touchcell.cell.runtime.ground_truth import TrueEdgeSource
 
     return None if scene is None else TrueEdgeSource(scene, name)
-
-
-def _image_message(image: Any, kind: str, seq: int, t_ns: int) -> dict[str, Any]:
-    import cv2
-
-    encoded = cv2.imencode(".jpg" if kind == "jpeg" else ".png", image)[1].tobytes()
-    return {
-        "timestamp": {"sec": t_ns // 10**9, "nsec": t_ns % 10**9},
-        "frame_id": str(seq),
-        "format": kind,
-        "data": base64.b64encode(encoded).decode(),
-    }

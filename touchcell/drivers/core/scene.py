@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -13,6 +13,7 @@ from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.samples import Stamped
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
+from touchcell.geometry.solids import Solid
 from touchcell.geometry.types import Array
 from touchcell.registry import Registry
 
@@ -83,12 +84,35 @@ class Scene(SceneTruth, Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class SceneBody:
+    """Something in a scene to draw.
+
+    Attributes:
+        name: of the surface or object.
+        solids: its parts, each with its pose (4, 4) in the body's frame.
+        pose: returns its pose in the world (4, 4) at a time of the scene; that at the start for a free object.
+        moves: whether a prescribed motion moves it.
+        free: whether it is a free object, whose pose ``SceneTruth.objects`` gives.
+    """
+
+    name: str
+    solids: tuple[tuple[Solid, Array], ...]
+    pose: Callable[[float], Array]
+    moves: bool = False
+    free: bool = False
+
+
 class SceneSection(BaseModel):
     """Base of the pydantic model of a ``scene:`` section."""
 
     def build(self, clock: Clock) -> Scene:
         """Build the scene; its motions start now."""
         raise NotImplementedError
+
+    def bodies(self) -> Sequence[SceneBody]:
+        """Return what there is to draw."""
+        return ()
 
     def modules(self) -> Mapping[str, tuple[str, str]]:
         """Return the optional modules that it needs, each with the key that asks for it and how to install it."""
