@@ -234,6 +234,7 @@ class RunRecord:
         if objects is not None:
             viewers.objects(objects)
         viewers.moving(reading.now_ns)
+        viewers.again(reading.now_ns)
 
     def _write_frames(self, frames: FrameCompressor) -> None:
         try:
