@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -36,6 +37,7 @@ class KinematicPlant:
         broken: the arm reports an invalid pose.
         seen: ``T_f_s`` (4, 4) of the latest cycle.
         operator_stop: whether the operator requests the end.
+        force_n: the arm's measurement of the force on its tip for an indentation in mm; None measures none.
     """
 
     def __init__(self, gap_mm: float = 5.0, tilt_deg: tuple[float, float] = (4.0, -3.0)) -> None:
@@ -51,6 +53,7 @@ class KinematicPlant:
         self.in_range = True
         self.broken = False
         self.operator_stop = False
+        self.force_n: Callable[[float], float] | None = None
         self.twist = np.zeros(6)
         self.seen = T_f_s
         self._anchored = False
@@ -91,7 +94,11 @@ class KinematicPlant:
             self._seq += 1
             self._contact = self._estimate()
         contacts = {} if self._contact is None else {"sensor": self._contact}
-        return Observation(self.now_ns, {"arm": self._state}, contacts, self.operator_stop)
+        wrenches = {}
+        if self.force_n is not None:
+            force_n = self.force_n(max(1e3 * float(self.seen[2, 3]), 0.0))
+            wrenches["arm"] = Stamped(np.array([0.0, 0.0, force_n, 0.0, 0.0, 0.0]), self.now_ns, self._seq)
+        return Observation(self.now_ns, {"arm": self._state}, contacts, self.operator_stop, wrenches=wrenches)
 
     def _estimate(self) -> ContactEstimate:
         nothing = ContactEstimate(False, None, self.now_ns, self._seq, self.now_ns)

@@ -22,6 +22,8 @@ ARM: Final = "arm"
 """Role of the arm in tasks with one arm."""
 SENSOR: Final = "sensor"
 """Role of the tactile sensor that it carries."""
+_RETURN_S: Final = 10.0
+"""Longest return to where a contact was lost; the way is that of a few frames."""
 
 
 class ServoConfig(ContactServoConfig):
@@ -34,6 +36,8 @@ class ServoConfig(ContactServoConfig):
         settle_timeout_s: settling fails when it takes longer.
         retract_mm: distance to withdraw at the end.
         retract_speed_mm_s: speed of that.
+        return_lift_mm: before a contact that was lost while the behavior ran is searched for again, the sensor returns
+            to where it was last felt, less deep by this much; none searches from where the sensor is.
         max_reapproach: number of times that a lost contact is searched for again.
         stale_timeout_s: the task trips when the arm has been stopped for lack of a valid estimate for this long.
         prepare_timeout_s: longest wait for the first frame and arm state.
@@ -45,6 +49,7 @@ class ServoConfig(ContactServoConfig):
     settle_timeout_s: PositiveFloat = 10.0
     retract_mm: PositiveFloat = 20.0
     retract_speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
+    return_lift_mm: PositiveFloat | None = None
     max_reapproach: NonNegativeInt = 2
     stale_timeout_s: PositiveFloat = 0.5
     prepare_timeout_s: PositiveFloat = 5.0
@@ -57,6 +62,7 @@ class ServoState(Enum):
     APPROACH = auto()
     SETTLE = auto()
     RUN = auto()
+    RETURN = auto()
     RETRACT = auto()
     DONE = auto()
     STOPPED = auto()
@@ -77,6 +83,7 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float) -> Table:
             StateDef(s.APPROACH, approach_s, "timeout", on_enter="start_approach"),
             StateDef(s.SETTLE, config.settle_timeout_s, "timeout", on_enter="start_settle"),
             StateDef(s.RUN, run_timeout_s, "timeout", on_enter="start_run"),
+            StateDef(s.RETURN, _RETURN_S, "timeout", on_enter="start_return"),
             StateDef(s.RETRACT, retract_s, "timeout", on_enter="start_retract"),
             StateDef(s.DONE, terminal=True),
             StateDef(s.STOPPED, terminal=True),
@@ -95,8 +102,10 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float) -> Table:
             TransitionDef("lost", s.SETTLE, s.RETRACT),
             TransitionDef("finished", s.RUN, s.RETRACT),
             TransitionDef("missed", s.RUN, s.RETRACT),
+            TransitionDef("lost", s.RUN, s.RETURN, guard="may_return"),
             TransitionDef("lost", s.RUN, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.RUN, s.RETRACT),
+            TransitionDef("returned", s.RETURN, s.APPROACH),
             TransitionDef("retracted", s.RETRACT, s.STOPPED, guard="was_stopped"),
             TransitionDef("retracted", s.RETRACT, s.DONE, guard="has_finished"),
             TransitionDef("retracted", s.RETRACT, s.FAILED),
@@ -162,6 +171,10 @@ class ServoTask(MachineTask):
         """Guard: a lost contact may be searched for again."""
         return self._reapproaches < self._config.max_reapproach
 
+    def may_return(self) -> bool:
+        """Guard: a lost contact is searched for again, from where it was last felt."""
+        return self.may_reapproach() and self._config.return_lift_mm is not None
+
     def was_stopped(self) -> bool:
         """Guard: the operator requested a stop."""
         return self._stop_seen
@@ -175,6 +188,13 @@ class ServoTask(MachineTask):
         self._reapproaches += record.event == "lost"
         for servo in self._servos:
             servo.reset_travel()
+        self._blind_s = 0.0
+
+    def start_return(self, record: TransitionRecord) -> None:
+        """On entry: aim at where each contact was last felt."""
+        self._reapproaches += 1
+        for servo in self._servos:
+            servo.aim_back(1e-3 * (self._config.return_lift_mm or 0.0))
         self._blind_s = 0.0
 
     def start_settle(self, record: TransitionRecord) -> None:
@@ -228,6 +248,10 @@ class ServoTask(MachineTask):
                         self._post("missed", missed)
                     else:
                         self._post("finished")
+            case ServoState.RETURN:
+                self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in servos))
+                if all(servo.is_back() for servo in servos):
+                    self._post("returned")
             case ServoState.RETRACT:
                 if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in servos):
                     self._post("retracted")
@@ -256,6 +280,10 @@ class ServoTask(MachineTask):
         if state is ServoState.RETRACT:
             speed_m_s = -1e-3 * self._config.retract_speed_mm_s
             return [(servo, servo.along_z(speed_m_s)) for servo in self._servos if servo.T_base_sensor is not None]
+        if state is ServoState.RETURN:
+            if not all(servo.has_fresh_data for servo in self._servos):
+                return []
+            return [(servo, servo.way_back(1e-3 * self._config.approach_speed_mm_s)) for servo in self._servos]
         if state not in (ServoState.APPROACH, ServoState.SETTLE, ServoState.RUN):
             return []
         searching = state is ServoState.APPROACH
@@ -269,7 +297,8 @@ class ServoTask(MachineTask):
             if searching and not servo.in_contact:
                 V_tcp = servo.along_z(1e-3 * self._config.approach_speed_mm_s)
             else:
-                V_tcp = servo.servo_step(servo.run.feedforward if state is ServoState.RUN else np.zeros(6))
+                running = state is ServoState.RUN
+                V_tcp = servo.servo_step(servo.run.feedforward if running else np.zeros(6), running=running)
             if V_tcp is not None:
                 twists.append((servo, V_tcp))
         return twists

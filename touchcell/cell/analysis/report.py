@@ -119,8 +119,26 @@ def summarise(run: Run) -> dict[str, Any]:
     return {
         "errors": {
             sensor: errors for sensor in run.roles("sensors", "contact") if (errors := _sensor_errors(run, sensor))
-        }
+        },
+        "health": {
+            topic.removeprefix(_HEALTH): _health(series)
+            for topic, series in sorted(run.topics.items())
+            if topic.startswith(_HEALTH)
+        },
     }
+
+
+def _health(series: Series) -> dict[str, dict[str, float]]:
+    """Return first, least, greatest and last value of each number that a device reported about itself."""
+    names = dict.fromkeys(name for row in series.rows for name, value in row.items() if not isinstance(value, str))
+    found = {}
+    for name in names:
+        values = series.column(name)
+        values = values[np.isfinite(values)]
+        if name != "seq" and len(values):
+            ends = {"first": values[0], "least": values.min(), "greatest": values.max(), "last": values[-1]}
+            found[name] = {key: float(value) for key, value in ends.items()}
+    return found
 
 
 def _sensor_errors(run: Run, sensor: str) -> dict[str, dict[str, dict[str, float]]]:
@@ -200,6 +218,14 @@ def _text(folder: Path, result: dict[str, Any], summary: dict[str, Any], picture
                 f"{statistics['rms'][name]:11.3f}" if name in statistics["rms"] else f"{'-':>11}" for name in COMPONENTS
             )
             lines.append(f"  {_KINDS[kind]:<19}{cells}")
+    for device, readings in summary["health"].items():
+        changed = {name: each for name, each in readings.items() if each["least"] != each["greatest"]}
+        if changed:
+            lines.append(f"health of {device:<20}" + "".join(f"{name:>12}" for name in _HEALTH_COLUMNS))
+            lines += [
+                f"  {name:<28}" + "".join(f"{each[key]:12.5g}" for key in _HEALTH_COLUMNS)
+                for name, each in changed.items()
+            ]
     if stages := result.get("stages_us"):
         lines.append("time per cycle      " + f"{'median us':>11}{'p99 us':>11}{'times':>9}")
         lines += [
@@ -213,6 +239,8 @@ def _text(folder: Path, result: dict[str, Any], summary: dict[str, Any], picture
     return "\n".join(lines)
 
 
+_HEALTH = "/health/"
+_HEALTH_COLUMNS = ("first", "least", "greatest", "last")
 _ENDED = {
     "object_error_mm": "object {:.1f} mm from the target",
     "object_heading_error_deg": "object heading {:+.1f} deg off",

@@ -101,8 +101,9 @@ def compose(
             role_of[pair.follower] for pair in plan.cell.pairs if pair.on_stop == "hold" and pair.follower in role_of
         ),
         watched_joints=frozenset(role for role, body in planning_scene.bodies.items() if body.link_count),
-        watched_wrenches=_watched(plan, role_of, "wrench", WrenchSource),
+        watched_wrenches=_watched_wrenches(plan, role_of),
         watched_torques=_watched(plan, role_of, "external_torque", ExternalTorqueSource),
+        watched_readings=frozenset(key for entry in plan.cell.interlocks.values() for key in entry.reads),
         enabling_device=_enabling_device(plan, world.clock, enabling_device),
         scene=world.truth,
         scene_start_ns=scene_start_ns,
@@ -124,6 +125,12 @@ def _watched(plan: CellPlan, role_of: Mapping[str, str], measure: str, source: t
     if not any(measure in entry.measures for entry in plan.cell.interlocks.values()):
         return frozenset()
     return frozenset(role for name, role in role_of.items() if source in plan.arms[name].spec.capabilities.provides)
+
+
+def _watched_wrenches(plan: CellPlan, role_of: Mapping[str, str]) -> frozenset[str]:
+    """Roles of arms whose wrench an interlock or the task needs."""
+    of_task = frozenset(plan.task.needs_wrenches(plan.task_config))
+    return of_task | _watched(plan, role_of, "wrench", WrenchSource)
 
 
 def _enabling_device(plan: CellPlan, clock: Clock, given: EnablingDevice | None) -> EnablingDevice | None:

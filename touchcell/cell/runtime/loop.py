@@ -228,6 +228,7 @@ class RunLoop:
             operator_stop=self._stop.orderly,
             ended=self._observer.exhausted,
             devices=reading.devices,
+            wrenches=reading.wrenches,
         )
         action = cell.task.tick(observation)
         thought = time.perf_counter_ns()

@@ -124,6 +124,8 @@ class RunRecord:
                 self.write(f"/sensors/{role}/{topic}", t_ns, message)
             if self._frames is not None and (frame := sensor.new_frame()) is not None:
                 self._frames.add(role, frame.t_ns, frame.value.image)
+        for name, health in reading.health.items():
+            self.write(f"/health/{name}", health.t_ns, {"seq": health.seq, **health.value})
         for role, sample in reading.devices.items():
             self.write(f"/devices/{role}/reading", sample.t_ns, {"seq": sample.seq, **sample.value})
         if verdict.allow:

@@ -32,6 +32,7 @@ class Sensor:
         arm_role: role of the arm that carries it, None where nothing moves it.
         T_tcp_sensor: (4, 4) its pose in that arm's tool frame.
         truth: what is known to be true: the simulator's own contact, or the label of a replayed image.
+        true_edge: the simulator's own edge, for an estimator of edges.
         frames: how images are recorded.
         watched: whether an interlock looks at the pictures.
     """
@@ -40,6 +41,7 @@ class Sensor:
     arm_role: str | None
     T_tcp_sensor: Array
     truth: ContactSource | None = None
+    true_edge: ContactSource | None = None
     frames: str = "none"
     watched: bool = False
     _recorded_seq: int = field(default=-1, init=False)
@@ -96,13 +98,13 @@ class Sensor:
             measured = self.source.measurement
             if measured is not None and measured.belief is not None:
                 yield "measurement", measured.t_ns, {"seq": measured.seq, **belief_message(measured.belief)}
-        if self.truth is not None:
-            true = self.truth.update(now_ns)
+        for topic, source in (("truth", self.truth), ("true_edge", self.true_edge)):
+            true = None if source is None else source.update(now_ns)
             if true is not None:
                 message: dict[str, Any] = {"in_contact": true.in_contact}
                 if true.belief is not None:
                     message |= pose_message(se3.inverse(true.belief.mean))
-                yield "truth", true.t_ns, message
+                yield topic, true.t_ns, message
 
 
 def build_sensor(
@@ -124,12 +126,14 @@ def build_sensor(
     section = plan.cell.sensors[name]
     T_tcp_sensor = section.T_tcp_sensor
     truth = _truth(name, devices.get(section.mounted_on or ""), scene, T_tcp_sensor)
-    context = EstimatorContext(name, cast(FrameSource, devices[name]), truth)
+    edge = _true_edge(name, scene) if section.estimator.feature == "edge" else None
+    context = EstimatorContext(name, cast(FrameSource, devices[name]), truth, edge)
     return Sensor(
         source=section.estimator.build(context),
         arm_role=role_of[section.mounted_on] if section.mounted_on else None,
         T_tcp_sensor=T_tcp_sensor,
         truth=truth,
+        true_edge=edge,
         frames=plan.cell.recording.frames,
         watched=any(interlock.kind in ("frame_frozen", "exposure") for interlock in plan.cell.interlocks.values()),
     )
@@ -142,3 +146,9 @@ def _truth(name: str, mount: Device | None, scene: SceneTruth | None, T_tcp_sens
     if scene is not None:
         return TrueContactSource(scene, name)
     return LabelledContactSource(mount, T_tcp_sensor) if isinstance(mount, ReplayArm) else None
+
+
+def _true_edge(name: str, scene: SceneTruth | None) -> ContactSource | None:
+    from touchcell.cell.runtime.ground_truth import TrueEdgeSource
+
+    return None if scene is None else TrueEdgeSource(scene, name)
