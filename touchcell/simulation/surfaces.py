@@ -40,7 +40,8 @@ _FLAT = (0.0, 0.0)
 
 
 def _lengths(points: Array) -> Array:
-    return np.sqrt(np.einsum("kc,kc->k", points, points))
+    lengths: Array = np.sqrt(np.einsum("kc,kc->k", points, points))
+    return lengths
 
 
 class Shape(Protocol):

@@ -26,9 +26,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from touchcell.drivers.core.can_packets import FRAME_SIZES, LONGEST, pack, unpack
 from touchcell.drivers.core.errors import CodecError, DeviceError
 from touchcell.drivers.damiao import codec
-from touchcell.drivers.damiao.can_packets import FRAME_SIZES, LONGEST, pack, unpack
 from touchcell.drivers.damiao.codec import MitCommand, Ranges, Register
 from touchcell.drivers.damiao.descent import Descent
 from touchcell.drivers.damiao.driver import DamiaoCanConfig, open_bus

@@ -18,8 +18,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from touchcell.drivers.core.can_packets import FRAME_SIZES, LONGEST, pack, unpack
 from touchcell.drivers.core.errors import ConnectError
-from touchcell.drivers.damiao.can_packets import FRAME_SIZES, LONGEST, pack, unpack
 from touchcell.geometry.types import Array
 
 if TYPE_CHECKING:

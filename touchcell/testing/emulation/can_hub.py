@@ -23,7 +23,7 @@ from typing import Any
 import can
 
 from touchcell.drivers.core import can_errors
-from touchcell.drivers.damiao.can_packets import pack, unpack
+from touchcell.drivers.core.can_packets import pack, unpack
 
 # What the hub makes the adapter of a client do: refuse sends (count, error number or 0 for none), be down (seconds).
 _REFUSE = struct.Struct("=Ii")
