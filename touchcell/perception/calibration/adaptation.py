@@ -35,6 +35,7 @@ from touchcell.perception.calibration.transfer_fit import (
 )
 from touchcell.perception.calibration.zero_frame import similarity
 from touchcell.perception.errors import ModelError, TrainingError
+from touchcell.perception.markers.camera_check import transferred_check
 from touchcell.perception.markers.detection import Discs, detect_markers, typical_size
 from touchcell.perception.markers.estimator import displacement_model_of, matcher_of
 from touchcell.perception.markers.layers import layers_of, mixed
@@ -172,10 +173,15 @@ def adapt_to(
     contacts = contact_from_xi(dataset.xi[matched])
     candidates = _Candidates(old, displacements[matched], contacts, settings)
     method, left_out = candidates.judged()
-    update = {"input_size": preprocessing.output_size, "size": size}
+    update: dict[str, object] = {"input_size": preprocessing.output_size, "size": size}
     architecture = old.header.architecture
     assert isinstance(architecture, MarkerArchitecture)
     labels, tensors = candidates.labels, dict(old.tensors)
+    check, check_tensors = transferred_check(
+        displacement_model_of(old), architecture.rings, displacements[matched].astype(np.float64)
+    )
+    update["camera_check"] = check
+    tensors |= check_tensors
     sigma_scale, sigma_power, transfer = (1.0,) * 6, (1.0,) * 6, None
     if method == "transfer":
         fitted = candidates.transfer()

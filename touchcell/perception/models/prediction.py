@@ -25,12 +25,14 @@ class Prediction:
         in_range: the mean lies in the model's training range of labels. Outside it, and out of contact, a prediction is
             unreliable.
         markers: fraction of the markers expected in view that were detected, for a marker model.
+        refusal: why the image does not show the contact as the model's camera would; empty where it does.
     """
 
     xi: Array
     covariance: Array
     in_range: bool
     markers: float | None = None
+    refusal: str = ""
 
     @property
     def sigma(self) -> Array:

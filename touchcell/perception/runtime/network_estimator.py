@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
 
-from pydantic import PositiveFloat, model_validator
+from pydantic import NonNegativeInt, PositiveFloat, model_validator
 
 from touchcell.errors import ConfigError
 from touchcell.input_file import BUILTIN, InputFile, files_in
@@ -53,6 +53,9 @@ class NetworkEstimator(EstimatorConfig):
     Attributes:
         model: model file, or ``builtin:NAME`` for one that ships.
         calibration: file of ``touchcell calibrate``, where another camera taught the model.
+        from_camera: the camera gives grey 640x480 frames, and the model was trained on images as data sets are
+            published: cropped, black and white.
+        crop_corner_px: with ``from_camera``: left and top of the crop in the frame; none for the frame's centre.
         gate: decides about contact without the network; without it every frame goes through the network.
         filter: fuses the estimates over time; without it each frame stands by itself.
     """
@@ -60,6 +63,8 @@ class NetworkEstimator(EstimatorConfig):
     kind: Literal["network"]
     model: Annotated[str, _MODEL]
     calibration: Annotated[str | None, _CALIBRATION] = None
+    from_camera: bool = False
+    crop_corner_px: tuple[NonNegativeInt, NonNegativeInt] | None = None
     gate: GateConfig | None = None
     filter: FilterSection | None = None
 
@@ -79,7 +84,12 @@ class NetworkEstimator(EstimatorConfig):
         # A second thread gains nothing on images of this size, and takes a core from other sensors.
         cv2.setNumThreads(1)
         calibration = None if self.calibration is None else Path(self.calibration)
-        model = load_estimator(model_path(self.model), calibration)
+        model = load_estimator(
+            model_path(self.model),
+            calibration,
+            from_camera=self.from_camera,
+            crop_corner_px=self.crop_corner_px,
+        )
         contact_gate = None
         if self.gate is not None:
             if model.reference is None:
