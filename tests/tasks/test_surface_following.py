@@ -33,7 +33,8 @@ def path(task: Task) -> list[tuple[str, str, str]]:
 
 WHOLE = [
     ("prepare", "ready", "approach"),
-    ("approach", "contact", "settle"),
+    ("approach", "contact", "check"),
+    ("check", "agrees", "settle"),
     ("settle", "settled", "run"),
     ("run", "finished", "retract"),
     ("retract", "retracted", "done"),

@@ -15,6 +15,7 @@ from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Six
 from touchcell.tasks.interface import SPEED, Action, Observation, TaskContext, TaskSpec, TransitionRecord
+from touchcell.tasks.sensor_check import SensorCheck
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
 from touchcell.tasks.state_machine_task import MachineTask
 
@@ -30,6 +31,11 @@ class ServoConfig(ContactServoConfig):
     Attributes:
         approach_speed_mm_s: speed towards the surface, along the sensor's z axis.
         approach_distance_mm: the approach fails when no contact was made within it.
+        check_s: duration of the motion after first contact whose measured answer must agree with the arm's before the
+            arm servos on the estimates (``sensor_check``); 0 leaves it out.
+        check_press_mm: depth that this motion adds.
+        check_shift_mm: its largest shift along the surface.
+        check_tilt_deg: its largest tilt.
         settle_time_s: the contact has settled when errors were below the tolerances for this long.
         settle_timeout_s: settling fails when it takes longer.
         retract_mm: distance to withdraw at the end.
@@ -41,6 +47,10 @@ class ServoConfig(ContactServoConfig):
 
     approach_speed_mm_s: Annotated[PositiveFloat, SPEED] = 10.0
     approach_distance_mm: PositiveFloat = 50.0
+    check_s: NonNegativeFloat = 1.0
+    check_press_mm: NonNegativeFloat = 0.5
+    check_shift_mm: PositiveFloat = 0.3
+    check_tilt_deg: PositiveFloat = 1.0
     settle_time_s: NonNegativeFloat = 0.3
     settle_timeout_s: PositiveFloat = 10.0
     retract_mm: PositiveFloat = 20.0
@@ -55,6 +65,7 @@ class ServoState(Enum):
 
     PREPARE = auto()
     APPROACH = auto()
+    CHECK = auto()
     SETTLE = auto()
     RUN = auto()
     RETRACT = auto()
@@ -65,16 +76,18 @@ class ServoState(Enum):
     FAULTED = auto()
 
 
-def servo_table(task: str, config: ServoConfig, run_timeout_s: float) -> Table:
+def servo_table(task: str, config: ServoConfig, run_timeout_s: float, servos: int = 1) -> Table:
     """Return the states and transitions of a servoing task; motions time out after twice their nominal duration."""
     s = ServoState
     approach_s = 2.0 * config.approach_distance_mm / config.approach_speed_mm_s + 1.0
+    check_s = 2.0 * servos * config.check_s + 1.0
     retract_s = 2.0 * config.retract_mm / config.retract_speed_mm_s + 1.0
     return Table(
         task,
         (
             StateDef(s.PREPARE, config.prepare_timeout_s, "timeout"),
             StateDef(s.APPROACH, approach_s, "timeout", on_enter="start_approach"),
+            StateDef(s.CHECK, check_s, "timeout", on_enter="start_check"),
             StateDef(s.SETTLE, config.settle_timeout_s, "timeout", on_enter="start_settle"),
             StateDef(s.RUN, run_timeout_s, "timeout", on_enter="start_run"),
             StateDef(s.RETRACT, retract_s, "timeout", on_enter="start_retract"),
@@ -88,8 +101,12 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float) -> Table:
             TransitionDef("ready", s.PREPARE, s.APPROACH),
             TransitionDef("timeout", s.PREPARE, s.FAILED),
             TransitionDef(STOP, s.PREPARE, s.STOPPED),
+            TransitionDef("contact", s.APPROACH, s.CHECK, guard="must_check"),
             TransitionDef("contact", s.APPROACH, s.SETTLE),
             TransitionDef("no_contact", s.APPROACH, s.RETRACT),
+            TransitionDef("agrees", s.CHECK, s.SETTLE),
+            TransitionDef("lost", s.CHECK, s.APPROACH, guard="may_reapproach"),
+            TransitionDef("lost", s.CHECK, s.RETRACT),
             TransitionDef("settled", s.SETTLE, s.RUN),
             TransitionDef("lost", s.SETTLE, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.SETTLE, s.RETRACT),
@@ -114,7 +131,8 @@ class ServoTask(MachineTask):
 
     While the contact servos search for the surface or hold it, they move only on fresh frames, fresh arm states and
     valid estimates, all of them or none. When they retract, away from the surface, a fresh arm state suffices. A servo
-    that has made its contact holds it until the others have made theirs.
+    that has made its contact holds it until the others have made theirs; until its sensor was checked it stands still.
+    The sensors are checked one after another, once.
 
     Args:
         name: the task's name.
@@ -130,7 +148,10 @@ class ServoTask(MachineTask):
         self._config = config
         self._period_s = 1.0 / context.rate_hz
         self._servos = servos
-        self._machine = TaskMachine(servo_table(name, config, min(servo.run.timeout_s for servo in servos)), self)
+        run_timeout_s = min(servo.run.timeout_s for servo in servos)
+        self._machine = TaskMachine(servo_table(name, config, run_timeout_s, len(servos)), self)
+        self._checks: list[SensorCheck] = []
+        self._unchecked = config.check_s > 0.0
         self._now_ns = 0
         self._steady_s = 0.0
         self._blind_s = 0.0
@@ -158,6 +179,10 @@ class ServoTask(MachineTask):
             self._telemetry(observation),
         )
 
+    def must_check(self) -> bool:
+        """Guard: the sensors have not been checked yet."""
+        return self._unchecked
+
     def may_reapproach(self) -> bool:
         """Guard: a lost contact may be searched for again."""
         return self._reapproaches < self._config.max_reapproach
@@ -175,6 +200,15 @@ class ServoTask(MachineTask):
         self._reapproaches += record.event == "lost"
         for servo in self._servos:
             servo.reset_travel()
+        self._blind_s = 0.0
+
+    def start_check(self, record: TransitionRecord) -> None:
+        """On entry: begin the motion of the first sensor."""
+        c = self._config
+        self._checks = [
+            SensorCheck(c.check_s, press_mm=c.check_press_mm, shift_mm=c.check_shift_mm, tilt_deg=c.check_tilt_deg)
+            for _ in self._servos
+        ]
         self._blind_s = 0.0
 
     def start_settle(self, record: TransitionRecord) -> None:
@@ -212,6 +246,9 @@ class ServoTask(MachineTask):
                     self._post("contact")
                 elif max(servo.travelled_m() for servo in searching) >= 1e-3 * self._config.approach_distance_mm:
                     self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
+            case ServoState.CHECK:
+                self._watch_contact(dt_s)
+                self._watch_check()
             case ServoState.SETTLE:
                 self._watch_contact(dt_s)
                 steady = all(servo.steady() for servo in servos)
@@ -231,6 +268,26 @@ class ServoTask(MachineTask):
             case ServoState.RETRACT:
                 if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in servos):
                     self._post("retracted")
+
+    def _watch_check(self) -> None:
+        """Record what the sensors measure, and judge it when all have moved."""
+        for check, servo in zip(self._checks, self._servos, strict=True):
+            if servo.T_base_sensor is not None:
+                check.record_pose(self._now_ns, servo.T_base_sensor)
+            contact, T_s_f = servo.contact, servo.T_s_f_measured
+            if contact is not None and T_s_f is not None and check is self._moving_check():
+                check.record_contact(contact.seq, contact.t_frame_ns, T_s_f)
+        if self._moving_check() is not None:
+            return
+        for check, servo in zip(self._checks, self._servos, strict=True):
+            if wrong := check.verdict():
+                self._post(TRIP, f"{servo.sensor}: {wrong}")
+                return
+        self._unchecked = False
+        self._post("agrees")
+
+    def _moving_check(self) -> SensorCheck | None:
+        return next((check for check in self._checks if not check.finished), None)
 
     def _watch_contact(self, dt_s: float) -> None:
         for servo in self._servos:
@@ -256,6 +313,8 @@ class ServoTask(MachineTask):
         if state is ServoState.RETRACT:
             speed_m_s = -1e-3 * self._config.retract_speed_mm_s
             return [(servo, servo.along_z(speed_m_s)) for servo in self._servos if servo.T_base_sensor is not None]
+        if state is ServoState.CHECK:
+            return self._check_twists()
         if state not in (ServoState.APPROACH, ServoState.SETTLE, ServoState.RUN):
             return []
         searching = state is ServoState.APPROACH
@@ -268,11 +327,21 @@ class ServoTask(MachineTask):
             V_tcp: Array | None
             if searching and not servo.in_contact:
                 V_tcp = servo.along_z(1e-3 * self._config.approach_speed_mm_s)
+            elif searching and self._unchecked:
+                V_tcp = None
             else:
                 V_tcp = servo.servo_step(servo.run.feedforward if state is ServoState.RUN else np.zeros(6))
             if V_tcp is not None:
                 twists.append((servo, V_tcp))
         return twists
+
+    def _check_twists(self) -> list[tuple[ContactServo, Array]]:
+        if not all(servo.has_fresh_data and servo.T_s_f is not None for servo in self._servos):
+            return []
+        for check, servo in zip(self._checks, self._servos, strict=True):
+            if not check.finished:
+                return [(servo, servo.in_tcp(check.step(self._period_s)))]
+        return []
 
     def _command(self, servo: ContactServo, V_tcp: Array) -> TwistCommand:
         return TwistCommand(

@@ -33,13 +33,14 @@ from touchcell.perception.calibration.transfer_fit import (
     old_sensor,
     with_sigma,
 )
-from touchcell.perception.calibration.zero_frame import similarity
 from touchcell.perception.errors import ModelError, TrainingError
 from touchcell.perception.markers.camera_check import transferred_check
 from touchcell.perception.markers.detection import Discs, detect_markers, typical_size
 from touchcell.perception.markers.estimator import displacement_model_of, matcher_of
+from touchcell.perception.markers.lattice_fit import fit_lattice
 from touchcell.perception.markers.layers import layers_of, mixed
 from touchcell.perception.markers.matching import DisplacementModel, MarkerMatcher
+from touchcell.perception.markers.zero_frame import similarity
 from touchcell.perception.models.camera_change import CameraChange
 from touchcell.perception.models.labels import CONTACT_NAMES, contact_from_xi, shear_direction, xi_from_contact
 from touchcell.perception.models.marker_architecture import MarkerArchitecture, MarkerSize
@@ -47,7 +48,6 @@ from touchcell.perception.models.model_file import Header, Labels, Model, load_m
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.contact_network import Alignment
 from touchcell.perception.networks.displacement_network import DisplacementNetwork, Jitter, displacement_loss
-from touchcell.perception.networks.marker_learning import fit_lattice
 from touchcell.perception.networks.marker_training import LabelledDiscs, preprocessing_for
 from touchcell.perception.networks.sigma_scaling import calibrate
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from touchcell.perception.models.architecture_spec import ArchitectureConfig
 
@@ -18,6 +18,35 @@ nearly straight."""
 
 LOG_PRECISION_BOUNDS = (-3.0, 7.0)
 """Bounds of the logarithms of its inverse standard deviations: sigma from 20 label half-ranges to a thousandth."""
+
+
+CHECK = "check."
+"""Prefix of the tensors of an image check."""
+
+
+class ImageCheckSpec(BaseModel):
+    """A second, smaller network of the same kind that recognises images of the model's own sensor and camera.
+
+    Its first output is the log-odds of an image of this sensor against anything else; its second, of this camera
+    against one that is turned by a multiple of 60 degrees or mirrored, where the two differ at all.
+
+    Attributes:
+        channels: features of each block.
+        hidden: units of the hidden layer.
+        least: smallest accepted first output.
+        least_upright: smallest accepted second output; None where the sensor is too regular for it.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
+
+    channels: Annotated[tuple[Annotated[int, Field(gt=0)], ...], Field(min_length=1)] = (8, 16, 24, 32, 32)
+    hidden: int = Field(default=48, gt=0)
+    least: float = Field(allow_inf_nan=False)
+    least_upright: float | None = Field(default=None, allow_inf_nan=False)
+
+    def architecture(self, input_size: tuple[int, int]) -> Architecture:
+        """Return the network's architecture for images (height, width)."""
+        return Architecture(kind="cnn", input_size=input_size, channels=self.channels, hidden=self.hidden)
 
 
 class Architecture(ArchitectureConfig):
@@ -35,6 +64,7 @@ class Architecture(ArchitectureConfig):
         feature_dropout: rate before the hidden layer.
         mean_dropout: rate before each of the six means.
         precision_dropout: rate before each of the six inverse standard deviations (gdn).
+        check: recognises images of the model's own sensor; None for files without it.
     """
 
     kind: Literal["gdn", "cnn"] = "gdn"
@@ -44,6 +74,7 @@ class Architecture(ArchitectureConfig):
     feature_dropout: Rate = 0.0
     mean_dropout: SixRates = (0.0,) * 6
     precision_dropout: SixRates = (0.0,) * 6
+    check: ImageCheckSpec | None = None
 
     @model_validator(mode="after")
     def _features_remain(self) -> Architecture:
@@ -87,4 +118,7 @@ class Architecture(ArchitectureConfig):
         shapes["hidden.bias"] = (self.hidden,)
         shapes["output.weight"] = (self.outputs, self.hidden)
         shapes["output.bias"] = (self.outputs,)
+        if self.check is not None:
+            own = self.check.architecture(self.input_size).tensor_shapes()
+            shapes |= {f"{CHECK}{name}": shape for name, shape in own.items()}
         return shapes
