@@ -9,12 +9,7 @@ from tests.helpers.pushing_cell import cell_file, push
 from touchcell.cell.runtime.stop_request import StopRequest
 
 CELL = "dual_push_sim.yaml"
-START = [
-    ("prepare", "ready", "approach"),
-    ("approach", "contact", "check"),
-    ("check", "agrees", "settle"),
-    ("settle", "settled", "run"),
-]
+START = [("prepare", "ready", "approach"), ("approach", "contact", "settle"), ("settle", "settled", "run")]
 END = [("run", "finished", "retract"), ("retract", "retracted", "done")]
 SHORT = {"task__target_mm": [50, 3], "task__retract_mm": 12, "scene__step_ms": 10}
 

@@ -8,8 +8,7 @@ from tests.helpers.pushing_cell import cell_file, push
 
 WHOLE = [
     ("prepare", "ready", "approach"),
-    ("approach", "contact", "check"),
-    ("check", "agrees", "settle"),
+    ("approach", "contact", "settle"),
     ("settle", "settled", "run"),
     ("run", "finished", "retract"),
     ("retract", "retracted", "done"),
@@ -45,8 +44,8 @@ def test_a_lost_object_is_searched_for_and_pushed_again(tmp_path):
 
     data = cell_file(CELL, **SHORT | {"task__target_mm": [80, 0]})
     pushed = push(data, tmp_path, snatch)
-    assert pushed.path == [*WHOLE[:4], ("run", "lost", "approach"), *WHOLE[1:]]
-    assert "sensor" in pushed.cell.task.transitions[4].reason
+    assert pushed.path == [*WHOLE[:3], ("run", "lost", "approach"), *WHOLE[1:]]
+    assert "sensor" in pushed.cell.task.transitions[3].reason
     assert pushed.object_mm_deg[0] == pytest.approx(80.0, abs=5.0)
 
 
@@ -84,12 +83,12 @@ def test_an_object_that_is_lost_beside_its_path_is_not_done(tmp_path, cell):
 
 def test_an_object_that_ends_beyond_the_tolerance_is_not_done(tmp_path):
     pushed = push(cell_file(CELL, **SHORT | {"task__arrival_tolerance_mm": 0.001}), tmp_path)
-    assert pushed.path == [*WHOLE[:4], ("run", "missed", "retract"), ("retract", "retracted", "failed")]
-    assert "mm from the target, tolerance 0.001 mm" in pushed.cell.task.transitions[4].reason
+    assert pushed.path == [*WHOLE[:3], ("run", "missed", "retract"), ("retract", "retracted", "failed")]
+    assert "mm from the target, tolerance 0.001 mm" in pushed.cell.task.transitions[3].reason
 
 
 def test_a_heading_beyond_the_tolerance_is_not_done(tmp_path):
     changes = {"task__goal_heading_deg": 10.0, "task__arrival_tolerance_deg": 0.001, "task__target_mm": [180, 15]}
     pushed = push(cell_file(CELL, **SHORT | changes), tmp_path)
     assert pushed.path[-1] == ("retract", "retracted", "failed")
-    assert "deg off at the target" in pushed.cell.task.transitions[4].reason
+    assert "deg off at the target" in pushed.cell.task.transitions[3].reason

@@ -164,6 +164,11 @@ class ContactServo:
         return None if self.contact.belief is None else self.contact.belief.mean
 
     @property
+    def is_estimated(self) -> bool:
+        """True if a model measured the newest contact, rather than a simulator or a label."""
+        return self.contact is not None and self.contact.measured is not None
+
+    @property
     def T_s_f_measured(self) -> Array | None:  # noqa: N802  the field's own name
         """Valid contact pose (4, 4) of the newest frame by itself, or None."""
         if self.T_s_f is None or self.contact is None or self.contact.measured is None:

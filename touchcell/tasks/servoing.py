@@ -32,7 +32,7 @@ class ServoConfig(ContactServoConfig):
         approach_speed_mm_s: speed towards the surface, along the sensor's z axis.
         approach_distance_mm: the approach fails when no contact was made within it.
         check_s: duration of the motion after first contact whose measured answer must agree with the arm's before the
-            arm servos on the estimates (``sensor_check``); 0 leaves it out.
+            arm servos on a model's estimates (``sensor_check``); 0 leaves it out.
         check_press_mm: depth that this motion adds.
         check_shift_mm: its largest shift along the surface.
         check_tilt_deg: its largest tilt.
@@ -180,8 +180,8 @@ class ServoTask(MachineTask):
         )
 
     def must_check(self) -> bool:
-        """Guard: the sensors have not been checked yet."""
-        return self._unchecked
+        """Guard: a sensor's contact is estimated by a model, and the sensors have not been checked yet."""
+        return self._unchecked and any(servo.is_estimated for servo in self._servos)
 
     def may_reapproach(self) -> bool:
         """Guard: a lost contact may be searched for again."""
@@ -327,7 +327,7 @@ class ServoTask(MachineTask):
             V_tcp: Array | None
             if searching and not servo.in_contact:
                 V_tcp = servo.along_z(1e-3 * self._config.approach_speed_mm_s)
-            elif searching and self._unchecked:
+            elif searching and self._unchecked and servo.is_estimated:
                 V_tcp = None
             else:
                 V_tcp = servo.servo_step(servo.run.feedforward if state is ServoState.RUN else np.zeros(6))

@@ -202,7 +202,7 @@ class ContactPipeline:
             in_range=prediction.in_range,
             nis=nis,
             markers=prediction.markers,
-            measured=None if self._filter is None else observed,
+            measured=observed,
             refusal=prediction.refusal,
         )
 
