@@ -138,7 +138,13 @@ def _measured(options: argparse.Namespace, scratch: Path) -> tuple[list[dict[str
             subprocess.run([*program, *words, str(time.monotonic_ns())], check=True, env=environment)
             with np.load(result) as found:
                 each, camera = (
-                    Scores(labels[which], found[f"{kind}xi"], found[f"{kind}covariance"], found[f"{kind}in_range"])
+                    Scores(
+                        labels[which],
+                        found[f"{kind}xi"],
+                        found[f"{kind}covariance"],
+                        found[f"{kind}in_range"],
+                        _tail(found, kind),
+                    )
                     for kind, which in (("", slice(None)), ("served_", shown))
                 )
                 figures = json.loads(str(found["figures"]))
@@ -167,6 +173,11 @@ def _measured(options: argparse.Namespace, scratch: Path) -> tuple[list[dict[str
                 }
             )
     return rows, scores
+
+
+def _tail(found: Mapping[str, np.ndarray], kind: str) -> float | None:
+    scale = float(found[f"{kind}tail_scale"])
+    return None if np.isnan(scale) else scale
 
 
 def _changed(options: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:

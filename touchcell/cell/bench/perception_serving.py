@@ -77,6 +77,7 @@ def _arrays(prefix: str, predictions: Sequence[Prediction]) -> dict[str, Any]:
         f"{prefix}xi": np.stack([prediction.xi for prediction in predictions]),
         f"{prefix}covariance": np.stack([prediction.covariance for prediction in predictions]),
         f"{prefix}in_range": np.array([prediction.in_range for prediction in predictions]),
+        f"{prefix}tail_scale": np.array(predictions[0].tail_scale or np.nan),
     }
 
 

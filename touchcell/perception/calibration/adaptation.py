@@ -57,6 +57,7 @@ _MATCHED = 0.5
 _MOST_PROCESS_CONTACTS = 400
 _FOLDS, _FEW = 4, 120
 _RIDGE = 0.01
+_TAIL_SCALE = 0.6  # Of models that were calibrated on thousands of contacts.
 _SECTORS = 8
 
 Method = Literal["transfer", "scratch"]
@@ -199,6 +200,7 @@ def adapt_to(
             labels=labels,
             sigma_scale=sigma_scale,
             sigma_power=sigma_power,
+            tail_scale=_TAIL_SCALE,
             camera=camera,
             transfer=transfer,
             network_labels=None if transfer is None else old.header.labels,

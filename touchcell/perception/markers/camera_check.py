@@ -205,11 +205,13 @@ def learn_check(
 ) -> tuple[CameraCheckSpec, dict[str, NDArray[np.float32]]]:
     """Return the camera check, and its tensors, of a sensor of many known displacements (n, 2 m) px."""
     off = displacements - model.mean
-    rows, sd = principal(off, min(_COMPONENTS, len(off) // 4 + 1))
+    # Components describe the contacts that they were learned from better than any others.
+    learned, others = off[::2], off[1::2]
+    rows, sd = principal(learned, min(_COMPONENTS, len(learned) // 10 + 1))
     functionals = fit_functionals(model.reference, rings, model.mean, [(rows, sd)], _NOISE_PX)
     basis = rows.astype(np.float32)
     tensors = {"camera.mean": model.mean.astype(np.float32), "camera.functionals": functionals, "camera.basis": basis}
-    return misfit_of(model, off, basis, _SPARE), tensors
+    return misfit_of(model, others, basis, _SPARE), tensors
 
 
 def transferred_check(

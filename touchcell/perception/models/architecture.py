@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from touchcell.perception.models.architecture_spec import ArchitectureConfig
@@ -31,6 +33,7 @@ class ImageCheckSpec(BaseModel):
     against one that is turned by a multiple of 60 degrees or mirrored, where the two differ at all.
 
     Attributes:
+        shrink: side of the squares of pixels that are averaged for its input.
         channels: features of each block.
         hidden: units of the hidden layer.
         least: smallest accepted first output.
@@ -39,6 +42,7 @@ class ImageCheckSpec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
+    shrink: int = Field(default=1, gt=0)
     channels: Annotated[tuple[Annotated[int, Field(gt=0)], ...], Field(min_length=1)] = (8, 16, 24, 32, 32)
     hidden: int = Field(default=48, gt=0)
     least: float = Field(allow_inf_nan=False)
@@ -46,7 +50,20 @@ class ImageCheckSpec(BaseModel):
 
     def architecture(self, input_size: tuple[int, int]) -> Architecture:
         """Return the network's architecture for images (height, width)."""
-        return Architecture(kind="cnn", input_size=input_size, channels=self.channels, hidden=self.hidden)
+        height, width = input_size
+        shrunk = height // self.shrink, width // self.shrink
+        return Architecture(kind="cnn", input_size=shrunk, channels=self.channels, hidden=self.hidden)
+
+
+def shrunk(images: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+    """Return images (..., height, width) with squares of so many pixels averaged; what remains at the border is cut."""
+    if factor == 1:
+        return images
+    height, width = images.shape[-2] // factor, images.shape[-1] // factor
+    parts = images[..., : height * factor, : width * factor]
+    parts = parts.reshape(*images.shape[:-2], height, factor, width, factor)
+    means: NDArray[np.float32] = parts.mean(axis=(-3, -1), dtype=np.float32)
+    return means
 
 
 class Architecture(ArchitectureConfig):

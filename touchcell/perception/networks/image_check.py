@@ -19,12 +19,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from touchcell.geometry.types import ImageArray
-from touchcell.perception.models.architecture import CHECK, ImageCheckSpec
+from touchcell.perception.models.architecture import CHECK, ImageCheckSpec, shrunk
 from touchcell.perception.models.preprocessing import scale
 from touchcell.perception.networks.contact_network import ContactNetwork
 
 STEPS = 1000
 LEAST_IMAGES = 200
+_LEAST_SIDE_PX = 50
 _BATCH = 48
 _LEARNING_RATE = 3e-3
 _SET_ASIDE = 400
@@ -54,7 +55,13 @@ def train_check(
         seed: of everything random.
         progress: called with the steps done and their number.
     """
-    spec = ImageCheckSpec(least=0.0)
+    spec = ImageCheckSpec(least=0.0, shrink=max(1, min(input_size) // _LEAST_SIDE_PX))
+    images = np.concatenate(
+        [
+            np.rint(255.0 * shrunk(scale(part), spec.shrink)).astype(np.uint8)
+            for part in np.array_split(images, max(1, len(images) // 256))
+        ]
+    )
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(images))
     aside = images[order[: min(_SET_ASIDE, max(1, len(images) // 10))]]
@@ -159,9 +166,9 @@ def _kept(images: Tensor, rng: np.random.Generator) -> Tensor:
     reach = max(1, round(pin))
     hidden = functional.max_pool2d(torch.from_numpy(covered), 2 * reach + 1, stride=1, padding=reach)
     out = out * (1.0 - hidden)
-    for i in np.flatnonzero(rng.random(n) < 0.3):
+    for spot in np.flatnonzero(rng.random(n) < 0.3):
         cu, cv, radius = rng.uniform(0.2, 0.8) * width, rng.uniform(0.2, 0.8) * height, rng.uniform(0.02, 0.07) * width
-        out[i, 0][torch.from_numpy((u - cu) ** 2 + (v - cv) ** 2 < radius**2)] = float(rng.random() < 0.2)
+        out[spot, 0][torch.from_numpy((u - cu) ** 2 + (v - cv) ** 2 < radius**2)] = float(rng.random() < 0.2)
     return out
 
 
@@ -202,7 +209,7 @@ def _cut(images: Tensor, others: Tensor, rng: np.random.Generator) -> Tensor:
     out = images.clone()
     _, _, height, width = images.shape
     for i in range(len(images)):
-        side, where = rng.integers(4), rng.uniform(0.3, 0.7)
+        edge, where = int(rng.integers(4)), rng.uniform(0.3, 0.7)
         rows, columns = int(where * height), int(where * width)
         everything = slice(None)
         part: tuple[slice, slice] = (
@@ -210,7 +217,7 @@ def _cut(images: Tensor, others: Tensor, rng: np.random.Generator) -> Tensor:
             (slice(rows, None), everything),
             (everything, slice(0, columns)),
             (everything, slice(columns, None)),
-        )[side]
+        )[edge]
         choice = rng.random()
         if choice < 0.62:
             out[i, 0][part] = others[rng.integers(len(others)), 0][part]

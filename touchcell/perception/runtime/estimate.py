@@ -21,7 +21,7 @@ class ContactEstimate:
         in_range: False when the network's output is outside its training range.
         nis: normalised innovation squared of the last correction (6 degrees of freedom), None before the second frame.
         markers: fraction of the markers expected in view that were detected, for a marker estimator.
-        measured: Gaussian of the frame by itself, before any filter; None without contact, or where no model measured it.
+        measured: Gaussian of the frame by itself, before any filter; None without contact, or without a model.
         refusal: why the frame does not show the contact as the model's camera would; empty where it does.
     """
 

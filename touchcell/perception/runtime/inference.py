@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.geometry.types import ImageArray
-from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.architecture import Architecture, shrunk
 from touchcell.perception.models.graph import IMAGES, OUTPUTS, check_graph, onnx_model
 from touchcell.perception.models.model_file import Header, Model, load_model
 from touchcell.perception.models.prediction import RANGE_TOLERANCE, Prediction
@@ -114,7 +114,7 @@ class ContactModel:
             return _OTHER
         if self._check is None or self._spec is None:
             return ""
-        own, upright = self._check(scale(reduced)[None, None])[0, :2].tolist()
+        own, upright = self._check(shrunk(scale(reduced), self._spec.shrink)[None, None])[0, :2].tolist()
         if own < self._spec.least:
             return _OTHER
         if self._spec.least_upright is not None and upright < self._spec.least_upright:
@@ -145,4 +145,5 @@ class ContactModel:
         mean = output[:6].astype(np.float64)
         sigma = np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else np.ones(6)
         xi, covariance = self.header.labels.xi_gaussian(mean, self.header.calibrated(sigma))
-        return Prediction(xi, covariance, in_range=bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE)))
+        in_range = bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
+        return Prediction(xi, covariance, in_range, tail_scale=self.header.tail_scale)
