@@ -12,6 +12,7 @@ from pathlib import Path
 
 BENCHMARKS = {
     "adapt": "benchmarks.adapt",
+    "against": "benchmarks.against",
     "armed": "benchmarks.armed",
     "calibration": "benchmarks.calibration",
     "emulated-push": "benchmarks.emulated_push",
@@ -22,7 +23,10 @@ BENCHMARKS = {
     "fuzz-cells": "tests.fault_injection.fuzz_cells",
     "fuzz-recordings": "tests.fault_injection.fuzz_recordings",
     "gdn-vs-cnn": "benchmarks.gdn_vs_cnn",
+    "keeper": "benchmarks.keeper",
     "mutation": "benchmarks.mutation",
+    "hil-mutation": "benchmarks.hil_mutation",
+    "phantom": "benchmarks.phantom",
     "kinematics": "benchmarks.kinematics",
     "safety": "tests.fault_injection.safety",
     "safety-against": "benchmarks.safety_against",
@@ -31,6 +35,7 @@ BENCHMARKS = {
     "structure": "benchmarks.structure",
     "soak": "tests.fault_injection.soak",
     "tuning": "benchmarks.tuning",
+    "world-faults": "benchmarks.world_faults",
 }
 
 

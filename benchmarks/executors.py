@@ -2,7 +2,9 @@
 
 ``no-op`` is the time for each of many pieces of work that do nothing, without the start of the workers; ``sweep`` is
 the time of a real sweep over the time of its trials shared among the workers; ``killed`` ends the command of a sweep by
-SIGKILL at random moments and counts trials that were lost, or run twice after they had finished.
+SIGKILL at random moments and counts trials that were lost, or run twice after they had finished; ``mixed`` is a sweep
+of 64 trials of which one raises, one is killed and one hangs; ``apart`` compares the recordings of a sweep on dask
+workers in network namespaces of their own, which do not see the sweep's folder, with those of this machine.
 """
 
 from __future__ import annotations
@@ -18,12 +20,22 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from benchmarks.separate_workers import separate_workers
 from touchcell.cell.analysis.provenance import provenance
+from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.experiments.executors import EXECUTORS, Workers
 from touchcell.cell.experiments.remote_work import send_by_value
+from touchcell.cell.recording.compare import compare_recordings
+from touchcell.cell.recording.mcap import RECORDING
+from touchcell.cell.sweeps.factors import make_factors
+from touchcell.cell.sweeps.measures import run_measures
+from touchcell.cell.sweeps.sweep import Sweep, run_sweep
+from touchcell.paths import CONFIGS
 
 MODULES = {"local": "pebble", "dask": "distributed", "ray": "ray", "slurm:local": "submitit"}
 SHORT = {"sensors.sensor.estimator": "{kind: true_contact}", "task.distance_mm": "10"}
@@ -95,12 +107,53 @@ def killed(times: int, trials: int, jobs: int, seed: int) -> dict[str, int]:
     return {"kills": times, "trials": trials, "finished": len(known), "lost": lost, "repeated": repeated}
 
 
+def measure_or_break(folder: RunFolder) -> Mapping[str, float]:
+    """Return the numbers of a trial; number 13 raises, 29 is killed, 47 hangs."""
+    number = int(folder.path.name)
+    if number == 13:
+        raise RuntimeError("trial 13 raises")
+    if number == 29:
+        os.kill(os.getpid(), signal.SIGKILL)
+    while number == 47:
+        time.sleep(1.0)
+    return run_measures(folder)
+
+
+def mixed(trials: int, jobs: int, limit_s: float) -> dict[str, Any]:
+    """Return the outcomes of a sweep in which three trials break, and the reasons of these three."""
+    settings: dict[str, Any] = {"sensors.sensor.estimator": {"kind": "true_contact"}, "task.distance_mm": 10}
+    factors = make_factors({}, {"seed": f"1..{trials}"}, samples=None)
+    sweep = Sweep(CONFIGS / "surface_follow_sim.yaml", factors, measure=measure_or_break, settings=settings)
+    with tempfile.TemporaryDirectory() as name:
+        found = run_sweep(sweep, Path(name), workers=Workers(jobs, limit_s, None, ""))
+    return {
+        "outcomes": dict(Counter(each.outcome for each in found.finished)),
+        "broken": {each.trial.name: each.reason for each in found.finished if each.broken},
+    }
+
+
+def apart(trials: int) -> dict[str, int]:
+    """Return how many recordings of workers that share nothing equal those of this machine, message by message."""
+    with tempfile.TemporaryDirectory() as name:
+        here, there = Path(name) / "here", Path(name) / "hidden" / "there"
+        there.mkdir(parents=True)
+        subprocess.run(sweep_command(here, trials, 1), check=True, stdout=subprocess.DEVNULL)
+        with separate_workers(there.parent, Path(name) / "workers") as address:
+            command = [*sweep_command(there, trials, 2), "--executor", f"dask:{address}"]
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        folders = sorted(path.name for path in (here / "trials").iterdir())
+        pairs = [(here / "trials" / each / RECORDING, there / "trials" / each / RECORDING) for each in folders]
+        same = sum(all(topic.identical for topic in compare_recordings(*pair)) for pair in pairs)
+    return {"trials": trials, "workers": 2, "same": same}
+
+
 def run(arguments: list[str], out: Path) -> None:
     """Print the table, and leave it in ``out/executors.json``."""
     parser = argparse.ArgumentParser("executors", description=__doc__)
     parser.add_argument("--items", type=int, default=1000, help="pieces of work that do nothing")
     parser.add_argument("--trials", type=int, default=60, help="of the real sweep")
     parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--limit-s", type=float, default=60.0, help="time limit of each trial of ``mixed``")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args(arguments)
     found: dict[str, Any] = {**provenance(), "no_op": {}}
@@ -122,4 +175,11 @@ def run(arguments: list[str], out: Path) -> None:
     )
     found["killed"] = killed(options.kills, options.trials, options.jobs, seed=1)
     print("killed: " + ", ".join(f"{name} {value}" for name, value in found["killed"].items()))
+    found["mixed"] = mixed(64, options.jobs, options.limit_s)
+    print(f"mixed: {found['mixed']['outcomes']}")
+    for trial, reason in found["mixed"]["broken"].items():
+        print(f"  {trial}: {reason}")
+    if os.geteuid() == 0:
+        found["apart"] = apart(6)
+        print("apart: " + ", ".join(f"{name} {value}" for name, value in found["apart"].items()))
     (out / "executors.json").write_text(json.dumps(found, indent=1) + "\n")

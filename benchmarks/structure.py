@@ -1,7 +1,8 @@
-"""``touchcell bench structure``: files per room, arrows and cycles between rooms and modules, and how code is worded.
+"""``python -m benchmarks structure``: rooms, arrows and cycles, wording, and lines to add one thing of each kind.
 
 A room is a folder with Python files. An arrow leads from one room to another that it imports, also inside functions and
-under TYPE_CHECKING. Two checkouts beside each other: ``touchcell bench structure . ../before``.
+under TYPE_CHECKING. Two checkouts beside each other: ``python -m benchmarks structure . ../before``. The things added
+are those of the package that the tests install beside touchcell, which no file of touchcell names.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import argparse
 import ast
 import json
 import re
+import tomllib
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -131,6 +133,21 @@ def dialect(tree: Tree) -> tuple[int, int]:
     return hit, count
 
 
+def additions(root: Path) -> dict[str, int]:
+    """Return the lines of source of each thing in the foreign test package; empty where there is none."""
+    package = root / "tests" / "packaging" / "acme"
+    if not package.is_dir():
+        return {}
+    points = tomllib.loads((package / "pyproject.toml").read_text())["project"]["entry-points"]
+    return {
+        f"{group.removeprefix('touchcell.')} {name}": len(
+            (package / (where.partition(":")[0].replace(".", "/") + ".py")).read_text().splitlines()
+        )
+        for group, names in points.items()
+        for name, where in names.items()
+    }
+
+
 def measure(root: Path) -> dict[str, Any]:
     """Return all figures of one checkout."""
     tree = read_tree(root)
@@ -146,19 +163,25 @@ def measure(root: Path) -> dict[str, Any]:
         "imports between rooms": arrows,
         "cycles between rooms": cycles(graph),
         "cycles between modules": cycles(tree.imports),
+        "lines to add one": additions(root),
         "docstrings in dialect": f"{hit} of {docstrings} ({100 * hit / max(docstrings, 1):.1f} %)",
     }
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
     """Print the figures of each checkout; write ``structure.json`` into ``out``."""
-    parser = argparse.ArgumentParser("touchcell bench structure", description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser("structure", description=__doc__.partition("\n")[0])
     parser.add_argument("roots", nargs="*", type=Path, default=[Path(__file__).parent.parent], metavar="checkout")
     roots = parser.parse_args(arguments).roots
     found = {str(root): measure(root) for root in roots}
     for root, figures in found.items():
         print(root)
         for name, value in figures.items():
+            if isinstance(value, dict):
+                print(f"  {name}")
+                for key, count in value.items():
+                    print(f"    {key:38}{count:>6}")
+                continue
             print(f"  {name:26} {len(value) if name.startswith('cycles') else value}")
             for cycle in value if name.startswith("cycles") else ():
                 print(f"    {' '.join(cycle)}")

@@ -240,50 +240,40 @@ def test_only_a_running_arm_may_be_active(mode: RobotMode) -> None:
 # State, without a controller
 
 
-class Receive:
-    """Fake of ur-rtde's receive interface with the given present values."""
+class Stream:
+    """A state stream that delivers one packet with the given present values at each poll."""
+
+    connected = True
 
     def __init__(self) -> None:
         self.timestamp = 1.0
-        self.timestamps_read = 0
-        self.overtakes = False
         self.pose = [0.4, -0.1, 0.3, 0.0, 3.0, 0.0]
         self.q = [0.0] * 6
         self.robot_mode = 7
 
-    def getTimestamp(self) -> float:  # noqa: N802
-        self.timestamps_read += 1
-        return self.timestamp + (0.002 * self.timestamps_read if self.overtakes else 0.0)
-
-    def getActualTCPPose(self) -> list[float]:  # noqa: N802
-        return self.pose
-
-    def getActualQ(self) -> list[float]:  # noqa: N802
-        return self.q
-
-    def getRobotMode(self) -> int:  # noqa: N802
-        return self.robot_mode
-
-    def getSafetyMode(self) -> int:  # noqa: N802
-        return 1
-
-    def getSafetyStatusBits(self) -> int:  # noqa: N802
-        return 1
-
-    def getRuntimeState(self) -> int:  # noqa: N802
-        return 1
-
-    def getTargetSpeedFraction(self) -> float:  # noqa: N802
-        return 1.0
-
-    def _six(self) -> list[float]:
-        return [0.0] * 6
-
-    getActualTCPSpeed = getActualTCPForce = getActualQd = getTargetQd = getJointTemperatures = _six  # noqa: N815
+    def receive(self) -> list[dict[str, ur_codec.Value]]:
+        zero = (0.0,) * 6
+        return [
+            {
+                "timestamp": self.timestamp,
+                "actual_q": tuple(self.q),
+                "actual_qd": zero,
+                "target_qd": zero,
+                "actual_TCP_pose": tuple(self.pose),
+                "actual_TCP_speed": zero,
+                "actual_TCP_force": zero,
+                "robot_mode": self.robot_mode,
+                "safety_mode": 1,
+                "safety_status_bits": 1,
+                "runtime_state": 1,
+                "target_speed_fraction": 1.0,
+                "joint_temperatures": zero,
+            }
+        ]
 
 
 def test_a_packet_read_late_does_not_look_fresh() -> None:
-    clock, receive = VirtualClock(), Receive()
+    clock, receive = VirtualClock(), Stream()
     reader = StateReader(receive, clock)
     for _ in range(20):
         receive.timestamp += 0.002
@@ -298,7 +288,7 @@ def test_a_packet_read_late_does_not_look_fresh() -> None:
 
 @pytest.mark.parametrize("drift", [-100e-6, 100e-6])
 def test_ages_stay_true_while_the_clocks_drift_apart(drift: float) -> None:
-    clock, receive = VirtualClock(), Receive()
+    clock, receive = VirtualClock(), Stream()
     reader = StateReader(receive, clock)
     for _ in range(5_000):
         receive.timestamp += 0.01 * (1.0 + drift)
@@ -306,12 +296,6 @@ def test_ages_stay_true_while_the_clocks_drift_apart(drift: float) -> None:
         snapshot = reader.poll()
     assert snapshot is not None
     assert snapshot.age_s(clock.now_ns()) == pytest.approx(0.0, abs=1e-5)
-
-
-def test_a_packet_overwritten_during_its_read_is_discarded() -> None:
-    receive = Receive()
-    receive.overtakes = True
-    assert StateReader(receive, VirtualClock()).poll() is None
 
 
 @pytest.mark.parametrize(
@@ -328,7 +312,7 @@ def test_a_packet_overwritten_during_its_read_is_discarded() -> None:
     ],
 )
 def test_bad_packets_are_counted_and_never_substituted(field: str, value: Any) -> None:
-    receive = Receive()
+    receive = Stream()
     reader = StateReader(receive, VirtualClock())
     good = reader.poll()
     receive.timestamp += 0.002
@@ -339,7 +323,7 @@ def test_bad_packets_are_counted_and_never_substituted(field: str, value: Any) -
 
 
 def test_an_older_packet_is_out_of_order() -> None:
-    receive = Receive()
+    receive = Stream()
     reader = StateReader(receive, VirtualClock())
     good = reader.poll()
     receive.timestamp -= 0.002
@@ -348,7 +332,7 @@ def test_an_older_packet_is_out_of_order() -> None:
 
 
 def test_eleven_bad_packets_of_fifty_are_over_the_budget() -> None:
-    receive = Receive()
+    receive = Stream()
     reader = StateReader(receive, VirtualClock())
     for i in range(50):
         receive.timestamp += 0.002
@@ -373,7 +357,10 @@ def test_connecting_and_configuring_changes_nothing(arm: UrArm, emulator: Emulat
     assert state["energising"] == 0
     assert state["commands"] == {}
     pose = arm.tcp(0.2).value.T_base_tcp
-    np.testing.assert_allclose(pose[:3, 3], state["position_m"], atol=1e-12)
+    # No tool is set on the pendant; the pose is that of the configured one, 100 mm ahead of the flange.
+    flange = np.array(state["T_base_tcp"])
+    np.testing.assert_allclose(pose[:3, 3], flange[:3, 3] + 0.1 * flange[:3, 2], atol=1e-9)
+    assert arm.health()["pendant_tool_differs"]
     np.testing.assert_allclose(arm.joints(0.2).value.q, state["q"], atol=1e-12)
     assert arm.health()["robot_mode"] == "RUNNING"
     with pytest.raises(LifecycleError):
@@ -397,7 +384,7 @@ def test_a_frozen_controller_does_not_block(emulator: EmulatorProcess, address: 
 
 
 def test_a_missing_sdk_names_the_extra(monkeypatch: pytest.MonkeyPatch, address: int) -> None:
-    monkeypatch.setitem(sys.modules, "rtde_receive", None)
+    monkeypatch.setitem(sys.modules, "rtde_control", None)
     with pytest.raises(ConnectError, match=r"touchcell\[ur\]"):
         UrArm("ur", UrConfig(host=host_of(address), flange_to_tcp_mm_deg=TOOL_MM_DEG), CLOCK).connect()
 
@@ -597,6 +584,11 @@ def test_bad_joint_goals_are_not_sent(q: np.ndarray, fraction: float, reason: Re
 def test_the_wrench_is_the_external_wrench_on_the_tool(arm: UrArm, emulator: EmulatorProcess) -> None:
     wrench = [1.0, -2.0, 3.0, 0.1, 0.2, -0.3]
     emulator.fault("wrench", wrench)
+    # Measured where the pendant's tool is, at the flange; told at the configured one, 100 mm ahead of it.
+    lever_m = 0.1 * np.array(emulator.state()["T_base_tcp"])[:3, 2]
+    told = [*wrench[:3], *(np.array(wrench[3:]) - np.cross(lever_m, wrench[:3]))]
+    wait_until(lambda: bool(np.allclose(arm.wrench(0.2).value, told)), "wrench")
+    emulator.fault("pendant_tool", [0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
     wait_until(lambda: arm.wrench(0.2).value.tolist() == wrench, "wrench")
 
 
@@ -807,7 +799,7 @@ def test_a_slider_at_zero_in_motion_is_a_fault(arm: UrArm, emulator: EmulatorPro
 def test_an_endless_wrist_may_turn_as_far_as_its_model_allows() -> None:
     ur3e = ChainDescription.named("ur3e")
     ends = np.deg2rad([max(-joint.lower_deg, joint.upper_deg) for joint in ur3e.joints])
-    receive = Receive()
+    receive = Stream()
     receive.q = [0.0, 0.0, 0.0, 0.0, 0.0, 9.0]
     assert StateReader(receive, VirtualClock(), ends).poll() is not None
     reader = StateReader(receive, VirtualClock())

@@ -60,6 +60,11 @@ class TactileServo:
         return self._t_ns is not None
 
     @property
+    def clipped(self) -> bool:
+        """True if the controller's limits have cut the latest output."""
+        return bool(self._pid.clipped.any())
+
+    @property
     def latest_error(self) -> Array:
         """Error motion (6,) of the latest step on the controlled components, zero on the others and after a reset."""
         return np.where(self._free, 0.0, self._e)

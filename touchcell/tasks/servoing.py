@@ -13,7 +13,7 @@ from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Six
+from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Sidestepping, Six
 from touchcell.tasks.interface import SPEED, Action, Observation, TaskContext, TaskSpec, TransitionRecord
 from touchcell.tasks.sensor_check import SensorCheck
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
@@ -23,12 +23,33 @@ ARM: Final = "arm"
 """Role of the arm in tasks with one arm."""
 SENSOR: Final = "sensor"
 """Role of the tactile sensor that it carries."""
+_RETURN_S: Final = 10.0
+"""Longest return to where a contact was lost; the way is that of a few frames."""
+
+
+_START_CHANGE: Final = 0.02
+"""Change of the image, of 1, by which a sensor that backs off shows that it was in contact: 0.2 mm of depth."""
+
+
+class _Preparation(Enum):
+    """What has been done before the approach."""
+
+    FIRST_ZERO = auto()
+    BACK_OFF = auto()
+    STAND = auto()
+    READY = auto()
+
+
+_CLEAR_M: Final = 0.008
+"""Distance by which a sensor lets go of an object before it steps aside."""
 
 
 class ServoConfig(ContactServoConfig):
     """Parameters of all tasks that hold contacts; those of one contact servo apply to the leading arm.
 
     Attributes:
+        back_off_mm: distance to withdraw before the approach, while the sensor's image is compared with a zero frame:
+            one that changes was in contact.
         approach_speed_mm_s: speed towards the surface, along the sensor's z axis.
         approach_distance_mm: the approach fails when no contact was made within it.
         check_s: duration of the motion after first contact whose measured answer must agree with the arm's before the
@@ -40,11 +61,14 @@ class ServoConfig(ContactServoConfig):
         settle_timeout_s: settling fails when it takes longer.
         retract_mm: distance to withdraw at the end.
         retract_speed_mm_s: speed of that.
+        return_lift_mm: before a contact that was lost while the behavior ran is searched for again, the sensor returns
+            to where it was last felt, less deep by this much; none searches from where the sensor is.
         max_reapproach: number of times that a lost contact is searched for again.
         stale_timeout_s: the task trips when the arm has been stopped for lack of a valid estimate for this long.
         prepare_timeout_s: longest wait for the first frame and arm state.
     """
 
+    back_off_mm: PositiveFloat = 2.0
     approach_speed_mm_s: Annotated[PositiveFloat, SPEED] = 10.0
     approach_distance_mm: PositiveFloat = 50.0
     check_s: NonNegativeFloat = 1.0
@@ -55,6 +79,7 @@ class ServoConfig(ContactServoConfig):
     settle_timeout_s: PositiveFloat = 10.0
     retract_mm: PositiveFloat = 20.0
     retract_speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
+    return_lift_mm: PositiveFloat | None = None
     max_reapproach: NonNegativeInt = 2
     stale_timeout_s: PositiveFloat = 0.5
     prepare_timeout_s: PositiveFloat = 5.0
@@ -68,6 +93,8 @@ class ServoState(Enum):
     CHECK = auto()
     SETTLE = auto()
     RUN = auto()
+    RETURN = auto()
+    SIDESTEP = auto()
     RETRACT = auto()
     DONE = auto()
     STOPPED = auto()
@@ -76,8 +103,18 @@ class ServoState(Enum):
     FAULTED = auto()
 
 
-def servo_table(task: str, config: ServoConfig, run_timeout_s: float, servos: int = 1) -> Table:
-    """Return the states and transitions of a servoing task; motions time out after twice their nominal duration."""
+def servo_table(
+    task: str, config: ServoConfig, run_timeout_s: float, *, sidesteps: bool = False, servos: int = 1
+) -> Table:
+    """Return the states and transitions of a servoing task; motions time out after twice their nominal duration.
+
+    Args:
+        task: its name.
+        config: its parameters.
+        run_timeout_s: longest time in ``run``.
+        sidesteps: whether a contact may be given up for another beside it.
+        servos: number of sensors, which are checked one after another.
+    """
     s = ServoState
     approach_s = 2.0 * config.approach_distance_mm / config.approach_speed_mm_s + 1.0
     check_s = 2.0 * servos * config.check_s + 1.0
@@ -90,6 +127,8 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float, servos: in
             StateDef(s.CHECK, check_s, "timeout", on_enter="start_check"),
             StateDef(s.SETTLE, config.settle_timeout_s, "timeout", on_enter="start_settle"),
             StateDef(s.RUN, run_timeout_s, "timeout", on_enter="start_run"),
+            StateDef(s.RETURN, _RETURN_S, "timeout", on_enter="start_return"),
+            *((StateDef(s.SIDESTEP, config.settle_timeout_s, "timeout", on_enter="start_sidestep"),) * sidesteps),
             StateDef(s.RETRACT, retract_s, "timeout", on_enter="start_retract"),
             StateDef(s.DONE, terminal=True),
             StateDef(s.STOPPED, terminal=True),
@@ -99,6 +138,7 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float, servos: in
         ),
         (
             TransitionDef("ready", s.PREPARE, s.APPROACH),
+            TransitionDef("touching", s.PREPARE, s.FAILED),
             TransitionDef("timeout", s.PREPARE, s.FAILED),
             TransitionDef(STOP, s.PREPARE, s.STOPPED),
             TransitionDef("contact", s.APPROACH, s.CHECK, guard="must_check"),
@@ -112,8 +152,15 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float, servos: in
             TransitionDef("lost", s.SETTLE, s.RETRACT),
             TransitionDef("finished", s.RUN, s.RETRACT),
             TransitionDef("missed", s.RUN, s.RETRACT),
+            TransitionDef("lost", s.RUN, s.RETURN, guard="may_return"),
+            *(
+                (TransitionDef("aside", s.RUN, s.SIDESTEP), TransitionDef("placed", s.SIDESTEP, s.APPROACH))
+                if sidesteps
+                else ()
+            ),
             TransitionDef("lost", s.RUN, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.RUN, s.RETRACT),
+            TransitionDef("returned", s.RETURN, s.APPROACH),
             TransitionDef("retracted", s.RETRACT, s.STOPPED, guard="was_stopped"),
             TransitionDef("retracted", s.RETRACT, s.DONE, guard="has_finished"),
             TransitionDef("retracted", s.RETRACT, s.FAILED),
@@ -148,8 +195,9 @@ class ServoTask(MachineTask):
         self._config = config
         self._period_s = 1.0 / context.rate_hz
         self._servos = servos
-        run_timeout_s = min(servo.run.timeout_s for servo in servos)
-        self._machine = TaskMachine(servo_table(name, config, run_timeout_s, len(servos)), self)
+        timeout_s = min(servo.run.timeout_s for servo in servos)
+        sidesteps = any(isinstance(servo.run, Sidestepping) for servo in servos)
+        self._machine = TaskMachine(servo_table(name, config, timeout_s, sidesteps=sidesteps, servos=len(servos)), self)
         self._checks: list[SensorCheck] = []
         self._unchecked = config.check_s > 0.0
         self._now_ns = 0
@@ -158,6 +206,10 @@ class ServoTask(MachineTask):
         self._reapproaches = 0
         self._stop_seen = False
         self._finished_run = False
+        self._prepared = _Preparation.FIRST_ZERO
+        self._stood_s = 0.0
+        self._zero: frozenset[str] = frozenset()
+        self._zero_seq: dict[str, int] = {}
 
     def tick(self, observation: Observation) -> Action:
         """Process one cycle."""
@@ -174,9 +226,9 @@ class ServoTask(MachineTask):
         except TouchcellError as error:
             self._machine.fire(FAULT, str(error), now_ns=observation.now_ns)
             return Action()
+        zero, self._zero = self._zero, frozenset()
         return Action(
-            {servo.arm: self._command(servo, V) for servo, V in twists},
-            self._telemetry(observation),
+            {servo.arm: self._command(servo, V) for servo, V in twists}, self._telemetry(observation), zero=zero
         )
 
     def must_check(self) -> bool:
@@ -186,6 +238,10 @@ class ServoTask(MachineTask):
     def may_reapproach(self) -> bool:
         """Guard: a lost contact may be searched for again."""
         return self._reapproaches < self._config.max_reapproach
+
+    def may_return(self) -> bool:
+        """Guard: a lost contact is searched for again, from where it was last felt."""
+        return self.may_reapproach() and self._config.return_lift_mm is not None
 
     def was_stopped(self) -> bool:
         """Guard: the operator requested a stop."""
@@ -199,7 +255,14 @@ class ServoTask(MachineTask):
         """On entry: measure the travelled distance from here."""
         self._reapproaches += record.event == "lost"
         for servo in self._servos:
-            servo.reset_travel()
+            servo.start_approach()
+        self._blind_s = 0.0
+
+    def start_return(self, record: TransitionRecord) -> None:
+        """On entry: aim at where each contact was last felt."""
+        self._reapproaches += 1
+        for servo in self._servos:
+            servo.aim_back(1e-3 * (self._config.return_lift_mm or 0.0))
         self._blind_s = 0.0
 
     def start_check(self, record: TransitionRecord) -> None:
@@ -222,6 +285,12 @@ class ServoTask(MachineTask):
         """On entry: keep servoing, now with the feedforward."""
         self._blind_s = 0.0
 
+    def start_sidestep(self, record: TransitionRecord) -> None:
+        """On entry: plan the step aside of the servos that asked for one; the others hold their contact."""
+        self._blind_s = 0.0
+        for servo in self._servos:
+            servo.start_sidestep(_CLEAR_M)
+
     def start_retract(self, record: TransitionRecord) -> None:
         """On entry: measure the travelled distance from here, unless a stop only confirms a retraction under way."""
         if record.source != state_name(ServoState.RETRACT):
@@ -237,12 +306,13 @@ class ServoTask(MachineTask):
         servos = self._servos
         match self._machine.state:
             case ServoState.PREPARE:
-                if all(servo.has_fresh_data for servo in servos):
-                    self._post("ready")
+                self._prepare()
             case ServoState.APPROACH:
                 self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in servos))
-                searching = [servo for servo in servos if not servo.in_contact]
-                if not searching:
+                searching = [servo for servo in servos if not servo.touches]
+                if stuck := next((servo.sensor for servo in servos if servo.contact_is_stuck), None):
+                    self._post(TRIP, f"{stuck}: its contact does not change while the arm moves")
+                elif not searching:
                     self._post("contact")
                 elif max(servo.travelled_m() for servo in searching) >= 1e-3 * self._config.approach_distance_mm:
                     self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
@@ -265,6 +335,16 @@ class ServoTask(MachineTask):
                         self._post("missed", missed)
                     else:
                         self._post("finished")
+            case ServoState.RETURN:
+                self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in servos))
+                if all(servo.is_back() for servo in servos):
+                    self._post("returned")
+                elif any(isinstance(s.run, Sidestepping) and s.run.sidestep_m is not None for s in servos):
+                    self._post("aside", "the object is pushed beside its centre")
+            case ServoState.SIDESTEP:
+                self._watch_sight(dt_s, blind=any(servo.T_base_sensor is None for servo in servos))
+                if not any(servo.sidestepping for servo in servos):
+                    self._post("placed")
             case ServoState.RETRACT:
                 if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in servos):
                     self._post("retracted")
@@ -288,6 +368,43 @@ class ServoTask(MachineTask):
 
     def _moving_check(self) -> SensorCheck | None:
         return next((check for check in self._checks if not check.finished), None)
+
+    def _prepare(self) -> None:
+        """Take a zero frame, back off a little, and take another, unless the first motion changes the image."""
+        servos = self._servos
+        if not all(servo.has_fresh_data and servo.seq > self._zero_seq.get(servo.sensor, -1) for servo in servos):
+            # Until a frame has come after the zero frame, what is known still compares with what was before it.
+            return
+        match self._prepared:
+            case _Preparation.FIRST_ZERO:
+                if touching := next(
+                    (servo.sensor for servo in servos if not servo.has_zero and servo.in_contact), None
+                ):
+                    self._post("touching", f"{touching} is in contact before the approach: move it clear")
+                elif any(servo.has_zero for servo in servos):
+                    self._take_zero(_Preparation.BACK_OFF)
+                    for servo in servos:
+                        servo.reset_travel()
+                else:
+                    self._post("ready")
+            case _Preparation.BACK_OFF:
+                touching = next((servo.sensor for servo in servos if servo.change_since_zero > _START_CHANGE), None)
+                if touching is not None:
+                    self._post("touching", f"{touching} is in contact before the approach: move it clear")
+                elif all(s.travelled_m() >= 1e-3 * self._config.back_off_mm for s in servos if s.has_zero):
+                    self._prepared = _Preparation.STAND
+            case _Preparation.STAND:
+                # A frame that was exposed after the motion.
+                self._stood_s += self._period_s
+                if self._stood_s >= 1e-3 * max(servo.max_frame_age_ms for servo in servos) / 3.0:
+                    self._take_zero(_Preparation.READY)
+            case _Preparation.READY:
+                self._post("ready")
+
+    def _take_zero(self, then: _Preparation) -> None:
+        self._zero = frozenset(servo.sensor for servo in self._servos if servo.has_zero)
+        self._zero_seq = {servo.sensor: servo.seq for servo in self._servos}
+        self._prepared = then
 
     def _watch_contact(self, dt_s: float) -> None:
         for servo in self._servos:
@@ -315,6 +432,24 @@ class ServoTask(MachineTask):
             return [(servo, servo.along_z(speed_m_s)) for servo in self._servos if servo.T_base_sensor is not None]
         if state is ServoState.CHECK:
             return self._check_twists()
+        if state is ServoState.RETURN:
+            if not all(servo.has_fresh_data for servo in self._servos):
+                return []
+            return [(servo, servo.way_back(1e-3 * self._config.approach_speed_mm_s)) for servo in self._servos]
+        if state is ServoState.PREPARE:
+            speed_m_s = -1e-3 * self._config.approach_speed_mm_s
+            backing = self._prepared is _Preparation.BACK_OFF and all(servo.has_fresh_data for servo in self._servos)
+            return [(servo, servo.along_z(speed_m_s)) for servo in self._servos if backing and servo.has_zero]
+        if state is ServoState.SIDESTEP:
+            if any(servo.T_base_sensor is None for servo in self._servos):
+                return []
+            speed_m_s = 1e-3 * self._config.retract_speed_mm_s
+            return [
+                (servo, V)
+                for servo in self._servos
+                if (V := servo.step_aside(speed_m_s) if servo.sidestepping else servo.servo_step(np.zeros(6)))
+                is not None
+            ]
         if state not in (ServoState.APPROACH, ServoState.SETTLE, ServoState.RUN):
             return []
         searching = state is ServoState.APPROACH
@@ -325,12 +460,13 @@ class ServoTask(MachineTask):
         twists = []
         for servo in self._servos:
             V_tcp: Array | None
-            if searching and not servo.in_contact:
+            if searching and not servo.touches:
                 V_tcp = servo.along_z(1e-3 * self._config.approach_speed_mm_s)
             elif searching and self._unchecked and servo.is_estimated:
                 V_tcp = None
             else:
-                V_tcp = servo.servo_step(servo.run.feedforward if state is ServoState.RUN else np.zeros(6))
+                running = state is ServoState.RUN
+                V_tcp = servo.servo_step(servo.run.feedforward if running else np.zeros(6), running=running)
             if V_tcp is not None:
                 twists.append((servo, V_tcp))
         return twists

@@ -93,7 +93,8 @@ class CellModule(pytest.Module):
 def _rig_of(plan: CellPlan, device: DevicePlan) -> FixtureFactory:
     """Build a device fixture with no emulator and no ground truth."""
     from touchcell.cell.runtime.devices import build_devices
-    from touchcell.drivers.core.clock import MonotonicClock, VirtualClock
+    from touchcell.drivers.core.clock import VirtualClock
+    from touchcell.drivers.core.paced_clock import emulated_clock
     from touchcell.testing.emulation.rig import DeviceFixture
 
     def rig(folder: Path, address: int) -> DeviceFixture:
@@ -104,7 +105,7 @@ def _rig_of(plan: CellPlan, device: DevicePlan) -> FixtureFactory:
             energising=None,
             position=None,
             state_rate_hz=getattr(device.config, "rate_hz", None) or _scene_rate_hz(plan, device),
-            clock=VirtualClock if plan.cell.time == "simulated" else MonotonicClock,
+            clock=VirtualClock if plan.cell.time == "simulated" else emulated_clock,
             process=False,
         )
 
@@ -141,7 +142,12 @@ def rig_in(file: Path, plan: Callable[[], CellPlan], device: str, world: str) ->
             started = plan()
             return _rig_of(started, started.devices[device])(folder, address).build(clock)
 
-        return replace(found, build=build)
+        def clock() -> Clock:
+            # The emulators' time begins with them.
+            plan()
+            return found.clock()
+
+        return replace(found, build=build, clock=clock)
 
     return rig
 

@@ -43,6 +43,8 @@ class ScriptedArm(BusArm):
 
     def _switch_off(self) -> None: ...
 
+    def _reopen_bus(self) -> None: ...
+
     def _cycle(self, now_ns: int, dt_s: float, until_ns: int) -> None:
         self.cycles += 1
         if self.failure is not None:
@@ -99,7 +101,7 @@ def test_a_bus_that_returns_can_be_recovered_without_reconnecting(arm: ScriptedA
     arm.failure = DeviceGone("arm", "interface is down")
     arm.turn()
     assert arm.state is Lifecycle.FAULTED
-    with pytest.raises(DeviceGone):
+    with pytest.raises(TransportTimeout):
         arm.recover(OperatorToken("test", 0))
     arm.failure = None
     arm.turn()

@@ -18,7 +18,8 @@ from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_OK, EXIT_TASK_F
 from touchcell.cell.cli.output import say, warn
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.worlds import WorldName
-from touchcell.cell.recording.mcap import RECORDING, Recorder
+from touchcell.cell.recording.mcap import RECORDING
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.recording.reserved_file import ReservedFile
 from touchcell.cell.runtime.black_box import BlackBox, cause_record, keep_earlier, note_crashes, stop_record
 from touchcell.cell.runtime.cell import Cell
@@ -27,6 +28,7 @@ from touchcell.cell.runtime.heap import trim_heap
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.operator_channel import OperatorChannel
 from touchcell.cell.runtime.operator_input import stop_on_keys, stop_on_signals
+from touchcell.cell.runtime.run_description import describe_run, wall_clock_ns
 from touchcell.cell.runtime.run_directory import RunFolderError, run_directory
 from touchcell.cell.runtime.run_result import Outcome, Progress, RunResult
 from touchcell.cell.runtime.stop_request import StopRequest
@@ -192,7 +194,7 @@ def _running(cell: Cell, folder: Path, live: bool, result_file: ReservedFile) ->
     with (
         note_crashes(folder),
         BlackBox(folder, _about(cell, folder)) as box,
-        Recorder(folder / RECORDING) as recorder,
+        _recorder(folder, cell) as recorder,
         cell,
         stop_on_signals(stop),
         stop_on_keys(stop, channel=channel) as look_at_keys,
@@ -232,6 +234,13 @@ def _running(cell: Cell, folder: Path, live: bool, result_file: ReservedFile) ->
         yield run
     if explained:
         box.discard()
+
+
+@contextlib.contextmanager
+def _recorder(folder: Path, cell: Cell) -> Iterator[Recorder]:
+    with Recorder(folder / RECORDING, wall_offset_ns=wall_clock_ns() - cell.clock.now_ns()) as recorder:
+        describe_run(recorder, cell)
+        yield recorder
 
 
 def _about(cell: Cell, folder: Path) -> dict[str, Any]:

@@ -16,11 +16,18 @@ from touchcell.control.interlocks.config import build_interlocks
 from touchcell.control.interlocks.coverage import ArmFacts, CellFacts, SensorFacts
 from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.planning_scene import PlanningScene
+from touchcell.control.interlocks.readings import ReadingConfig
 from touchcell.control.interlocks.timers import TimedInterlock
 from touchcell.control.interlocks.violation import Severity
 from touchcell.control.proof import Proof, prove
 from touchcell.drivers.core.arm import LimitsConfig
-from touchcell.drivers.core.protocols import ExternalTorqueSource, ReadingSource, TwistSink, WrenchSource
+from touchcell.drivers.core.protocols import (
+    ExternalTorqueSource,
+    HealthSource,
+    ReadingSource,
+    TwistSink,
+    WrenchSource,
+)
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
@@ -94,7 +101,28 @@ def cell_facts(plan: CellPlan, scene: PlanningScene | None = None) -> CellFacts:
             for role, name in plan.auxiliary_roles.items()
             if ReadingSource in plan.auxiliaries[name].spec.capabilities.provides
         ),
+        _health_facts(plan),
     )
+
+
+def _health_facts(plan: CellPlan) -> dict[str, dict[str, float]]:
+    """Return the devices that report about themselves, each with a value within the limits of each limited reading."""
+    devices = {**plan.arms, **plan.sensors, **plan.auxiliaries}
+    sources = {HealthSource, ReadingSource}
+    found: dict[str, dict[str, float]] = {
+        name: {} for name, device in devices.items() if sources & device.spec.capabilities.provides
+    }
+    bounds: dict[tuple[str, str], list[tuple[float | None, float | None]]] = {}
+    for entry in plan.cell.interlocks.values():
+        if isinstance(entry, ReadingConfig):
+            bounds.setdefault((entry.device, entry.name), []).append(entry.bounds)
+    for (device, name), limits in bounds.items():
+        least = max((low for low, _ in limits if low is not None), default=None)
+        most = min((high for _, high in limits if high is not None), default=None)
+        if device in found:
+            within = [bound for bound in (least, most) if bound is not None]
+            found[device][name] = sum(within) / len(within)
+    return found
 
 
 def arm_roles(plan: CellPlan) -> dict[str, str]:

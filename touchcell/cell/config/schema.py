@@ -27,15 +27,16 @@ from touchcell.cell.config.cell_plan import (
     SensorSection,
 )
 from touchcell.cell.config.feasibility import unfeasible
-from touchcell.cell.config.input_files import with_input_files
+from touchcell.cell.config.input_files import with_input_files, with_paths
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
+from touchcell.cell.config.truth import SampledTruth, sample
 from touchcell.cell.config.worlds import WorldChanges, WorldName, world_changes
 from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile
 from touchcell.control.interlocks.boundary import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.drivers.core.arm import LimitsConfig
-from touchcell.drivers.core.protocols import JointSource, ReadingSource, protocol_names
+from touchcell.drivers.core.protocols import JointSource, ReadingSource, WrenchSource, protocol_names
 from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DRIVERS, AnyDriver, DriverConfig
 from touchcell.drivers.core.stand_in import STAND_INS, Placement
@@ -137,13 +138,15 @@ class _Planner:
         self._overrides = overrides
         self._settings = settings
         self._problems: list[ConfigError] = []
+        self._truth = SampledTruth()
 
     def plan(self) -> CellPlan:
         file = self._file
         if "data" in self._overrides and isinstance(collect := file.data.get("collect"), dict):
             collect["data"] = self._overrides["data"]
         cell = self._with_input_files(file.validate(CellFile, file.data), ())
-        self._require_scene_fits(cell)
+        cell = self._in_truth(cell)
+        cell = self._with_scenes(cell)
         task, task_config = self._task(cell)
         arm_roles = self._roles(cell, "arms", task.arms, cell.arms) if task else {}
         sensor_roles = self._roles(cell, "sensors", task.sensors, cell.sensors) if task else {}
@@ -168,6 +171,8 @@ class _Planner:
             self._require_collection(cell, task)
             self._require_protocols(task, "arms", task.arms, arm_roles, arms)
             self._require_protocols(task, "devices", task.devices, auxiliary_roles, others)
+            if task_config is not None:
+                self._require_forces(cell, task, task_config, arm_roles, arms)
             self._require_processes(cell, task, arm_roles)
             self._require_data_is_used(cell, {**arms, **sensors})
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
@@ -194,6 +199,7 @@ class _Planner:
             self._settings,
             auxiliaries,
             auxiliary_roles,
+            truth=self._truth.values,
         )
         if not self._to_run:
             return planned
@@ -201,13 +207,40 @@ class _Planner:
             raise InvalidCell(problems)
         return self._require_armed(planned)
 
-    def _require_scene_fits(self, cell: CellFile) -> None:
+    def _in_truth(self, cell: CellFile) -> CellFile:
+        """Return the cell with its scene as it truly is, and keep what is true of its devices."""
+        if cell.truth is None or cell.world in ("bench", "emulated"):
+            return cell
+        if cell.scene is None:
+            if cell.world is None and self._to_run:
+                self._add(("truth",), "only a simulated world has one, and there is no `scene:`", hint="leave it out")
+            return cell
+        for kind, known in (("arms", cell.arms), ("sensors", cell.sensors), ("objects", cell.scene.get("objects", {}))):
+            for name in getattr(cell.truth, kind):
+                if name not in known:
+                    hint = suggest(name, sorted(known))
+                    self._add(("truth", kind, name), f"there is no {name!r} in `{kind}:`", value=name, hint=hint)
+        self._truth = sample(cell.truth, cell.seed)
+        return cell.model_copy(update={"scene": self._truth.scene(cell.scene)})
+
+    def _with_truth(self, at: tuple[str, str], spec: AnyDriver, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a device's keys with those that are true in place of those that are told."""
+        true = self._truth.device(*at, given) if at[0] in ("arms", "sensors") else {}
+        for key in true.keys() - spec.config.model_fields.keys():
+            self._add(("truth", *at, key), f"{spec.name} has no {key!r}", hint="leave it out")
+        return {**given, **true}
+
+    def _with_scenes(self, cell: CellFile) -> CellFile:
+        """Return ``cell`` with its scenes checked, and the files that they name found."""
         if cell.world == "bench":
             self._require_nothing_simulated(cell)
-        if cell.scene is not None:
-            self._validated(scene_section(), cell.scene, ("scene",))
-        if cell.emulated_scene is not None:
-            self._validated(scene_section(), cell.emulated_scene, ("emulated_scene",))
+        found = {}
+        for key in ("scene", "emulated_scene"):
+            data = getattr(cell, key)
+            section = None if data is None else self._validated(scene_section(), data, (key,))
+            if section is not None:
+                found[key] = with_paths(data, section, self._with_input_files(section, (key,)))
+        return cell.model_copy(update=found)
 
     def _require_nothing_simulated(self, cell: CellFile) -> None:
         if cell.enabling_device == "simulated":
@@ -329,9 +362,14 @@ class _Planner:
             )
         fields = spec.config.model_fields
         settings = {key: value for key, value in {**shared, **self._overrides}.items() if key in fields}
-        config = self._validated(spec.config, {**(section.model_extra or {}), **settings}, at)
+        given = self._with_truth(at, spec, {**(section.model_extra or {}), **settings})
+        config = self._validated(spec.config, given, at)
         if config is None:
             return None
+        if cell.world == "bench" and (key := config.emulated_address()) is not None:
+            reason = "leads to an emulator on this machine, and the cell is to run on the bench"
+            hint = "give the device's own address, or run --on emulated"
+            self._add((*at, key), reason, value=getattr(config, key, None), hint=hint)
         if cell.reduced_speed:
             config = _at_reduced_speed(config)
         return DevicePlan(at[1], spec, self._with_input_files(config, at))
@@ -525,6 +563,29 @@ class _Planner:
                     value=devices[name].spec.name,
                     hint="choose another driver; `touchcell list` names all",
                 )
+
+    def _require_forces(
+        self,
+        cell: CellFile,
+        task: AnyTask,
+        config: TaskConfig,
+        names: Mapping[str, str],
+        arms: Mapping[str, DevicePlan],
+    ) -> None:
+        for role, key in task.needs_wrenches(config).items():
+            if cell.processes == "separate":
+                reason = f"{task.name} waits for {key}, which no other process passes on"
+                self._add(("processes",), reason, value=cell.processes, hint="leave out `processes:`")
+            name = names.get(role)
+            if name is None or name not in arms or WrenchSource in arms[name].spec.capabilities.provides:
+                continue
+            driver = arms[name].spec.name
+            self._add(
+                ("task",),
+                f"a step waits for {key}, but {driver} measures no force",
+                value=driver,
+                hint=f"use depth_mm or contact, or an arm with a force sensor for arms.{name}.driver",
+            )
 
     def _require_use_of_data(self, cell: CellFile, devices: Mapping[str, DevicePlan]) -> None:
         reads = any("data" in device.spec.config.model_fields for device in devices.values())

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import matplotlib
 
 matplotlib.use("Agg")
@@ -20,6 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from touchcell.cell.analysis.run_folder import Poses, RunFolder, object_poses, scene_time, sensor_poses, true_contacts
 from touchcell.cell.experiments.scenes import scene
 from touchcell.cell.recording.mcap import read
+from touchcell.cell.recording.recorded_images import recorded_images
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array, ImageArray
@@ -220,15 +219,12 @@ class _Stage:
 
 def _tactile(run: RunFolder, role: str) -> Images | None:
     """Return a function from scene time to a sensor's image; None where neither images nor contacts are known."""
-    topic = f"/sensors/{role}/image"
-    recorded = [message for message in read(run.path / "run.mcap") if message.topic == topic]
+    recorded = [image for image in recorded_images(read(run.path / "run.mcap")) if image.role == role]
     if recorded:
-        times_s = np.array([message.t_ns * 1e-9 for message in recorded])
+        times_s = np.array([image.t_ns * 1e-9 for image in recorded])
 
         def seen(t_s: float) -> ImageArray:
-            data = recorded[max(0, int(np.searchsorted(times_s, t_s, side="right")) - 1)].data["data"]
-            encoded = np.frombuffer(base64.b64decode(data), np.uint8)
-            return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE), np.uint8)
+            return recorded[max(0, int(np.searchsorted(times_s, t_s, side="right")) - 1)].image
 
         return seen
     if run.recording.series(f"/sensors/{role}/truth") is None:

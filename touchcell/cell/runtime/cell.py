@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.recording.dataset_writer import Collection
+from touchcell.cell.runtime.health import health_of
 from touchcell.cell.runtime.sensor import Sensor
 from touchcell.cell.runtime.watchdog import NullWatchdog, Watchdog
 from touchcell.control.supervisor import Supervisor
@@ -18,7 +19,11 @@ from touchcell.drivers.core.device import Device, Lifecycle
 from touchcell.drivers.core.enabling import EnablingDevice
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import StopCategory
+from touchcell.errors import ConfigError
 from touchcell.tasks.interface import Task
+
+_FIRST_READING_NS = 1_000_000_000
+_POLL_NS = 20_000_000
 
 if TYPE_CHECKING:
     from touchcell.drivers.core.scene import SceneTruth
@@ -39,11 +44,13 @@ class Cell:
         stop_categories: by which each arm stops when something is wrong, by role.
         holding: roles of arms that keep their power when another's fault stops them.
         watched_joints: roles of arms whose joint angles an interlock reads.
-        watched_wrenches, watched_torques: roles of arms whose wrench, or external torque, an interlock needs.
+        watched_wrenches, watched_torques: roles of arms whose wrench, or external torque, is needed.
+        watched_readings: names of devices and of the readings in their health that interlocks limit.
         enabling_device: operator input of a cell whose file names one.
         scene: what is simulated around the arms, as far as it can be looked into; None in a cell of real devices.
         collection: where labelled frames go, None where the task labels none.
         watchdog: stops the arms when the loop falls silent.
+        scene_start_ns: when the scene's own time began.
         require_armed: raises ConfigError unless every interlock trips on the faults that it guards against; called when
             all devices have answered and none is energised.
     """
@@ -62,16 +69,18 @@ class Cell:
     watched_joints: frozenset[str] = frozenset()
     watched_wrenches: frozenset[str] = frozenset()
     watched_torques: frozenset[str] = frozenset()
+    watched_readings: frozenset[tuple[str, str]] = frozenset()
     enabling_device: EnablingDevice | None = None
     scene: SceneTruth | None = None
     collection: Collection | None = None
     watchdog: Watchdog = field(default_factory=NullWatchdog)
     require_armed: Callable[[], None] = lambda: None
+    scene_start_ns: int = 0
     start_ns: int = 0
     _exit: ExitStack = field(default_factory=ExitStack, init=False)
 
     def __repr__(self) -> str:
-        devices = ", ".join(repr(device) for device in self._devices())
+        devices = ", ".join(repr(device) for device in self.devices())
         return f"<Cell {self.plan.cell.name!r}: task {self.task_name} in {self.task.state!r}, {devices}>"
 
     @property
@@ -92,7 +101,7 @@ class Cell:
     def __enter__(self) -> Self:
         with self._exit:
             self._exit.enter_context(self.watchdog)
-            for device in self._devices():
+            for device in self.devices():
                 self._exit.enter_context(device)
                 if device.state is Lifecycle.FAULTED:
                     raise DeviceError(
@@ -102,8 +111,9 @@ class Cell:
                     )
                 device.configure()
             self.require_armed()
+            self._require_readings()
             # Every device must answer before the first one is energised.
-            for device in self._devices():
+            for device in self.devices():
                 device.activate()
                 self._exit.callback(self._deactivate, device)
             self.watchdog.self_test()
@@ -116,11 +126,27 @@ class Cell:
     ) -> None:
         self._exit.close()
 
-    def _devices(self) -> list[Device]:
+    def devices(self) -> list[Device]:
+        """Every device of the cell, once."""
         unique = {
             id(device): device for device in [*self.arms.values(), *self.cameras.values(), *self.auxiliaries.values()]
         }
         return list(unique.values())
+
+    def _require_readings(self) -> None:
+        """Raise ConfigError for a limited reading that a device does not report within a second of being asked."""
+        devices = {device.name: device for device in self.devices()}
+        for name, reading in sorted(self.watched_readings):
+            deadline_ns = self.clock.now_ns() + _FIRST_READING_NS
+            while reading not in (health := health_of(devices[name])):
+                if self.clock.now_ns() >= deadline_ns:
+                    raise ConfigError(
+                        f"{name} reports no {reading!r}",
+                        file=str(self.plan.file),
+                        key="interlocks",
+                        hint=f"it reports {', '.join(sorted(health))}",
+                    )
+                self.clock.sleep_until_ns(self.clock.now_ns() + _POLL_NS)
 
     def _deactivate(self, device: Device) -> None:
         section = self.plan.cell.arms.get(device.name) or self.plan.cell.devices.get(device.name)

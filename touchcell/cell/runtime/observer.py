@@ -10,13 +10,14 @@ from functools import partial
 from typing import TypeVar
 
 from touchcell.cell.runtime.cell import Cell
+from touchcell.cell.runtime.health import HealthMonitor
 from touchcell.cell.runtime.sensor import Sensor
 from touchcell.cell.runtime.timing import CycleTimes
 from touchcell.control.interlocks.snapshot import ArmView, CellView, DeviceView, SensorView
 from touchcell.drivers.core.commands import Sent, TwistCommand
 from touchcell.drivers.core.errors import DeviceFault
 from touchcell.drivers.core.protocols import ReadingSource
-from touchcell.drivers.core.samples import JointState, Stamped, TcpState
+from touchcell.drivers.core.samples import Health, JointState, Stamped, TcpState
 from touchcell.errors import TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.finite import all_finite
@@ -36,12 +37,16 @@ class Reading:
         states: of the arms, by role.
         contacts: of the sensors that have seen a frame, by role.
         devices: of the other devices that are read, by role.
+        health: what devices have just reported about themselves, by name; most cycles have none.
+        wrenches: (6,) N and N m of the arms of which they are needed, by role.
     """
 
     now_ns: int
     states: Mapping[str, Stamped[TcpState]]
     contacts: Mapping[str, ContactEstimate]
     devices: Mapping[str, Stamped[Mapping[str, float]]] = field(default_factory=dict)
+    health: Mapping[str, Stamped[Health]] = field(default_factory=dict)
+    wrenches: Mapping[str, Stamped[Array]] = field(default_factory=dict)
 
 
 class Observer:
@@ -57,6 +62,8 @@ class Observer:
     def __init__(self, cell: Cell, times: CycleTimes) -> None:
         self._cell = cell
         self._times = times
+        self._watched = {device for device, _ in cell.watched_readings}
+        self._health = HealthMonitor(cell.devices(), cell.clock)
 
     @property
     def exhausted(self) -> bool:
@@ -75,6 +82,7 @@ class Observer:
         self._times.begin()
         started = time.perf_counter_ns()
         states = {role: call_driver(arm.name, arm.tcp) for role, arm in cell.arms.items()}
+        wrenches = {role: self._wrench(role) for role in cell.watched_wrenches}
         self._times.add("read arms", time.perf_counter_ns() - started)
         contacts = {}
         for role, sensor in cell.sensors.items():
@@ -87,8 +95,12 @@ class Observer:
                 raise device.fault
             if isinstance(device, ReadingSource):
                 devices[role] = call_driver(device.name, device.read)
+        started = time.perf_counter_ns()
+        health = self._health.read()
+        if health:
+            self._times.add("read health", time.perf_counter_ns() - started)
         # Only now: what a device's own thread brought in the meantime would seem to come from the future.
-        return Reading(cell.clock.now_ns(), states, contacts, devices)
+        return Reading(cell.clock.now_ns(), states, contacts, devices, health, wrenches)
 
     def view(
         self,
@@ -112,7 +124,7 @@ class Observer:
                     asked.twists.get(role),
                     sent.get(role),
                     self._joints(role),
-                    self._wrench(role),
+                    reading.wrenches.get(role),
                     self._external_torque(role),
                 )
                 for role, state in reading.states.items()
@@ -124,6 +136,7 @@ class Observer:
             devices={
                 role: DeviceView(reading.devices.get(role), asked.settings.get(role)) for role in cell.auxiliaries
             },
+            health={name: self._health.newest[name] for name in self._watched if name in self._health.newest},
         )
 
     def _device(self, sensor_role: str) -> str:
@@ -141,9 +154,9 @@ class Observer:
         arm = self._cell.arms[role]
         return call_driver(arm.name, arm.joints) if role in self._cell.watched_joints else None
 
-    def _wrench(self, role: str) -> Stamped[Array] | None:
+    def _wrench(self, role: str) -> Stamped[Array]:
         arm = self._cell.arms[role]
-        return call_driver(arm.name, arm.wrench) if role in self._cell.watched_wrenches else None
+        return call_driver(arm.name, arm.wrench)
 
     def _external_torque(self, role: str) -> Stamped[Array] | None:
         arm = self._cell.arms[role]

@@ -16,7 +16,7 @@ import numpy as np
 from touchcell.control.interlocks.planning_scene import PlanningScene
 from touchcell.control.interlocks.snapshot import ArmView, CellView, DeviceView, SensorView
 from touchcell.drivers.core.gate import TwistLimits
-from touchcell.drivers.core.samples import Stamped, TcpState
+from touchcell.drivers.core.samples import Health, Stamped, TcpState
 from touchcell.errors import suggest
 from touchcell.geometry.types import Array
 
@@ -90,6 +90,7 @@ class CellFacts:
         scene: where the arms stand and what they look like.
         enabling_device: True if an operator input holds the cell enabled.
         devices: roles of other devices that are read.
+        health: devices that report about themselves, by name, with healthy values of the readings that are limited.
     """
 
     period_s: float
@@ -99,6 +100,7 @@ class CellFacts:
     scene: PlanningScene = field(default_factory=PlanningScene)
     enabling_device: bool = False
     devices: Sequence[str] = ()
+    health: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def healthy(self, now_ns: int, task_state: str) -> CellView:
         """Return a snapshot with fresh data in which every arm is at rest and no sensor in contact."""
@@ -117,7 +119,10 @@ class CellFacts:
                 arm=sensor.arm,
             )
         devices = {role: DeviceView(Stamped({}, now_ns, now_ns)) for role in self.devices}
-        return CellView(now_ns, arms, sensors, task_state, devices=devices)
+        health: dict[str, Stamped[Health]] = {
+            name: Stamped(readings, now_ns, now_ns) for name, readings in self.health.items()
+        }
+        return CellView(now_ns, arms, sensors, task_state, devices=devices, health=health)
 
     def base(self, arm: str) -> Array:
         """Return the pose (4, 4) of an arm's base in the world."""
@@ -206,6 +211,13 @@ def with_reading(view: CellView, role: str, age_s: float = 0.0, **values: float)
     """Return ``view`` with named numbers that another device has read, ``age_s`` ago."""
     reading: Stamped[Mapping[str, float]] = Stamped(values, view.now_ns - round(1e9 * age_s), view.now_ns)
     return replace(view, devices={**view.devices, role: replace(view.devices[role], reading=reading)})
+
+
+def with_health(view: CellView, device: str, age_s: float = 0.0, **readings: float) -> CellView:
+    """Return ``view`` with changed readings of what a device reports about itself, ``age_s`` ago."""
+    before = view.health[device]
+    sample: Stamped[Health] = Stamped({**before.value, **readings}, view.now_ns - round(1e9 * age_s), before.seq)
+    return replace(view, health={**view.health, device: sample})
 
 
 def with_motion(view: CellView, role: str, T_base_tcp: Array | None = None, twist: Array | None = None) -> CellView:

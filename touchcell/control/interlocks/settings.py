@@ -42,6 +42,11 @@ class InterlockSettings(BaseModel):
         return frozenset()
 
     @property
+    def reads(self) -> frozenset[tuple[str, str]]:
+        """What it needs that devices report about themselves: names of devices and of their readings."""
+        return frozenset()
+
+    @property
     def level(self) -> Severity:
         """The severity as the interlocks use it."""
         return Severity[self.severity.upper()]

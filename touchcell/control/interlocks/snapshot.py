@@ -9,7 +9,7 @@ import numpy as np
 
 from touchcell.drivers.core.commands import Sent, TwistCommand, in_base_axes
 from touchcell.drivers.core.enabling import EnablingPosition
-from touchcell.drivers.core.samples import JointState, Stamped, TcpState
+from touchcell.drivers.core.samples import Health, JointState, Stamped, TcpState
 from touchcell.geometry.types import Array
 
 
@@ -101,7 +101,8 @@ class CellView:
     """Snapshot of the cell at ``now_ns``: arms, sensors and other devices by their role, and the task's state.
 
     ``at_work`` is False while a tripped run waits for an operator: then nothing is being pushed or held. ``enabling``
-    is the position of the enabling device, where the cell has one.
+    is the position of the enabling device, where the cell has one. ``health`` is what devices last reported about
+    themselves, by their name in the cell file, where a rule of the cell needs it.
     """
 
     now_ns: int
@@ -111,6 +112,7 @@ class CellView:
     at_work: bool = True
     enabling: Stamped[EnablingPosition] | None = None
     devices: Mapping[str, DeviceView] = field(default_factory=dict)
+    health: Mapping[str, Stamped[Health]] = field(default_factory=dict)
 
     def works_in(self, states: frozenset[str]) -> bool:
         """Return True if the task is at work, and in one of ``states`` if any are named."""

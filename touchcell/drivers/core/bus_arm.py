@@ -189,6 +189,10 @@ class BusArm(JointArm):
         """Close the bus; the loop has ended."""
 
     @abstractmethod
+    def _reopen_bus(self) -> None:
+        """Open the bus again, and see which motors are still enabled. The lock is held. Raises ConnectError."""
+
+    @abstractmethod
     def _cycle(self, now_ns: int, dt_s: float, until_ns: int) -> None:
         """Send setpoints ``dt_s`` after the previous ones and collect replies until ``until_ns``. The lock is held."""
 
@@ -223,8 +227,27 @@ class BusArm(JointArm):
         self._close_bus()
 
     def _require_loop(self) -> None:
-        if self._thread is None or not self._thread.is_alive() or self._lost_bus is not None:
-            raise DeviceGone(self.name, "lost connection to the bus", hint="disconnect and connect again")
+        if self._thread is None or not self._thread.is_alive():
+            raise DeviceGone(self.name, "its bus loop has ended", hint="disconnect and connect again")
+        if self._lost_bus is not None:
+            self._return_to_bus()
+
+    def _return_to_bus(self) -> None:
+        """Open the bus again after its adapter was unplugged; wait for a state of all joints. Raises DeviceError."""
+        with self._lock:
+            try:
+                self._reopen_bus()
+            except ConnectError as error:
+                what = error.message.removeprefix(f"{self.name}: ")
+                raise DeviceGone(self.name, f"has not returned: {what}", hint=error.hint) from error
+            self._missed.clear()
+            returned_ns = self._clock.now_ns()
+        deadline_ns = self._clock.now_ns() + round(_FIRST_SAMPLE_S * 1e9)
+        # The loop notes that a cycle has succeeded.
+        while self._lost_bus is not None or self._joints is None or self._joints.t_ns < returned_ns:
+            if self._clock.now_ns() >= deadline_ns:
+                raise TransportTimeout(self.name, "complete state", _FIRST_SAMPLE_S)
+            self._clock.sleep_until_ns(self._clock.now_ns() + 1_000_000)
 
     def _after_rest(self, policy: DeactivatePolicy) -> None:
         if policy is DeactivatePolicy.BRAKE:

@@ -25,12 +25,18 @@ CLASSES: Mapping[int, str] = MappingProxyType(
     }
 )
 
+COUNTERS_CHANGED = 0x200
 _PASSIVE = 0x30
 
 
 def describe(arbitration_id: int) -> str:
     """Return the error classes of an error frame as text."""
     return ", ".join(name for bit, name in CLASSES.items() if arbitration_id & bit) or "unspecified error"
+
+
+def counters(data: bytes) -> tuple[int, int]:
+    """Return the transmit and receive error counters of an error frame (data bytes 6 and 7); 0 where it has none."""
+    return (data[6], data[7]) if len(data) > 7 else (0, 0)
 
 
 def is_error_passive(arbitration_id: int, data: bytes) -> bool:

@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from touchcell.drivers.core.commands import TwistCommand, TwistFrame, read_only
+from touchcell.drivers.core.commands import TwistCommand, TwistFrame, is_immutable, read_only
 from touchcell.drivers.core.errors import CommandRejected, Rejection
 from touchcell.geometry.finite import all_finite
 from touchcell.geometry.types import Array
 
 _SIX = (6,)
+_FLOAT64 = np.dtype(np.float64)
 _REAL_KINDS = "fiu"
 
 
@@ -37,12 +38,13 @@ def finite_array(device: str, what: str, value: Any, shape: Sequence[int]) -> Ar
     Raises:
         CommandRejected: NON_FINITE or SHAPE, in that order.
     """
-    if type(value) is np.ndarray and value.dtype == np.float64 and value.shape == shape:
+    if type(value) is np.ndarray and value.dtype == _FLOAT64 and value.shape == shape:
         array = value
     else:
         array = _as_float64(device, what, value)
-    # From here on a copy: nobody can change it between check and use.
-    array = read_only(array)
+    # From here on in memory of its own: it cannot change between check and use.
+    if not is_immutable(array):
+        array = read_only(array)
     if not all_finite(array):
         raise CommandRejected(device, Rejection.NON_FINITE, f"{what} is not finite", value=array)
     if array.shape != tuple(shape):
@@ -97,4 +99,6 @@ def checked_twist_command(device: str, command: TwistCommand) -> TwistCommand:
     except TypeError:
         reason = f"time stamp {command.t_ns!r} is no whole number of nanoseconds"
         raise CommandRejected(device, Rejection.EXPIRED, reason, value=command.t_ns) from None
+    if twist is command.twist and t_ns is command.t_ns and ttl_s is command.ttl_s and type(command) is TwistCommand:
+        return command
     return TwistCommand(twist, command.frame, t_ns, ttl_s, command.t_cause_ns)

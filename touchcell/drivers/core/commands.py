@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Generic, TypeVar
+from typing import Final, Generic, TypeVar
 
 import numpy as np
 
@@ -23,8 +23,13 @@ class TwistFrame(Enum):
 
 def read_only(array: Array) -> Array:
     """A copy of ``array`` that cannot be written to, nor be made writeable."""
-    copy: Array = np.frombuffer(array.tobytes(), array.dtype).reshape(array.shape)
-    return copy
+    copy: Array = np.frombuffer(array.tobytes(), array.dtype)
+    return copy if array.ndim == 1 else copy.reshape(array.shape)
+
+
+def is_immutable(array: Array) -> bool:
+    """Whether ``array`` lies in memory that nothing can change, as the copies of ``read_only`` of one dimension do."""
+    return isinstance(array.base, bytes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +55,7 @@ class TwistCommand:
 
     def __post_init__(self) -> None:
         twist = self.twist
-        if type(twist) is np.ndarray and twist.flags.writeable and twist.dtype == np.float64:
+        if type(twist) is np.ndarray and not is_immutable(twist) and twist.dtype == _FLOAT64 and twist.flags.writeable:
             object.__setattr__(self, "twist", read_only(twist))
 
 
@@ -72,5 +77,9 @@ def in_base_axes(command: TwistCommand, T_base_tcp: Array) -> Array:
     """Return the command's twist along base axes, (6,), rotated by the orientation of the tool where needed."""
     if command.frame is TwistFrame.BASE:
         return command.twist
-    R = T_base_tcp[:3, :3]
-    return np.concatenate([R @ command.twist[:3], R @ command.twist[3:]])
+    # Both vectors at once.
+    turned: Array = (command.twist.reshape(2, 3) @ T_base_tcp[:3, :3].T).ravel()
+    return turned
+
+
+_FLOAT64: Final = np.dtype(np.float64)

@@ -66,6 +66,8 @@ class TwistGate:
     ) -> None:
         self._device = device
         self._limits = limits
+        self._accels = limits.accel_m_s2, limits.rot_accel_rad_s2
+        self._jerks = limits.jerk_m_s3, limits.rot_jerk_rad_s3
         self._desk = desk
         self._clock = clock
         self._max_ttl_s = max_ttl_s
@@ -103,7 +105,6 @@ class TwistGate:
         now_ns = self._clock.now_ns()
         command = self._checked(command, lease, state, now_ns)
         wanted, lost = follow(in_base_axes(command, T_base_tcp))
-        self._require_finite(wanted)
         adjustments = list(lost)
         if self._at_rest or now_ns > self._expires_ns:
             # After a silence longer than the time-to-live the arm stands: limit from rest. When the next command will
@@ -114,8 +115,8 @@ class TwistGate:
             dt_s = min(command.ttl_s, (now_ns - self._last_ns) * 1e-9)
         # A time-to-live may be as short as the smallest positive number, and is divided by.
         dt_s = max(dt_s, _SHORTEST_STEP_S)
-        limits, local = self._limits, joints()
-        wanted = _limited(wanted, limits.speed_m_s, limits.rot_speed_rad_s, adjustments)
+        local = joints()
+        wanted = self._limited(wanted, adjustments)
         if local is not None:
             wanted = _within(local, wanted, adjustments)
         step = self._step(wanted - self._last, dt_s, adjustments)
@@ -124,7 +125,7 @@ class TwistGate:
             step = share * step
             adjustments.extend(why)
         # Nothing that smoothes a motion may carry it over the limits that end it.
-        allowed = _limited(self._last + step, limits.speed_m_s, limits.rot_speed_rad_s, adjustments)
+        allowed = self._limited(self._last + step, adjustments)
         if local is not None:
             allowed = _within(local, allowed, adjustments)
         allowed = read_only(allowed)
@@ -143,8 +144,7 @@ class TwistGate:
         The acceleration points along the way, as large as allowed and as can still be taken off before the way ends; it
         changes by no more than the jerk allows.
         """
-        limits, last = self._limits, self._last_accel
-        accels, jerks = (limits.accel_m_s2, limits.rot_accel_rad_s2), (limits.jerk_m_s3, limits.rot_jerk_rad_s3)
+        last, accels, jerks = self._last_accel, self._accels, self._jerks
         lefts = _norms(way)
         rate = smooth = 1.0 / dt_s
         for name, left, most, jerk in zip(_PARTS, lefts, accels, jerks, strict=True):
@@ -165,7 +165,26 @@ class TwistGate:
                 share = min(share, jerk * dt_s / step)
         if share == 1.0 and min(rate, smooth) * dt_s == 1.0:
             return way
-        return (last + share * change) * dt_s
+        return (last + (change if share == 1.0 else share * change)) * dt_s
+
+    def _limited(self, twist: Array, adjustments: list[Adjustment]) -> Array:
+        """``twist`` scaled by one factor so that neither part exceeds its speed; CommandRejected if it is not finite.
+
+        One factor for both parts: scaling them apart would bend the motion of whatever sits on a lever, and a tactile
+        sensor that turns about its contact would be torn off it.
+        """
+        linear, angular = _norms(twist)
+        max_linear, max_angular = self._limits.speed_m_s, self._limits.rot_speed_rad_s
+        if linear <= max_linear and angular <= max_angular:
+            return twist
+        self._require_finite(twist)
+        scale = 1.0
+        for part, size, limit in (("linear", linear, max_linear), ("angular", angular, max_angular)):
+            if size > limit * _ROUNDING:
+                adjustments.append(Adjustment(f"tcp {part} speed", size, limit))
+            if size > limit:
+                scale = min(scale, limit / size)
+        return twist if scale == 1.0 else twist * scale
 
     def _checked(self, command: TwistCommand, lease: Lease, state: Lifecycle, now_ns: int) -> TwistCommand:
         """``command`` with values of its own, or the first reason to refuse it."""
@@ -191,8 +210,8 @@ class TwistGate:
         """Refuse what must not be sent, whatever has made it: a driver's ``follow``, its kinematics, or its limits."""
         linear, angular = _norms(twist)
         limits = self._limits
-        self._require_finite(twist)
         if not (linear <= limits.speed_m_s * _ROUNDING and angular <= limits.rot_speed_rad_s * _ROUNDING):
+            self._require_finite(twist)
             raise self._rejected(
                 Rejection.LIMIT,
                 f"the twist to be sent has {linear:g} m/s and {angular:g} rad/s, above the limits",
@@ -206,21 +225,6 @@ class TwistGate:
 
     def _rejected(self, reason: Rejection, message: str, value: object, limit: object = None) -> CommandRejected:
         return CommandRejected(self._device, reason, message, value=value, limit=limit)
-
-
-def _limited(twist: Array, max_linear: float, max_angular: float, adjustments: list[Adjustment]) -> Array:
-    """``twist`` scaled by one factor so that neither part exceeds its speed.
-
-    One factor for both parts: scaling them apart would bend the motion of whatever sits on a lever, and a tactile
-    sensor that turns about its contact would be torn off it.
-    """
-    scale = 1.0
-    for part, size, limit in zip(_PARTS, _norms(twist), (max_linear, max_angular), strict=True):
-        if size > limit * _ROUNDING:
-            adjustments.append(Adjustment(f"tcp {part} speed", size, limit))
-        if size > limit:
-            scale = min(scale, limit / size)
-    return twist if scale == 1.0 else twist * scale
 
 
 def _within(local: LocalIk, twist: Array, adjustments: list[Adjustment]) -> Array:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Generic, TypeVar
+from typing import Generic, TypeAlias, TypeVar
 
 from touchcell.geometry.types import Array, ImageArray
 
 T = TypeVar("T")
+Health: TypeAlias = Mapping[str, float | int | str | bool]
+"""What a device reports about itself: named readings, with units in the names."""
 
 
 class Quality(Enum):

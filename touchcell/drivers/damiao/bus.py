@@ -53,10 +53,12 @@ class Address:
 
 @dataclass(slots=True)
 class Counters(BusCounters):
-    """Message statistics, with the error frames of the CAN controller and failed reads of the adapter."""
+    """Message statistics, with failed reads of the adapter, error frames, and the error counters they last carried."""
 
     error_frames: int = 0
     not_received: int = 0
+    transmit_errors: int = 0
+    receive_errors: int = 0
 
 
 @dataclass(slots=True, eq=False)
@@ -117,6 +119,7 @@ class MotorBus:
         self._wanted_register: tuple[int, int, bool] | None = None
         self._replies: list[codec.RegisterReply] = []
         self._bus_off = False
+        self._passive = False
         self._fences: list[_Pending | None] = [None] * n
         self._fence_turns = [0] * n
         self.counters = Counters()
@@ -128,7 +131,9 @@ class MotorBus:
         """Return the controller state from python-can and error frames: active, passive, error or closed."""
         if self._bus is None:
             return "closed"
-        return "error" if self._bus_off else str(self._bus.state.name).lower()
+        if self._bus_off:
+            return "error"
+        return "passive" if self._passive else str(self._bus.state.name).lower()
 
     def open(self) -> None:
         """Open the bus and read the full scales of every motor; changes no settings.
@@ -310,7 +315,7 @@ class MotorBus:
         if message is None:
             return False
         if message.is_error_frame:
-            self._note_error(message.arbitration_id)
+            self._note_error(message.arbitration_id, bytes(message.data))
         elif not message.is_extended_id and not message.is_remote_frame:
             self._take(message.arbitration_id, bytes(message.data))
         return True
@@ -371,13 +376,16 @@ class MotorBus:
         self.counters.answered += 1
         self._newest[index] = Reply(feedback, queue.popleft().t_ns)
 
-    def _note_error(self, arbitration_id: int) -> None:
+    def _note_error(self, arbitration_id: int, data: bytes) -> None:
         self.counters.error_frames += 1
+        self.counters.transmit_errors, self.counters.receive_errors = can_errors.counters(data)
+        if arbitration_id & can_errors.CONTROLLER:
+            self._passive = can_errors.is_error_passive(arbitration_id, data)
         self.last_error = can_errors.describe(arbitration_id)
         if arbitration_id & can_errors.BUS_OFF:
             self._bus_off = True
         elif arbitration_id & can_errors.RESTARTED:
-            self._bus_off = False
+            self._bus_off = self._passive = False
 
     def _gone(self, error: Exception) -> DeviceGone:
         return DeviceGone(

@@ -11,18 +11,20 @@ position and disables itself after its own timeout. **An arm without brakes sink
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from touchcell.drivers.core.behaviour import ArmBehaviour
+from touchcell.drivers.core.bench_address import is_virtual_can
 from touchcell.drivers.core.bus_arm import BusArm, BusArmConfig
 from touchcell.drivers.core.bus_reply import Reply
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle, OperatorToken
+from touchcell.drivers.core.diagnosis import Finding, finding_of
 from touchcell.drivers.core.errors import (
     ConnectError,
     DeviceError,
@@ -46,6 +48,7 @@ from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.damiao import codec
 from touchcell.drivers.damiao.bus import TRIES, Address, MotorBus
 from touchcell.drivers.damiao.codec import Feedback, MitCommand, Register
+from touchcell.drivers.damiao.keeper_bus import KeeperBus
 from touchcell.drivers.kinematics.chain import GRAVITY_M_S2, ChainDescription, ChainFile, SerialChain, Vector3
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
@@ -54,7 +57,14 @@ _logger = logging.getLogger(__name__)
 
 _TURN_RAD = 2.0 * np.pi
 _MAX_BUS_LOAD = 0.8
+_PCAN_CLOCK_HZ = 80_000_000
+_SAMPLE_POINT_PERCENT = 80.0
 _PLAUSIBLE_JUMP_RAD = 0.1
+_ENABLE_TRIES = 3
+_WARM_C = 70
+_SHORTEST_QUEUE = 100
+_MODE_REPORTS = ("openarm_can 64", "dimos 1897")
+_SCALE_REPORTS = ("openarm_can 146",)
 # While one motor is asked, the others hear nothing: all tries together must not last as long as their watchdog.
 _ASKING_FRACTION = 0.75
 
@@ -104,6 +114,9 @@ class DamiaoCanConfig(BusArmConfig):
         gravity_m_s2: gravity along the axes of the arm's base, for compensation.
         motors: one for each joint, from the base.
         watchdog_s: silence after which a motor lets go by itself: the arm sinks.
+        keeper: a process of its own owns the bus; it holds the arm when this process dies, and lowers it slowly.
+        lower_after_s: time from the death of this process until the keeper begins to lower the arm.
+        lower_speed_mm_s: greatest speed of the tool while it does.
     """
 
     interface: str = "socketcan"
@@ -117,8 +130,16 @@ class DamiaoCanConfig(BusArmConfig):
     gravity_m_s2: Vector3 = GRAVITY_M_S2
     motors: tuple[MotorConfig, ...] = Field(min_length=1)
 
+    keeper: bool = False
+    lower_after_s: Annotated[float, Field(ge=0.0, le=60.0)] = 1.0
+    lower_speed_mm_s: Annotated[float, Field(gt=0.0, le=50.0)] = 40.0
+
     rate_hz: Annotated[float, Field(ge=50.0, le=1000.0)] = 250.0
     watchdog_s: Annotated[float, Field(ge=0.02, le=0.4)] = 0.1
+
+    def emulated_address(self) -> str | None:
+        """Return ``channel`` if it is a virtual bus of this machine."""
+        return "channel" if is_virtual_can(self.interface, self.channel) else None
 
     @property
     def joint_count(self) -> int:
@@ -166,6 +187,7 @@ class DamiaoCanArm(BusArm):
     """
 
     _config: DamiaoCanConfig
+    _keeper: KeeperBus | None
 
     def __init__(self, name: str, config: DamiaoCanConfig, clock: Clock) -> None:
         super().__init__(name, config, clock, SerialChain(config.describe(), config.tool, config.gravity_m_s2))
@@ -177,15 +199,24 @@ class DamiaoCanArm(BusArm):
         self._bus = MotorBus(
             name,
             addresses,
-            partial(open_bus, name, config),
+            self._connect,
             clock,
             max_silence_s=config.max_silence_s,
             answer_s=config.watchdog_s * _ASKING_FRACTION / TRIES,
             fd=config.fd,
         )
 
+    def _connect(self) -> Any:
+        if not self._config.keeper:
+            return open_bus(self.name, self._config)
+        settings = self._config.model_dump(mode="json")
+        keeper = KeeperBus(self.name, self._config.interface, self._config.channel, settings)
+        self._keeper = keeper
+        return keeper
+
     def _reset_state(self) -> None:
         super()._reset_state()
+        self._keeper = None
         self._answers: list[Reply[Feedback] | None] = [None] * len(self._config.motors)
         self._held: tuple[Array, Array] | None = None
         self._turns: Array | None = None
@@ -204,6 +235,7 @@ class DamiaoCanArm(BusArm):
             "bus_state": self._bus.state,
             "bus_error": self._bus.last_error,
             "bus_load": self._config.bus_load,
+            "keeper_pid": 0 if self._keeper is None else self._keeper.pid,
             "turns_added": "" if self._turns is None else " ".join(f"{turn / _TURN_RAD:.0f}" for turn in self._turns),
         }
         readings |= super().health()
@@ -214,6 +246,56 @@ class DamiaoCanArm(BusArm):
                 readings[f"{joint}_rotor_c"] = answer.state.rotor_c
         return readings
 
+    def diagnose(self) -> Iterator[Finding]:
+        """Yield what is wrong with motors, bus and adapter; reads registers only."""
+        with self._lock:
+            for index, motor in enumerate(self._config.motors):
+                for check in (self._check_mode, self._check_ranges):
+                    try:
+                        check(index)
+                    except ConfigError as error:
+                        yield finding_of(error, *(_MODE_REPORTS if check == self._check_mode else _SCALE_REPORTS))
+                if not self._bus.read(index, Register.TIMEOUT):
+                    what = f"motor {motor.esc_id} has no timeout: it would obey its last command for ever"
+                    yield Finding(
+                        what, "configure sets it until the next power cycle", ("lerobot 3178",), is_fault=False
+                    )
+        yield from self._diagnose_joints()
+        if self._bus.state != "active":
+            what = f"the CAN controller is {self._bus.state}; it reported: {self._bus.last_error or 'nothing'}"
+            yield Finding(what, "check wiring, termination and bit rates", ("CANopenNode 319", "yarp-devices 246"))
+        if self._bus.counters.not_sent:
+            what = f"the adapter refused {self._bus.counters.not_sent} frames: {self._bus.last_error}"
+            yield Finding(what, "sudo ip link set can0 txqueuelen 1000", ("python-can 1495", "python-can 2004"), False)
+        queue = _transmit_queue(self._config)
+        if queue is not None and queue < _SHORTEST_QUEUE:
+            what = f"the transmit queue of {self._config.channel} holds {queue} frames"
+            remedy = f"sudo ip link set {self._config.channel} txqueuelen 1000"
+            yield Finding(what, remedy, ("python-can 1495", "linux-can/can-utils 400"), is_fault=False)
+
+    def _diagnose_joints(self) -> Iterator[Finding]:
+        for motor, answer in zip(self._config.motors, self._answers, strict=True):
+            if answer is None:
+                continue
+            if (code := codec.fault(answer.state.status)) is not None:
+                yield Finding(f"motor {motor.esc_id}: {code.name}", code.hint, ("arx5-sdk 20",))
+            hottest_c = max(answer.state.mos_c, answer.state.rotor_c)
+            if hottest_c >= _WARM_C:
+                yield Finding(f"motor {motor.esc_id} is at {hottest_c} degrees Celsius", "let it cool down", (), False)
+        if self._turns is not None and self._turns.any():
+            joints = [name for name, turn in zip(self._chain.joint_names, self._turns, strict=True) if turn]
+            what = f"powered up one turn off, and corrected: {', '.join(joints)}"
+            yield Finding(what, "nothing to do", ("axol 208", "i2rt 82"), is_fault=False)
+        if self._joints is not None:
+            q = self._joints.value.q
+            for joint in np.flatnonzero((q < self._chain.lower) | (q > self._chain.upper)):
+                what = (
+                    f"joint {self._chain.joint_names[joint]} is at {np.rad2deg(q[joint]):.0f} deg, outside its limits"
+                )
+                yield Finding(
+                    what, "move it back by hand; only if its angle is wrong, correct offset_deg", ("axol 208",)
+                )
+
     def _open_bus(self) -> None:
         self._bus.open()
 
@@ -221,16 +303,19 @@ class DamiaoCanArm(BusArm):
         self._switch_off()
         self._bus.close()
 
+    def _reopen_bus(self) -> None:
+        self._bus.close()
+        self._bus.open()
+        # What they held is over: motors disable themselves when they hear nothing, and may have lost their power.
+        self._answers = [None] * len(self._answers)
+        self._turns = None
+        states = self._exchange([None] * len(self._answers))
+        self._enabled = [each is not None and each.state.status == codec.ENABLED for each in states]
+
     def _configure(self) -> None:
         with self._lock:
-            for index, motor in enumerate(self._config.motors):
-                if (mode := self._bus.read(index, Register.CTRL_MODE)) != codec.MIT_MODE:
-                    raise ConfigError(
-                        f"motor {motor.esc_id} is in control mode {mode}, not MIT (1)",
-                        key="motors",
-                        value=mode,
-                        hint="set register 10 to 1 with the manufacturer's tool; a driver does not change modes",
-                    )
+            for index in range(len(self._config.motors)):
+                self._check_mode(index)
                 self._check_ranges(index)
                 self._set_watchdog(index)
 
@@ -251,6 +336,8 @@ class DamiaoCanArm(BusArm):
                 )
             for index in range(len(self._enabled)):
                 self._check_watchdog(index, int(self._bus.read(index, Register.TIMEOUT)))
+            if self._keeper is not None:
+                self._keeper.tell_offsets(self._offset)
             if all(self._enabled):
                 return
             # Motors that are enabled already keep their setpoint, whatever load makes them sag.
@@ -278,6 +365,15 @@ class DamiaoCanArm(BusArm):
         if answer is None or (self._clock.now_ns() - answer.t_ns) * 1e-9 > limit_s:
             raise TransportTimeout(self.name, f"reply of motor {self._config.motors[index].esc_id}", limit_s)
         return answer
+
+    def _check_mode(self, index: int) -> None:
+        if (mode := self._bus.read(index, Register.CTRL_MODE)) != codec.MIT_MODE:
+            raise ConfigError(
+                f"motor {self._config.motors[index].esc_id} is in control mode {mode}, not MIT (1)",
+                key="motors",
+                value=mode,
+                hint="set register 10 to 1 with the manufacturer's tool; a driver does not change modes",
+            )
 
     def _check_ranges(self, index: int) -> None:
         motor, ranges = self._config.motors[index], self._bus.ranges(index)
@@ -322,20 +418,39 @@ class DamiaoCanArm(BusArm):
             )
 
     def _enable(self, indices: list[int]) -> None:
-        """Enable these motors at the setpoint; if one fails, disable all of them."""
+        """Enable these motors at the setpoint, all at once; if one fails, disable all of them."""
         frames = self._frames(self._setpoint.q, np.zeros_like(self._setpoint.q))
+        waiting = list(indices)
         try:
-            for index in indices:
-                self._enabled[index] = True
-                self._bus.command(index, codec.ENABLE)
-                # A motor enabled without gains is limp: send its setpoint before the next one is enabled.
-                status = self._bus.command(index, frames[index]).status
-                if status != codec.ENABLED:
-                    code = codec.fault(status) or _DOES_NOT_ENABLE
-                    raise _motor_fault(self.name, self._config.motors[index].esc_id, status, code)
+            # Some motors do not take the first command to enable (openarm issue 471).
+            for _ in range(_ENABLE_TRIES):
+                self._exchange([codec.ENABLE if i in waiting else self._own(frames, i) for i in range(len(frames))])
+                for index in waiting:
+                    self._enabled[index] = True
+                # A motor enabled without gains is limp until it has its setpoint.
+                answers = self._exchange([self._own(frames, i) for i in range(len(frames))])
+                waiting = [index for index in waiting if not self._is_enabled(index, answers[index])]
+                if not waiting:
+                    return
+            raise _motor_fault(self.name, self._config.motors[waiting[0]].esc_id, codec.DISABLED, _DOES_NOT_ENABLE)
         except DeviceError:
             self._disable(indices)
             raise
+
+    def _own(self, frames: Sequence[bytes], index: int) -> bytes | None:
+        return frames[index] if self._enabled[index] else None
+
+    def _is_enabled(self, index: int, answer: Reply[Feedback] | None) -> bool:
+        """Return whether a motor that was enabled reports so. Raises DeviceFault for one that reports a fault."""
+        status = codec.DISABLED if answer is None else answer.state.status
+        if (code := codec.fault(status)) is not None:
+            raise _motor_fault(self.name, self._config.motors[index].esc_id, status, code)
+        return status == codec.ENABLED
+
+    def _exchange(self, frames: Sequence[bytes | None]) -> list[Reply[Feedback] | None]:
+        """Send every motor a frame, or ask it for its state, and wait for all replies, outside the loop."""
+        wait_s = self._config.watchdog_s * _ASKING_FRACTION / TRIES
+        return self._bus.exchange(frames, self._clock.now_ns() + round(wait_s * 1e9))
 
     def _switch_off(self) -> None:
         self._disable(range(len(self._enabled)))
@@ -471,6 +586,16 @@ class DamiaoCanArm(BusArm):
                     self._check_watchdog(index, ticks)
 
 
+def _transmit_queue(config: DamiaoCanConfig) -> int | None:
+    """Return the length of the kernel's transmit queue, or None where there is none."""
+    if config.interface != "socketcan":
+        return None
+    try:
+        return int(Path(f"/sys/class/net/{config.channel}/tx_queue_len").read_text())
+    except (OSError, ValueError):
+        return None
+
+
 def open_bus(device: str, config: DamiaoCanConfig) -> Any:
     """Open the python-can bus of ``config`` at its bit rates. Raises ConnectError."""
     import can
@@ -481,8 +606,14 @@ def open_bus(device: str, config: DamiaoCanConfig) -> Any:
     if config.fd and not is_kernels:
         rates["data_bitrate"] = config.data_bitrate
     options: dict[str, Any] = rates | config.bus_options
+    channel: str | int = config.channel
+    if config.interface == "gs_usb" and config.channel.isdigit():
+        # python-can takes the number of the adapter.
+        channel = int(config.channel)
+    if config.interface == "pcan":
+        _complete_pcan(device, config, options)
     try:
-        bus = can.Bus(interface=config.interface, channel=config.channel, fd=config.fd, **options)
+        bus = can.Bus(interface=config.interface, channel=channel, fd=config.fd, **options)
     except (can.CanError, OSError, ValueError, TypeError) as error:
         raise ConnectError(
             device,
@@ -497,6 +628,24 @@ def open_bus(device: str, config: DamiaoCanConfig) -> Any:
             device, f"{config.interface} does not send CAN FD frames", hint="set fd: false, or use another adapter"
         )
     return bus
+
+
+def _complete_pcan(device: str, config: DamiaoCanConfig, options: dict[str, Any]) -> None:
+    """Check the bit rate of a PCAN adapter, for which python-can silently takes 500 kbit/s; give FD its timing."""
+    import can
+    from can.interfaces.pcan.basic import PCAN_BITRATES
+
+    if config.fd and not {"timing", "f_clock", "f_clock_mhz"} & options.keys():
+        options["timing"] = can.BitTimingFd.from_sample_point(
+            f_clock=_PCAN_CLOCK_HZ,
+            nom_bitrate=config.bitrate,
+            nom_sample_point=_SAMPLE_POINT_PERCENT,
+            data_bitrate=config.data_bitrate,
+            data_sample_point=_SAMPLE_POINT_PERCENT,
+        )
+    elif not config.fd and config.bitrate not in PCAN_BITRATES:
+        known = ", ".join(map(str, sorted(PCAN_BITRATES)))
+        raise ConnectError(device, f"a PCAN adapter has no bit rate of {config.bitrate}", hint=f"one of {known}")
 
 
 def _motor_fault(device: str, esc_id: int, status: int, code: codec.StatusCode) -> DeviceFault:

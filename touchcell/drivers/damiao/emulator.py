@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import errno
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -31,6 +32,8 @@ _TICK_S = 2e-3
 _GRAVITY_EVERY = 8
 _ROOM_TEMPERATURE_C = 35.0
 _OVER_TEMPERATURE_C = 100.0
+# Details in an error frame (linux/can/error.h).
+_NO_ACKNOWLEDGEMENT, _PASSIVE_BOTH = 0x020, 0x30
 
 MODELS: Mapping[str, codec.Ranges] = {
     "4310": codec.Ranges(12.5, 30.0, 10.0),
@@ -76,6 +79,16 @@ class Motor:
         }
 
     @property
+    def scale(self) -> codec.Ranges:
+        """Full scales of its frames, from its registers."""
+        registers = self.registers
+        return codec.Ranges(
+            float(registers[codec.Register.PMAX]),
+            float(registers[codec.Register.VMAX]),
+            float(registers[codec.Register.TMAX]),
+        )
+
+    @property
     def timeout_s(self) -> float:
         """Longest silence while enabled, s; 0 is off."""
         return float(self.registers[codec.Register.TIMEOUT]) * codec.TIMEOUT_TICK_S
@@ -110,6 +123,18 @@ class DamiaoArm(Emulator):
         "tx_full": "the adapter's transmit queue refuses this many frames of the host",
         "push": "[motor index, N m]: external torque on that joint",
         "refuse": "this motor (index from 0) does not enable",
+        "enobufs": "the interface's queue is full (ENOBUFS) for this many frames of the host",
+        "net_down": "the interface is down for this many seconds (ENETDOWN)",
+        "id_clash": "[motor index, other index]: the second motor has the ids of the first; their replies collide",
+        "wrong_rate": "the motors listen at another bit rate: nothing is acknowledged",
+        "registers": "[motor index, register, value]: overwrite a register of that motor",
+        "deaf": "[motor index, count]: it ignores this many commands to enable",
+        "error_passive": "the controller is error-passive, with [transmit, receive] error counters",
+        "chatter": "another node sends this many frames every 2 ms",
+        "echo": "the adapter returns the host's own frames",
+        "stray_registers": "this many replies are preceded by one to another host's register write",
+        "disable": "another host disables this motor (index)",
+        "spike": "this many replies have a position at the end of the scale",
         "turn_off": "[motor index, turns]: the motor powered up with its angle that many whole turns off",
         "nan": "the full-scale registers read as NaN",
         "restart": "the motors lose power for a moment",
@@ -163,6 +188,7 @@ class DamiaoArm(Emulator):
         """Open the hub and start the simulated time."""
         self._start_s = self._now_s()
         self._hub.open()
+        self.publish_joints(self._q)
         self._ticker = asyncio.create_task(self._tick())
 
     async def stop(self) -> None:
@@ -210,6 +236,21 @@ class DamiaoArm(Emulator):
         elif fault == "tx_full":
             self._hub.fill_transmit_queues(int(value))
             del self.active[fault]
+        elif fault == "enobufs":
+            self._hub.fill_transmit_queues(int(value), errno.ENOBUFS)
+            del self.active[fault]
+        elif fault == "net_down":
+            self._hub.take_down(float(value))
+            del self.active[fault]
+        elif fault == "registers":
+            index, register, number = value
+            self.motors[index].registers[register] = number
+            del self.active[fault]
+        elif fault == "disable":
+            self.motors[int(value)].status = codec.DISABLED
+            del self.active[fault]
+        elif fault == "error_passive":
+            self._hub.send(_error_frame(can_errors.CONTROLLER | can_errors.COUNTERS_CHANGED, passive=value))
         elif fault == "fault_bits":
             index, status = value
             self._let_go(self.motors[index], status)
@@ -244,6 +285,9 @@ class DamiaoArm(Emulator):
             self._hub.drain()
             self._check_timeouts()
             self._integrate()
+            for _ in range(int(self.active.get("chatter", 0))):
+                self._hub.send(can.Message(arbitration_id=0x7FF, is_extended_id=False, data=bytes(8)))
+            self.publish_joints(self._q)
 
     def _check_timeouts(self) -> None:
         now_s = self._now_s()
@@ -287,6 +331,11 @@ class DamiaoArm(Emulator):
     def _on_frame(self, message: can.Message) -> None:
         if "bus_off" in self.active or message.is_error_frame or message.is_extended_id:
             return
+        if "wrong_rate" in self.active:
+            self._hub.send(_error_frame(can_errors.BUS_ERROR | _NO_ACKNOWLEDGEMENT))
+            return
+        if "echo" in self.active:
+            self._hub.send(message)
         if "pause" in self.active or message.is_remote_frame or len(message.data) != 8:
             return
         data = bytes(message.data)
@@ -294,23 +343,36 @@ class DamiaoArm(Emulator):
         parameter = number == codec.PARAMETER_ID
         if parameter:
             number = codec.decode_parameter_request(data)[0]
+        first, second = self.active.get("id_clash", (-1, -1))
         for index, motor in enumerate(self.motors):
-            if motor.esc_id == number and self.active.get("silent") != index:
+            if index in (first, second):
+                if number == self.motors[first].esc_id and index == first:
+                    # Both reply with one id and different data: bit errors, until both controllers are off the bus.
+                    self._hub.send(_error_frame(can_errors.BUS_ERROR))
+                continue
+            if number == self._esc_id(motor) and self.active.get("silent") != index:
                 self._integrate()
                 motor.heard_s = self._now_s()
                 answer = self._on_parameter(index, data) if parameter else self._on_command(index, data)
                 if answer is not None:
                     self._reply(index, answer, message)
 
-    def _on_command(self, index: int, data: bytes) -> bytes:
+    @staticmethod
+    def _esc_id(motor: Motor) -> int:
+        return int(motor.registers[codec.Register.ESC_ID])
+
+    def _on_command(self, index: int, data: bytes) -> bytes | None:
         motor = self.motors[index]
+        if motor.registers[codec.Register.CTRL_MODE] != codec.MIT_MODE and data[:7] != codec.ENABLE[:7]:
+            # In the other modes a motor listens to other ids (0x100 + id and so on), and not to this one.
+            return None
         self._last_command_s = self._now_s()
         self._commands += 1
         if data[:7] == codec.ENABLE[:7] and data[7] >= codec.CLEAR_ERROR[7]:
             self._energising += 1
             self._on_special(index, data)
         elif motor.status == codec.ENABLED:
-            command = codec.decode_mit(data, motor.ranges)
+            command = codec.decode_mit(data, motor.scale)
             motor.command = replace(command, q=command.q - self._turned(index))
             self._onset.note(index, data[:5])
         return self._feedback(index)
@@ -318,6 +380,10 @@ class DamiaoArm(Emulator):
     def _on_special(self, index: int, data: bytes) -> None:
         motor = self.motors[index]
         if data == codec.ENABLE and self.active.get("refuse") == index:
+            return
+        deaf, left = self.active.get("deaf", (-1, 0))
+        if data == codec.ENABLE and deaf == index and left > 0:
+            self.active["deaf"] = [index, left - 1]
             return
         if data == codec.ENABLE and motor.status in (codec.DISABLED, codec.ENABLED):
             motor.status = codec.ENABLED
@@ -353,11 +419,13 @@ class DamiaoArm(Emulator):
         return codec.encode_register_reply(motor.esc_id, register, value, write=operation == 0x55)
 
     def _feedback(self, index: int) -> bytes:
-        motor, ranges = self.motors[index], self.motors[index].ranges
+        motor, ranges = self.motors[index], self.motors[index].scale
         shown = codec.Feedback(
             motor=motor.esc_id & 0xF,
             status=motor.status,
-            q=_within(self._q[index] + self._turned(index), ranges.position_rad),
+            q=ranges.position_rad
+            if self.spend("spike")
+            else _within(self._q[index] + self._turned(index), ranges.position_rad),
             dq=_within(self._dq[index], ranges.velocity_rad_s),
             tau=_within(self._tau[index], ranges.torque_n_m),
             mos_c=33,
@@ -376,8 +444,17 @@ class DamiaoArm(Emulator):
             data = bytes(byte ^ 0xFF for byte in data)
         elif self.spend("foreign"):
             data = bytes([data[0] & 0xF0 | (data[0] + 1) & 0xF]) + data[1:]
+        if self.spend("stray_registers"):
+            esc_id = self.motors[index].esc_id
+            self._hub.send(
+                can.Message(
+                    arbitration_id=self.motors[index].mst_id,
+                    is_extended_id=False,
+                    data=codec.encode_register_reply(esc_id, codec.Register.CTRL_MODE, codec.MIT_MODE, write=True),
+                )
+            )
         answer = can.Message(
-            arbitration_id=self.motors[index].mst_id,
+            arbitration_id=int(self.motors[index].registers[codec.Register.MST_ID]),
             is_extended_id=False,
             data=data,
             is_fd=request.is_fd,
@@ -420,5 +497,6 @@ def _within(value: float, limit: float) -> float:
     return min(max(float(value), -limit), limit)
 
 
-def _error_frame(error_class: int) -> can.Message:
-    return can.Message(arbitration_id=error_class, is_error_frame=True, is_extended_id=False, dlc=8, data=bytes(8))
+def _error_frame(error_class: int, passive: Sequence[int] | None = None) -> can.Message:
+    data = bytes(8) if passive is None else bytes([0, _PASSIVE_BOTH, 0, 0, 0, 0, *passive])
+    return can.Message(arbitration_id=error_class, is_error_frame=True, is_extended_id=False, dlc=8, data=data)

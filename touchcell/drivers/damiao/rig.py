@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from touchcell.drivers.damiao import driver as damiao_can
-from touchcell.testing.emulation.in_cell import EmulatedDriver, start_arguments, tcp_of_state
+from touchcell.testing.emulation.in_cell import EmulatedDriver, start_arguments, tcp_of_joints
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
@@ -49,6 +49,7 @@ def rig(folder: Path, address: int) -> DeviceFixture:
         start=start,
         build=lambda clock: damiao_can.DamiaoCanArm("arm", config(channel), clock),
         config=config(channel),
+        configured=lambda other, clock: damiao_can.DamiaoCanArm("arm", other, clock),
         state_rate_hz=125.0,
         pose="T_base_tcp",
         reset="reset",
@@ -96,4 +97,4 @@ def _start(config: damiao_can.DamiaoCanConfig, start_deg: Sequence[float] | None
     )
 
 
-EMULATED = EmulatedDriver("damiao_can", _settings, _start, tcp_of_state)
+EMULATED = EmulatedDriver("damiao_can", _settings, _start, tcp_of_joints)

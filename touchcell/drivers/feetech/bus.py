@@ -93,6 +93,11 @@ class ServoBus:
                 self._port.close()
                 self._port = None
 
+    @property
+    def firmware(self) -> str:
+        """Versions of the servos' firmware, each once."""
+        return ", ".join(sorted({identity.firmware for identity in self._identities.values()}))
+
     def identity(self, servo: int) -> Identity:
         """Return the identity read when the line was opened."""
         return self._identities[servo]

@@ -121,6 +121,7 @@ class Identity:
         multi_turn: whether it counts turns instead of wrapping at 4096.
         speed_unit_ticks_s: one unit of its speeds.
         homing_offset_ticks: offset subtracted from the encoder.
+        firmware: version.
     """
 
     model: int
@@ -133,6 +134,7 @@ class Identity:
     speed_unit_ticks_s: int
     homing_offset_ticks: int
     mode: int
+    firmware: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -308,6 +310,7 @@ def decode_identity(data: bytes) -> Identity:
         speed_unit_ticks_s=1 if phase & 0x04 else 50,
         homing_offset_ticks=from_signed_word(data[Register.HOMING_OFFSET : Register.HOMING_OFFSET + 2], 11),
         mode=data[Register.MODE],
+        firmware=f"{data[Register.FIRMWARE]}.{data[Register.FIRMWARE + 1]}",
     )
 
 

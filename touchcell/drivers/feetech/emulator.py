@@ -9,8 +9,10 @@ real brown-out lets an arm sink.
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import os
 import pty
+import struct
 import tty
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -32,6 +34,13 @@ _FACTORY_TORQUE = 1000
 _MIDDLE = 2048
 _CALIBRATE_HERE = 128
 _LOG_LENGTH = 64
+_WHEEL_MODE = 1
+_ALL = -1
+_STRAY = b"\x00"
+# Register 6, by its value (Feetech, "SMS/STS series memory table").
+_BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
+_TCGETS2 = 0x802C542A
+_TERMIOS2 = struct.Struct("=4IB19s2I")
 _EEPROM_LENGTH = 40
 _TABLE_LENGTH = 128
 _GOAL_SPEED = 46
@@ -156,6 +165,9 @@ class Servo:
 
     def step(self, dt_s: float) -> None:
         """Advance by ``dt_s``."""
+        if self._table[Register.MODE] == _WHEEL_MODE:
+            self._turn_freely(dt_s)
+            return
         lowest, highest = (int.from_bytes(self.get(r, 2), "little") for r in (Register.MIN_TICKS, Register.MAX_TICKS))
         left = min(max(self.goal, lowest), highest) - self.position
         speed = codec.from_signed_word(self.get(_GOAL_SPEED, 2)) or _FASTEST_TICKS_S
@@ -168,6 +180,14 @@ class Servo:
         self.put(Register.LOAD, codec.signed_word(round(np.sign(left) * 950) if strained else 0, 10))
         if self._strained_s > self._table[Register.PROTECTION_TIME] * 0.01:
             self.status |= _OVERLOAD
+        self._measure()
+
+    def _turn_freely(self, dt_s: float) -> None:
+        """Advance in wheel mode, in which the goal speed is signed and the goal position is ignored."""
+        speed = codec.from_signed_word(self.get(_GOAL_SPEED, 2))
+        turns = self.torque and not self.status & _OVERLOAD and not self.blocked
+        self.velocity = float(np.clip(speed, -_FASTEST_TICKS_S, _FASTEST_TICKS_S)) if turns else 0.0
+        self.encoder += self.velocity * dt_s
         self._measure()
 
     def _measure(self) -> None:
@@ -201,6 +221,13 @@ class FeetechArm(Emulator):
         "out_of_order": "this many replies are overtaken by the same servo's next one",
         "foreign": "this many replies carry an id that was not requested",
         "unplug": "the adapter vanishes",
+        "noise": "this many replies are preceded by a stray byte",
+        "id_clash": "[servo index, other index]: the second servo has the id of the first; their replies collide",
+        "baud": "[servo index, code of register 6]: it listens at that baud rate only; index -1 for all",
+        "voltage": "[servo index, V]: measured voltage",
+        "temperature": "[servo index, degrees Celsius]: measured temperature",
+        "busy": "another program holds the port",
+        "adapter_echo": "the adapter echoes transmitted bytes",
         "fault_bits": "[servo index, status bits]: the servo reports them; bits 3 and 5 until its torque is off",
         "turn_off": "this servo (index) reports its position one turn lower, below 0, as after a homing offset",
         "block": "this servo (index) cannot turn",
@@ -232,6 +259,7 @@ class FeetechArm(Emulator):
         self._protection_time_s = protection_time_s
         self._master: int | None = None
         self._slave: int | None = None
+        self._rival: int | None = None
         self._ticker: asyncio.Task[None] | None = None
         self._reset()
 
@@ -253,6 +281,7 @@ class FeetechArm(Emulator):
     async def start(self) -> None:
         """Open the pseudo-terminal and start the simulated time."""
         self._plug_in()
+        self.publish_joints(self._q())
         self._ticker = asyncio.create_task(self._tick())
 
     async def stop(self) -> None:
@@ -291,6 +320,14 @@ class FeetechArm(Emulator):
         """Apply faults that act at once."""
         if fault == "unplug":
             self._unplug()
+        elif fault == "busy":
+            self._hold_port()
+        elif fault == "voltage":
+            index, volts = value
+            self.servos[index].put(Register.VOLTAGE, bytes([round(10.0 * volts)]))
+        elif fault == "temperature":
+            index, celsius = value
+            self.servos[index].put(Register.TEMPERATURE, bytes([round(celsius)]))
         elif fault == "fault_bits":
             index, bits = value
             self.servos[index].status |= bits
@@ -319,6 +356,8 @@ class FeetechArm(Emulator):
         """Reconnect the adapter, unblock the servos, and end the faults that are not latched."""
         if fault == "unplug" and self._master is None:
             self._plug_in()
+        elif fault == "busy":
+            self._release_port()
         elif fault == "block":
             for servo in self.servos:
                 servo.blocked = False
@@ -337,7 +376,33 @@ class FeetechArm(Emulator):
         self._link.symlink_to(os.ttyname(self._slave))
         asyncio.get_running_loop().add_reader(self._master, self._on_bytes)
 
+    def _hold_port(self) -> None:
+        if self._slave is not None and self._rival is None:
+            self._rival = os.open(os.ttyname(self._slave), os.O_RDWR | os.O_NOCTTY)
+            fcntl.flock(self._rival, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    def _release_port(self) -> None:
+        if self._rival is not None:
+            os.close(self._rival)
+            self._rival = None
+
+    def _host_baud(self) -> int:
+        """Return the baud rate that the client has set."""
+        assert self._master is not None
+        # struct termios2 (asm-generic/termbits.h) also has the rates without a constant, such as 76800.
+        settings = fcntl.ioctl(self._master, _TCGETS2, bytes(_TERMIOS2.size))
+        return int(_TERMIOS2.unpack(settings)[-1])
+
+    def _hears(self, index: int) -> bool:
+        servo, rate = self.active.get("baud", (None, 0))
+        if self.active.get("silent") == index:
+            return False
+        if servo not in (index, _ALL):
+            rate = self.servos[index].get(Register.BAUD_RATE, 1)[0]
+        return rate < len(_BAUD_RATES) and _BAUD_RATES[rate] == self._host_baud()
+
     def _unplug(self) -> None:
+        self._release_port()
         if self._master is not None and self._slave is not None:
             asyncio.get_running_loop().remove_reader(self._master)
             os.close(self._master)
@@ -357,6 +422,7 @@ class FeetechArm(Emulator):
         while True:
             await asyncio.sleep(_TICK_S)
             self._integrate()
+            self.publish_joints(self._q())
 
     def _integrate(self) -> None:
         now_s = self._now_s()
@@ -375,7 +441,7 @@ class FeetechArm(Emulator):
             heard = os.read(self._master, 4096)
         except OSError:
             return
-        if self._echo:
+        if self._echo or "adapter_echo" in self.active:
             self._put(heard)
         found = codec.split(self._buffer + heard)
         self._buffer = found.rest
@@ -387,9 +453,12 @@ class FeetechArm(Emulator):
 
     def _on_packet(self, packet: Packet) -> None:
         data = packet.data
-        listening = {
-            servo.number: servo for index, servo in enumerate(self.servos) if self.active.get("silent") != index
-        }
+        listening = {servo.number: servo for index, servo in enumerate(self.servos) if self._hears(index)}
+        if "id_clash" in self.active:
+            first, second = (self.servos[index] for index in self.active["id_clash"])
+            listening.pop(second.number, None)
+            if first.number in listening:
+                listening[first.number] = first
         addressed = [s for n, s in listening.items() if packet.servo in (n, codec.BROADCAST_ID)]
         alone = packet.servo != codec.BROADCAST_ID
         if packet.code == Instruction.PING:
@@ -441,6 +510,10 @@ class FeetechArm(Emulator):
             if self.spend("drop"):
                 continue
             packet = codec.encode(self._spoilt(Packet(servo.number, servo.status, data)))
+            if "id_clash" in self.active:
+                packet = self._collided(servo, packet, data)
+            if self.spend("noise"):
+                packet = _STRAY + packet
             if self.spend("corrupt"):
                 packet = packet[:-2] + bytes([packet[-2] ^ 0x10]) + packet[-1:]
             elif self.spend("short"):
@@ -453,6 +526,16 @@ class FeetechArm(Emulator):
                 asyncio.get_running_loop().call_later(later_s, self._put, packet)
             else:
                 self._put(packet)
+
+    def _collided(self, servo: Servo, packet: bytes, data: bytes) -> bytes:
+        """Return what the host hears when the other servo of the same id replies at once: its zeros pull the line."""
+        first, second = self.active["id_clash"]
+        if servo is not self.servos[first]:
+            return packet
+        rival = self.servos[second]
+        # Another servo stands elsewhere, and its oscillator is never quite in step.
+        other = codec.encode(Packet(servo.number, rival.status, bytes(~byte & 0xFF for byte in data)))
+        return bytes(a & b for a, b in zip(packet, other[1:] + other[:1], strict=True))
 
     def _spoilt(self, packet: Packet) -> Packet:
         end = Register.CURRENT + 2

@@ -32,9 +32,10 @@ from touchcell.drivers.core.errors import (
     TransportTimeout,
 )
 from touchcell.drivers.ur.codec import Value
+from touchcell.drivers.ur.dashboard import dashboard
 from touchcell.drivers.ur.modes import RuntimeState
 from touchcell.drivers.ur.registers import Registers
-from touchcell.drivers.ur.sdk import dashboard, upload_control_program
+from touchcell.drivers.ur.sdk import upload_control_program
 from touchcell.geometry.types import Array
 
 PERIOD_S = 0.002
@@ -190,7 +191,7 @@ class ControlLink:
                 return
             registers.close()
             with suppress(DeviceError), dashboard(self._device, self._host) as client:
-                client.stop()
+                client.ask("stop")
 
     def _start_program(self) -> Registers:
         upload_control_program(self._device, self._host)

@@ -9,18 +9,21 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import Annotated, Any, Final, Self
+from importlib.util import find_spec
+from typing import Annotated, Final, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from touchcell.drivers.core.arm import Arm, JointLimitsConfig, LimitsConfig
 from touchcell.drivers.core.behaviour import ArmBehaviour
+from touchcell.drivers.core.bench_address import is_this_machine
 from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
+from touchcell.drivers.core.diagnosis import Finding, finding_of
 from touchcell.drivers.core.errors import (
     CommandRejected,
     ConnectError,
@@ -52,10 +55,10 @@ from touchcell.drivers.kinematics.adjustment import Adjustment
 from touchcell.drivers.kinematics.chain import ChainDescription, ChainFile, DifferentialIk, LocalIk, SerialChain, Tool
 from touchcell.drivers.ur import codec as ur_codec
 from touchcell.drivers.ur.control import ControlLink
+from touchcell.drivers.ur.dashboard import dashboard
 from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyMode, power_fault, program_fault, safety_fault
-from touchcell.drivers.ur.registers import RtdeWire
-from touchcell.drivers.ur.sdk import dashboard
-from touchcell.drivers.ur.state import RATE_HZ, VARIABLES, Snapshot, StateReader
+from touchcell.drivers.ur.registers import Registers, RtdeWire
+from touchcell.drivers.ur.state import RATE_HZ, Snapshot, StateReader, StateStream
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
@@ -73,6 +76,9 @@ _EXPLANATION_NS = 20_000_000
 _STILL_TARGET_RAD_S = 1e-6
 _STILL_ACTUAL_RAD_S = 0.01
 _BEYOND_LIMIT_RAD = 0.1
+_SAME_TOOL = 1e-6
+_WARM_C, _LOW_VOLTAGE_V = 70.0, 43.0
+_TOOL_MM, _CALIBRATION_MM, _TOOL_DEG = 1.0, 20.0, 2.0
 
 _STOPS = frozenset(StopCategory)
 
@@ -115,6 +121,10 @@ class UrConfig(DriverConfig):
             )
         return self
 
+    def emulated_address(self) -> str | None:
+        """Return ``host`` if it is this machine."""
+        return "host" if is_this_machine(self.host) else None
+
     def described_chain(self) -> SerialChain:
         """Return the chain of the named model with the configured tool. Raises ConfigError."""
         tool = Tool(origin_mm=self.flange_to_tcp_mm_deg[:3], rotation_deg=self.flange_to_tcp_mm_deg[3:])
@@ -129,8 +139,8 @@ class UrConfig(DriverConfig):
 class UrArm(Arm):
     """Driver for a UR arm.
 
-    Before activation, ``tcp`` reports the pose of the tool centre point that is set on the pendant, because only a
-    running program may set another; afterwards that of ``flange_to_tcp_mm_deg``, read back.
+    ``tcp`` and ``wrench`` are of the tool centre point of ``flange_to_tcp_mm_deg``, also before activation, when
+    another may be set on the pendant: only a running program may set it. ``health`` warns where they differ.
 
     One supervision thread, started by ``connect`` and joined by ``disconnect``, checks the state every 4 ms, ends
     expired twists, feeds the watchdog and latches faults. It cannot run while another thread holds the GIL; then the
@@ -153,7 +163,7 @@ class UrArm(Arm):
         # All UR joints but a UR3e's endless wrist turn by a full turn; a little beyond where software limits are wider.
         ends = np.maximum(np.abs(self._chain.lower), np.abs(self._chain.upper))
         self._max_joint_rad = np.maximum(ends, 2.0 * math.pi) + _BEYOND_LIMIT_RAD
-        self._receive: Any = None
+        self._stream: StateStream | None = None
         self._reader: StateReader | None = None
         self._link: ControlLink | None = None
         self._supervision_thread: threading.Thread | None = None
@@ -161,6 +171,7 @@ class UrArm(Arm):
         self._supervised_from_seq: int | None = None
         self._power_off_by: StopCategory | None = None
         self._model = ""
+        self._tool_warning = ""
         self._proven_watchdog_s: float | None = None
         self._ttl_stops = 0
         self._dropping = threading.Lock()
@@ -169,7 +180,11 @@ class UrArm(Arm):
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
         """Return pose and twist of the tool centre point. Raises StaleData if older than ``max_age_s``."""
         snapshot = self._newest(max_age_s)
-        state = TcpState(_pose(snapshot.tcp_pose), snapshot.tcp_speed.copy())
+        T_base_tcp = self._tool_pose_of(snapshot)
+        lever_m = T_base_tcp[:3, 3] - snapshot.tcp_pose[:3]
+        twist = snapshot.tcp_speed.copy()
+        twist[:3] += np.cross(twist[3:], lever_m)
+        state = TcpState(T_base_tcp, twist)
         return Stamped(state, snapshot.t_ns, snapshot.seq, snapshot.t_device_ns)
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
@@ -181,7 +196,9 @@ class UrArm(Arm):
     def wrench(self, max_age_s: float | None = None) -> Stamped[Array]:
         """Return (6,) [force N, torque N m] at the tool centre point along base axes, compensated by the controller."""
         snapshot = self._newest(max_age_s)
-        return Stamped(snapshot.tcp_force.copy(), snapshot.t_ns, snapshot.seq, snapshot.t_device_ns)
+        wrench = snapshot.tcp_force.copy()
+        wrench[3:] -= np.cross(self._tool_pose_of(snapshot)[:3, 3] - snapshot.tcp_pose[:3], wrench[:3])
+        return Stamped(wrench, snapshot.t_ns, snapshot.seq, snapshot.t_device_ns)
 
     def at_rest(self) -> bool:
         """Return whether measured and target joint speeds are zero. Raises TransportError if the state is stale."""
@@ -229,7 +246,7 @@ class UrArm(Arm):
         snapshot = self._newest(None)
         reader = self._opened()
         link = self._link
-        return {
+        readings: dict[str, float | int | str | bool] = {
             "model": self._model,
             "robot_mode": snapshot.robot_mode.name,
             "safety_mode": snapshot.safety_mode.name,
@@ -244,15 +261,78 @@ class UrArm(Arm):
             "watchdog_hz": self._config.watchdog_hz,
             "watchdog_trip_s": link.trip_s if link is not None else 0.0,
             "ttl_stops": self._ttl_stops + (link.ttl_stops if link is not None else 0),
+            "pendant_tool_differs": bool(self._tool_warning),
         }
+        if math.isfinite(snapshot.voltage_v):
+            readings["robot_voltage_v"] = snapshot.voltage_v
+        if self._tool_warning:
+            readings["warning"] = self._tool_warning
+        return readings
+
+    def diagnose(self) -> Iterator[Finding]:
+        """Yield what is wrong with the controller and its settings; claims the registers for a moment, writes none."""
+        snapshot = self._fresh()
+        for check, reports in (
+            (self._require_safe, ("ur_modern_driver 353", "airo-mono 143", "Universal_Robots_Client_Library 58")),
+            (self._require_remote_control, ("Universal_Robots_ROS2_Driver 181",)),
+            (self._require_no_program, ("Universal_Robots_ROS_Driver 296",)),
+            (self._require_registers, ("Universal_Robots_ROS_Driver 28",)),
+            (self._require_chain, ("Universal_Robots_ROS_Driver 317",)),
+        ):
+            try:
+                check()
+            except DeviceError as error:
+                yield finding_of(error, *reports)
+        if self._tool_warning:
+            remedy = "set the same tool and its payload on the pendant (Installation > General > TCP)"
+            yield Finding(self._tool_warning, remedy, ("Universal_Robots_ROS_Driver 557",), is_fault=False)
+        if 0.0 < snapshot.speed_fraction < 1.0:
+            what = f"the speed slider is at {snapshot.speed_fraction:.0%}: every motion is slower by that factor"
+            yield Finding(what, "move it to 100 %", ("Universal_Robots_ROS_Driver 737",), is_fault=False)
+        if (hottest_c := float(snapshot.temperatures.max())) >= _WARM_C:
+            yield Finding(f"a joint is at {hottest_c:.0f} degrees Celsius", "let it cool down", (), is_fault=False)
+        if snapshot.voltage_v < _LOW_VOLTAGE_V:
+            yield Finding(f"the arm's supply is at {snapshot.voltage_v:.1f} V, not 48 V", "have the controller checked")
+        if snapshot.robot_mode is not RobotMode.RUNNING:
+            what = f"the arm is {snapshot.robot_mode.name}"
+            yield Finding(what, "activate powers it on and releases its brakes", (), is_fault=False)
+
+    def _require_registers(self) -> None:
+        Registers(self.name, self._config.host, self._config.connect_timeout_s).close()
+
+    def _require_chain(self) -> None:
+        snapshot = self._fresh()
+        if snapshot.tcp_offset is not None:
+            # Only of the flange: the tool is compared by itself.
+            require_same_arm(self.name, self._chain, snapshot.q, self._tool_pose_of(snapshot))
+
+    def _tool_pose_of(self, snapshot: Snapshot) -> Array:
+        """Return the pose (4, 4) of the configured tool centre point, whatever tool is set in the controller."""
+        T_base_tcp = _pose(snapshot.tcp_pose)
+        offset = snapshot.tcp_offset
+        if offset is None:
+            # An older controller: ours once the program has set it, and until then where the chain puts it.
+            return T_base_tcp if self._link is not None else np.asarray(self._chain.forward(snapshot.q))
+        if np.allclose(offset, self._flange_to_tcp, rtol=0.0, atol=_SAME_TOOL):
+            return T_base_tcp
+        return np.asarray(T_base_tcp @ se3.inverse(_pose(offset)) @ _pose(self._flange_to_tcp))
+
+    def _compare_tools(self, snapshot: Snapshot) -> str:
+        """Return how the tool set on the pendant differs from the configured one; empty if it hardly does."""
+        apart = se3.compose(se3.inverse(self._tool_pose_of(snapshot)), _pose(snapshot.tcp_pose))
+        away_mm = 1e3 * float(np.linalg.norm(apart[:3, 3]))
+        turned_deg = math.degrees(float(np.linalg.norm(se3.log(apart)[3:])))
+        exact = snapshot.tcp_offset is not None
+        if away_mm <= (_TOOL_MM if exact else _CALIBRATION_MM) and turned_deg <= _TOOL_DEG:
+            return ""
+        return (
+            f"the tool on the pendant is {away_mm:.1f} mm and {turned_deg:.1f} deg from flange_to_tcp_mm_deg, which is "
+            "the one that is used; payload and safety limits are still those of the pendant's"
+        )
 
     def _open(self) -> None:
-        try:
-            import rtde_receive  # noqa: F401
-        except ImportError as error:
-            raise ConnectError(
-                self.name, "ur-rtde is not installed", [error], hint="pip install touchcell[ur]"
-            ) from None
+        if not _is_installed("rtde_control"):
+            raise ConnectError(self.name, "ur-rtde is not installed", hint="pip install touchcell[ur]")
         version = _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
         if not _OLDEST_POLYSCOPE <= version[:2] < (6, 0):
             raise ConnectError(
@@ -262,7 +342,8 @@ class UrArm(Arm):
             )
         self._start_receiving()
         with dashboard(self.name, self._config.host) as client:
-            self._model = f"{client.getRobotModel()}, PolyScope {client.polyscopeVersion()}"
+            self._tool_warning = self._compare_tools(self._newest(None))
+            self._model = f"{client.ask('get robot model')}, {client.ask('PolyscopeVersion')}"
         self._ending.clear()
         self._supervision_thread = threading.Thread(target=self._supervise, name=f"{self.name} keeper", daemon=True)
         self._supervision_thread.start()
@@ -277,9 +358,10 @@ class UrArm(Arm):
         self._drop_program()
         if self._power_off_by is not None:
             with suppress(DeviceError), dashboard(self.name, self._config.host) as client:
-                client.powerOff()
+                client.ask("power off")
         self._power_off_by = None
         self._stop_receiving()
+        self._reader = None
 
     def _present_fault(self) -> DeviceError | None:
         snapshot = self._fresh()
@@ -454,7 +536,7 @@ class UrArm(Arm):
             if self._power_off_by is StopCategory.STOP_THEN_REMOVE_POWER and not self.at_rest():
                 return
             with dashboard(self.name, self._config.host) as client:
-                client.powerOff()
+                client.ask("power off")
         self._drop_program()
         self._power_off_by = None
 
@@ -468,13 +550,13 @@ class UrArm(Arm):
                 self._ttl_stops += link.ttl_stops
 
     def _start_receiving(self) -> None:
-        from rtde_receive import RTDEReceiveInterface
-
+        self._stop_receiving()
         try:
-            self._receive = RTDEReceiveInterface(self._config.host, RATE_HZ, list(VARIABLES))
-        except RuntimeError as error:
+            stream = StateStream(self.name, self._config.host, self._config.connect_timeout_s)
+        except (OSError, TransportError) as error:
             raise DeviceGone(self.name, f"RTDE state of {self._config.host}: {error}") from error
-        reader = StateReader(self._receive, self._clock, self._max_joint_rad)
+        self._stream = stream
+        reader = StateReader(stream, self._clock, self._max_joint_rad)
         deadline_ns = self._clock.now_ns() + round(_FIRST_STATE_S * 1e9)
         warm_ns = self._clock.now_ns() + round(_CLOCK_WARM_UP_S * 1e9)
         while reader.poll() is None or self._clock.now_ns() < warm_ns:
@@ -485,9 +567,10 @@ class UrArm(Arm):
         self._reader = reader
 
     def _stop_receiving(self) -> None:
-        # Dropping the last reference closes the connection. Its own ``disconnect`` leaks file descriptors.
-        self._reader = None
-        self._receive = None
+        # The reader stays until there is another: the supervision thread may be reading.
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.close()
 
     def _opened(self) -> StateReader:
         if self._reader is None:
@@ -533,7 +616,7 @@ class UrArm(Arm):
 
     def _require_remote_control(self) -> None:
         with dashboard(self.name, self._config.host) as client:
-            if not client.isInRemoteControl():
+            if client.ask("is in remote control") != "true":
                 raise DeviceFault(
                     self.name,
                     "the pendant is in local control",
@@ -558,36 +641,35 @@ class UrArm(Arm):
         if self._fresh().robot_mode is RobotMode.RUNNING:
             return
         with dashboard(self.name, self._config.host) as client:
-            client.powerOn()
+            client.ask("power on")
             self._await(lambda state: state.robot_mode in (RobotMode.IDLE, RobotMode.RUNNING), _MODE_CHANGE_S, "power")
-            client.brakeRelease()
+            client.ask("brake release")
             self._await(lambda state: state.robot_mode is RobotMode.RUNNING, _MODE_CHANGE_S, "release of the brakes")
 
     def _power_off(self) -> None:
         with dashboard(self.name, self._config.host) as client:
-            client.powerOff()
+            client.ask("power off")
         self._await(lambda state: state.robot_mode is RobotMode.POWER_OFF, _MODE_CHANGE_S, "power-off")
 
     def _end_program(self) -> None:
         # It may have survived the fault if the controller was unreachable then.
         if self._fresh().runtime_state is not RuntimeState.STOPPED:
             with dashboard(self.name, self._config.host) as client:
-                client.stop()
+                client.ask("stop")
         self._await(lambda state: state.runtime_state is RuntimeState.STOPPED, _RECOVER_S, "end of the program")
         self._program_is_ours = False
 
     def _unlock(self) -> None:
         with dashboard(self.name, self._config.host) as client:
-            try:
-                client.unlockProtectiveStop()
-            except RuntimeError as error:
-                raise DeviceFault(
-                    self.name,
-                    f"the protective stop remains: {error}",
-                    fault_class=FaultClass.CONTACT,
-                    needs=Remedy.RECOVER,
-                    hint="inspect the arm, and wait until 5 s after the stop",
-                ) from error
+            reply = client.ask("unlock protective stop")
+        if not reply.startswith("Protective stop releasing"):
+            raise DeviceFault(
+                self.name,
+                f"the protective stop remains: {reply}",
+                fault_class=FaultClass.CONTACT,
+                needs=Remedy.RECOVER,
+                hint="inspect the arm, and wait until 5 s after the stop",
+            )
         self._await(
             lambda state: state.safety_mode is not SafetyMode.PROTECTIVE_STOP,
             _RECOVER_S,
@@ -621,6 +703,14 @@ def _ask_version(device: str, host: str, timeout_s: float) -> tuple[int, int, in
             [error],
             hint=f"is {host} the controller, powered and reachable?",
         ) from error
+
+
+def _is_installed(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except ValueError:
+        # Imported, without a record of where from.
+        return False
 
 
 def _pose_vector(T: Array) -> Array:

@@ -1,36 +1,17 @@
-"""Calls to ur-rtde 1.6.5 besides its state stream, with its blocking contained.
+"""The only use of ur-rtde 1.6.5: its control program is uploaded, by a process of its own.
 
-Its constructors and destructors hold the GIL: call a constructor only right after the controller has replied, and let a
-destructor run only when no arm moves, because it sleeps 0.5 s.
+Its constructors and destructors hold the interpreter's lock, up to half a second in a destructor, which would starve
+every other arm of this process.
 """
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
 
 from touchcell.drivers.core.errors import DeviceGone
 
-_DASHBOARD_S = 1.0
 _UPLOAD_S = 10.0
-
-
-@contextmanager
-def dashboard(device: str, host: str) -> Iterator[Any]:
-    """Connect ur-rtde's dashboard client. Raises DeviceGone when the dashboard does not reply."""
-    from dashboard_client import DashboardClient
-
-    client = DashboardClient(host)
-    try:
-        client.connect(round(_DASHBOARD_S * 1e3))
-        yield client
-    except RuntimeError as error:
-        raise DeviceGone(device, f"dashboard of {host}: {error}") from error
-    finally:
-        client.disconnect()
 
 
 def upload_control_program(device: str, host: str) -> None:

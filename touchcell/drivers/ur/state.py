@@ -1,9 +1,8 @@
-"""Validated state of a UR controller.
+"""Validated state of a UR controller, from a real-time connection of our own.
 
-ur-rtde's receive thread keeps only the newest packet: no reception time, no queue, and values of different packets
-where it overtakes the reader. So the reader accepts only whole packets (same timestamp before and after), maps them to
-host time by the controller's own clock, and drops values that are not finite, out of range, or older than the newest.
-RTDE has no checksum: a wrong value within the ranges below cannot be detected.
+Every packet is one control period. The reader maps it to host time by the controller's own clock, and drops values that
+are not finite, out of range, or older than the newest. RTDE has no checksum: a wrong value within the ranges below
+cannot be detected. No threads: whoever asks for the state reads what has arrived.
 """
 
 from __future__ import annotations
@@ -12,13 +11,18 @@ import logging
 import math
 import threading
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
 from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.errors import ConnectError, CorruptMessage, DeviceGone
+from touchcell.drivers.ur import codec as ur_codec
+from touchcell.drivers.ur.codec import Packet, PacketType, Recipe, Value
 from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyMode
+from touchcell.drivers.ur.registers import RtdeWire
 from touchcell.geometry.types import Array
 from touchcell.logs import OncePerCause
 
@@ -40,6 +44,8 @@ VARIABLES = (
     "target_speed_fraction",
     "joint_temperatures",
 )
+OPTIONAL = ("actual_robot_voltage", "tcp_offset")
+"""Variables that older controllers do not have (Universal_Robots_ROS_Driver issues 605 and 749)."""
 
 _MAX_JOINT_SPEED_RAD_S = 2.0 * math.pi
 # Largest plausible magnitudes, in the order in which StateReader reads: far beyond what the arm can reach.
@@ -56,10 +62,13 @@ _BOUNDS = np.array(
         *[200.0] * 6,  # temperatures, Celsius
     ]
 )
+_VECTORS = ("actual_TCP_pose", "actual_TCP_speed", "actual_TCP_force")
+_JOINT_VECTORS = ("actual_q", "actual_qd", "target_qd", "joint_temperatures")
+_MODES = ("robot_mode", "safety_mode", "runtime_state")
 _JOINTS = slice(20, 26)
 _ONE_TURN_RAD = 2.0 * math.pi + 0.1
 _JUMP_SLACK_RAD = 0.02
-_ATTEMPTS = 3
+_MOST_READS = 16
 # Two quartz clocks differ by less; see _place.
 _MAX_CLOCK_DRIFT = 200e-6
 _BUDGET_WINDOW = 50
@@ -80,6 +89,8 @@ class Snapshot:
         tcp_force: [f, t] on it along base axes.
         temperatures: of the joints, Celsius.
         speed_fraction: position of the speed slider.
+        voltage_v: of the robot's supply; NaN where the controller does not report it.
+        tcp_offset: [x y z rx ry rz] of the active tool centre point in the flange frame; None likewise.
     """
 
     t_ns: int
@@ -97,17 +108,104 @@ class Snapshot:
     safety_bits: int
     runtime_state: RuntimeState
     speed_fraction: float
+    voltage_v: float = math.nan
+    tcp_offset: Array | None = None
 
     def age_s(self, now_ns: int) -> float:
         """Return the seconds since the sample."""
         return (now_ns - self.t_ns) * 1e-9
 
 
-class StateReader:
-    """Turn ur-rtde's receive interface into validated snapshots. Any thread may poll.
+class PacketSource(Protocol):
+    """Delivers the packets of a state stream."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether the connection is up."""
+        ...
+
+    def receive(self) -> list[Mapping[str, Value]]:
+        """Return the packets that have arrived since the last call, oldest first; never blocks."""
+        ...
+
+
+class StateStream:
+    """A connection that streams ``VARIABLES``, and those of ``OPTIONAL`` that the controller has, at ``RATE_HZ``.
 
     Args:
-        receive: ``RTDEReceiveInterface`` that streams ``VARIABLES``.
+        device: name for errors.
+        host: address of the controller.
+        timeout_s: timeout of the connection and of each reply of its setup.
+
+    Raises on construction:
+        ConnectError: the controller does not have one of ``VARIABLES``.
+        OSError, TransportError: it cannot be reached or does not reply.
+    """
+
+    def __init__(self, device: str, host: str, timeout_s: float) -> None:
+        self._wire = RtdeWire(device, host, timeout_s)
+        self._connected = True
+        try:
+            self._wire.ask(ur_codec.version_request())
+            self._recipe = self._granted(device, host)
+            self._wire.ask(Packet(PacketType.START))
+        except BaseException:
+            self._wire.close()
+            raise
+
+    @property
+    def connected(self) -> bool:
+        """Whether the connection is up."""
+        return self._connected
+
+    def receive(self) -> list[Mapping[str, Value]]:
+        """Return the packets that have arrived since the last call, oldest first; never blocks."""
+        found: list[Mapping[str, Value]] = []
+        try:
+            for _ in range(_MOST_READS):
+                packets = self._wire.receive(0.0)
+                if not packets:
+                    break
+                found += [self._recipe.unpack(packet.payload) for packet in packets if packet.kind is PacketType.DATA]
+        except (DeviceGone, CorruptMessage):
+            # A stream of packets of the wrong size cannot be resynchronised.
+            self._connected = False
+        return found
+
+    def close(self) -> None:
+        """Close the connection; idempotent."""
+        self._connected = False
+        self._wire.close()
+
+    def _granted(self, device: str, host: str) -> Recipe:
+        names: tuple[str, ...] = (*VARIABLES, *OPTIONAL)
+        types = self._types(names)
+        missing = [name for name, kind in zip(names, types, strict=True) if kind == ur_codec.NOT_FOUND]
+        if needed := sorted(set(missing) - set(OPTIONAL)):
+            raise ConnectError(
+                device,
+                f"the controller at {host} does not stream {', '.join(needed)}",
+                hint="update PolyScope to 5.6 or later of version 5",
+            )
+        if missing:
+            names = tuple(name for name in names if name not in missing)
+            types = self._types(names)
+        return Recipe(self._number, names, types)
+
+    def _types(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        payload = self._wire.ask(ur_codec.setup_outputs(RATE_HZ, names)).payload
+        types = ur_codec.parse_names(payload[1:])
+        if len(types) != len(names):
+            raise CorruptMessage("rtde", f"{len(types)} types for {len(names)} variables")
+        self._number = payload[0]
+        return types
+
+
+class StateReader:
+    """Turn a stream of packets into validated snapshots. Any thread may poll.
+
+    Args:
+        stream: connection that streams ``VARIABLES``.
         clock: the host's clock.
         max_joint_rad: largest plausible angles, of all joints or each (6,).
 
@@ -117,14 +215,13 @@ class StateReader:
         out_of_order: packets dropped because a newer one had been received.
     """
 
-    def __init__(self, receive: Any, clock: Clock, max_joint_rad: Array | float = _ONE_TURN_RAD) -> None:
-        self._receive = receive
+    def __init__(self, stream: PacketSource, clock: Clock, max_joint_rad: Array | float = _ONE_TURN_RAD) -> None:
+        self._stream = stream
         self._clock = clock
         self._bounds = _BOUNDS.copy()
         self._bounds[_JOINTS] = max_joint_rad
         self._lock = threading.Lock()
         self._newest: Snapshot | None = None
-        self._seen_s = math.nan
         self._offset_ns: float | None = None
         self._offset_at_ns = 0
         self._misses: deque[bool] = deque(maxlen=_BUDGET_WINDOW)
@@ -135,8 +232,8 @@ class StateReader:
 
     @property
     def connected(self) -> bool:
-        """Return whether the connection is up."""
-        return bool(self._receive.isConnected())
+        """Whether the connection is up."""
+        return self._stream.connected
 
     @property
     def drops_too_many(self) -> bool:
@@ -153,40 +250,20 @@ class StateReader:
     def poll(self) -> Snapshot | None:
         """Return the newest good snapshot, or None before the first."""
         with self._lock:
-            for _ in range(_ATTEMPTS):
-                timestamp_s = self._receive.getTimestamp()
-                if timestamp_s == self._seen_s:
-                    break
-                if not math.isfinite(timestamp_s):
-                    self._miss_corrupt("time is not finite")
-                    break
-                values = self._values()
-                if self._receive.getTimestamp() == timestamp_s:
-                    self._seen_s = timestamp_s
-                    self._take(timestamp_s, values)
-                    break
+            for packet in self._stream.receive():
+                self._take(packet)
             return self._newest
 
-    def _values(self) -> tuple[list[float], list[float], tuple[int, ...]]:
-        receive = self._receive
-        tool = [*receive.getActualTCPPose(), *receive.getActualTCPSpeed(), *receive.getActualTCPForce()]
-        joints = [
-            *receive.getActualQ(),
-            *receive.getActualQd(),
-            *receive.getTargetQd(),
-            *receive.getJointTemperatures(),
-        ]
-        modes = (
-            receive.getRobotMode(),
-            receive.getSafetyMode(),
-            receive.getSafetyStatusBits(),
-            receive.getRuntimeState(),
+    def _take(self, packet: Mapping[str, Value]) -> None:
+        timestamp_s = _number(packet["timestamp"])
+        numbers = np.array(
+            [
+                timestamp_s,
+                *(value for name in _VECTORS for value in _vector(packet[name])),
+                _number(packet["target_speed_fraction"]),
+                *(value for name in _JOINT_VECTORS for value in _vector(packet[name])),
+            ]
         )
-        return [*tool, receive.getTargetSpeedFraction()], joints, modes
-
-    def _take(self, timestamp_s: float, values: tuple[list[float], list[float], tuple[int, ...]]) -> None:
-        tool, joints, (robot_mode, safety_mode, safety_bits, runtime_state) = values
-        numbers = np.array([timestamp_s, *tool, *joints])
         # Written so that NaN fails.
         plausible = np.abs(numbers) <= self._bounds
         if not plausible.all() or timestamp_s < 0.0:
@@ -204,6 +281,7 @@ class StateReader:
             reach = _MAX_JOINT_SPEED_RAD_S * passed_ns * 1e-9 + _JUMP_SLACK_RAD
             if not (np.abs(q - newest.q) <= reach).all():
                 return self._miss_corrupt("joints jump")
+        robot_mode, safety_mode, runtime_state = (int(_number(packet[name])) for name in _MODES)
         try:
             modes = RobotMode(robot_mode), SafetyMode(safety_mode), RuntimeState(runtime_state)
         except ValueError:
@@ -222,9 +300,11 @@ class StateReader:
             temperatures=numbers[38:44],
             robot_mode=modes[0],
             safety_mode=modes[1],
-            safety_bits=safety_bits,
+            safety_bits=int(_number(packet["safety_status_bits"])),
             runtime_state=modes[2],
             speed_fraction=float(numbers[19]),
+            voltage_v=_number(packet.get("actual_robot_voltage", math.nan)),
+            tcp_offset=np.array(_vector(packet["tcp_offset"])) if "tcp_offset" in packet else None,
         )
         return None
 
@@ -251,3 +331,13 @@ class StateReader:
             offset_ns = min(offset_ns, self._offset_ns + _MAX_CLOCK_DRIFT * (now_ns - self._offset_at_ns))
         self._offset_ns, self._offset_at_ns = offset_ns, now_ns
         return t_device_ns + round(offset_ns)
+
+
+def _number(value: Value) -> float:
+    assert not isinstance(value, tuple), "the recipe gives one number"
+    return value
+
+
+def _vector(value: Value) -> tuple[float, ...]:
+    assert isinstance(value, tuple), "the recipe gives a vector"
+    return value

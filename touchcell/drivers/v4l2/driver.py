@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 import os
-import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting, camera_behaviour
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle
+from touchcell.drivers.core.diagnosis import Finding
 from touchcell.drivers.core.errors import ConnectError, DeviceFault, DeviceGone, FaultClass, Remedy, TransportError
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.drivers.core.samples import Quality
@@ -23,6 +24,7 @@ from touchcell.drivers.v4l2.shim import EMULATED_CAMERAS, ShimCalls
 
 _LONGEST_PAUSE_S = 0.5
 _FEWEST_BUFFERS = 4
+_SETTINGS_CHECKED_WITHIN_NS = 2_000_000_000
 _RATE_TOLERANCE = 0.01
 _FUTURE_NS = 1_000_000
 _CLOCK_TOLERANCE_NS = 1_000_000_000
@@ -72,11 +74,13 @@ class V4l2Camera(Camera):
         self._previous: codec.Arrival | None = None
         self._number = -1
         self._queue_empty_ns = 0
+        self._next_check_ns = 0
+        self._checked = 0
         self._exposure_us: int | None = None
         self._gain: int | None = None
 
     def _open(self) -> None:
-        if abs(self._clock.now_ns() - time.monotonic_ns()) > _CLOCK_TOLERANCE_NS:
+        if abs(self._clock.now_ns() - self._calls.now_ns()) > _CLOCK_TOLERANCE_NS:
             raise ConnectError(
                 self.name,
                 "the kernel stamps frames on CLOCK_MONOTONIC, but the cell's clock is another",
@@ -166,29 +170,45 @@ class V4l2Camera(Camera):
             return None
         given = node.control(identity) if value is None else node.set_control(identity, value)
         if value is not None:
-            self._expect(setting, value * unit, given * unit)
-        self._fixed[identity] = setting, given
+            self._expect(setting, value * unit, None if given is None else given * unit)
+        if given is not None:
+            self._fixed[identity] = setting, given
         return given
 
     def _check_settings(self, node: VideoNode) -> None:
         """Read every control back while the stream runs: some cameras reset them when it starts, or later."""
-        for identity, (setting, value) in self._fixed.items():
-            if (found := node.control(identity)) != value:
-                raise DeviceFault(
-                    self.name,
-                    f"{setting} has changed from {value} to {found} by itself",
-                    vendor_code=setting,
-                    fault_class=FaultClass.CONFIGURATION,
-                    needs=Remedy.OPERATOR,
-                    hint="does another program use the camera? a camera that forgets its settings cannot be used",
-                )
+        for identity in self._fixed:
+            self._check_setting(node, identity)
 
-    def _expect(self, setting: str, requested: int, given: int) -> None:
+    def _check_setting(self, node: VideoNode, identity: int) -> None:
+        setting, value = self._fixed[identity]
+        found = node.control(identity)
+        if found is not None and found != value:
+            raise DeviceFault(
+                self.name,
+                f"{setting} has changed from {value} to {found} by itself",
+                vendor_code=setting,
+                fault_class=FaultClass.CONFIGURATION,
+                needs=Remedy.OPERATOR,
+                hint="does another program use the camera? a camera that forgets its settings cannot be used",
+            )
+
+    def _check_next_setting(self) -> None:
+        # One at a time: a control request to a USB camera takes some milliseconds.
+        if not self._fixed or self._clock.now_ns() < self._next_check_ns:
+            return
+        self._next_check_ns = self._clock.now_ns() + _SETTINGS_CHECKED_WITHIN_NS // len(self._fixed)
+        self._checked += 1
+        self._check_setting(self._opened(), list(self._fixed)[self._checked % len(self._fixed)])
+
+    def _expect(self, setting: str, requested: int, given: int | None) -> None:
         if requested != given:
             raise UnsupportedSetting(self.name, setting, requested, given)
 
     def _collect(self) -> bool:
         node = self._opened()
+        if self.state is not Lifecycle.PASSIVE:
+            self._check_next_setting()
         taken = 0
         # Bounded: a camera that is faster than this loop must not block the caller for ever.
         while taken < 2 * self._buffers:
@@ -271,7 +291,41 @@ class V4l2Camera(Camera):
         return readings
 
     def _verify(self) -> None:
-        self._check_settings(self._opened())
+        self._check_next_setting()
+
+    def diagnose(self) -> Iterator[Finding]:
+        """Yield what is wrong with the camera and the name that it has in the cell file; asks, and sets nothing."""
+        node, config = self._opened(), self._config
+        formats = node.pixel_formats()
+        if config.pixel_format not in formats:
+            what = f"does not offer {config.pixel_format}, only {', '.join(formats)}"
+            yield Finding(what, "set pixel_format to one of them", ("lerobot 1225", "lerobot 1558"))
+        given = node.try_format(config.pixel_format, config.width_px, config.height_px)
+        if (given.pixel_format, given.width_px, given.height_px) != (
+            config.pixel_format,
+            config.width_px,
+            config.height_px,
+        ):
+            what = f"gives {given.pixel_format} {given.width_px} x {given.height_px} for what the cell file asks"
+            yield Finding(what, "`v4l2-ctl --list-formats-ext` shows what it offers", ("lerobot 1225", "lerobot 1558"))
+        if node.is_busy():
+            yield Finding("another program streams from it", "close that program", ("lerobot 3569",))
+        if not is_stable_name(config.device):
+            what = f"{config.device} may be another camera after a restart or a re-plug"
+            yield Finding(what, "use its name under /dev/v4l/by-id or by-path", ("U20CAM-9281M 4", "rosys 69"), False)
+        elif not node.serial and config.expect_bus is None and "/by-id/" in config.device:
+            what = "has no serial number of its own: a second camera of this make may take its name"
+            yield Finding(what, f"set expect_bus: {node.bus}", ("rosys 69", "octoprint_deploy 203"), is_fault=False)
+        for identity, setting, _ in _AUTOMATICS:
+            if node.has_control(identity) and node.control(identity) is None:
+                what = f"its control for {setting} does not answer"
+                yield Finding(what, "try another cable or port, or another camera", ("showmewebcam 213",))
+        if config.exposure_us is None and node.has_control(codec.CID_EXPOSURE_ABSOLUTE):
+            steps = node.control(codec.CID_EXPOSURE_ABSOLUTE)
+            if steps is not None and steps * codec.EXPOSURE_UNIT_US * config.rate_hz > 1e6:
+                exposure_us = steps * codec.EXPOSURE_UNIT_US
+                what = f"its exposure of {exposure_us} us is longer than a frame at {config.rate_hz:g} Hz"
+                yield Finding(what, "set exposure_us", ("autonomous-os 79", "picam 133"))
 
     def _opened(self) -> VideoNode:
         assert self._node is not None, "the lifecycle prevents reading a closed camera"

@@ -8,6 +8,7 @@ import fcntl
 import mmap
 import os
 import select
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,11 +17,15 @@ from typing import Protocol
 from touchcell.drivers.core.errors import ConnectError, DeviceError, DeviceGone, TransportError
 from touchcell.drivers.v4l2 import codec
 
-_GONE = (errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN, errno.EPIPE)
+_GONE = (errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN)
 
 
 class SystemCalls(Protocol):
     """System calls that a camera needs. Real cameras use ``KernelCalls``; an emulator may provide its own."""
+
+    def now_ns(self) -> int:
+        """Return the time of the clock that frames are stamped with."""
+        ...
 
     def open(self, path: str) -> int:
         """Return a file descriptor, read-write and non-blocking."""
@@ -45,6 +50,9 @@ class SystemCalls(Protocol):
 
 class KernelCalls:
     """System calls of the kernel."""
+
+    def now_ns(self) -> int:
+        return time.monotonic_ns()
 
     def open(self, path: str) -> int:
         return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -147,6 +155,24 @@ class VideoNode:
         pix = request.pix
         return AppliedFormat(codec.fourcc_text(pix.pixelformat), pix.width, pix.height, pix.bytesperline)
 
+    def try_format(self, pixel_format: str, width_px: int, height_px: int) -> AppliedFormat:
+        """Return the format that the device would choose for a request; nothing changes. Raises as ``set_format``."""
+        request = codec.Format(type=codec.VIDEO_CAPTURE)
+        request.pix.width, request.pix.height = width_px, height_px
+        request.pix.pixelformat, request.pix.field = codec.fourcc(pixel_format), codec.FIELD_NONE
+        self._ask(codec.TRY_FMT, request, "try the image format")
+        pix = request.pix
+        return AppliedFormat(codec.fourcc_text(pix.pixelformat), pix.width, pix.height, pix.bytesperline)
+
+    def is_busy(self) -> bool:
+        """Return whether another program holds its buffers; asked by freeing our own, of which there are none."""
+        none = codec.RequestBuffers(type=codec.VIDEO_CAPTURE, memory=codec.MEMORY_MMAP)
+        try:
+            self._calls.ioctl(self._fd, codec.REQBUFS, none)
+        except OSError as error:
+            return error.errno == errno.EBUSY
+        return False
+
     def set_rate(self, rate_hz: float) -> float | None:
         """Request a frame rate and return the one that the device chose, Hz; None if it has no such setting.
 
@@ -177,22 +203,28 @@ class VideoNode:
             raise self._error(error, "query a control") from None
         return not query.flags & codec.CTRL_DISABLED
 
-    def control(self, identity: int) -> int:
-        """Return the present value of a control. Raises TransportError, DeviceGone."""
+    def control(self, identity: int) -> int | None:
+        """Return the present value of a control, or None if the device does not tell it. Raises DeviceGone."""
         request = codec.Control(id=identity)
-        self._ask(codec.G_CTRL, request, "read a control")
+        try:
+            self._calls.ioctl(self._fd, codec.G_CTRL, request)
+        except OSError as error:
+            # A stalled control request (EPIPE), a transfer error, or whatever else the camera's firmware answers.
+            if error.errno in _GONE:
+                raise self._error(error, "read a control") from None
+            return None
         return int(request.value)
 
-    def set_control(self, identity: int, value: int) -> int:
-        """Set a control and return the value read back; the device may refuse silently.
+    def set_control(self, identity: int, value: int) -> int | None:
+        """Set a control and return the value read back, None if it cannot be read; the device may refuse silently.
 
         Raises:
-            TransportError, DeviceGone: the device failed for a reason other than the value.
+            DeviceGone: the device is disconnected.
         """
         try:
             self._calls.ioctl(self._fd, codec.S_CTRL, codec.Control(id=identity, value=value))
         except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.ERANGE, errno.EACCES, errno.EBUSY):
+            if error.errno in _GONE:
                 raise self._error(error, "set a control") from None
         return self.control(identity)
 

@@ -166,6 +166,11 @@ static int dequeue(int fd, struct device *device, struct v4l2_buffer *wanted)
     count = recv(fd, &filled, sizeof filled, 0);
     if (count < 0)
         return fail(errno == EAGAIN || errno == EINTR ? errno : ENODEV);
+    if (count == 2 * sizeof(int32_t)) { /* an error of the transfer */
+        int32_t error[2];
+        memcpy(error, &filled, sizeof error);
+        return fail(error[1]);
+    }
     if (count == 1) /* streaming has ended while this thread waited */
         return fail(EINVAL);
     if (count != sizeof filled || filled.index >= VIDEO_MAX_FRAME)

@@ -23,6 +23,7 @@ from touchcell.perception.models.labels import CONTACT_NAMES, contact_from_xi, s
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.models.transfer_spec import TransferSpec
 
+_HOW_TO_TRAIN = "train one with `touchcell train --data DIR --out NAME.safetensors`"
 FORMAT_VERSION = 1
 _METADATA_KEY = "touchcell"
 _REFERENCE = "reference_image"
@@ -244,7 +245,7 @@ def load_model(path: Path) -> Model:
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
-        raise ModelError(path, "no such file", hint="train one with `touchcell train DATA --out NAME.safetensors`")
+        raise ModelError(path, "no such file", hint=_HOW_TO_TRAIN)
     try:
         with safe_open(path, framework="np") as stored:
             metadata = stored.metadata() or {}
@@ -268,7 +269,7 @@ def load_header(path: Path) -> Header:
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
-        raise ModelError(path, "no such file", hint="train one with `touchcell train DATA --out NAME.safetensors`")
+        raise ModelError(path, "no such file", hint=_HOW_TO_TRAIN)
     try:
         with safe_open(path, framework="np") as stored:
             return _parse_header((stored.metadata() or {}).get(_METADATA_KEY), path)

@@ -19,7 +19,7 @@ from touchcell.drivers.core.protocols import FrameSource
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.geometry import gaussian
 from touchcell.geometry.gaussian import PoseGaussian
-from touchcell.geometry.types import Array
+from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.models.prediction import ContactEstimator
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.runtime.contact_gate import ContactGate
@@ -47,6 +47,10 @@ class ContactSource(Protocol):
     def await_frame(self) -> None:
         """Wait for the first frame, so that no control cycle has to. Raises DeviceError."""
         return
+
+    def take_zero(self) -> bool:
+        """Take the newest frame for one out of contact; return False for a source that compares with none."""
+        return False
 
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
         """Record the sensor's pose at ``t_ns``; called before ``update``."""
@@ -111,6 +115,7 @@ class ContactPipeline:
         self._newest: ContactEstimate | None = None
         self._ended = False
         self._filtering = False
+        self._reduced: ImageArray | None = None
         self.measurement: Measurement | None = None
         self.frame: Stamped[Frame] | None = None
         self.times = StageTimes()
@@ -138,6 +143,19 @@ class ContactPipeline:
             if self._zero is not None and self._contact_gate is not None:
                 zeroed = self._zero(frame.value.image, self._model, self._contact_gate)
                 self._model, self._contact_gate = zeroed.estimator, zeroed.gate
+
+    def take_zero(self) -> bool:
+        """Let the contact gate compare with the newest frame from now on; False without a gate, or before a frame.
+
+        The filter begins anew: what it knew was of a contact that is no more.
+        """
+        if self._contact_gate is None or self._reduced is None:
+            return False
+        self._contact_gate.take_zero(self._reduced)
+        if self._filter is not None:
+            self._filter.reset()
+            self._filtering = False
+        return True
 
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
         """Record the sensor's pose at ``t_ns``."""
@@ -167,8 +185,9 @@ class ContactPipeline:
 
     def _process(self, frame: Stamped[Frame], read_ns: int) -> ContactEstimate:
         start = self._timer()
-        reduced = self._model.reduce(frame.value.image)
+        reduced = self._reduced = self._model.reduce(frame.value.image)
         in_contact = self._contact_gate is None or self._contact_gate.update(reduced)
+        change = None if self._contact_gate is None else self._contact_gate.score
         preprocess_ns = self._timer() - start
         if not in_contact:
             self.times = StageTimes(read_ns, preprocess_ns)
@@ -176,7 +195,7 @@ class ContactPipeline:
             if self._filter is not None:
                 self._filter.reset()
                 self._filtering = False
-            return ContactEstimate(False, None, frame.t_ns, frame.seq, frame.t_ns)
+            return ContactEstimate(False, None, frame.t_ns, frame.seq, frame.t_ns, change=change)
         start = self._timer()
         prediction = self._model.predict_reduced(reduced)
         infer_ns = self._timer() - start
@@ -204,6 +223,7 @@ class ContactPipeline:
             markers=prediction.markers,
             measured=observed,
             refusal=prediction.refusal,
+            change=change,
         )
 
     def _replayed(self, estimate: ContactEstimate, now_ns: int) -> ContactEstimate:

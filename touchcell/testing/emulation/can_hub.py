@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import errno
 import math
+import os
 import select
 import socket
 import struct
@@ -22,51 +23,12 @@ from typing import Any
 import can
 
 from touchcell.drivers.core import can_errors
+from touchcell.drivers.core.can_packets import pack, unpack
 
-_CLASSIC = struct.Struct("=IB3x8s")
-_FD = struct.Struct("=IBB2x64s")
-_EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
-_REFUSED_SENDS = struct.Struct("=I")
-_BIT_RATE_SWITCH, _FD_FRAME = 0x01, 0x04
-
-
-def pack(message: can.Message) -> bytes:
-    """Encode a message in SocketCAN's layout."""
-    number = message.arbitration_id
-    number |= _EXTENDED if message.is_extended_id else 0
-    number |= _REMOTE if message.is_remote_frame else 0
-    number |= _ERROR if message.is_error_frame else 0
-    data = bytes(message.data)
-    if message.is_fd:
-        flags = _FD_FRAME | (_BIT_RATE_SWITCH if message.bitrate_switch else 0)
-        return _FD.pack(number, len(data), flags, data)
-    return _CLASSIC.pack(number, message.dlc, data)
-
-
-def unpack(packet: bytes, timestamp_s: float = 0.0) -> can.Message:
-    """Decode a packet of ``pack``. Raises ValueError for a packet of another size or with an impossible length."""
-    if len(packet) == _CLASSIC.size:
-        (number, length, data), flags, longest = _CLASSIC.unpack(packet), 0, 8
-    elif len(packet) == _FD.size:
-        number, length, flags, data = _FD.unpack(packet)
-        longest = 64
-    else:
-        raise ValueError(f"a packet of {len(packet)} bytes is not a CAN frame")
-    if length > longest:
-        raise ValueError(f"a frame cannot carry {length} bytes")
-    is_remote = bool(number & _REMOTE)
-    return can.Message(
-        timestamp=timestamp_s,
-        arbitration_id=number & 0x1FFFFFFF,
-        is_extended_id=bool(number & _EXTENDED),
-        is_remote_frame=is_remote,
-        is_error_frame=bool(number & _ERROR),
-        is_fd=len(packet) == _FD.size,
-        bitrate_switch=bool(flags & _BIT_RATE_SWITCH),
-        dlc=length,
-        data=None if is_remote else data[:length],
-        check=True,
-    )
+# What the hub makes the adapter of a client do: refuse sends (count, error number or 0 for none), be down (seconds).
+_REFUSE = struct.Struct("=Ii")
+_DOWN = struct.Struct("=4xd")
+_MOST_FRAMES = 256
 
 
 class HubBus(can.BusABC):  # type: ignore[misc]
@@ -89,15 +51,20 @@ class HubBus(can.BusABC):  # type: ignore[misc]
         self.channel_info = f"touchcell_hub {channel}"
         self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         self._bus_state = can.BusState.ACTIVE
-        self._refused_sends = 0
+        self._refused_sends, self._refusal = 0, 0
+        self._down_until_s, self._down_reported = 0.0, True
         super().__init__(channel=channel, can_filters=can_filters)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send a frame. Raises CanOperationError when the adapter is disconnected or its queue is full."""
         if self._refused_sends:
             self._refused_sends -= 1
-            # As python-can's socketcan interface reports a queue that select() finds full: without an error number.
-            raise can.CanOperationError("Transmit buffer full")
+            if not self._refusal:
+                # As python-can's socketcan interface reports a queue that select() finds full: without an error number.
+                raise can.CanOperationError("Transmit buffer full")
+            raise can.CanOperationError(f"Failed to transmit: {os.strerror(self._refusal)}", self._refusal)
+        if time.monotonic() < self._down_until_s:
+            raise can.CanOperationError(f"Failed to transmit: {os.strerror(errno.ENETDOWN)}", errno.ENETDOWN)
         try:
             self._socket.settimeout(timeout or 0.0)
             self._socket.send(pack(msg))
@@ -107,6 +74,10 @@ class HubBus(can.BusABC):  # type: ignore[misc]
             raise can.CanOperationError(f"adapter is disconnected: {error}", error.errno) from error
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self._down_reported:
+            # A raw socket reports once that its interface went down, and then waits.
+            self._down_reported = True
+            raise can.CanOperationError(f"Failed to receive: {os.strerror(errno.ENETDOWN)}", errno.ENETDOWN)
         # Not select(), which fails for file descriptors beyond 1023.
         poller = select.poll()
         poller.register(self._socket, select.POLLIN)
@@ -118,8 +89,14 @@ class HubBus(can.BusABC):  # type: ignore[misc]
             raise can.CanOperationError(f"adapter is disconnected: {error}", error.errno) from error
         if not packet:
             raise can.CanOperationError("adapter is disconnected", errno.ENODEV)
-        if len(packet) == _REFUSED_SENDS.size:
-            (self._refused_sends,) = _REFUSED_SENDS.unpack(packet)
+        if len(packet) == _REFUSE.size:
+            self._refused_sends, self._refusal = _REFUSE.unpack(packet)
+            return None, False
+        if len(packet) == _DOWN.size:
+            self._down_until_s = time.monotonic() + _DOWN.unpack(packet)[0]
+            self._down_reported = False
+            return None, False
+        if time.monotonic() < self._down_until_s:
             return None, False
         message = unpack(packet, time.time())
         if message.is_error_frame:
@@ -200,9 +177,20 @@ class Hub:
             except OSError:
                 self._leave(client)
 
-    def fill_transmit_queues(self, sends: int) -> None:
-        """Make the adapter of every client refuse that many frames, as if nothing drained its transmit queue."""
-        packet = _REFUSED_SENDS.pack(sends)
+    def fill_transmit_queues(self, sends: int, code: int = 0) -> None:
+        """Make the adapter of every client refuse that many frames, as if nothing drained its transmit queue.
+
+        Args:
+            sends: number of frames.
+            code: error number of the refusal; 0 for one without.
+        """
+        self._command(_REFUSE.pack(sends, code))
+
+    def take_down(self, seconds: float) -> None:
+        """Take the interface of every client down for that long, and up again, as ``ip link`` does."""
+        self._command(_DOWN.pack(seconds))
+
+    def _command(self, packet: bytes) -> None:
         for client in list(self._clients):
             with contextlib.suppress(OSError):
                 client.send(packet)
@@ -220,7 +208,10 @@ class Hub:
         asyncio.get_running_loop().add_reader(client, self._read, client)
 
     def _read(self, client: socket.socket) -> None:
-        while client in self._clients:
+        # Bounded: a client that sends faster than a busy machine reads must not stop everything else.
+        for _ in range(_MOST_FRAMES):
+            if client not in self._clients:
+                return
             try:
                 packet = client.recv(128)
             except BlockingIOError:

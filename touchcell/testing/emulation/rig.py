@@ -54,6 +54,7 @@ class DeviceFixture:
         start: starts a fresh emulator and waits until it is ready; None for real hardware, which has no ground truth.
         build: builds the DISCONNECTED device for that emulator; called again after a restart.
         config: the device's part of a cell file, for running tasks on the emulator; None if unused.
+        configured: builds the device with another configuration; None if unused.
         energising: entry of the emulator's ``state()`` that counts messages which change power, mode or zero; None for
             a device that has no such messages.
         position: entry with the tool's true position [x, y, z] in m (arms), or None for cameras.
@@ -74,6 +75,7 @@ class DeviceFixture:
     start: Callable[[], Emulated] | None
     build: Callable[[Clock], Device]
     config: DriverConfig | None = None
+    configured: Callable[[Any, Clock], Device] | None = None
     energising: str | None = "energising"
     position: str | None = "position_m"
     pose: str | None = None

@@ -327,9 +327,9 @@ def decode_connect(payload: bytes) -> tuple[int, int]:
     return version, port
 
 
-def connect_reply(command_id: int, accepted: bool) -> bytes:
+def connect_reply(command_id: int, accepted: bool, version: int = VERSION) -> bytes:
     """Encode the reply to CONNECT: success, or "incompatible version" with the supported version."""
-    return encode_reply(Request.CONNECT, command_id, 0 if accepted else 1, struct.pack("<H", VERSION))
+    return encode_reply(Request.CONNECT, command_id, 0 if accepted else 1, struct.pack("<H", version))
 
 
 def decode_move(payload: bytes) -> MoveRequest:

@@ -45,7 +45,7 @@ from touchcell.drivers.franka.emulator.codec import (
 from touchcell.drivers.franka.errors import BY_NAME, ERRORS
 from touchcell.errors import ConfigError
 from touchcell.testing.emulation.base import CommandOnset, Emulator
-from touchcell.testing.emulation.ticker import Ticker
+from touchcell.testing.emulation.ticker import Tick, Ticker
 
 _PERIOD_NS = 1_000_000
 _LOST_LIMIT = 20
@@ -74,6 +74,11 @@ class FrankaEmulator(Emulator):
         "user_stop": "the user stop button is pressed",
         "locked": "the joints are locked in Desk",
         "external_wrench": "external wrench VALUE [fx fy fz tx ty tz] N, N m on the end effector along base axes",
+        "fci_off": "the control interface is not activated in Desk: connections are refused",
+        "version": "the controller speaks version VALUE of the interface",
+        "other_client": "another client is connected",
+        "slow_recovery": "error recovery takes VALUE seconds",
+        "guiding": "the arm is guided by hand",
         "restart": "drop the client and return after a fifth of a second with the clock at zero",
     }
 
@@ -108,6 +113,7 @@ class FrankaEmulator(Emulator):
         self._udp.bind((self._host, 0))
         self._udp.setblocking(False)
         self._describe_tool()
+        self.publish_joints(self._arm.q)
         self._ticker = Ticker(_PERIOD_NS, self._tick)
 
     async def stop(self) -> None:
@@ -164,6 +170,10 @@ class FrankaEmulator(Emulator):
             self._finish_move(MoveStatus.PREEMPTED_BY_SAFETY, Mode.USER_STOPPED)
         elif fault == "locked":
             self._finish_move(MoveStatus.PREEMPTED_BY_SAFETY, Mode.OTHER)
+        elif fault == "guiding":
+            self._finish_move(MoveStatus.PREEMPTED_BY_SAFETY, Mode.GUIDING)
+        elif fault == "fci_off":
+            self._stop_listening()
         elif fault == "external_wrench":
             self._arm.wrench = np.array(value, dtype=np.float64)
         elif fault == "restart":
@@ -171,8 +181,10 @@ class FrankaEmulator(Emulator):
             self._restart()
 
     def on_clear(self, fault: str) -> None:
-        if fault in ("user_stop", "locked"):
+        if fault in ("user_stop", "locked", "guiding"):
             self._state.mode = Mode.IDLE
+        elif fault == "fci_off":
+            self._listen()
         elif fault == "external_wrench":
             self._arm.wrench = np.zeros(6)
 
@@ -205,7 +217,7 @@ class FrankaEmulator(Emulator):
         client, _ = self._listener.accept()
         # The previous client may have disconnected since the last tick.
         self._read_requests()
-        if self._client is not None:
+        if self._client is not None or "other_client" in self.active:
             # The controller serves one client at a time.
             client.close()
             return
@@ -219,16 +231,18 @@ class FrankaEmulator(Emulator):
             self._client.close()
             self._client, self._client_udp = None, None
 
-    def _tick(self, late: bool) -> None:
+    def _tick(self, tick: Tick) -> None:
         if "pause" in self.active:
             return
-        self._counts["late"] += late
+        self._counts["late"] += tick.late
+        self._coast(tick.coasted)
         self._state.message_id += 1
         if "unplug" not in self.active:
             self._read_requests()
         command = self._read_command()
         if self._move_id is not None:
             self._advance(command)
+        self.publish_joints(self._arm.q)
         self._send_state()
 
     def _read_requests(self) -> None:
@@ -279,7 +293,8 @@ class FrankaEmulator(Emulator):
             version, port = decode_connect(payload)
             assert self._client is not None
             self._client_udp = (self._client.getpeername()[0], port)
-            self._reply(connect_reply(command_id, version == VERSION))
+            spoken = int(self.active.get("version", VERSION))
+            self._reply(connect_reply(command_id, version == spoken, spoken))
         elif request is Request.MOVE:
             self._begin_move(command_id, payload)
         elif request is Request.STOP_MOVE:
@@ -287,7 +302,9 @@ class FrankaEmulator(Emulator):
                 self._finish_move(MoveStatus.PREEMPTED, Mode.IDLE)
             self._reply(encode_reply(request, command_id, SetterStatus.SUCCESS))
         elif request is Request.AUTOMATIC_ERROR_RECOVERY:
-            self._reply(encode_reply(request, command_id, self._recover()))
+            asyncio.get_running_loop().call_later(
+                float(self.active.get("slow_recovery", 0.0)), self._finish_recovery, command_id
+            )
         elif request is Request.GET_ROBOT_MODEL:
             self._reply(encode_reply(request, command_id, SetterStatus.SUCCESS, urdf().encode()))
         else:
@@ -315,6 +332,9 @@ class FrankaEmulator(Emulator):
             self._state.generator, self._state.controller, self._state.mode = generator, controller, Mode.MOVE
             self._state.reflex_reason[:] = bytes(len(ERRORS))
         self._reply(encode_reply(Request.MOVE, command_id, status))
+
+    def _finish_recovery(self, command_id: int) -> None:
+        self._reply(encode_reply(Request.AUTOMATIC_ERROR_RECOVERY, command_id, self._recover()))
 
     def _recover(self) -> RecoveryStatus:
         if self._state.mode in (Mode.USER_STOPPED, Mode.OTHER):
@@ -373,6 +393,15 @@ class FrankaEmulator(Emulator):
             return
         if command is not None and (command.finished or command.torque_finished):
             self._finish_move(MoveStatus.SUCCESS, Mode.IDLE)
+
+    def _coast(self, periods: int) -> None:
+        """Move on for periods in which this process did not run; that no command came is not the client's fault."""
+        self._state.message_id += periods
+        try:
+            for _ in range(periods if self._move_id is not None else 0):
+                self._arm.step(None, _PERIOD_NS * 1e-9)
+        except Reflex as reflex:
+            self._reflex(reflex.name, reflex.detail)
 
     def _reflex(self, name: str, detail: str = "") -> None:
         flag = _INDEX[name]

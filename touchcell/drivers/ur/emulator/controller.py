@@ -43,9 +43,10 @@ class Controller:
     Args:
         unlock_after_s: time after a protective stop before it can be unlocked (5 s on the real controller).
         q: (6,) rad joint angles at which it begins.
+        model: lengths of the arm.
     """
 
-    def __init__(self, unlock_after_s: float = 5.0, q: Array = HOME_Q) -> None:
+    def __init__(self, unlock_after_s: float = 5.0, q: Array = HOME_Q, model: ur_model.Model = ur_model.UR5E) -> None:
         self._unlock_after_s = unlock_after_s
         self.energising = 0
         self.commands: Counter[str] = Counter()
@@ -55,7 +56,10 @@ class Controller:
         self.remote_control = True
         self.speed_slider = 1.0
         self.wrench = np.zeros(6)
-        self.arm = ArmState(q)
+        self.temperature_c = 31.0
+        self.voltage_v = 48.0
+        self.digital_outputs = 0
+        self.arm = ArmState(q, model)
         self.inputs: dict[str, Value] = {}
         self._boot(RobotMode.RUNNING)
 
@@ -131,6 +135,8 @@ class Controller:
     def write_inputs(self, values: dict[str, Value]) -> None:
         """Apply a data packet. Registers keep their values when a program stops or a client disconnects."""
         self.inputs.update(values)
+        self._set_slider(values)
+        self._set_digital_outputs(values)
         speeds = tuple(value for name, value in values.items() if "double" in name)
         if speeds:
             self.onset.note("arm", speeds)
@@ -140,6 +146,18 @@ class Controller:
                 self._input_s = self.t_s
                 self._input_travel_m = self.arm.travel_m
                 self.commands[NAMES.get(command, str(command))] += 1
+
+    def _set_slider(self, values: dict[str, Value]) -> None:
+        fraction = values.get("speed_slider_fraction")
+        if values.get("speed_slider_mask") == 1 and isinstance(fraction, float) and 0.0 <= fraction <= 1.0:
+            self.speed_slider = fraction
+
+    def _set_digital_outputs(self, values: dict[str, Value]) -> None:
+        for group, first in (("standard", 0), ("configurable", 8), ("tool", 16)):
+            mask, levels = values.get(f"{group}_digital_output_mask"), values.get(f"{group}_digital_output")
+            if isinstance(mask, int) and isinstance(levels, int):
+                changed = mask << first
+                self.digital_outputs = self.digital_outputs & ~changed | (levels << first) & changed
 
     def start_program(self, text: str) -> None:
         """Run an uploaded script if it is ur-rtde's and the arm is powered, safe, and in remote control."""
@@ -175,6 +193,15 @@ class Controller:
             return False
         self.energising += 1
         self.runtime_state = RuntimeState.PLAYING
+        return True
+
+    def pause(self) -> bool:
+        """Pause a playing program, as the pendant does: the arm decelerates, and the program waits for play."""
+        if self.runtime_state is not RuntimeState.PLAYING:
+            return False
+        self.runtime_state = RuntimeState.PAUSED
+        if self.motion is not None:
+            self.motion = Brake(_STOP_PROGRAM_DECEL_RAD_S2, linear=False)
         return True
 
     def protective_stop(self) -> None:
@@ -265,10 +292,12 @@ class Controller:
             "speed_scaling": self.speed_slider,
             "target_speed_fraction": self.speed_slider,
             "joint_mode": (253,) * 6 if self.energised else (249,) * 6,
-            "joint_temperatures": (31.0,) * 6,
-            "actual_main_voltage": 48.0,
-            "actual_robot_voltage": 48.0,
+            "joint_temperatures": (self.temperature_c,) * 6,
+            "actual_main_voltage": self.voltage_v,
+            "actual_robot_voltage": self.voltage_v,
+            "actual_digital_output_bits": self.digital_outputs,
             "payload": 0.0,
+            "tcp_offset": _six(ur_model.pose_vector(arm.T_flange_tcp)),
         }
 
 

@@ -19,9 +19,11 @@ class ArmState:
         q, qd: joint angles and speeds (6,).
         T_flange_tcp: tool offset.
         T_base_tcp, J, twist: pose, Jacobian and [v, w] of the tool centre point along base axes.
+        model: lengths of the arm.
     """
 
-    def __init__(self, q: Array) -> None:
+    def __init__(self, q: Array, model: ur_model.Model = ur_model.UR5E) -> None:
+        self.model = model
         self.q = q.copy()
         self.qd = np.zeros(ur_model.JOINTS)
         self.T_flange_tcp = np.eye(4)
@@ -30,7 +32,7 @@ class ArmState:
 
     def refresh(self) -> None:
         """Recompute the tool pose from the joints."""
-        self.T_base_tcp, self.J = ur_model.forward(self.q, self.T_flange_tcp)
+        self.T_base_tcp, self.J = ur_model.forward(self.q, self.T_flange_tcp, self.model)
         self.twist = self.J @ self.qd
 
     def move_to(self, q: Array, dt_s: float) -> None:
@@ -196,7 +198,7 @@ class MoveL:
         T = np.asarray(se3.exp(np.concatenate([np.zeros(3), self._turn * fraction])))
         T[:3, :3] = T[:3, :3] @ self._start[:3, :3]
         T[:3, 3] = self._start[:3, 3] + self._line * fraction
-        q = ur_model.inverse(T, arm.q, arm.T_flange_tcp)
+        q = ur_model.inverse(T, arm.q, arm.T_flange_tcp, arm.model)
         if q is None:
             self.done = True
             return arm.q

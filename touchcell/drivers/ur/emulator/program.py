@@ -22,6 +22,7 @@ from touchcell.drivers.ur.emulator.motion import ArmState, Brake, Motion, MoveJ,
 from touchcell.geometry.types import Array
 
 PERIOD_S = 0.002
+_JOINT_END_RAD = 2.0 * np.pi
 READY, DONE = 1, 2
 
 MOVEJ, MOVEJ_IK, MOVEL, MOVEL_FK = 1, 2, 3, 4
@@ -154,6 +155,8 @@ class ControlProgram:
             q = values if command == SERVOJ else self._inverse(values)
             self._servo_target = (q, self._double(8), self._double(9))
             self._servo = self._servo or self._servo_thread()
+        else:
+            raise ProgramError(f"command {command} is not emulated")
 
     def _execute(self, command: int) -> Thread:
         controller = self._controller
@@ -187,12 +190,16 @@ class ControlProgram:
             self._reply(ur_model.pose_vector(controller.arm.T_base_tcp))
         elif command == INVERSE_KINEMATICS:
             self._reply(self._inverse(self._vector(0)))
-        elif command in (POSE_IN_LIMITS, JOINTS_IN_LIMITS, IS_STEADY):
-            controller.outputs[f"output_int_register_{1 + self._offset}"] = 1
+        elif command in (POSE_IN_LIMITS, JOINTS_IN_LIMITS):
+            values = self._vector(0)
+            q = values if command == JOINTS_IN_LIMITS else self._solution(values)
+            self._decide(q is not None and bool((np.abs(q) <= _JOINT_END_RAD).all()))
+        elif command == IS_STEADY:
+            self._decide(not controller.arm.qd.any())
         elif command in (ZERO_FT_SENSOR, SET_PAYLOAD):
             controller.energising += 1
         else:
-            controller.log(f"command {command} is not emulated")
+            raise ProgramError(f"command {command} is not emulated")
 
     def _speed_thread(self) -> Thread:
         controller = self._controller
@@ -238,15 +245,25 @@ class ControlProgram:
             raise ProgramError(f"speed {speed} and acceleration {accel} of a move must be positive")
         if command in (MOVEJ, MOVEJ_IK):
             return MoveJ(arm, values if command == MOVEJ else self._inverse(values), speed, accel)
-        T = ur_model.from_pose_vector(values) if command == MOVEL else ur_model.forward(values, arm.T_flange_tcp)[0]
+        T = ur_model.from_pose_vector(values) if command == MOVEL else self._forward(values)
         return MoveL(arm, T, speed, accel)
 
-    def _inverse(self, pose: Array) -> Array:
+    def _decide(self, answer: bool) -> None:
+        self._controller.outputs[f"output_int_register_{1 + self._offset}"] = int(answer)
+
+    def _solution(self, pose: Array) -> Array | None:
         arm = self._controller.arm
-        q = ur_model.inverse(ur_model.from_pose_vector(pose), arm.q, arm.T_flange_tcp)
+        return ur_model.inverse(ur_model.from_pose_vector(pose), arm.q, arm.T_flange_tcp, arm.model)
+
+    def _inverse(self, pose: Array) -> Array:
+        q = self._solution(pose)
         if q is None:
             raise ProgramError("get_inverse_kin: no solution")
         return q
+
+    def _forward(self, q: Array) -> Array:
+        arm = self._controller.arm
+        return ur_model.forward(q, arm.T_flange_tcp, arm.model)[0]
 
     def _report_operation(self, *, running: bool) -> None:
         self._writes = (self._writes + 1) % 128

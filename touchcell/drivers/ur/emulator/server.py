@@ -27,6 +27,7 @@ from touchcell.testing.emulation.base import Emulator
 DASHBOARD_PORT = 29999
 SCRIPT_PORTS = (30001, 30002, 30003)
 VERSION = (5, 11, 1, 108249)
+_POLYSCOPE_X = 10
 _MAX_LATE_S = 0.5
 _MAX_BUFFER_BYTES = 1 << 20
 
@@ -51,6 +52,7 @@ _OUTPUT_TYPES = {
             "actual_joint_voltage",
             "ft_raw_wrench",
             "payload_inertia",
+            "tcp_offset",
         ],
         "VECTOR6D",
     ),
@@ -151,14 +153,34 @@ class UrEmulator(Emulator):
         "registers_in_use": "a fieldbus owns the input registers",
         "power_off": "the arm is powered off",
         "speed_slider": "the speed slider is at this fraction",
+        "program_pause": "the program is paused from the pendant",
+        "cut_rtde": "the connections to the real-time interface are cut, and accepted again",
+        "no_dashboard": "nothing serves the dashboard, as on PolyScope X",
+        "version": "[major, minor, bugfix, build] of the controller's software",
+        "missing_variable": "the controller does not know this state variable",
+        "temperature": "degrees Celsius of the joints",
+        "voltage": "V of the robot's supply",
+        "pendant_tool": "[x y z rx ry rz] m and rotation vector: tool set on the pendant",
         "wrench": "[fx fy fz tx ty tz] N and N m act on the tool",
     }
 
-    def __init__(self, host: str, unlock_after_s: float = 5.0, start_deg: Sequence[float] | None = None) -> None:
+    def __init__(
+        self,
+        host: str,
+        unlock_after_s: float = 5.0,
+        start_deg: Sequence[float] | None = None,
+        *,
+        model: str = "ur5e",
+        version: Sequence[int] = VERSION,
+    ) -> None:
         super().__init__()
+        self._model = model
+        self._default_version = tuple(version)
         self._host = host
         self._unlock_after_s = unlock_after_s
-        self._controller = Controller(unlock_after_s, HOME_Q if start_deg is None else np.radians(start_deg))
+        self._controller = Controller(
+            unlock_after_s, HOME_Q if start_deg is None else np.radians(start_deg), ur_model.MODELS[model]
+        )
         self._servers: list[asyncio.Server] = []
         self._clients: list[_RtdeClient] = []
         self._writers: set[asyncio.StreamWriter] = set()
@@ -169,8 +191,13 @@ class UrEmulator(Emulator):
         self._steps = 0
         self._previous: dict[str, Value] = {}
 
+    @property
+    def _version(self) -> tuple[int, ...]:
+        return tuple(self.active.get("version", self._default_version))
+
     async def start(self) -> None:
         await self._listen()
+        self.publish_joints(self._controller.arm.q)
         self._clock = asyncio.create_task(self._run())
 
     async def stop(self) -> None:
@@ -232,6 +259,22 @@ class UrEmulator(Emulator):
             controller.play_foreign_program()
         elif fault == "power_off":
             controller.power(RobotMode.POWER_OFF)
+        elif fault == "program_pause":
+            controller.pause()
+        elif fault == "cut_rtde":
+            for client in self._clients:
+                client.writer.transport.abort()
+            self._clients.clear()
+            del self.active[fault]
+        elif fault == "no_dashboard" or (fault == "version" and self._version[0] >= _POLYSCOPE_X):
+            self._close_dashboard()
+        elif fault == "temperature":
+            controller.temperature_c = float(value)
+        elif fault == "voltage":
+            controller.voltage_v = float(value)
+        elif fault == "pendant_tool":
+            controller.arm.T_flange_tcp = ur_model.from_pose_vector(np.array(value, dtype=np.float64).reshape(6))
+            controller.arm.refresh()
         elif fault == "speed_slider":
             controller.speed_slider = float(value)
         elif fault == "wrench":
@@ -242,6 +285,9 @@ class UrEmulator(Emulator):
         if fault == "pause":
             self._awake.set()
         elif fault == "unplug":
+            self._spawn(self._listen())
+        elif fault in ("no_dashboard", "version"):
+            self._hang_up()
             self._spawn(self._listen())
         elif fault in ("emergency_stop", "fault_bits"):
             controller.stop_by_safety(SafetyMode.NORMAL)
@@ -255,12 +301,19 @@ class UrEmulator(Emulator):
             controller.wrench = np.zeros(6)
 
     async def _listen(self) -> None:
-        services = [(ur_codec.PORT, self._serve_rtde), (DASHBOARD_PORT, self._serve_dashboard)]
+        services = [(ur_codec.PORT, self._serve_rtde)]
+        if self._version[0] < _POLYSCOPE_X and "no_dashboard" not in self.active:
+            services.append((DASHBOARD_PORT, self._serve_dashboard))
         services += [(port, self._serve_script) for port in SCRIPT_PORTS]
         for port, service in services:
             self._servers.append(
                 await asyncio.start_server(self._guarded(service), self._host, port, reuse_address=True)
             )
+
+    def _close_dashboard(self) -> None:
+        for server in self._servers:
+            if server.sockets and server.sockets[0].getsockname()[1] == DASHBOARD_PORT:
+                server.close()
 
     def _hang_up(self) -> None:
         for server in self._servers:
@@ -298,6 +351,7 @@ class UrEmulator(Emulator):
             due_s = max(due_s + PERIOD_S, loop.time() - _MAX_LATE_S)
             await asyncio.sleep(max(0.0, due_s - loop.time()))
             self._controller.step()
+            self.publish_joints(self._controller.arm.q)
             self._steps += 1
             self._stream()
 
@@ -359,7 +413,7 @@ class UrEmulator(Emulator):
             known = ur_codec.parse_version_request(payload) == ur_codec.PROTOCOL_VERSION
             self._send(client.writer, ur_codec.accepted(kind, known))
         elif kind is PacketType.GET_URCONTROL_VERSION:
-            self._send(client.writer, ur_codec.controller_version(*VERSION))
+            self._send(client.writer, ur_codec.controller_version(*self._version))
         elif kind is PacketType.SETUP_OUTPUTS:
             self._setup_outputs(client, payload)
         elif kind is PacketType.SETUP_INPUTS:
@@ -372,7 +426,8 @@ class UrEmulator(Emulator):
 
     def _setup_outputs(self, client: _RtdeClient, payload: bytes) -> None:
         rate_hz, names = ur_codec.parse_setup_outputs(payload)
-        types = [_output_type(name) for name in names]
+        missing = self.active.get("missing_variable")
+        types = [NOT_FOUND if name == missing else _output_type(name) for name in names]
         if NOT_FOUND not in types:
             client.outputs = Recipe(1, names, tuple(types))
             client.every = max(1, round(1.0 / (rate_hz * PERIOD_S)))
@@ -415,10 +470,10 @@ class UrEmulator(Emulator):
         controller = self._controller
         playing = controller.runtime_state is RuntimeState.PLAYING
         questions = {
-            "polyscopeversion": "URSoftware 5.11.1.108249 (Nov 11 2021)",
-            "version": "5.11.1",
+            "polyscopeversion": f"URSoftware {'.'.join(map(str, self._version))} (Nov 11 2021)",
+            "version": ".".join(map(str, self._version[:3])),
             "get serial number": "20225500001",
-            "get robot model": "UR5",
+            "get robot model": self._model.removesuffix("e").upper(),
             "get loaded program": "No program loaded",
             "isprogramsaved": "true",
             "is in remote control": str(controller.remote_control).lower(),
@@ -443,6 +498,10 @@ class UrEmulator(Emulator):
         if word == "stop":
             controller.stop_program()
             return "Stopped"
+        if word == "pause":
+            return "Pausing program" if controller.pause() else "Failed to execute: pause"
+        if word.startswith("load "):
+            return f"File not found: {word.removeprefix('load ')}"
         if word == "play":
             return "Starting program" if controller.play() else "Failed to execute: play"
         if word == "unlock protective stop":
@@ -494,8 +553,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--unlock-after", type=float, default=5.0, metavar="S", help="seconds before a protective stop can be unlocked"
     )
     parser.add_argument("--start-deg", type=float, nargs=6, metavar="DEG", help="joint angles at which it begins")
+    parser.add_argument("--model", choices=sorted(ur_model.MODELS), default="ur5e", help="model of the arm")
+    parser.add_argument(
+        "--version",
+        type=int,
+        nargs=4,
+        default=VERSION,
+        metavar=("MAJOR", "MINOR", "BUGFIX", "BUILD"),
+        help="software of the controller; from 10 on (PolyScope X) there is no dashboard",
+    )
 
 
 def build(arguments: argparse.Namespace) -> UrEmulator:
     """Build the emulator."""
-    return UrEmulator(arguments.host, arguments.unlock_after, arguments.start_deg)
+    return UrEmulator(
+        arguments.host,
+        arguments.unlock_after,
+        arguments.start_deg,
+        model=arguments.model,
+        version=arguments.version,
+    )

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+from touchcell.drivers.core.paced_clock import emulated_clock
 from touchcell.drivers.v4l2 import codec
 
 S = TypeVar("S", bound=ctypes.Structure)
@@ -29,6 +29,7 @@ _PIX_PRIV_MAGIC = 0xFEEDCAFE
 _DESCRIBED_COMPRESSED = 1
 _DISCRETE = 1
 _INPUT_CAMERA = 2
+_CAP_META_CAPTURE = 0x00800000
 _EVENT_ALL, _EVENT_CONTROL = 0, 3
 _EVENT_SEND_INITIAL, _EVENT_ALLOW_FEEDBACK = 1, 2
 _EVENT_VALUE, _EVENT_FLAGS = 1, 2
@@ -140,6 +141,11 @@ class CameraModel:
         self.forgetful = False
         self.fixed_rate = False
         self.no_bandwidth = False
+        self.only_format: tuple[str, int, int] | None = None
+        self.granted_rate_hz: float | None = None
+        self.control_error = 0
+        self.busy = False
+        self.is_metadata = False
         self.stamp_flags = codec.BUF_TIMESTAMP_MONOTONIC | codec.BUF_STAMP_START_OF_EXPOSURE
         self.requests: Counter[str] = Counter()
         self.settings_changed = 0
@@ -171,7 +177,7 @@ class CameraModel:
             return errno.ENOTTY
         if request in _CHANGING:
             self.settings_changed += 1
-            self.last_command_ns = time.monotonic_ns()
+            self.last_command_ns = emulated_clock().now_ns()
         try:
             if request in _GUARDED and handle.priority < max(other.priority for other in self.handles):
                 raise Refused(errno.EBUSY)
@@ -204,6 +210,8 @@ class CameraModel:
         reply.driver, reply.card, reply.bus_info = b"touchcell", self.card.encode(), self.bus.encode()
         reply.version = 0x00060100
         reply.device_caps = codec.CAP_VIDEO_CAPTURE | codec.CAP_STREAMING | codec.CAP_EXT_PIX_FORMAT
+        if self.is_metadata:
+            reply.device_caps = _CAP_META_CAPTURE | codec.CAP_STREAMING
         reply.capabilities = reply.device_caps | codec.CAP_DEVICE_CAPS
 
     def _enum_formats(self, handle: Handle, body: bytearray) -> None:
@@ -233,10 +241,10 @@ class CameraModel:
         self._describe_format(body, self.pixel_format, self.width, self.height)
 
     def _try_format(self, handle: Handle, body: bytearray) -> None:
-        self._describe_format(body, *_nearest_format(body))
+        self._describe_format(body, *(self.only_format or _nearest_format(body)))
 
     def _set_format(self, handle: Handle, body: bytearray) -> None:
-        wanted = _nearest_format(body)
+        wanted = self.only_format or _nearest_format(body)
         self._describe_format(body, *wanted)
         if self.buffers:
             raise Refused(errno.EBUSY)
@@ -258,7 +266,10 @@ class CameraModel:
         if reply.type != codec.VIDEO_CAPTURE:
             raise Refused(errno.EINVAL)
         reply.capability = codec.CAP_TIMEPERFRAME
-        reply.timeperframe = codec.Fraction(1, self.rate_hz)
+        granted_hz = self.granted_rate_hz
+        reply.timeperframe = (
+            codec.Fraction(1, self.rate_hz) if granted_hz is None else codec.Fraction(1000, round(1000 * granted_hz))
+        )
 
     def _set_parameters(self, handle: Handle, body: bytearray) -> None:
         request_body = codec.StreamParameters.from_buffer_copy(body)
@@ -301,7 +312,7 @@ class CameraModel:
         request_body = codec.RequestBuffers.from_buffer_copy(body)
         if request_body.type != codec.VIDEO_CAPTURE or request_body.memory != codec.MEMORY_MMAP:
             raise Refused(errno.EINVAL)
-        if self.owner not in (None, handle) or self.streaming:
+        if self.owner not in (None, handle) or self.streaming or self.busy:
             raise Refused(errno.EBUSY)
         reply = _fresh(codec.RequestBuffers, body, "type", "memory")
         reply.count = self.buffers = min(request_body.count, codec.MAX_BUFFERS)
@@ -407,10 +418,16 @@ class CameraModel:
         reply.name = self.controls[reply.id].menu[reply.index].encode()
 
     def _get_control(self, handle: Handle, body: bytearray) -> None:
+        self._fail_if_broken()
         request = codec.Control.from_buffer(body)
         request.value = self._readable(request.id).value
 
+    def _fail_if_broken(self) -> None:
+        if self.control_error:
+            raise Refused(self.control_error)
+
     def _set_control(self, handle: Handle, body: bytearray) -> None:
+        self._fail_if_broken()
         request = codec.Control.from_buffer(body)
         self._check(request.id, request.value)
         request.value = self._store(handle, request.id, request.value)
@@ -513,7 +530,7 @@ class CameraModel:
                 self._post(handle, identity, changes)
 
     def _post(self, handle: Handle, identity: int, changes: int) -> None:
-        control, now_ns = self.controls[identity], time.monotonic_ns()
+        control, now_ns = self.controls[identity], emulated_clock().now_ns()
         handle.events.append(
             codec.Event(
                 type=_EVENT_CONTROL,

@@ -10,18 +10,19 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import errno
 import math
 import mmap
 import os
 import socket
 import struct
 import sys
-import time
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
+from touchcell.drivers.core.paced_clock import emulated_clock
 from touchcell.drivers.v4l2 import codec
 from touchcell.drivers.v4l2.emulator import picture
 from touchcell.drivers.v4l2.emulator.device import SLOT_BYTES, CameraModel, Handle
@@ -37,6 +38,7 @@ _FOREIGN_CLOCK_NS = 1_000_000_000_000
 _EXPOSURE_FOR_FULL_LIGHT = 157
 _GAIN_FOR_DOUBLE_LIGHT = 50
 _LIGHT_STEP = 0.01
+_DARKNESS = 0.05
 
 
 class _Client:
@@ -69,6 +71,7 @@ class V4l2Emulator(Emulator):
         minor: number N of its /dev/videoN.
         images: folder of images to show instead of the synthetic ones.
         show: function from a frame's number to the grey image (height, width) to show; replaces both.
+        latency_s: time from a frame's exposure to its delivery.
     """
 
     faults: ClassVar = {
@@ -78,6 +81,7 @@ class V4l2Emulator(Emulator):
         "freeze_frame": "the same image for ever, with fresh timestamps and numbers",
         "corrupt": "number of truncated frames",
         "error_flag": "number of frames that the kernel marks as corrupt",
+        "gain": "factor on the brightness, as of a lamp that fails",
         "exposure_drift": "change of brightness per second, as a fraction",
         "stuck_controls": "controls accept every value and change nothing",
         "no_monotonic": "timestamps on an unknown clock",
@@ -90,6 +94,15 @@ class V4l2Emulator(Emulator):
         "no_bandwidth": "the USB bus has no room: streaming cannot start",
         "forgets": "every control returns to its default when the stream starts",
         "reset_controls": "every control returns to its default now",
+        "unreadable": "number of times that a frame cannot be dequeued (EIO)",
+        "empty": "number of frames without any bytes",
+        "busy": "another program streams from the camera",
+        "metadata_node": "the name is that of the camera's second node, for metadata",
+        "only_format": "[pixel format, width, height]: the camera has no other and substitutes it silently",
+        "granted_rate": "frame rate that the camera grants, and makes, whatever is asked for",
+        "control_errors": "requests for controls fail with this error number",
+        "slow_start": "seconds until the first frame of a stream",
+        "dark": "the light is off",
         "other_camera": "another camera of the same make, at another socket, has this name",
         "restart": "seconds for which the camera is disconnected before it returns by itself",
     }
@@ -100,8 +113,10 @@ class V4l2Emulator(Emulator):
         minor: int = 0,
         images: Path | None = None,
         show: Callable[[int], ImageArray] | None = None,
+        latency_s: float = 0.0,
     ) -> None:
         super().__init__()
+        self._latency_s = latency_s
         self._show = show
         self._folder = folder
         self._minor = minor
@@ -172,7 +187,7 @@ class V4l2Emulator(Emulator):
         if fault == "restart":
             asyncio.get_running_loop().call_later(float(value), self.end, "restart")
         if fault == "exposure_drift":
-            self._drift_since_s = time.monotonic()
+            self._drift_since_s = 1e-9 * emulated_clock().now_ns()
         if fault == "no_monotonic":
             self.model.stamp_flags &= ~codec.BUF_TIMESTAMP_MASK
         if fault == "reset_controls":
@@ -186,6 +201,11 @@ class V4l2Emulator(Emulator):
         model.forgetful = "forgets" in active
         model.fixed_rate = "no_s_parm" in active
         model.no_bandwidth = "no_bandwidth" in active
+        model.only_format = tuple(active["only_format"]) if "only_format" in active else None
+        model.granted_rate_hz = float(active["granted_rate"]) if "granted_rate" in active else None
+        model.control_error = int(active.get("control_errors", 0))
+        model.busy = "busy" in active
+        model.is_metadata = "metadata_node" in active
         model.bus = f"{self._bus}.4" if "other_camera" in active else self._bus
 
     def on_clear(self, fault: str) -> None:
@@ -269,9 +289,10 @@ class V4l2Emulator(Emulator):
 
     async def _run_sensor(self) -> None:
         loop = asyncio.get_running_loop()
-        next_s = loop.time()
+        next_s = loop.time() + float(self.active.get("slow_start", 0.0))
         while True:
-            period_s = max(1.0 / float(self.active.get("true_rate", self.model.rate_hz)), self.model.exposure_s)
+            made_hz = self.model.granted_rate_hz or self.model.rate_hz
+            period_s = max(1.0 / float(self.active.get("true_rate", made_hz)), self.model.exposure_s)
             next_s += period_s
             if loop.time() - next_s > _LATE_PERIODS * period_s:
                 next_s = loop.time()
@@ -280,7 +301,7 @@ class V4l2Emulator(Emulator):
                 self._expose()
 
     def _expose(self) -> None:
-        stamp_ns = time.monotonic_ns()
+        stamp_ns = emulated_clock().now_ns()
         self._sequence += 1
         if self.spend("drop"):
             self._counts["dropped"] += 1
@@ -288,6 +309,10 @@ class V4l2Emulator(Emulator):
         data, flags, sequence = self._picture(), 0, self._sequence
         if self.spend("corrupt"):
             data = data[: len(data) // 2]
+        if self.spend("empty"):
+            data = b""
+        if self.spend("unreadable"):
+            self._fail_dequeue(errno.EIO)
         if self.spend("padding"):
             data += b"\x13\xff\xd8\x07" * 8
         if self.spend("hole"):
@@ -299,7 +324,7 @@ class V4l2Emulator(Emulator):
             stamp_ns -= _OLDER_FRAMES * round(1e9 / self.model.rate_hz)
         if "no_monotonic" in self.active:
             stamp_ns += _FOREIGN_CLOCK_NS
-        stream, delay_s = self._stream, float(self.active.get("delay", 0.0))
+        stream, delay_s = self._stream, self._latency_s + float(self.active.get("delay", 0.0))
         if delay_s > 0.0:
             asyncio.get_running_loop().call_later(delay_s, self._deliver, stream, data, sequence, stamp_ns, flags)
         else:
@@ -321,6 +346,11 @@ class V4l2Emulator(Emulator):
             client.frames.send(bytes(self.model.filled(index, len(data), sequence, stamp_ns, flags)))
         self._counts["delivered"] += 1
         self._last_stamp_ns = stamp_ns
+
+    def _fail_dequeue(self, error: int) -> None:
+        if self.model.owner in self._clients:
+            with contextlib.suppress(OSError):
+                self._clients[self.model.owner].frames.send(struct.pack("=2i", 0, error))
 
     def _picture(self) -> bytes:
         if "freeze_frame" in self.active and self._shown:
@@ -345,8 +375,11 @@ class V4l2Emulator(Emulator):
         light = 1.0 + controls[codec.CID_GAIN].value / _GAIN_FOR_DOUBLE_LIGHT
         if controls[codec.CID_EXPOSURE_AUTO].value == codec.EXPOSURE_MANUAL:
             light *= math.sqrt(controls[codec.CID_EXPOSURE_ABSOLUTE].value / _EXPOSURE_FOR_FULL_LIGHT)
+        if "dark" in self.active:
+            light *= _DARKNESS
+        light *= float(self.active.get("gain", 1.0))
         drift_per_s = float(self.active.get("exposure_drift", 0.0))
-        return light * max(0.0, 1.0 + drift_per_s * (time.monotonic() - self._drift_since_s))
+        return light * max(0.0, 1.0 + drift_per_s * (1e-9 * emulated_clock().now_ns() - self._drift_since_s))
 
 
 @lru_cache(maxsize=96)
