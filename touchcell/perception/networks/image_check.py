@@ -31,7 +31,7 @@ _LEARNING_RATE = 3e-3
 _SET_ASIDE = 400
 _REJECTED = 0.002
 _MOST_ODDS = -1.0
-_MARGIN = 0.5
+_MARGIN = 0.2
 _MARKERS_ACROSS = 21.0
 _UPRIGHT_SHARE = 0.98
 
@@ -88,8 +88,8 @@ def train_check(
                 progress(step + 1, steps)
         network.eval()
         with torch.inference_mode():
-            kept = network(_exposed(_kept(_scaled(aside), rng), rng)).numpy()[:, :2]
-            turned = network(_exposed(_symmetric(_scaled(aside), rng), rng)).numpy()[:, 1]
+            kept = network(_exposed(_worn(_kept(_scaled(aside), rng), rng), rng)).numpy()[:, :2]
+            turned = network(_exposed(_worn(_symmetric(_scaled(aside), rng), rng), rng)).numpy()[:, 1]
     least = min(_MOST_ODDS, float(np.quantile(kept[:, 0], _REJECTED)) - _MARGIN)
     # Where both classes look the same, the odds do not separate them.
     limit = min(_MOST_ODDS, float(np.quantile(kept[:, 1], _REJECTED)))
@@ -124,7 +124,7 @@ def _examples(batch: ImageArray, rng: np.random.Generator, *, upright: bool) -> 
     straight[: len(plain)] = 1.0
     weighed = torch.zeros(n)
     weighed[: len(plain) + len(turned)] = 1.0
-    return _exposed(inputs, rng), own, straight, weighed
+    return _exposed(_worn(inputs, rng), rng), own, straight, weighed
 
 
 def _warp(
@@ -149,11 +149,17 @@ def _warp(
 
 
 def _kept(images: Tensor, rng: np.random.Generator) -> Tensor:
-    """Jitter as between sessions, missing pins, dust, noise: what must stay accepted. A third is as it is."""
-    n, _, height, width = images.shape
+    """Jitter as between sessions; a third is as it is."""
+    n = len(images)
     jittered = _warp(images, 1.0 + rng.normal(0, 0.004, n), rng.normal(0, 0.005, n), rng.normal(0, 0.0025, (n, 2)))
     which = torch.from_numpy(rng.random(n) < 0.67)[:, None, None, None]
-    out = torch.where(which, jittered, images)
+    return torch.where(which, jittered, images)
+
+
+def _worn(images: Tensor, rng: np.random.Generator) -> Tensor:
+    """Hide pins and add dust, as wear does. It happens to images of either class, and must not tell them apart."""
+    out = images.clone()
+    n, _, height, width = images.shape
     v, u = np.mgrid[:height, :width]
     pin = 0.45 * width / _MARKERS_ACROSS
     covered = np.zeros((n, 1, height, width), np.float32)
