@@ -26,6 +26,7 @@ BENCHMARKS = {
     "keeper": "benchmarks.keeper",
     "mutation": "benchmarks.mutation",
     "hil-mutation": "benchmarks.hil_mutation",
+    "phantom": "benchmarks.phantom",
     "kinematics": "benchmarks.kinematics",
     "safety": "tests.fault_injection.safety",
     "safety-against": "benchmarks.safety_against",

@@ -9,6 +9,7 @@ from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.scene import ContactState
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
+from touchcell.simulation.contact import ContactLaw
 from touchcell.simulation.scene import SceneConfig
 
 mujoco = pytest.importorskip("mujoco")
@@ -46,14 +47,68 @@ def test_a_sliding_contact_keeps_the_shear_that_friction_holds() -> None:
     assert hand.move((20, 0, 0, 0, 0, 0), 0.5).slipping
     state = hand.move((2, 0, 0, 0, 0, 0), 0.3)
     assert state.slipping
-    # 1.5 N/mm times 3 mm, and half of that against 1 N/mm.
+    # 1.5 N/mm times 3 mm; the shear is that of the law, whatever the coefficient.
     assert state.normal_force_n == pytest.approx(4.5, rel=0.03)
-    assert parts(state)[0] == pytest.approx(0.5 * 4.5, rel=0.03)
+    assert state.shear_force_n[0] == pytest.approx(-0.5 * 4.5, rel=0.03)
+    assert parts(state)[0] == pytest.approx(1e3 * ContactLaw().max_shear_m(0.003), rel=0.03)
     away = hand.move((0, 0, -10, 0, 0, 0), 0.5)
     assert not away.in_contact
     assert not away.slipping
     assert away.normal_force_n == 0.0
     np.testing.assert_allclose(parts(away), [0, 0, -2, 0, 0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("depth_mm", [0.5, 1.0, 2.0, 3.0, 4.5, 6.0])
+def test_what_survives_a_slide_is_within_a_tenth_of_the_law_that_was_fitted_to_real_images(depth_mm: float) -> None:
+    hand = CommandedTip(FLOOR, ABOVE)
+    hand.move((0, 0, 10, 0, 0, 0), 0.1 * (depth_mm + 0.5))
+    hand.move((20, 0, 0, 0, 0, 0), 0.7)
+    state = hand.move((2, 0, 0, 0, 0, 0), 0.3)
+    assert state.slipping
+    assert parts(state)[0] == pytest.approx(1e3 * ContactLaw().max_shear_m(1e-3 * depth_mm), rel=0.1)
+
+
+def test_a_centre_of_mass_aside_turns_a_prism_that_is_pushed_through_its_middle() -> None:
+    yaw = {}
+    for aside_mm in (-10, 0, 10):
+        for physics in ("quasi_static", "dynamic"):
+            prism = {**PRISM, "center_of_mass_mm": [0, aside_mm]}
+            hand = CommandedTip({"objects": {"prism": prism}}, BEHIND, physics)
+            hand.move((0, 0, 20, 0, 0, 0), 2.0)
+            T = hand.object()
+            yaw[physics, aside_mm] = float(np.degrees(np.arctan2(T[1, 0], T[0, 0])))
+    for physics in ("quasi_static", "dynamic"):
+        assert abs(yaw[physics, 0]) < 0.5
+        assert yaw[physics, 10] == pytest.approx(-yaw[physics, -10], rel=0.1)
+        # The heavy side stays behind.
+        assert yaw[physics, 10] > 3.0
+    assert yaw["quasi_static", 10] == pytest.approx(yaw["dynamic", 10], rel=0.3)
+
+
+@pytest.mark.parametrize(("tilt_deg", "slides"), [(14.0, False), (20.0, True)])
+def test_an_object_slides_down_a_table_that_is_steeper_than_its_friction(tilt_deg: float, slides: bool) -> None:
+    scene = {"objects": {"prism": PRISM}, "table": {"friction": 0.3, "tilt_deg": [0, tilt_deg]}}
+    # The tip stands far away.
+    hand = CommandedTip(scene, (-300, 0, 30, 0, 90, 0))
+    hand.move(STILL, 0.5)
+    # MuJoCo's friction creeps by some micrometres.
+    assert (1e3 * hand.object()[0, 3] > 1.0) == slides
+
+
+def test_quasi_static_physics_refuse_a_slope_on_which_nothing_rests() -> None:
+    table = {"friction": 0.3, "tilt_deg": [0, 20]}
+    with pytest.raises(ValidationError, match="steeper than friction"):
+        SceneConfig.model_validate({"physics": "quasi_static", "objects": {"prism": PRISM}, "table": table})
+
+
+@pytest.mark.parametrize("physics", ["quasi_static", "dynamic"])
+def test_an_object_is_harder_to_push_on_a_rough_patch(physics: str) -> None:
+    depth_mm = []
+    for factor in (1.0, 2.0):
+        table = {"friction": "mdf", "patches": [{"center_mm": [0, 0], "radius_mm": 300, "factor": factor}]}
+        hand = CommandedTip({"objects": {"prism": PRISM}, "table": table}, BEHIND, physics)
+        depth_mm.append(1e3 * hand.move((0, 0, 20, 0, 0, 0), 1.0).depth_m)
+    assert depth_mm[1] == pytest.approx(2.0 * depth_mm[0], rel=0.05)
 
 
 @pytest.mark.parametrize("kind", ["dome", "ramp"])
@@ -130,12 +185,13 @@ def test_two_tips_carry_a_prism_off_the_table() -> None:
     hand.move_all({"tip": (-20, 0, 0, 0, 0, 0), "other": (20, 0, 0, 0, 0, 0)}, 1.0)
     hand.move(STILL, 0.5)
     weight_n = 0.479 * GRAVITY_M_S2
-    assert hand.object()[2, 3] == pytest.approx(0.020 - weight_n / 2000.0, abs=3e-4)
+    shear_n_mm = 1e-3 * ContactLaw().shear_stiffness_n_m(0.006)
+    assert 1e3 * hand.object()[2, 3] == pytest.approx(20.0 - 0.5 * weight_n / shear_n_mm, abs=0.3)
     for name in ("tip", "other"):
         state = hand.scene.contact(name).value
         assert state.depth_m == pytest.approx(0.006, abs=1e-4)
-        # Half of the weight pulls each tip down by its shear stiffness of 1 N/mm.
-        assert abs(parts(state)[0]) == pytest.approx(weight_n / 2.0, abs=0.05)
+        # Half of the weight pulls each tip down by its shear stiffness at that depth.
+        assert abs(parts(state)[0]) == pytest.approx(0.5 * weight_n / shear_n_mm, abs=0.05)
 
 
 def test_a_sticking_contact_does_not_creep() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import count
 from unittest.mock import patch
 
 import numpy as np
@@ -19,7 +20,7 @@ from touchcell.tasks.state_machine import state_name
 from touchcell.tasks.surface_following import SPEC, Follow, SurfaceFollowingConfig
 
 QUICK = SurfaceFollowingConfig(distance_mm=20.0, approach_distance_mm=20.0, retract_mm=5.0, settle_time_s=0.1)
-ACTIVE = ("prepare", "approach", "settle", "run", "return", "retract")
+ACTIVE = ("prepare", "approach", "check", "settle", "run", "return", "retract")
 ON_SURFACE = ("approach", "settle", "run")
 
 
@@ -33,7 +34,8 @@ def path(task: Task) -> list[tuple[str, str, str]]:
 
 WHOLE = [
     ("prepare", "ready", "approach"),
-    ("approach", "contact", "settle"),
+    ("approach", "contact", "check"),
+    ("check", "agrees", "settle"),
     ("settle", "settled", "run"),
     ("run", "finished", "retract"),
     ("retract", "retracted", "done"),
@@ -206,6 +208,7 @@ def every_way() -> set[tuple[str, str, str]]:
         plant.run(task)
         seen.update(path(task))
 
+    finish(KinematicPlant(gap_mm=-1.0), build())
     for state in ACTIVE:
         plant, task = reached(state)
         finish(plant, task)
@@ -222,7 +225,7 @@ def every_way() -> set[tuple[str, str, str]]:
         plant.frozen = True
         plant.frames = state != "prepare"
         finish(plant, task)
-        if state in ("settle", "run"):
+        if state in ("check", "settle", "run"):
             plant, task = reached(state)
             for _ in range(2):
                 plant.touching = False
@@ -230,6 +233,14 @@ def every_way() -> set[tuple[str, str, str]]:
                 plant.touching = True
                 plant.run(task, until=state)
             finish(plant, task)
+    plant, task = reached("check")
+    for cycle in count():
+        # Each estimate comes before the arm trips for lack of one, and the motion takes too long.
+        plant.in_range = cycle % 40 == 39
+        plant.cycle(task)
+        if task.state != "check":
+            break
+    finish(plant, task)
     plant, task = KinematicPlant(), build(QUICK.model_copy(update={"return_lift_mm": None}))
     plant.run(task, until="run")
     plant.touching = False
@@ -244,6 +255,38 @@ def every_way() -> set[tuple[str, str, str]]:
     assert task.transitions[-2].reason == "5 mm from the target"
     assert not task.succeeded
     return seen
+
+
+def test_it_takes_a_zero_frame_before_and_after_it_backs_off() -> None:
+    plant, task = KinematicPlant(gap_mm=3.0), build()
+    plant.image = 0.3
+    start = plant.T_w_s
+    plant.run(task, until="approach")
+    assert plant.zeros == 2
+    back = se3.compose(se3.inverse(start), plant.T_w_s)[:3, 3]
+    np.testing.assert_allclose(back, [0, 0, -0.002], atol=3e-4)
+    plant.run(task, until="settle")
+    assert 0.0005 < plant.seen[2, 3] < 0.0015
+
+
+@pytest.mark.parametrize("image", [None, 0.3])
+def test_it_refuses_by_name_to_start_in_contact(image) -> None:
+    plant, task = KinematicPlant(gap_mm=-1.0), build()
+    plant.image = image
+    plant.run(task)
+    assert path(task) == [("prepare", "touching", "failed")]
+    assert "sensor is in contact before the approach" in task.transitions[-1].reason
+
+
+def test_an_image_that_changes_without_touch_and_then_stays_trips() -> None:
+    plant, task = KinematicPlant(gap_mm=15.0), build()
+    plant.image = 0.0
+    plant.run(task, until="approach")
+    plant.knocked = 0.2
+    plant.run(task)
+    assert path(task)[-1] == ("approach", "trip", "tripped")
+    assert "does not change while the arm moves" in task.transitions[-1].reason
+    assert plant.seen[2, 3] < -0.005
 
 
 def test_every_transition_can_be_made_and_no_other():

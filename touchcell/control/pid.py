@@ -62,8 +62,8 @@ class Pid:
 
     The error is smoothed by an exponentially weighted average before it is differentiated. The integral *term* is
     accumulated and clipped, in m/s and rad/s: with constant gains that equals the paper's clipped integral. Errors
-    outside the integral zone are not integrated. After ``reset`` the first step has no derivative and no history, so it
-    starts without a kick.
+    outside the integral zone are not integrated, nor is what would drive a clipped output farther beyond its limit.
+    After ``reset`` the first step has no derivative and no history, so it starts without a kick.
     """
 
     def __init__(self, gains: PidGains) -> None:
@@ -74,6 +74,12 @@ class Pid:
         """Clear the integral, the derivative and the error history."""
         self._integral = np.zeros(6)
         self._smoothed: Array | None = None
+        self._clipped: NDArray[np.bool_] = np.zeros(6, dtype=bool)
+
+    @property
+    def clipped(self) -> NDArray[np.bool_]:
+        """(6,) bool: components of the latest output that their limit has cut."""
+        return self._clipped
 
     @property
     def integral(self) -> Array:
@@ -98,11 +104,17 @@ class Pid:
             smoothed = SMOOTHING * e + (1.0 - SMOOTHING) * before
             near = np.where(np.abs(e) <= gains.integral_zone, e, 0.0)
             integral = _clipped(self._integral + gains.ki @ near * dt_s, gains.integral_limit)
-            output = V_ff + gains.kp @ e + integral + gains.kd @ ((smoothed - before) / dt_s)
+            rest = V_ff + gains.kp @ e + gains.kd @ ((smoothed - before) / dt_s)
+            # Conditional integration: what would push a clipped component farther beyond its limit is not added.
+            beyond = np.abs(rest + integral) > gains.output_limit
+            winding = beyond & ((integral - self._integral) * (rest + integral) > 0.0)
+            integral = np.where(winding, self._integral, integral)
+            output = rest + integral
         if not all_finite(output):
             raise ControlError("e", "is so large that the output overflows", e)
         self._smoothed = smoothed
         self._integral = integral
+        self._clipped = np.abs(output) > gains.output_limit
         return _clipped(output, gains.output_limit)
 
 

@@ -14,7 +14,7 @@ Free objects touch the table, tips and each other, but not prescribed surfaces.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -51,6 +51,8 @@ class _Mounted:
         R_start: (3, 3) the same before that step.
         speed: (6,) [v, w] in that step along ``R_start``, at the tip's position.
         normal: (3,) outward, of the nearest surface.
+        depth: m, indentation after that step; negative out of contact.
+        stiffness: N/m, of the springs across the normal.
     """
 
     T_world_s: Array
@@ -58,6 +60,8 @@ class _Mounted:
     R_start: Array
     speed: Array
     normal: Array
+    depth: float
+    stiffness: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +110,9 @@ class DynamicWorld:
         table_height_m: height of the level plane under them.
         tip: mechanics of every tip.
         step_s: time step of the physics; steps of the scene must be multiples of it.
+        gravity_m_s2: in the world frame.
+        friction_factor: returns the table's friction at a place (x, y, m) over that elsewhere; None for the same
+            everywhere.
 
     Raises:
         ConfigError: nothing to touch.
@@ -118,6 +125,8 @@ class DynamicWorld:
         table_height_m: float,
         tip: TipMechanics,
         step_s: float,
+        gravity_m_s2: Sequence[float] = (0.0, 0.0, -9.81),
+        friction_factor: Callable[[float, float], float] | None = None,
     ) -> None:
         if not (surfaces or objects):
             raise ConfigError("the scene has nothing to touch", key="scene")
@@ -127,8 +136,8 @@ class DynamicWorld:
         self._shapes = {name: shape_of(thing.solid) for name, thing in objects.items()}
         self._table_height_m = table_height_m if objects else None
         self._step_s = step_s
-        across = tip.shear_damping_n_s_m
-        self._damping = np.array([across, across, tip.damping_n_s_m, 0.0, 0.0, tip.torsion_damping_n_m_s])
+        self._gravity_m_s2 = gravity_m_s2
+        self._friction_factor = friction_factor
         self._mounted: dict[str, _Mounted] = {}
         self._t_s = 0.0
         self._build({})
@@ -136,9 +145,10 @@ class DynamicWorld:
     def mount(self, sensor: str, T_world_s: Array, t_s: float) -> ContactState:
         """Add ``sensor``; return its contact at ``T_world_s`` (4, 4) at ``t_s``. All tips start undeformed and all
         objects at rest."""
-        normal = self._nearest(T_world_s[:3, 3], t_s).normal
-        R_world_c = _upright(T_world_s, normal)
-        self._mounted[sensor] = _Mounted(T_world_s, R_world_c, R_world_c, np.zeros(6), normal)
+        nearest = self._nearest(T_world_s[:3, 3], t_s)
+        R_world_c, depth = _upright(T_world_s, nearest.normal), self.tip.radius_m - nearest.distance_m
+        stiffness = self.tip.shear_stiffness_n_m
+        self._mounted[sensor] = _Mounted(T_world_s, R_world_c, R_world_c, np.zeros(6), nearest.normal, depth, stiffness)
         self._t_s = t_s
         self._build(self.objects())
         return self._contact_of(sensor, T_world_s, t_s)()
@@ -148,6 +158,8 @@ class DynamicWorld:
         span_s = t_s - self._t_s
         for sensor, pose in T_world_s.items():
             self._carry(sensor, pose, span_s)
+        if self._friction_factor is not None:
+            self._place_feet(self._friction_factor)
         mujoco.mj_step(self._at.model, self._data, round(span_s / self._step_s))
         for sensor in T_world_s:
             self._settle(sensor)
@@ -188,6 +200,7 @@ class DynamicWorld:
             self.tip,
             self._step_s,
             patches=bool(self._surfaces),
+            gravity_m_s2=self._gravity_m_s2,
         )
         self._data = mujoco.MjData(self._at.model)
         model, data = self._at.model, self._data
@@ -216,6 +229,7 @@ class DynamicWorld:
         if not math.isfinite(float(T_world_s.sum())):
             raise PhysicsError(f"the pose of {sensor!r}", self._t_s)
         mounted, tip = self._mounted[sensor], self._tips[sensor]
+        self._stiffen(sensor, mounted)
         position = mounted.T_world_s[:3, 3]
         R_start, R_end = mounted.R_world_c, _upright(T_world_s, mounted.normal)
         swing = _swing(R_start, R_end)
@@ -228,11 +242,30 @@ class DynamicWorld:
         # Of the carriage at the tip's position: springs are damped relative to it, and carrying a tip takes no force.
         speed = np.concatenate([v + cross(w, tip.q[:3]), w])
         tip.rate[:] += speed
-        tip.applied[:] = self._damping * speed
+        at = self._at.tips[sensor].qvel
+        tip.applied[:] = self._at.model.dof_damping[at : at + 6] * speed
         if self._surfaces:
             self._place_patch(sensor, position + R_start @ tip.q[:3])
         mounted.T_world_s, mounted.R_world_c = T_world_s, R_end
         mounted.R_start, mounted.speed = R_start, speed
+
+    def _stiffen(self, sensor: str, mounted: _Mounted) -> None:
+        """Give the springs across the normal the stiffness of the last step's depth."""
+        if self.tip.law is None:
+            return
+        stiffness = self.tip.shear_stiffness_at_n_m(mounted.depth)
+        model, at = self._at.model, self._at.tips[sensor]
+        model.jnt_stiffness[at.joint : at.joint + 2] = stiffness
+        model.actuator_gainprm[at.servo : at.servo + 2, 0] = stiffness
+        model.dof_damping[at.qvel : at.qvel + 2] = 2.0 * math.sqrt(stiffness * self.tip.mass_kg)
+        mounted.stiffness = stiffness
+
+    def _place_feet(self, factor: Callable[[float, float], float]) -> None:
+        """Give every geometry of an object the friction of the table below it."""
+        model, data = self._at.model, self._data
+        for geom, friction in self._at.feet.items():
+            x, y = data.geom_xpos[geom, 0], data.geom_xpos[geom, 1]
+            model.geom_friction[geom, 0] = friction * factor(float(x), float(y))
 
     def _settle(self, sensor: str) -> None:
         """Express the tip's coordinates, and their rates, along its carriage's present axes."""
@@ -262,10 +295,12 @@ class DynamicWorld:
 
     def _contact_of(self, sensor: str, T_world_s: Array, t_s: float) -> DeferredContact:
         nearest, tip = self._nearest(T_world_s[:3, 3], t_s), self._tips[sensor]
-        self._mounted[sensor].normal = nearest.normal
+        mounted = self._mounted[sensor]
+        mounted.normal, mounted.depth = nearest.normal, self.tip.radius_m - nearest.distance_m
+        stiffness = mounted.stiffness
         dx, dy, dz, _, _, turned = tip.q.tolist()
         rate = float(tip.rate[2])
-        return lambda: _contact(self.tip, T_world_s, nearest, (dx, dy, dz), turned, rate)
+        return lambda: _contact(self.tip, stiffness, T_world_s, nearest, (dx, dy, dz), turned, rate)
 
     def _nearest(self, point: Array, t_s: float) -> SurfacePoint:
         """Return the nearest point to ``point`` (3,): of a surface, the table, or an object at its present pose."""
@@ -302,13 +337,15 @@ class DynamicWorld:
 
 def _contact(
     tip: TipMechanics,
+    stiffness: float,
     T_world_s: Array,
     nearest: SurfacePoint,
     deflection: tuple[float, float, float],
     turned: float,
     rate: float,
 ) -> ContactState:
-    """Return the contact of a tip whose springs are deflected by ``deflection`` and ``turned``."""
+    """Return the contact of a tip whose springs, of ``stiffness`` across the normal, are deflected by ``deflection``
+    and ``turned``."""
     R_f_s, depth = tilt_of(-nearest.normal @ T_world_s[:3, :3]), tip.radius_m - nearest.distance_m
     shear = pull = (0.0, 0.0)
     force, slipping = 0.0, False
@@ -317,10 +354,10 @@ def _contact(
         # The sphere stays behind with the surface, so its deflection is the sensor's own displacement reversed.
         sin, cos = math.sin(turned), math.cos(turned)
         shear = (-cos * dx - sin * dy, sin * dx - cos * dy)
-        pull = (-tip.shear_stiffness_n_m * shear[0], -tip.shear_stiffness_n_m * shear[1])
+        pull = (-stiffness * shear[0], -stiffness * shear[1])
         pressing = -tip.stiffness_n_m * dz
         held = math.hypot(
-            tip.shear_stiffness_n_m * math.hypot(dx, dy) / tip.friction,
+            stiffness * math.hypot(dx, dy) / tip.friction,
             tip.torsion_stiffness_n_m_rad * turned / tip.torsion_friction_m,
         )
         force = max(pressing - tip.damping_n_s_m * rate, 0.0)

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from touchcell.geometry.types import Array
+from touchcell.simulation.contact import ContactLaw
 from touchcell.simulation.objects import FreeObject
 from touchcell.simulation.shapes import Ball, Prism, Solid, Turned
 from touchcell.simulation.solids import friction_radius_m, mass_properties
@@ -33,6 +34,8 @@ _SOLVER_TOLERANCE = 5e-5
 # off centre at 20 mm/s turns 12 % too little, at 0.5 it turns as the limit surface predicts.
 _TABLE_SOLREF = (0.004, 0.5)
 _PATCH_HALF_M = (0.1, 0.1, 0.02)
+# Below this depth the springs across the normal stiffen no further.
+_SHALLOWEST_M = 0.2e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +48,8 @@ class TipMechanics:
         friction: coefficient of sliding friction against everything.
         mass_kg: mass of the sphere. Lighter ones creep where they should stick (docs/explanation/simulation.md).
         torsion_friction_m: frictional torque about the contact normal, per normal force.
+        law: contact law whose largest shear at each depth the springs across the normal have; None for springs of one
+            stiffness.
     """
 
     radius_m: float = 0.020
@@ -52,11 +57,18 @@ class TipMechanics:
     friction: float = 0.9
     mass_kg: float = 0.1
     torsion_friction_m: float = 0.005
+    law: ContactLaw | None = None
 
     @property
     def shear_stiffness_n_m(self) -> float:
         """Stiffness across the normal, in the proportion of 1 N/mm across to 1.5 N/mm along it."""
         return self.stiffness_n_m / 1.5
+
+    def shear_stiffness_at_n_m(self, depth_m: float) -> float:
+        """Return the stiffness across the normal at a depth, with which the skin slips at the shear of ``law``."""
+        if self.law is None:
+            return self.shear_stiffness_n_m
+        return self.law.shear_stiffness_n_m(max(depth_m, _SHALLOWEST_M))
 
     @property
     def torsion_stiffness_n_m_rad(self) -> float:
@@ -103,12 +115,14 @@ class TipAddress:
     Attributes:
         qpos, qvel: index of the first one.
         servo: index of the first of four actuators, which are the springs along x, y, z and about z.
+        joint: index of the first of its six joints.
         body: its body, whose frame in the world is the carriage's.
     """
 
     qpos: int
     qvel: int
     servo: int
+    joint: int
     body: int
 
 
@@ -121,12 +135,14 @@ class SceneModel:
         objects: free joint of each object.
         tips: tip of each sensor.
         patches: free joint of the surface patch in front of each sensor; empty without surfaces.
+        feet: friction coefficient of each geometry that touches the table, by its index.
     """
 
     model: Any
     objects: Mapping[str, Address]
     tips: Mapping[str, TipAddress]
     patches: Mapping[str, Address]
+    feet: Mapping[int, float]
 
 
 def build_model(
@@ -137,6 +153,7 @@ def build_model(
     step_s: float,
     *,
     patches: bool,
+    gravity_m_s2: Sequence[float] = (0.0, 0.0, -9.81),
 ) -> SceneModel:
     """Compile the model.
 
@@ -147,9 +164,11 @@ def build_model(
         tip: mechanics of every tip.
         step_s: time step.
         patches: whether each sensor has a patch of prescribed surface in front of it.
+        gravity_m_s2: in the world frame.
     """
     spec = mujoco.MjSpec()
     option = spec.option
+    option.gravity = list(gravity_m_s2)
     option.timestep = step_s
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -184,13 +203,19 @@ def build_model(
         {name: address(f"object/{name}") for name in objects},
         {sensor: _tip_address(model, sensor) for sensor in sensors},
         {sensor: address(f"patch/{sensor}") for sensor in sensors} if patches else {},
+        {
+            geom: float(model.geom_friction[geom, 0])
+            for name in objects
+            for geom in np.flatnonzero(model.geom_bodyid == model.body(f"object/{name}").id).tolist()
+        },
     )
 
 
 def _tip_address(model: Any, sensor: str) -> TipAddress:
     first = model.joint(f"tip/{sensor}/x")
     servo = int(model.actuator(f"tip/{sensor}/x").id)
-    return TipAddress(int(first.qposadr[0]), int(first.dofadr[0]), servo, int(model.body(f"tip/{sensor}").id))
+    body = int(model.body(f"tip/{sensor}").id)
+    return TipAddress(int(first.qposadr[0]), int(first.dofadr[0]), servo, int(first.id), body)
 
 
 def _add_tip(spec: Any, sensor: str, tip: TipMechanics, own_bit: int) -> None:
@@ -273,7 +298,7 @@ def _add_object(spec: Any, name: str, thing: FreeObject) -> None:
         pos=thing.T_world_object[:3, 3],
         quat=quaternion(thing.T_world_object[:3, :3]),
         mass=thing.mass_kg,
-        ipos=properties.com_m,
+        ipos=properties.com_m + np.array([*thing.center_of_mass_m, 0.0]),
         inertia=thing.mass_kg * properties.inertia_per_kg_m2,
         explicitinertial=True,
     )

@@ -22,14 +22,13 @@ from touchcell.drivers.core.scene import ContactState
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 from touchcell.simulation.contact import ContactLaw, ContactModel
-from touchcell.simulation.objects import FreeObject
+from touchcell.simulation.objects import GRAVITY_M_S2 as GRAVITY_M_S2
+from touchcell.simulation.objects import FreeObject, TableConfig
 from touchcell.simulation.shapes import Ball
 from touchcell.simulation.solids import friction_radius_m, plain_shape_of
 from touchcell.simulation.surfaces import Surface
 from touchcell.simulation.timeline import Restore
 from touchcell.simulation.world import DeferredContact
-
-GRAVITY_M_S2: Final = 9.81
 
 _Three = tuple[float, float, float]
 _Matrix = tuple[float, float, float, float, float, float, float, float, float]
@@ -43,12 +42,15 @@ _TOLERANCE: Final = 1e-7
 class _Slider:
     """A sliding object: its pose and the motion of its surface.
 
+    Friction acts about the centre of mass: under a body at rest the centre of pressure lies below it.
+
     Attributes:
-        x, y, yaw: of the object's origin in the world, m and rad.
+        x, y, yaw: of the object's centre of mass in the world, m and rad.
         weight_n: its own weight plus the downward force of tips.
+        com_x, com_y: centre of mass from the object's origin, m.
     """
 
-    def __init__(self, name: str, body: FreeObject) -> None:
+    def __init__(self, name: str, body: FreeObject, table: TableConfig) -> None:
         T, solid = body.T_world_object, body.solid
         if isinstance(solid, Ball):
             raise ConfigError(
@@ -66,17 +68,25 @@ class _Slider:
         self.surface = Surface(self.shape, self)
         self.radius_m = friction_radius_m(solid)
         self.friction = body.friction
-        self.own_weight_n = body.mass_kg * GRAVITY_M_S2
+        gravity = table.gravity_m_s2
+        self.own_weight_n = -body.mass_kg * gravity[2]
+        self.downhill_n = body.mass_kg * gravity[0], body.mass_kg * gravity[1]
         self.weight_n = self.own_weight_n
-        self.x, self.y, self.z = (float(value) for value in T[:3, 3])
+        self._factor = table.factor if table.patches else None
         self.yaw = math.atan2(T[1, 0], T[0, 0])
+        self.com_x, self.com_y = body.center_of_mass_m
+        sin, cos = math.sin(self.yaw), math.cos(self.yaw)
+        self.x = float(T[0, 3]) + cos * self.com_x - sin * self.com_y
+        self.y = float(T[1, 3]) + sin * self.com_x + cos * self.com_y
+        self.z = float(T[2, 3])
         self._velocity = np.zeros(6)
         self._T = T
 
     @property
     def limit_n(self) -> float:
         """Largest friction force of the table."""
-        return self.friction * self.weight_n
+        factor = 1.0 if self._factor is None else self._factor(self.x, self.y)
+        return factor * self.friction * self.weight_n
 
     def pose(self, t_s: float) -> Array:
         """Return T_world_body (4, 4) at the last step, whatever the time."""
@@ -103,9 +113,13 @@ class _Slider:
             self._velocity = np.array([dx, dy, 0.0, 0.0, 0.0, turn]) / dt_s
         if dx or dy or turn:
             sin, cos = math.sin(self.yaw), math.cos(self.yaw)
-            self._T = np.array(
-                [[cos, -sin, 0.0, self.x], [sin, cos, 0.0, self.y], [0.0, 0.0, 1.0, self.z], [0.0, 0.0, 0.0, 1.0]]
-            )
+            x = self.x - cos * self.com_x + sin * self.com_y
+            y = self.y - sin * self.com_x - cos * self.com_y
+            self._T = np.array([[cos, -sin, 0.0, x], [sin, cos, 0.0, y], [0.0, 0.0, 1.0, self.z], [0.0, 0.0, 0.0, 1.0]])
+            if dt_s > 0.0:
+                # The twist is that of the object's origin.
+                self._velocity[0] += turn / dt_s * (y - self.y) * -1.0
+                self._velocity[1] += turn / dt_s * (x - self.x)
 
 
 class QuasiStaticWorld:
@@ -115,16 +129,23 @@ class QuasiStaticWorld:
         surfaces: surfaces by name.
         objects: objects by name.
         law: contact law of every tip.
+        table: the table under the objects.
 
     Raises:
         ConfigError: nothing to touch, an object is not upright, or it is a ball.
     """
 
-    def __init__(self, surfaces: Mapping[str, Surface], objects: Mapping[str, FreeObject], law: ContactLaw) -> None:
+    def __init__(
+        self,
+        surfaces: Mapping[str, Surface],
+        objects: Mapping[str, FreeObject],
+        law: ContactLaw,
+        table: TableConfig | None = None,
+    ) -> None:
         if not (surfaces or objects):
             raise ConfigError("the scene has nothing to touch", key="scene")
         self.law = law
-        self._sliders = {name: _Slider(name, body) for name, body in objects.items()}
+        self._sliders = {name: _Slider(name, body, table or TableConfig()) for name, body in objects.items()}
         self._bodies = [*(slider.surface for slider in self._sliders.values()), *surfaces.values()]
         self._models: dict[str, ContactModel] = {}
         self._t_s = 0.0
@@ -267,13 +288,15 @@ def _force(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw, shift: _Three
     radius, stiff_n, nearest = slider.radius_m, law.stiffness_n_m, slider.shape.nearest_numbers
     x, y, yaw = slider.x + shift[0], slider.y + shift[1], slider.yaw + shift[2] / radius
     sin, cos = math.sin(yaw), math.cos(yaw)
-    force_x = force_y = force_turn = down = 0.0
+    com_x, com_y = slider.com_x, slider.com_y
+    force_x, force_y = slider.downhill_n
+    force_turn = down = 0.0
     xx = xy = xt = yx = yy = yt = tx = ty = tt = 0.0
     for tip in tips:
         cx, cy, cz = tip.centre[0] - x, tip.centre[1] - y, tip.centre[2] - slider.z
-        # From here on in the object's frame.
+        # From here on in the object's frame; levers are from its centre of mass.
         bx, by = cos * cx + sin * cy, cos * cy - sin * cx
-        distance, nx, ny, nz, px, py, pz = nearest(bx, by, cz)
+        distance, nx, ny, nz, px, py, pz = nearest(bx + com_x, by + com_y, cz)
         depth = law.tip_radius_m - distance
         if depth <= 0.0:
             continue
@@ -293,6 +316,7 @@ def _force(slider: _Slider, tips: Sequence[_Tip], law: ContactLaw, shift: _Three
             down -= stiff_t * sz
         force_x += cos * fx - sin * fy
         force_y += sin * fx + cos * fy
+        px, py = px - com_x, py - com_y
         force_turn += (px * fy - py * fx) / radius
         # For a shift of the object's side against the tip, along the normal and along the tangent. Depth and shear
         # change with the object's motion at the tip's centre.

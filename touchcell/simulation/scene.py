@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -382,9 +383,19 @@ class TipLawConfig(Section):
     radius_mm: float = Field(default=20.0, gt=0.0)
     stiffness_n_mm: float = Field(default=1.5, gt=0.0)
     friction: float = Field(default=0.9, gt=0.0, le=3.0, description="of the skin, where objects are free")
+    slip_at_1mm_mm: float = Field(
+        default=0.34, gt=0.0, le=3.0, description="shear that survives at 1 mm depth, fitted to real images"
+    )
+    slip_exponent: float = Field(default=1.83, ge=0.5, le=3.0, description="growth of that shear with depth")
 
     def build(self) -> ContactLaw:
-        return ContactLaw(self.radius_mm * 1e-3, self.stiffness_n_mm * 1e3, self.friction)
+        return ContactLaw(
+            self.radius_mm * 1e-3,
+            self.stiffness_n_mm * 1e3,
+            self.friction,
+            self.slip_at_1mm_mm * 1e-3,
+            self.slip_exponent,
+        )
 
 
 class SceneConfig(Section, SceneSection):
@@ -419,6 +430,10 @@ class SceneConfig(Section, SceneSection):
             raise ValueError("the scene has neither surfaces nor objects to touch")
         if self.physics == "kinematic" and self.objects:
             raise ValueError("free objects need physics other than kinematic")
+        gravity = self.table.gravity_m_s2
+        lowest = min((each.friction or self.table.coefficient for each in self.objects.values()), default=math.inf)
+        if self.physics == "quasi_static" and math.hypot(*gravity[:2]) >= lowest * -gravity[2]:
+            raise ValueError("table.tilt_deg is steeper than friction holds an object without inertia")
         steps = self.step_ms / self.physics_step_ms
         if self.physics == "dynamic" and abs(steps - max(round(steps), 1)) > 1e-6:
             raise ValueError(f"step_ms {self.step_ms:g} is not a multiple of physics_step_ms {self.physics_step_ms:g}")
@@ -454,16 +469,25 @@ class SceneConfig(Section, SceneSection):
             return KinematicWorld(surfaces, self.tip.build())
         if self.physics == "quasi_static":
             objects = {name: config.build(self.table) for name, config in self.objects.items()}
-            return QuasiStaticWorld(surfaces, objects, self.tip.build())
+            return QuasiStaticWorld(surfaces, objects, self.tip.build(), self.table)
         return self._dynamic_world(surfaces)
 
     def _dynamic_world(self, surfaces: Mapping[str, Surface]) -> World:
         with physics_engine("scene.physics", "dynamic"):
             from touchcell.simulation.dynamics import DynamicWorld
             from touchcell.simulation.dynamics_model import TipMechanics
-        tip = TipMechanics(1e-3 * self.tip.radius_mm, 1e3 * self.tip.stiffness_n_mm, self.tip.friction)
+        law = self.tip.build()
+        tip = TipMechanics(law.tip_radius_m, law.stiffness_n_m, law.friction, law=law)
         objects = {name: config.build(self.table) for name, config in self.objects.items()}
-        return DynamicWorld(surfaces, objects, 1e-3 * self.table.height_mm, tip, 1e-3 * self.physics_step_ms)
+        return DynamicWorld(
+            surfaces,
+            objects,
+            1e-3 * self.table.height_mm,
+            tip,
+            1e-3 * self.physics_step_ms,
+            self.table.gravity_m_s2,
+            self.table.factor if self.table.patches else None,
+        )
 
 
 SPEC = SceneSpec("simulated", "surfaces and free objects, kinematic, quasi-static or dynamic", SceneConfig)

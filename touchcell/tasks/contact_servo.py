@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Protocol
+from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
@@ -50,6 +50,24 @@ class Behavior(Protocol):
         ...
 
 
+@runtime_checkable
+class Sidestepping(Protocol):
+    """Behavior that may ask for its contact to be made anew beside the present one."""
+
+    @property
+    def sidestep_m(self) -> float | None:
+        """Distance to step to the left of the contact normal, as seen from above; None for no step."""
+        ...
+
+    def begin_sidestep(self) -> None:
+        """Take note that the contact is given up for another."""
+        ...
+
+    def begin_approach(self, T_base_sensor: Array) -> None:
+        """Take note of the pose (4, 4) from which the sensor approaches along its axis."""
+        ...
+
+
 Six = tuple[float, float, float, float, float, float]
 """One number for each of x, y, z, alpha, beta, gamma."""
 
@@ -69,6 +87,8 @@ class ContactServoConfig(TaskConfig):
         integral_zone_deg: ... nor does turning.
         max_speed_mm_s: largest speed of the sensor along each axis.
         max_turn_deg_s: largest angular rate of the sensor about each axis.
+        max_accel_mm_s2: largest change of the sensor's velocity per second, below what the arm's gate allows ...
+        max_turn_accel_deg_s2: ... and of its angular velocity: noise of single frames is smoothed by them.
         settle_tolerance_mm: the contact is steady when the controlled errors are below these ...
         settle_tolerance_deg: ... two.
         max_frame_age_ms: the arm stops when the newest frame is older.
@@ -84,6 +104,8 @@ class ContactServoConfig(TaskConfig):
     integral_zone_deg: PositiveFloat = 5.0
     max_speed_mm_s: PositiveFloat = 60.0
     max_turn_deg_s: PositiveFloat = 20.0
+    max_accel_mm_s2: PositiveFloat = 450.0
+    max_turn_accel_deg_s2: PositiveFloat = 120.0
     settle_tolerance_mm: PositiveFloat = 0.3
     settle_tolerance_deg: PositiveFloat = 2.0
     max_frame_age_ms: PositiveFloat = 150.0
@@ -122,6 +144,7 @@ class ContactServo:
         context: of the cell.
         running_axes: components x, y, z, alpha, beta, gamma of the sensor's twist that the behavior leaves to the
             controller; the others are held at rest once the contact has settled.
+        decoupled: see ``TactileServo``.
 
     Attributes:
         T_base_sensor: (4, 4) pose of the sensor; None where it is unknown or too old.
@@ -140,6 +163,8 @@ class ContactServo:
         run: Behavior,
         context: TaskContext,
         running_axes: tuple[bool, bool, bool, bool, bool, bool] = (True, True, True, True, True, True),
+        *,
+        decoupled: bool = False,
     ) -> None:
         self.arm = arm
         self.sensor = sensor
@@ -149,13 +174,20 @@ class ContactServo:
         self._running_axes = None if all(running_axes) else np.array(running_axes, np.float64)
         self._Ad_tcp_sensor = se3.adjoint(self._T_tcp_sensor)
         T_f_sref = se3.from_euler_mm_deg(np.array(reference_mm_deg))
-        self.controller = TactileServo(se3.inverse(T_f_sref), self._T_tcp_sensor, config.gains(), 1.0 / context.rate_hz)
+        self.controller = TactileServo(
+            se3.inverse(T_f_sref), self._T_tcp_sensor, config.gains(), 1.0 / context.rate_hz, decoupled=decoupled
+        )
         self.T_base_sensor: Array | None = None
         self.contact: ContactEstimate | None = None
         self._before: Array | None = None
         self._start: Array | None = None
         self._felt: Array | None = None
         self._back: Array | None = None
+        self._period_s = 1.0 / context.rate_hz
+        self._V_tcp = np.zeros(6)
+        self._touched = False
+        self._first_touch: tuple[Array, float] | None = None
+        self._waypoints: list[Array] = []
 
     @property
     def has_fresh_data(self) -> bool:
@@ -168,11 +200,75 @@ class ContactServo:
         return self.contact is not None and self.contact.in_contact
 
     @property
+    def has_zero(self) -> bool:
+        """True if the sensor compares its images with a zero frame."""
+        return self.contact is not None and self.contact.change is not None
+
+    @property
+    def change_since_zero(self) -> float:
+        """Change of the newest image from the zero frame, 0 to 1; 0 where there is none."""
+        return 0.0 if self.contact is None or self.contact.change is None else self.contact.change
+
+    @property
+    def seq(self) -> int:
+        """Number of the newest frame; -1 where there is none."""
+        return -1 if self.contact is None else self.contact.seq
+
+    @property
+    def max_frame_age_ms(self) -> float:
+        """Age of a frame from which the arm stops."""
+        return self._config.max_frame_age_ms
+
+    @property
+    def touches(self) -> bool:
+        """True if the newest frame shows a contact that has changed as the sensor moved on."""
+        return self.in_contact and self._touched
+
+    @property
+    def contact_is_stuck(self) -> bool:
+        """True if a contact has shown since the sensor began to move and has not changed, however far it moved."""
+        return self.in_contact and not self._touched and self._pressed_m() > 1e-3 * _LONGEST_UNCHANGED_MM
+
+    def _pressed_m(self) -> float:
+        """Distance by which the sensor has moved along its axis since the contact first showed."""
+        if self._first_touch is None or self.T_base_sensor is None:
+            return 0.0
+        T, _ = self._first_touch
+        return float((self.T_base_sensor[:3, 3] - T[:3, 3]) @ T[:3, 2])
+
+    def _watch_touch(self) -> None:
+        """A contact is one once its image has changed as the sensor pressed on; one without images is one at once."""
+        if not self.in_contact or self.contact is None:
+            self._touched, self._first_touch = False, None
+        elif self.contact.change is None:
+            self._touched = True
+        elif self._first_touch is None:
+            if self.T_base_sensor is not None:
+                self._first_touch = self.T_base_sensor, self.contact.change
+        elif not self._touched:
+            _, change = self._first_touch
+            self._touched = (
+                self._pressed_m() >= 1e-3 * _SHORTEST_PRESS_MM and self.contact.change - change >= _LEAST_CHANGE
+            )
+
+    @property
     def T_s_f(self) -> Array | None:  # noqa: N802  the field's own name
         """Valid contact pose (4, 4), or None."""
         if self.contact is None or not (self.contact.in_contact and self.contact.in_range):
             return None
         return None if self.contact.belief is None else self.contact.belief.mean
+
+    @property
+    def is_estimated(self) -> bool:
+        """True if a model measured the newest contact, rather than a simulator or a label."""
+        return self.contact is not None and self.contact.measured is not None
+
+    @property
+    def T_s_f_measured(self) -> Array | None:  # noqa: N802  the field's own name
+        """Valid contact pose (4, 4) of the newest frame by itself, or None."""
+        if self.T_s_f is None or self.contact is None or self.contact.measured is None:
+            return self.T_s_f
+        return self.contact.measured.mean
 
     def update(self, observation: Observation) -> None:
         """Update sensor pose and contact from an observation, dropping what is stale."""
@@ -186,6 +282,8 @@ class ContactServo:
             self.contact = None
         if self.T_base_sensor is not None and self.in_contact:
             self._felt = self.T_base_sensor
+        if self.contact is not None:
+            self._watch_touch()
 
     def aim_back(self, lift_m: float) -> None:
         """Aim at the pose in which the contact was last felt, withdrawn along the sensor's axis by ``lift_m``."""
@@ -209,9 +307,45 @@ class ContactServo:
         V_tcp: Array = self._Ad_tcp_sensor @ (V / fastest)
         return V_tcp
 
+    def start_approach(self) -> None:
+        """Measure the travelled distance from the current pose, from which the sensor approaches."""
+        self.reset_travel()
+        if isinstance(self.run, Sidestepping) and self.T_base_sensor is not None:
+            self.run.begin_approach(self.T_base_sensor)
+
     def reset_travel(self) -> None:
         """Measure the travelled distance from the current pose."""
         self._start = self.T_base_sensor
+
+    def start_sidestep(self, clear_m: float) -> None:
+        """Plan a step aside: back by ``clear_m`` along the sensor's axis, then as far aside as the behavior asks."""
+        self._waypoints = []
+        if self.T_base_sensor is None or not isinstance(self.run, Sidestepping) or self.run.sidestep_m is None:
+            return
+        R, position = self.T_base_sensor[:3, :3], self.T_base_sensor[:3, 3]
+        left = np.cross([0.0, 0.0, 1.0], R[:, 2])
+        away = position - clear_m * R[:, 2]
+        self._waypoints = [away, away + self.run.sidestep_m * left]
+        self.run.begin_sidestep()
+
+    @property
+    def sidestepping(self) -> bool:
+        """True while a step aside has not ended."""
+        return bool(self._waypoints)
+
+    def step_aside(self, speed_m_s: float) -> Array:
+        """Return the twist (6,) of the tool towards the next waypoint; drop waypoints that are reached."""
+        assert self.T_base_sensor is not None
+        while self._waypoints:
+            to = self._waypoints[0] - self.T_base_sensor[:3, 3]
+            distance_m = float(np.linalg.norm(to))
+            if distance_m > _REACHED_M:
+                # The last stretch is slower, so that it ends there.
+                v = to / distance_m * min(speed_m_s, _APPROACH_PER_S * distance_m)
+                V_s = np.concatenate([self.T_base_sensor[:3, :3].T @ v, np.zeros(3)])
+                return np.asarray(self._Ad_tcp_sensor @ V_s)
+            self._waypoints.pop(0)
+        return np.zeros(6)
 
     def travelled_m(self) -> float:
         """Return the distance of the sensor from its pose at ``reset_travel``, m; 0 while it is unknown."""
@@ -237,7 +371,12 @@ class ContactServo:
 
     def along_z(self, speed_m_s: float) -> Array:
         """Return the twist (6,) of the tool that moves the sensor along its z axis."""
-        V_tcp: Array = self._Ad_tcp_sensor @ np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0])
+        return self.in_tcp(np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0]))
+
+    def in_tcp(self, V_sensor: Array) -> Array:
+        """Return the twist (6,) of the tool, in its frame, that gives the sensor a twist (6,) in its own."""
+        V_tcp: Array = self._Ad_tcp_sensor @ V_sensor
+        self._V_tcp = V_tcp
         return V_tcp
 
     def servo_step(self, V_ff: Array, *, running: bool = True) -> Array | None:
@@ -245,7 +384,16 @@ class ContactServo:
         V_tcp = self.controller.step(self.T_s_f, 0 if self.contact is None else self.contact.t_ns, V_ff)
         if running and self._running_axes is not None:
             V_tcp = self._Ad_tcp_sensor @ (self._running_axes * np.linalg.solve(self._Ad_tcp_sensor, V_tcp))
-        return None if self.T_s_f is None else V_tcp
+        if self.T_s_f is None:
+            self._V_tcp = np.zeros(6)
+            return None
+        self._V_tcp = np.concatenate(
+            [
+                _towards(self._V_tcp[:3], V_tcp[:3], 1e-3 * self._config.max_accel_mm_s2 * self._period_s),
+                _towards(self._V_tcp[3:], V_tcp[3:], math.radians(self._config.max_turn_accel_deg_s2) * self._period_s),
+            ]
+        )
+        return self._V_tcp
 
     def telemetry(self, observation: Observation, *, servoing: bool) -> Mapping[str, float]:
         """Return the age of the newest frame, and while ``servoing`` errors, references and the behavior's values."""
@@ -259,7 +407,23 @@ class ContactServo:
         for name, error, reference in zip(_COMPONENTS, errors, references, strict=True):
             if math.isfinite(reference):
                 values[f"error_{name}"], values[f"reference_{name}"] = error, reference
+        values["servo_clipped"] = float(self.controller.clipped)
         return {**values, **self.run.telemetry()}
+
+
+_SHORTEST_PRESS_MM = 0.3
+_LONGEST_UNCHANGED_MM = 2.5
+# The image changes by about 0.1 per millimetre of depth (``contact_gate``).
+_LEAST_CHANGE = 0.01
+_REACHED_M = 0.5e-3
+_APPROACH_PER_S = 8.0
+
+
+def _towards(start: Array, goal: Array, longest: float) -> Array:
+    """Return ``start`` (3,) moved towards ``goal`` (3,) by at most ``longest``."""
+    step = goal - start
+    length = math.sqrt(float(step @ step))
+    return goal if length <= longest else start + step * (longest / length)
 
 
 _COMPONENTS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")

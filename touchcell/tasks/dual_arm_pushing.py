@@ -15,6 +15,7 @@ from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig, Six, SixGains
 from touchcell.tasks.interface import CONTACT_DEPTH, TaskContext, TaskSpec
+from touchcell.tasks.predictive_push import twist_in_sensor
 from touchcell.tasks.servoing import ServoConfig, ServoTask
 from touchcell.tasks.single_arm_pushing import Push, PushConfig
 
@@ -36,13 +37,15 @@ class FollowerConfig(ContactServoConfig):
             0.9, a / (a^2 + c^2) with a from its centre to the contact and c its friction radius.
     """
 
-    active: bool = False
+    active: bool = True
     turn_deg_per_mm: PositiveFloat = 0.9
     reference_mm_deg: Annotated[Six, CONTACT_DEPTH] = (0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
     kp_per_s: SixGains = (0.0, 10.0, 10.0, 10.0, 0.0, 0.0)
     ki_per_s2: SixGains = (0.0, 25.0, 25.0, 25.0, 0.0, 0.0)
     integral_zone_mm: PositiveFloat = 5.0
     integral_zone_deg: PositiveFloat = 10.0
+    max_speed_mm_s: PositiveFloat = 140.0
+    max_turn_deg_s: PositiveFloat = 25.0
     settle_tolerance_mm: PositiveFloat = 0.5
 
 
@@ -82,6 +85,9 @@ class Follow:
         """
         if self._push is None:
             return np.zeros(6)
+        if (motion := self._push.object_motion) is not None:
+            left_m_s = motion.left_m_s + motion.turn_rad_s * self._middle_m
+            return twist_in_sensor(-motion.ahead_m_s, -left_m_s, motion.turn_rad_s, self._y_is_left)
         turn_rad_s = self._turn_per_m * self._push.left_m_s
         aside_m_s = self._y_is_left * self._middle_m * turn_rad_s
         return np.array([0.0, aside_m_s, -self._speed_m_s, self._y_is_left * turn_rad_s, 0.0, 0.0])

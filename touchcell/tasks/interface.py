@@ -79,6 +79,7 @@ class Action:
         twists: a command for each arm that shall move; an arm without one is stopped.
         telemetry: named numbers for recording and plots, units in the names.
         labels: contact T_f_s (4, 4) shown by the newest frame of a sensor, by role: the frame is stored with it.
+        zero: roles of sensors whose newest frame shows nothing: contacts are measured against it from now on.
         settings: named set values for each other device that shall change, by role; the others keep what they have.
     """
 
@@ -86,6 +87,7 @@ class Action:
     telemetry: Mapping[str, float] = field(default_factory=dict)
     labels: Mapping[str, Array] = field(default_factory=dict)
     settings: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    zero: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)

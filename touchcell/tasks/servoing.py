@@ -13,8 +13,9 @@ from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Six
+from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Sidestepping, Six
 from touchcell.tasks.interface import SPEED, Action, Observation, TaskContext, TaskSpec, TransitionRecord
+from touchcell.tasks.sensor_check import SensorCheck
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
 from touchcell.tasks.state_machine_task import MachineTask
 
@@ -26,12 +27,36 @@ _RETURN_S: Final = 10.0
 """Longest return to where a contact was lost; the way is that of a few frames."""
 
 
+_START_CHANGE: Final = 0.02
+"""Change of the image, of 1, by which a sensor that backs off shows that it was in contact: 0.2 mm of depth."""
+
+
+class _Preparation(Enum):
+    """What has been done before the approach."""
+
+    FIRST_ZERO = auto()
+    BACK_OFF = auto()
+    STAND = auto()
+    READY = auto()
+
+
+_CLEAR_M: Final = 0.008
+"""Distance by which a sensor lets go of an object before it steps aside."""
+
+
 class ServoConfig(ContactServoConfig):
     """Parameters of all tasks that hold contacts; those of one contact servo apply to the leading arm.
 
     Attributes:
+        back_off_mm: distance to withdraw before the approach, while the sensor's image is compared with a zero frame:
+            one that changes was in contact.
         approach_speed_mm_s: speed towards the surface, along the sensor's z axis.
         approach_distance_mm: the approach fails when no contact was made within it.
+        check_s: duration of the motion after first contact whose measured answer must agree with the arm's before the
+            arm servos on a model's estimates (``sensor_check``); 0 leaves it out.
+        check_press_mm: depth that this motion adds.
+        check_shift_mm: its largest shift along the surface.
+        check_tilt_deg: its largest tilt.
         settle_time_s: the contact has settled when errors were below the tolerances for this long.
         settle_timeout_s: settling fails when it takes longer.
         retract_mm: distance to withdraw at the end.
@@ -43,8 +68,13 @@ class ServoConfig(ContactServoConfig):
         prepare_timeout_s: longest wait for the first frame and arm state.
     """
 
+    back_off_mm: PositiveFloat = 2.0
     approach_speed_mm_s: Annotated[PositiveFloat, SPEED] = 10.0
     approach_distance_mm: PositiveFloat = 50.0
+    check_s: NonNegativeFloat = 1.0
+    check_press_mm: NonNegativeFloat = 0.5
+    check_shift_mm: PositiveFloat = 0.3
+    check_tilt_deg: PositiveFloat = 1.0
     settle_time_s: NonNegativeFloat = 0.3
     settle_timeout_s: PositiveFloat = 10.0
     retract_mm: PositiveFloat = 20.0
@@ -60,9 +90,11 @@ class ServoState(Enum):
 
     PREPARE = auto()
     APPROACH = auto()
+    CHECK = auto()
     SETTLE = auto()
     RUN = auto()
     RETURN = auto()
+    SIDESTEP = auto()
     RETRACT = auto()
     DONE = auto()
     STOPPED = auto()
@@ -71,19 +103,32 @@ class ServoState(Enum):
     FAULTED = auto()
 
 
-def servo_table(task: str, config: ServoConfig, run_timeout_s: float) -> Table:
-    """Return the states and transitions of a servoing task; motions time out after twice their nominal duration."""
+def servo_table(
+    task: str, config: ServoConfig, run_timeout_s: float, *, sidesteps: bool = False, servos: int = 1
+) -> Table:
+    """Return the states and transitions of a servoing task; motions time out after twice their nominal duration.
+
+    Args:
+        task: its name.
+        config: its parameters.
+        run_timeout_s: longest time in ``run``.
+        sidesteps: whether a contact may be given up for another beside it.
+        servos: number of sensors, which are checked one after another.
+    """
     s = ServoState
     approach_s = 2.0 * config.approach_distance_mm / config.approach_speed_mm_s + 1.0
+    check_s = 2.0 * servos * config.check_s + 1.0
     retract_s = 2.0 * config.retract_mm / config.retract_speed_mm_s + 1.0
     return Table(
         task,
         (
             StateDef(s.PREPARE, config.prepare_timeout_s, "timeout"),
             StateDef(s.APPROACH, approach_s, "timeout", on_enter="start_approach"),
+            StateDef(s.CHECK, check_s, "timeout", on_enter="start_check"),
             StateDef(s.SETTLE, config.settle_timeout_s, "timeout", on_enter="start_settle"),
             StateDef(s.RUN, run_timeout_s, "timeout", on_enter="start_run"),
             StateDef(s.RETURN, _RETURN_S, "timeout", on_enter="start_return"),
+            *((StateDef(s.SIDESTEP, config.settle_timeout_s, "timeout", on_enter="start_sidestep"),) * sidesteps),
             StateDef(s.RETRACT, retract_s, "timeout", on_enter="start_retract"),
             StateDef(s.DONE, terminal=True),
             StateDef(s.STOPPED, terminal=True),
@@ -93,16 +138,26 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float) -> Table:
         ),
         (
             TransitionDef("ready", s.PREPARE, s.APPROACH),
+            TransitionDef("touching", s.PREPARE, s.FAILED),
             TransitionDef("timeout", s.PREPARE, s.FAILED),
             TransitionDef(STOP, s.PREPARE, s.STOPPED),
+            TransitionDef("contact", s.APPROACH, s.CHECK, guard="must_check"),
             TransitionDef("contact", s.APPROACH, s.SETTLE),
             TransitionDef("no_contact", s.APPROACH, s.RETRACT),
+            TransitionDef("agrees", s.CHECK, s.SETTLE),
+            TransitionDef("lost", s.CHECK, s.APPROACH, guard="may_reapproach"),
+            TransitionDef("lost", s.CHECK, s.RETRACT),
             TransitionDef("settled", s.SETTLE, s.RUN),
             TransitionDef("lost", s.SETTLE, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.SETTLE, s.RETRACT),
             TransitionDef("finished", s.RUN, s.RETRACT),
             TransitionDef("missed", s.RUN, s.RETRACT),
             TransitionDef("lost", s.RUN, s.RETURN, guard="may_return"),
+            *(
+                (TransitionDef("aside", s.RUN, s.SIDESTEP), TransitionDef("placed", s.SIDESTEP, s.APPROACH))
+                if sidesteps
+                else ()
+            ),
             TransitionDef("lost", s.RUN, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.RUN, s.RETRACT),
             TransitionDef("returned", s.RETURN, s.APPROACH),
@@ -123,7 +178,8 @@ class ServoTask(MachineTask):
 
     While the contact servos search for the surface or hold it, they move only on fresh frames, fresh arm states and
     valid estimates, all of them or none. When they retract, away from the surface, a fresh arm state suffices. A servo
-    that has made its contact holds it until the others have made theirs.
+    that has made its contact holds it until the others have made theirs; until its sensor was checked it stands still.
+    The sensors are checked one after another, once.
 
     Args:
         name: the task's name.
@@ -139,13 +195,21 @@ class ServoTask(MachineTask):
         self._config = config
         self._period_s = 1.0 / context.rate_hz
         self._servos = servos
-        self._machine = TaskMachine(servo_table(name, config, min(servo.run.timeout_s for servo in servos)), self)
+        timeout_s = min(servo.run.timeout_s for servo in servos)
+        sidesteps = any(isinstance(servo.run, Sidestepping) for servo in servos)
+        self._machine = TaskMachine(servo_table(name, config, timeout_s, sidesteps=sidesteps, servos=len(servos)), self)
+        self._checks: list[SensorCheck] = []
+        self._unchecked = config.check_s > 0.0
         self._now_ns = 0
         self._steady_s = 0.0
         self._blind_s = 0.0
         self._reapproaches = 0
         self._stop_seen = False
         self._finished_run = False
+        self._prepared = _Preparation.FIRST_ZERO
+        self._stood_s = 0.0
+        self._zero: frozenset[str] = frozenset()
+        self._zero_seq: dict[str, int] = {}
 
     def tick(self, observation: Observation) -> Action:
         """Process one cycle."""
@@ -162,10 +226,14 @@ class ServoTask(MachineTask):
         except TouchcellError as error:
             self._machine.fire(FAULT, str(error), now_ns=observation.now_ns)
             return Action()
+        zero, self._zero = self._zero, frozenset()
         return Action(
-            {servo.arm: self._command(servo, V) for servo, V in twists},
-            self._telemetry(observation),
+            {servo.arm: self._command(servo, V) for servo, V in twists}, self._telemetry(observation), zero=zero
         )
+
+    def must_check(self) -> bool:
+        """Guard: a sensor's contact is estimated by a model, and the sensors have not been checked yet."""
+        return self._unchecked and any(servo.is_estimated for servo in self._servos)
 
     def may_reapproach(self) -> bool:
         """Guard: a lost contact may be searched for again."""
@@ -187,7 +255,7 @@ class ServoTask(MachineTask):
         """On entry: measure the travelled distance from here."""
         self._reapproaches += record.event == "lost"
         for servo in self._servos:
-            servo.reset_travel()
+            servo.start_approach()
         self._blind_s = 0.0
 
     def start_return(self, record: TransitionRecord) -> None:
@@ -195,6 +263,15 @@ class ServoTask(MachineTask):
         self._reapproaches += 1
         for servo in self._servos:
             servo.aim_back(1e-3 * (self._config.return_lift_mm or 0.0))
+        self._blind_s = 0.0
+
+    def start_check(self, record: TransitionRecord) -> None:
+        """On entry: begin the motion of the first sensor."""
+        c = self._config
+        self._checks = [
+            SensorCheck(c.check_s, press_mm=c.check_press_mm, shift_mm=c.check_shift_mm, tilt_deg=c.check_tilt_deg)
+            for _ in self._servos
+        ]
         self._blind_s = 0.0
 
     def start_settle(self, record: TransitionRecord) -> None:
@@ -207,6 +284,12 @@ class ServoTask(MachineTask):
     def start_run(self, record: TransitionRecord) -> None:
         """On entry: keep servoing, now with the feedforward."""
         self._blind_s = 0.0
+
+    def start_sidestep(self, record: TransitionRecord) -> None:
+        """On entry: plan the step aside of the servos that asked for one; the others hold their contact."""
+        self._blind_s = 0.0
+        for servo in self._servos:
+            servo.start_sidestep(_CLEAR_M)
 
     def start_retract(self, record: TransitionRecord) -> None:
         """On entry: measure the travelled distance from here, unless a stop only confirms a retraction under way."""
@@ -223,15 +306,19 @@ class ServoTask(MachineTask):
         servos = self._servos
         match self._machine.state:
             case ServoState.PREPARE:
-                if all(servo.has_fresh_data for servo in servos):
-                    self._post("ready")
+                self._prepare()
             case ServoState.APPROACH:
                 self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in servos))
-                searching = [servo for servo in servos if not servo.in_contact]
-                if not searching:
+                searching = [servo for servo in servos if not servo.touches]
+                if stuck := next((servo.sensor for servo in servos if servo.contact_is_stuck), None):
+                    self._post(TRIP, f"{stuck}: its contact does not change while the arm moves")
+                elif not searching:
                     self._post("contact")
                 elif max(servo.travelled_m() for servo in searching) >= 1e-3 * self._config.approach_distance_mm:
                     self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
+            case ServoState.CHECK:
+                self._watch_contact(dt_s)
+                self._watch_check()
             case ServoState.SETTLE:
                 self._watch_contact(dt_s)
                 steady = all(servo.steady() for servo in servos)
@@ -252,9 +339,72 @@ class ServoTask(MachineTask):
                 self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in servos))
                 if all(servo.is_back() for servo in servos):
                     self._post("returned")
+                elif any(isinstance(s.run, Sidestepping) and s.run.sidestep_m is not None for s in servos):
+                    self._post("aside", "the object is pushed beside its centre")
+            case ServoState.SIDESTEP:
+                self._watch_sight(dt_s, blind=any(servo.T_base_sensor is None for servo in servos))
+                if not any(servo.sidestepping for servo in servos):
+                    self._post("placed")
             case ServoState.RETRACT:
                 if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in servos):
                     self._post("retracted")
+
+    def _watch_check(self) -> None:
+        """Record what the sensors measure, and judge it when all have moved."""
+        for check, servo in zip(self._checks, self._servos, strict=True):
+            if servo.T_base_sensor is not None:
+                check.record_pose(self._now_ns, servo.T_base_sensor)
+            contact, T_s_f = servo.contact, servo.T_s_f_measured
+            if contact is not None and T_s_f is not None and check is self._moving_check():
+                check.record_contact(contact.seq, contact.t_frame_ns, T_s_f)
+        if self._moving_check() is not None:
+            return
+        for check, servo in zip(self._checks, self._servos, strict=True):
+            if wrong := check.verdict():
+                self._post(TRIP, f"{servo.sensor}: {wrong}")
+                return
+        self._unchecked = False
+        self._post("agrees")
+
+    def _moving_check(self) -> SensorCheck | None:
+        return next((check for check in self._checks if not check.finished), None)
+
+    def _prepare(self) -> None:
+        """Take a zero frame, back off a little, and take another, unless the first motion changes the image."""
+        servos = self._servos
+        if not all(servo.has_fresh_data and servo.seq > self._zero_seq.get(servo.sensor, -1) for servo in servos):
+            # Until a frame has come after the zero frame, what is known still compares with what was before it.
+            return
+        match self._prepared:
+            case _Preparation.FIRST_ZERO:
+                if touching := next(
+                    (servo.sensor for servo in servos if not servo.has_zero and servo.in_contact), None
+                ):
+                    self._post("touching", f"{touching} is in contact before the approach: move it clear")
+                elif any(servo.has_zero for servo in servos):
+                    self._take_zero(_Preparation.BACK_OFF)
+                    for servo in servos:
+                        servo.reset_travel()
+                else:
+                    self._post("ready")
+            case _Preparation.BACK_OFF:
+                touching = next((servo.sensor for servo in servos if servo.change_since_zero > _START_CHANGE), None)
+                if touching is not None:
+                    self._post("touching", f"{touching} is in contact before the approach: move it clear")
+                elif all(s.travelled_m() >= 1e-3 * self._config.back_off_mm for s in servos if s.has_zero):
+                    self._prepared = _Preparation.STAND
+            case _Preparation.STAND:
+                # A frame that was exposed after the motion.
+                self._stood_s += self._period_s
+                if self._stood_s >= 1e-3 * max(servo.max_frame_age_ms for servo in servos) / 3.0:
+                    self._take_zero(_Preparation.READY)
+            case _Preparation.READY:
+                self._post("ready")
+
+    def _take_zero(self, then: _Preparation) -> None:
+        self._zero = frozenset(servo.sensor for servo in self._servos if servo.has_zero)
+        self._zero_seq = {servo.sensor: servo.seq for servo in self._servos}
+        self._prepared = then
 
     def _watch_contact(self, dt_s: float) -> None:
         for servo in self._servos:
@@ -280,10 +430,26 @@ class ServoTask(MachineTask):
         if state is ServoState.RETRACT:
             speed_m_s = -1e-3 * self._config.retract_speed_mm_s
             return [(servo, servo.along_z(speed_m_s)) for servo in self._servos if servo.T_base_sensor is not None]
+        if state is ServoState.CHECK:
+            return self._check_twists()
         if state is ServoState.RETURN:
             if not all(servo.has_fresh_data for servo in self._servos):
                 return []
             return [(servo, servo.way_back(1e-3 * self._config.approach_speed_mm_s)) for servo in self._servos]
+        if state is ServoState.PREPARE:
+            speed_m_s = -1e-3 * self._config.approach_speed_mm_s
+            backing = self._prepared is _Preparation.BACK_OFF and all(servo.has_fresh_data for servo in self._servos)
+            return [(servo, servo.along_z(speed_m_s)) for servo in self._servos if backing and servo.has_zero]
+        if state is ServoState.SIDESTEP:
+            if any(servo.T_base_sensor is None for servo in self._servos):
+                return []
+            speed_m_s = 1e-3 * self._config.retract_speed_mm_s
+            return [
+                (servo, V)
+                for servo in self._servos
+                if (V := servo.step_aside(speed_m_s) if servo.sidestepping else servo.servo_step(np.zeros(6)))
+                is not None
+            ]
         if state not in (ServoState.APPROACH, ServoState.SETTLE, ServoState.RUN):
             return []
         searching = state is ServoState.APPROACH
@@ -294,14 +460,24 @@ class ServoTask(MachineTask):
         twists = []
         for servo in self._servos:
             V_tcp: Array | None
-            if searching and not servo.in_contact:
+            if searching and not servo.touches:
                 V_tcp = servo.along_z(1e-3 * self._config.approach_speed_mm_s)
+            elif searching and self._unchecked and servo.is_estimated:
+                V_tcp = None
             else:
                 running = state is ServoState.RUN
                 V_tcp = servo.servo_step(servo.run.feedforward if running else np.zeros(6), running=running)
             if V_tcp is not None:
                 twists.append((servo, V_tcp))
         return twists
+
+    def _check_twists(self) -> list[tuple[ContactServo, Array]]:
+        if not all(servo.has_fresh_data and servo.T_s_f is not None for servo in self._servos):
+            return []
+        for check, servo in zip(self._checks, self._servos, strict=True):
+            if not check.finished:
+                return [(servo, servo.in_tcp(check.step(self._period_s)))]
+        return []
 
     def _command(self, servo: ContactServo, V_tcp: Array) -> TwistCommand:
         return TwistCommand(

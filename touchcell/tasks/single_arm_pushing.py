@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, model_validator
 
 from touchcell.control.alignment import Aim, AlignmentGains, TargetAlignment
 from touchcell.control.path import Point
+from touchcell.control.push_model import Motion
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import ContactServoConfig, Six, SixGains
 from touchcell.tasks.interface import SPEED
+from touchcell.tasks.predictive_push import PredictivePush, PredictivePushSettings, Progress, twist_in_sensor
 from touchcell.tasks.push_path import Obstacle, plan
 from touchcell.tasks.servoing import ServoConfig, one_arm_task
 
@@ -45,10 +47,23 @@ class PushConfig(ContactServoConfig):
         align_kd_mm_per_deg: derivative gain on the bearing.
         align_max_mm_s: largest lateral speed.
         push_timeout_s: longest duration of the push.
+        steering: ``predictive`` estimates the object's centre as it moves and plans the path to the target anew in
+            each cycle (``touchcell.control.push_steering``); ``bearing`` is the paper's controller on the bearing of
+            the path, which the keys ``align_*`` set.
+        tip_radius_mm: radius of the tip.
+        sides: whether the pushed side is flat, or round so that its normal points at the object's centre.
+        friction_radius_mm: mean distance of the object's bottom from its centre, a first value for the estimate; three
+            quarters of the distance from contact to centre without it.
+        contact_friction: slope of the friction cone between skin and object that steering may use.
+        recontact_mm: where the object is found to be pushed farther than this beside its centre, the arm lets go of it,
+            steps aside and touches it again opposite its centre; none: never.
+        push_accel_mm_s2: acceleration at the start of a predictive push, and deceleration at its end.
+        arrival_speed_mm_s: its speed where it arrives.
         arrival_tolerance_mm: the task is done only if the object's centre, where touch and arm pose put it, ends this
             close to the target.
         arrival_tolerance_deg: likewise for ``goal_heading_deg``.
-        max_cross_track_mm: the push is given up where the object's centre is farther than this from its path.
+        max_cross_track_mm: the push is given up where the object's centre is farther than this from its path, or with
+            predictive steering would pass the target at more than this, as far as friction allows to steer.
     """
 
     renamed_keys: ClassVar[Mapping[str, str]] = {"middle_mm": "object_center_offset_mm"}
@@ -70,6 +85,16 @@ class PushConfig(ContactServoConfig):
     align_kd_mm_per_deg: NonNegativeFloat = 0.0
     align_max_mm_s: PositiveFloat = 10.0
     push_timeout_s: PositiveFloat = 120.0
+    steering: Literal["predictive", "bearing"] = "predictive"
+    tip_radius_mm: PositiveFloat = 20.0
+    sides: Literal["flat", "round"] = "flat"
+    friction_radius_mm: PositiveFloat | None = None
+    contact_friction: PositiveFloat = 0.8
+    recontact_mm: PositiveFloat | None = None
+    push_accel_mm_s2: PositiveFloat = 200.0
+    max_speed_mm_s: PositiveFloat = 140.0
+    max_turn_deg_s: PositiveFloat = 25.0
+    arrival_speed_mm_s: PositiveFloat = 8.0
     arrival_tolerance_mm: PositiveFloat = 5.0
     arrival_tolerance_deg: PositiveFloat = 10.0
     max_cross_track_mm: PositiveFloat = 60.0
@@ -87,10 +112,32 @@ class PushConfig(ContactServoConfig):
         )
         return TargetAlignment(self.route, gains)
 
+    def predictive(self) -> PredictivePush:
+        """Return the predictive steering, in SI units."""
+        lead_mm = self.object_center_offset_mm
+        radius_mm = self.friction_radius_mm or 0.75 * (lead_mm - self.tip_radius_mm)
+        settings = PredictivePushSettings(
+            lead_m=1e-3 * lead_mm,
+            tip_radius_m=1e-3 * self.tip_radius_mm,
+            lever_m2=1e-6 * radius_mm**2,
+            flat=self.sides == "flat",
+            speed_m_s=1e-3 * self.push_speed_mm_s,
+            max_tip_m_s=1e-3 * self.max_speed_mm_s,
+            max_turn_rad_s=math.radians(self.max_turn_deg_s),
+            slowest_m_s=1e-3 * min(self.arrival_speed_mm_s, self.push_speed_mm_s),
+            accel_m_s2=1e-3 * self.push_accel_mm_s2,
+            friction=self.contact_friction,
+            look_ahead_m=1e-3 * self.look_ahead_mm,
+            goal_heading_rad=None if self.goal_heading_deg is None else math.radians(self.goal_heading_deg),
+            recontact_m=None if self.recontact_mm is None else 1e-3 * self.recontact_mm,
+        )
+        return PredictivePush(settings, self.route, has_waypoints=bool(self.path_mm or self.obstacles_mm))
+
     def route(self, center: Point, heading_rad: float) -> Sequence[Point]:
         """Return the waypoints, m, from the object's centre and heading. Raises NoPathFound."""
         target = 1e-3 * self.target_mm[0], 1e-3 * self.target_mm[1]
-        if self.goal_heading_deg is None and not self.obstacles_mm:
+        planned = self.goal_heading_deg is not None and self.steering == "bearing"
+        if not (planned or self.obstacles_mm):
             return [*((1e-3 * x, 1e-3 * y) for x, y in self.path_mm), target]
         goal_rad = math.atan2(target[1] - center[1], target[0] - center[0])
         if self.goal_heading_deg is not None:
@@ -106,20 +153,30 @@ class PushConfig(ContactServoConfig):
 
 
 class SingleArmPushingConfig(PushConfig, ServoConfig):
-    """Parameters of single-arm pushing."""
+    """Parameters of single-arm pushing.
+
+    Attributes:
+        recontact_mm: where the object is found to be pushed farther than this beside its centre, the arm lets go of it,
+            steps aside and touches it again opposite its centre; none: never.
+    """
+
+    recontact_mm: PositiveFloat | None = 6.0
 
 
 class Push:
-    """Behavior of pushing: forward along the contact normal, lateral target alignment, until the target is reached."""
+    """Behavior of pushing: along the contact normal, steered to the target, until it is reached."""
 
     def __init__(self, config: PushConfig) -> None:
         self._speed_m_s = 1e-3 * config.push_speed_mm_s
         self._timeout_s = config.push_timeout_s
         self._alignment = config.alignment()
+        self._predictive = config.predictive() if config.steering == "predictive" else None
         self._goal_heading_deg = config.goal_heading_deg
         self._tolerance_m, self._tolerance_deg = 1e-3 * config.arrival_tolerance_mm, config.arrival_tolerance_deg
         self._max_cross_track_m = 1e-3 * config.max_cross_track_mm
+        self._lead_m = 1e-3 * config.object_center_offset_mm
         self._aim: Aim | None = None
+        self._miss_m = 0.0
         self._left_m_s = 0.0
         self._y_is_left = 1.0
 
@@ -129,8 +186,30 @@ class Push:
         return self._left_m_s
 
     @property
+    def object_motion(self) -> Motion | None:
+        """Motion of the object that predictive steering feeds forward; None with another steering."""
+        return None if self._predictive is None else self._predictive.motion
+
+    @property
+    def sidestep_m(self) -> float | None:
+        """Distance to step to the left of the contact normal before the push continues; None for no step."""
+        return None if self._predictive is None else self._predictive.sidestep_m
+
+    def begin_approach(self, T_base_sensor: Array) -> None:
+        """Take note of the direction of the approach, in which the object is expected."""
+        if self._predictive is not None:
+            self._predictive.begin_approach(T_base_sensor)
+
+    def begin_sidestep(self) -> None:
+        """Let go: the object rests where it is until it is touched again."""
+        assert self._predictive is not None
+        self._predictive.move_contact()
+
+    @property
     def feedforward(self) -> Array:
         """Twist (6,) in the desired sensor frame."""
+        if self._predictive is not None:
+            return twist_in_sensor(*self._predictive.tip_motion, self._y_is_left)
         return np.array([0.0, self._y_is_left * self._left_m_s, self._speed_m_s, 0.0, 0.0, 0.0])
 
     @property
@@ -139,14 +218,20 @@ class Push:
         return self._timeout_s
 
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
-        """Update target alignment; return True at the end of the path, or where the object is too far from it."""
+        """Update the steering; return True at the end of the path, or where the object is too far from it."""
         if T_s_f is None:
             self._alignment.pause()
+            if self._predictive is not None:
+                self._predictive.pause()
             self._left_m_s = 0.0
             return False
         self._y_is_left = -float(np.sign(now[2, 0]))
-        self._aim = self._alignment.aim(now, T_s_f)
-        self._left_m_s = self._alignment.step(self._aim, dt_s)
+        if self._predictive is not None:
+            progress = self._predictive.update(dt_s, now, T_s_f)
+            self._aim, self._miss_m = _aim_of(progress), progress.miss_m
+        else:
+            self._aim = self._alignment.aim(now, T_s_f)
+            self._left_m_s = self._alignment.step(self._aim, dt_s)
         return self._aim.remaining_m <= 0.0 or self._strayed(self._aim)
 
     def shortfall(self) -> str:
@@ -154,6 +239,11 @@ class Push:
         aim = self._aim
         if aim is None:
             return ""
+        if self._miss_m > self._max_cross_track_m:
+            return (
+                f"the target cannot be reached: friction turns the object too little, it would pass "
+                f"{1e3 * self._miss_m:.0f} mm beside; {1e3 * aim.target_distance_m:.0f} mm from the target"
+            )
         if self._strayed(aim):
             return (
                 f"object {1e3 * abs(aim.cross_track_error_m):.1f} mm beside its path, limit "
@@ -168,6 +258,8 @@ class Push:
         return ""
 
     def _strayed(self, aim: Aim) -> bool:
+        if self._predictive is not None:
+            return self._miss_m > self._max_cross_track_m and self._predictive.sidestep_m is None
         return abs(aim.cross_track_error_m) > self._max_cross_track_m
 
     def _heading_error_deg(self, aim: Aim) -> float | None:
@@ -190,7 +282,19 @@ class Push:
             "heading_deg": heading_deg,
             "align_mm_s": 1e3 * self._left_m_s,
             **off,
+            **({} if self._predictive is None else self._predictive.telemetry()),
         }
+
+
+def _aim_of(progress: Progress) -> Aim:
+    return Aim(
+        0.0,
+        progress.remaining_m,
+        progress.cross_track_error_m,
+        progress.target_lateral_error_m,
+        progress.target_distance_m,
+        progress.center.heading,
+    )
 
 
 SPEC = one_arm_task(

@@ -159,8 +159,9 @@ def ask(config: pytest.Config, device: str, what: str = _SHORT_MOVES) -> None:
     with capture.global_and_fixture_disabled():
         if sys.stdin is not None and sys.stdin.isatty():
             print(f"\n{device} will be powered {what}.")
-            question = "Is the space around it free, are people away, and is a hand on the emergency stop?"
-            print(f"{question} Type yes: ", end="")
+            print(
+                "Is the space around it free, are people away, and is a hand on the emergency stop? Type yes: ", end=""
+            )
         try:
             answer = input()
         except (EOFError, OSError):

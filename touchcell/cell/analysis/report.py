@@ -34,7 +34,8 @@ def write_report(folder: Path) -> str:
     result = json.loads(result_file.read_text()) if result_file.exists() else {}
     plan = _plan(source)
     calls = {} if plan is None else {"close_calls": close_calls(run, plan)}
-    summary = {**_push_errors(source), **calls, **summarise(run)}
+    truth = {"truth": dict(plan.truth)} if plan is not None and plan.truth else {}
+    summary = {**_push_errors(source), **calls, **truth, **summarise(run)}
     (folder / "summary.json").write_text(json.dumps({**result, **summary}, indent=1) + "\n")
     text = _text(folder, result, summary, _pictures(source), run)
     (folder / "summary.txt").write_text(text + "\n")

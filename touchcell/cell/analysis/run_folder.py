@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from touchcell.cell.analysis.run_data import Run, Series, load_run, tip_points
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.schema import plan_cell
+from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 
@@ -55,14 +56,22 @@ def scene_time(run: RunFolder, series: Series) -> Array:
 def sensor_poses(run: RunFolder, role: str) -> Poses:
     """Return the poses of the sensor of a role."""
     plan = run.plan
-    section = plan.cell.sensors[plan.sensor_roles[role]]
+    name = plan.sensor_roles[role]
+    section = plan.cell.sensors[name]
     assert section.mounted_on is not None
     arm = section.mounted_on
     arm_role = next((each for each, name in plan.arm_roles.items() if name == arm), arm)
     series = run.recording.series(f"/arms/{arm_role}/tcp")
     assert series is not None
-    T_world_base = plan.cell.arms[arm].T_world_base
-    return Poses(scene_time(run, series), T_world_base @ tip_points(series) @ section.T_tcp_sensor)
+    # Where a truth differs from what the file tells, the simulated devices have it.
+    T_world_base = _pose(plan.devices[arm].config, "base_pose_mm_deg", plan.cell.arms[arm].T_world_base)
+    T_tcp_sensor = _pose(plan.devices[name].config, "tcp_to_sensor_mm_deg", section.T_tcp_sensor)
+    return Poses(scene_time(run, series), T_world_base @ tip_points(series) @ T_tcp_sensor)
+
+
+def _pose(config: object, key: str, told: Array) -> Array:
+    given = getattr(config, key, None)
+    return told if given is None else se3.from_euler_mm_deg(np.array(given))
 
 
 def during(run: RunFolder, series: Series, state: str = "run") -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from touchcell.cell.config import cell_plan
 from touchcell.cell.config.json_schema import WithMeanings
 from touchcell.cell.config.meanings import summary
+from touchcell.cell.config.truth import TruthSection
 from touchcell.control.interlocks.spec import INTERLOCKS
 from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DRIVERS
@@ -49,6 +50,7 @@ _SECTIONS: Final[Mapping[str, type[BaseModel]]] = {
     "pair": cell_plan.PairSection,
     "recording": cell_plan.RecordingSection,
     "collect": cell_plan.CollectSection,
+    "truth": TruthSection,
 }
 SECTION: Final = "section"
 KINDS: Final = (SECTION, *_REGISTRIES)

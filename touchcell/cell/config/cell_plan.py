@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveFloat
 
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance
+from touchcell.cell.config.truth import TruthSection
 from touchcell.control.interlocks.config import InterlocksConfig
 from touchcell.control.proof import Proof
 from touchcell.drivers.core.device import DeactivatePolicy
@@ -256,6 +257,7 @@ class CellFile(_Section):
         task: what the cell does.
         recording: what is recorded of a run besides numbers.
         collect: where a task that labels frames puts them.
+        truth: what the simulated world truly is, where that differs from what this file tells the controllers.
         sweep: what ``touchcell sweep`` changes from trial to trial; nothing else reads it.
     """
 
@@ -270,6 +272,7 @@ class CellFile(_Section):
     max_duration_s: PositiveFloat = 3600.0
     scene: dict[str, Any] | None = None
     emulated_scene: dict[str, Any] | None = None
+    truth: TruthSection | None = None
     obstacles: dict[str, BoxSection] = {}
     arms: dict[str, ArmSection] = {}
     sensors: dict[str, SensorSection] = {}
@@ -315,6 +318,7 @@ class CellPlan:
         auxiliary_roles: role in the task -> name in the cell; a device without a role has its own name as role.
         world_settings: values that its world put in place of the file's own, by dotted key, behind ``settings``.
         notes: what its world does not show, and what it puts in place of something else.
+        truth: what the seed made of ``truth:``, by dotted key; empty without one.
     """
 
     file: Path
@@ -334,6 +338,7 @@ class CellPlan:
     proofs: tuple[Proof, ...] = ()
     world_settings: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    truth: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         devices = [f"{name} {device.spec.name}" for name, device in self.built.items()]

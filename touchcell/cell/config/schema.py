@@ -30,6 +30,7 @@ from touchcell.cell.config.feasibility import unfeasible
 from touchcell.cell.config.input_files import with_input_files, with_paths
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
+from touchcell.cell.config.truth import SampledTruth, sample
 from touchcell.cell.config.worlds import WorldChanges, WorldName, world_changes
 from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile
 from touchcell.control.interlocks.boundary import WorkspaceConfig
@@ -82,7 +83,7 @@ def plan_cell(
     if model is not None and isinstance(sensors := file.data.get("sensors"), dict):
         for sensor in sensors.values():
             estimator = sensor.get("estimator") if isinstance(sensor, dict) else None
-            if isinstance(estimator, dict) and estimator.get("kind") == "network":
+            if isinstance(estimator, dict) and estimator.get("kind") in ("network", "edge_network"):
                 estimator["model"] = model
     plan = _Planner(file, overrides, settings or {}, to_run=to_run).plan()
     return plan if world is None else replace(plan, world_settings=world.settings, notes=tuple(world.notes))
@@ -137,12 +138,14 @@ class _Planner:
         self._overrides = overrides
         self._settings = settings
         self._problems: list[ConfigError] = []
+        self._truth = SampledTruth()
 
     def plan(self) -> CellPlan:
         file = self._file
         if "data" in self._overrides and isinstance(collect := file.data.get("collect"), dict):
             collect["data"] = self._overrides["data"]
         cell = self._with_input_files(file.validate(CellFile, file.data), ())
+        cell = self._in_truth(cell)
         cell = self._with_scenes(cell)
         task, task_config = self._task(cell)
         arm_roles = self._roles(cell, "arms", task.arms, cell.arms) if task else {}
@@ -196,12 +199,36 @@ class _Planner:
             self._settings,
             auxiliaries,
             auxiliary_roles,
+            truth=self._truth.values,
         )
         if not self._to_run:
             return planned
         if problems := unfeasible(file, planned):
             raise InvalidCell(problems)
         return self._require_armed(planned)
+
+    def _in_truth(self, cell: CellFile) -> CellFile:
+        """Return the cell with its scene as it truly is, and keep what is true of its devices."""
+        if cell.truth is None or cell.world in ("bench", "emulated"):
+            return cell
+        if cell.scene is None:
+            if cell.world is None and self._to_run:
+                self._add(("truth",), "only a simulated world has one, and there is no `scene:`", hint="leave it out")
+            return cell
+        for kind, known in (("arms", cell.arms), ("sensors", cell.sensors), ("objects", cell.scene.get("objects", {}))):
+            for name in getattr(cell.truth, kind):
+                if name not in known:
+                    hint = suggest(name, sorted(known))
+                    self._add(("truth", kind, name), f"there is no {name!r} in `{kind}:`", value=name, hint=hint)
+        self._truth = sample(cell.truth, cell.seed)
+        return cell.model_copy(update={"scene": self._truth.scene(cell.scene)})
+
+    def _with_truth(self, at: tuple[str, str], spec: AnyDriver, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a device's keys with those that are true in place of those that are told."""
+        true = self._truth.device(*at, given) if at[0] in ("arms", "sensors") else {}
+        for key in true.keys() - spec.config.model_fields.keys():
+            self._add(("truth", *at, key), f"{spec.name} has no {key!r}", hint="leave it out")
+        return {**given, **true}
 
     def _with_scenes(self, cell: CellFile) -> CellFile:
         """Return ``cell`` with its scenes checked, and the files that they name found."""
@@ -335,7 +362,8 @@ class _Planner:
             )
         fields = spec.config.model_fields
         settings = {key: value for key, value in {**shared, **self._overrides}.items() if key in fields}
-        config = self._validated(spec.config, {**(section.model_extra or {}), **settings}, at)
+        given = self._with_truth(at, spec, {**(section.model_extra or {}), **settings})
+        config = self._validated(spec.config, given, at)
         if config is None:
             return None
         if cell.world == "bench" and (key := config.emulated_address()) is not None:

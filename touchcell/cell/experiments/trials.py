@@ -205,7 +205,8 @@ class Perform:
         if "collect" in data:
             data = {**data, "collect": {**data["collect"], "data": str(folder / COLLECTED)}}
         (folder / "cell.yaml").write_text(yaml.safe_dump(data, sort_keys=False))
-        cell = compose(plan_cell(folder / "cell.yaml"))
+        plan = plan_cell(folder / "cell.yaml")
+        cell = compose(plan)
         with Recorder(folder / "run.mcap") as recorder, cell:
             result = RunLoop(cell, recorder).run()
         measures = self.measure(RunFolder(folder)) if result.cycles else {}
@@ -216,6 +217,7 @@ class Perform:
             "outcome": result.outcome.value,
             "reason": result.reason,
             "duration_s": result.duration_s,
+            "truth": dict(plan.truth),
             "wall_s": round(time.perf_counter() - started, 3),
             # Measures that are not finite are left out, as JSON has no number for them.
             "measures": {name: float(value) for name, value in measures.items() if math.isfinite(value)},

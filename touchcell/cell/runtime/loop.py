@@ -231,6 +231,9 @@ class RunLoop:
             wrenches=reading.wrenches,
         )
         action = cell.task.tick(observation)
+        for role in sorted(action.zero):
+            if (zero := cell.sensors[role].take_zero()) is not None:
+                self._record.zero_frame(role, zero.t_ns, zero.value.image)
         thought = time.perf_counter_ns()
         verdict = cell.supervisor.review(self._observer.view(reading, action, self._sent), self._alarms())
         judged = time.perf_counter_ns()

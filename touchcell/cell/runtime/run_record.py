@@ -20,10 +20,12 @@ from touchcell.cell.recording.messages import (
 )
 from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.recording.viewer_record import ViewerRecord
+from touchcell.cell.recording.well_known import COMPRESSED_IMAGE, image_message
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.observer import Reading
 from touchcell.cell.runtime.timing import CycleTimes
 from touchcell.cell.scene.description import describe_scene
+from touchcell.cell.scene.frames import sensor_frame
 from touchcell.control.supervisor import Verdict
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import Sent, TwistCommand
@@ -31,7 +33,7 @@ from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import JointSource
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.errors import TouchcellError
-from touchcell.geometry.types import Array
+from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.tasks.interface import Action
 
@@ -236,6 +238,21 @@ class RunRecord:
         if objects is not None:
             viewers.objects(objects)
         viewers.moving(reading.now_ns)
+        viewers.again(reading.now_ns)
+
+    def zero_frame(self, role: str, t_ns: int, image: ImageArray) -> None:
+        """Record the image out of contact that a sensor compares others with; the arm stands meanwhile."""
+        if self._recorder is None:
+            return
+        import cv2
+
+        data = cv2.imencode(".png", image)[1].tobytes()
+        stamp = t_ns + self._recorder.wall_offset_ns
+        message = image_message(COMPRESSED_IMAGE, stamp, sensor_frame(role), "png", data)
+        try:
+            self._recorder.write_bytes(f"/sensors/{role}/zero", t_ns, COMPRESSED_IMAGE, message)
+        except RecordingError as error:
+            self._give_up(error)
 
     def _write_frames(self, frames: FrameCompressor) -> None:
         try:

@@ -57,6 +57,11 @@ class Sensor:
         """Wait for the first frame, so that no control cycle has to. Raises DeviceError."""
         self.source.await_frame()
 
+    def take_zero(self) -> Stamped[Frame] | None:
+        """Take the newest frame for one out of contact, and return it; None from a source that uses none."""
+        frame = self.frame
+        return frame if self.source.take_zero() else None
+
     def picture(self) -> tuple[int | None, float | None]:
         """A checksum and the mean grey level of every third pixel of the newest frame; (None, None) if not watched."""
         frame = self.frame if self.watched else None

@@ -58,6 +58,16 @@ class ContactGate:
         self.in_contact = False
         self.score = 0.0
 
+    def take_zero(self, reduced: ImageArray) -> None:
+        """Compare with this preprocessed image, taken out of contact, from now on.
+
+        Raises:
+            ImageError: the image is not of the reference's size.
+        """
+        self.compare(reduced)
+        self._reference = reduced.astype(np.int16)
+        self.in_contact, self.score = False, 0.0
+
     @classmethod
     def from_frames(cls, frames: Sequence[ImageArray], *, margin: float = 3.0) -> Self:
         """Learn reference and noise from preprocessed images, all out of contact.

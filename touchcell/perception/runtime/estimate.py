@@ -20,7 +20,11 @@ class ContactEstimate:
         t_ns: time of the estimate: the frame's, or later where it was propagated by the sensor's motion since.
         in_range: False when the network's output is outside its training range.
         nis: normalised innovation squared of the last correction (6 degrees of freedom), None before the second frame.
+        change: how much the newest image differs from the zero frame, 0 to 1, as the contact gate measures it; None
+            without a gate.
         markers: fraction of the markers expected in view that were detected, for a marker estimator.
+        measured: Gaussian of the frame by itself, before any filter; None without contact, or without a model.
+        refusal: why the frame does not show the contact as the model's camera would; empty where it does.
     """
 
     in_contact: bool
@@ -31,3 +35,6 @@ class ContactEstimate:
     in_range: bool = True
     nis: float | None = None
     markers: float | None = None
+    measured: PoseGaussian | None = None
+    refusal: str = ""
+    change: float | None = None

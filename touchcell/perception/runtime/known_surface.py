@@ -40,6 +40,10 @@ class KnownSurfaceSource:
         """Wait for the camera's first frame. Raises DeviceError."""
         self._camera.latest()
 
+    def take_zero(self) -> bool:
+        """Return False: it compares with no image."""
+        return False
+
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
         """Record the sensor's pose."""
         self._T_base_s = T_base_sensor

@@ -19,13 +19,14 @@ from touchcell.drivers.core.protocols import FrameSource
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.geometry import gaussian
 from touchcell.geometry.gaussian import PoseGaussian
-from touchcell.geometry.types import Array
+from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.models.prediction import ContactEstimator
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.runtime.contact_gate import ContactGate
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.perception.runtime.filter_spec import ContactFilter
 from touchcell.perception.runtime.motion import PoseHistory
+from touchcell.perception.runtime.zero import ZeroFrame
 
 Timer = Callable[[], int]
 
@@ -46,6 +47,10 @@ class ContactSource(Protocol):
     def await_frame(self) -> None:
         """Wait for the first frame, so that no control cycle has to. Raises DeviceError."""
         return
+
+    def take_zero(self) -> bool:
+        """Take the newest frame for one out of contact; return False for a source that compares with none."""
+        return False
 
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
         """Record the sensor's pose at ``t_ns``; called before ``update``."""
@@ -86,6 +91,7 @@ class ContactPipeline:
         model: any estimator, with its preprocessing.
         contact_gate: detects contact without the network; None passes every frame through the network.
         pose_filter: None treats each frame independently.
+        zero: compares the first frame with the model's own image out of contact; None accepts any.
         timer: nanosecond counter for stage durations; it never influences an estimate.
     """
 
@@ -96,17 +102,20 @@ class ContactPipeline:
         *,
         contact_gate: ContactGate | None = None,
         pose_filter: ContactFilter | None = None,
+        zero: ZeroFrame | None = None,
         timer: Timer = time.perf_counter_ns,
     ) -> None:
         self._camera = camera
         self._model = model
         self._contact_gate = contact_gate
         self._filter = pose_filter
+        self._zero = zero
         self._timer = timer
         self._poses = PoseHistory()
         self._newest: ContactEstimate | None = None
         self._ended = False
         self._filtering = False
+        self._reduced: ImageArray | None = None
         self.measurement: Measurement | None = None
         self.frame: Stamped[Frame] | None = None
         self.times = StageTimes()
@@ -122,9 +131,31 @@ class ContactPipeline:
         return self._model.header.preprocessing
 
     def await_frame(self) -> None:
-        """Wait for the camera's first frame, which the next update processes. Raises DeviceError."""
+        """Wait for the camera's first frame, which the next update processes, and compare it with the model's.
+
+        Raises:
+            DeviceError: from the camera.
+            CameraError: the sensor or its camera is not the model's.
+            ImageError: the camera's images do not match the model.
+        """
         with suppress(EndOfStream):
-            self._camera.latest()
+            frame = self._camera.latest()
+            if self._zero is not None and self._contact_gate is not None:
+                zeroed = self._zero(frame.value.image, self._model, self._contact_gate)
+                self._model, self._contact_gate = zeroed.estimator, zeroed.gate
+
+    def take_zero(self) -> bool:
+        """Let the contact gate compare with the newest frame from now on; False without a gate, or before a frame.
+
+        The filter begins anew: what it knew was of a contact that is no more.
+        """
+        if self._contact_gate is None or self._reduced is None:
+            return False
+        self._contact_gate.take_zero(self._reduced)
+        if self._filter is not None:
+            self._filter.reset()
+            self._filtering = False
+        return True
 
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
         """Record the sensor's pose at ``t_ns``."""
@@ -154,8 +185,9 @@ class ContactPipeline:
 
     def _process(self, frame: Stamped[Frame], read_ns: int) -> ContactEstimate:
         start = self._timer()
-        reduced = self._model.reduce(frame.value.image)
+        reduced = self._reduced = self._model.reduce(frame.value.image)
         in_contact = self._contact_gate is None or self._contact_gate.update(reduced)
+        change = None if self._contact_gate is None else self._contact_gate.score
         preprocess_ns = self._timer() - start
         if not in_contact:
             self.times = StageTimes(read_ns, preprocess_ns)
@@ -163,7 +195,7 @@ class ContactPipeline:
             if self._filter is not None:
                 self._filter.reset()
                 self._filtering = False
-            return ContactEstimate(False, None, frame.t_ns, frame.seq, frame.t_ns)
+            return ContactEstimate(False, None, frame.t_ns, frame.seq, frame.t_ns, change=change)
         start = self._timer()
         prediction = self._model.predict_reduced(reduced)
         infer_ns = self._timer() - start
@@ -189,6 +221,9 @@ class ContactPipeline:
             in_range=prediction.in_range,
             nis=nis,
             markers=prediction.markers,
+            measured=observed,
+            refusal=prediction.refusal,
+            change=change,
         )
 
     def _replayed(self, estimate: ContactEstimate, now_ns: int) -> ContactEstimate:

@@ -5,6 +5,7 @@ It has no joints, no singularities and no tracking error beyond those limits; it
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -45,6 +46,9 @@ class SimArmConfig(DriverConfig):
         base_pose_mm_deg: pose of the base in the world frame.
         limits: limits of the tool centre point.
         latency_ms: delay of twists; stops are not delayed.
+        lag_ms: time constant with which the arm follows its twist.
+        velocity_step_mm_s: resolution of its velocity; 0 for any velocity.
+        velocity_step_deg_s: resolution of its angular velocity, likewise.
         max_ttl_s: longest time-to-live of a command that is accepted.
         state_timeout_s: oldest pose with which a twist may be followed.
     """
@@ -53,6 +57,9 @@ class SimArmConfig(DriverConfig):
     base_pose_mm_deg: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     limits: LimitsConfig = LimitsConfig()
     latency_ms: float = Field(default=0.0, ge=0.0, le=500.0)
+    lag_ms: float = Field(default=0.0, ge=0.0, le=500.0)
+    velocity_step_mm_s: float = Field(default=0.0, ge=0.0, le=10.0)
+    velocity_step_deg_s: float = Field(default=0.0, ge=0.0, le=10.0)
     max_ttl_s: float = Field(default=1.0, gt=0.0, le=10.0)
     state_timeout_s: float = Field(default=0.1, gt=0.0, le=1.0)
 
@@ -82,7 +89,13 @@ class SimArm(Arm):
         self.moved_ns = 0
         self.T_world_base = se3.from_euler_mm_deg(config.base_pose_mm_deg)
         self._timeline = timeline or Timeline(clock)
-        self._body = TwistFollower(se3.from_euler_mm_deg(config.start_pose_mm_deg), self.limits, self._timeline.step_ns)
+        self._body = TwistFollower(
+            se3.from_euler_mm_deg(config.start_pose_mm_deg),
+            self.limits,
+            self._timeline.step_ns,
+            lag_s=1e-3 * config.lag_ms,
+            resolution=(1e-3 * config.velocity_step_mm_s, math.radians(config.velocity_step_deg_s)),
+        )
         self._latency_ns = round(config.latency_ms * 1e6)
         self._on_the_way = DelayedTwists()
         self._powered = False

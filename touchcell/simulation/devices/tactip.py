@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from dataclasses import replace
 from typing import Annotated, Literal, TypeVar
 
 import numpy as np
@@ -21,7 +22,7 @@ from touchcell.input_file import InputFile, files_in
 from touchcell.simulation.faults import FrameFaults
 from touchcell.simulation.render import FrameRenderer, Lighting
 from touchcell.simulation.scene import Carrier, LoadReceiver, MeasuredCarrier, Scene
-from touchcell.simulation.tip import Tip
+from touchcell.simulation.tip import Tip, TipParameters
 from touchcell.simulation.tip_file import SHIPPED as TIPS
 from touchcell.simulation.tip_file import load_tip
 
@@ -58,6 +59,9 @@ class SimTactipConfig(DriverConfig):
         tip: tip file of ``touchcell calibrate-sim``, or the name of one that ships.
         feels: ``plane`` draws the skin as on the tangent plane of what it touches, on which the shipped estimator was
             trained; ``shape`` adds what curvature, edges and pins change (docs/explanation/shapes.md).
+        shift_px: shift of the whole image along x and y.
+        zoom: magnification of the image.
+        camera_tilt_deg: tilt of the camera about the sensor's x and y axes, in addition to that of ``tip``.
         output: ``raw`` camera frames, or ``processed`` binary images as in the public data.
     """
 
@@ -73,8 +77,27 @@ class SimTactipConfig(DriverConfig):
         str | None,
         InputFile("a tip file", files_in(TIPS, ".yaml"), hint="`touchcell calibrate-sim` writes one"),
     ] = None
+    shift_px: tuple[float, float] = (0.0, 0.0)
+    zoom: float = Field(default=1.0, ge=0.5, le=2.0)
+    camera_tilt_deg: tuple[float, float] = (0.0, 0.0)
     output: Literal["raw", "processed"] = "raw"
     feels: Literal["plane", "shape"] = "plane"
+
+    def build_tip(self) -> Tip:
+        """Return the tip as this sensor's camera shows it."""
+        fitted = TipParameters() if self.tip is None else load_tip(self.tip).tip
+        return Tip(
+            replace(
+                fitted,
+                centre_px=(fitted.centre_px[0] + self.shift_px[0], fitted.centre_px[1] + self.shift_px[1]),
+                focal_px=self.zoom * fitted.focal_px,
+                disc_radius_px=self.zoom * fitted.disc_radius_px,
+                camera_tilt_rad=(
+                    fitted.camera_tilt_rad[0] + math.radians(self.camera_tilt_deg[0]),
+                    fitted.camera_tilt_rad[1] + math.radians(self.camera_tilt_deg[1]),
+                ),
+            )
+        )
 
 
 class SimTactip(Device):
@@ -110,7 +133,7 @@ class SimTactip(Device):
         self._period_ns = round(1e9 / config.rate_hz)
         self._latency_ns = round(config.latency_ms * 1e6)
         self._first = 0
-        self._tip = Tip() if config.tip is None else Tip(load_tip(config.tip).tip)
+        self._tip = config.build_tip()
         self._dropped = config.dropped
         self._seed = (seed, zlib.crc32(name.encode()))
         self._renderer = FrameRenderer(
