@@ -21,6 +21,11 @@ def add_parser(commands: Subparsers) -> None:
     report.add_argument("--html", action="store_true", help="also write report.html: one file, its plots interactive")
     report.add_argument("--animate", action="store_true", help="also write animation.gif")
 
+    felt = add_command(commands, "felt", _felt, "write the shape that a run has felt as a point cloud (PLY)")
+    add_run_folder(felt)
+    felt.add_argument("--out", type=Path, metavar="FILE", help="PLY file to write (default: felt.ply in the folder)")
+    felt.add_argument("--sensor", default="sensor", metavar="ROLE", help="role of the sensor (default: %(default)s)")
+
     opened = add_command(commands, "open", _open, "open a run in Foxglove or Rerun, arranged for its cell")
     add_run_folder(opened)
     viewer = opened.add_mutually_exclusive_group()
@@ -118,6 +123,25 @@ def _compare(options: argparse.Namespace) -> int:
         print(f"{len(different)} of {len(topics)} topics differ")
         return EXIT_TASK_FAILED
     print(f"identical bit for bit: {messages} messages of {len(topics)} topics, durations on this machine aside")
+    return EXIT_OK
+
+
+def _felt(options: argparse.Namespace) -> int:
+    from touchcell.cell.analysis.felt_cloud import felt_cloud, write_ply
+    from touchcell.cell.analysis.run_folder import RunFolder
+
+    folder = _folder(options)
+    run = RunFolder(folder)
+    cloud = felt_cloud(run, options.sensor)
+    path = options.out or folder / "felt.ply"
+    write_ply(cloud, path)
+    print(f"{path}: {len(cloud.points)} points with normals and standard deviations")
+    if run.plan.cell.scene is not None:
+        from touchcell.cell.experiments.scenes import distance_to_scene_mm
+
+        off = distance_to_scene_mm(run, cloud.points)
+        rms_mm, worst_mm = float((off**2).mean() ** 0.5), float(abs(off).max())
+        print(f"off the scene's surface: RMS {rms_mm:.3f} mm, at most {worst_mm:.3f} mm")
     return EXIT_OK
 
 
