@@ -258,6 +258,18 @@ class ContactServo:
             return None
         return None if self.contact.belief is None else self.contact.belief.mean
 
+    @property
+    def is_estimated(self) -> bool:
+        """True if a model measured the newest contact, rather than a simulator or a label."""
+        return self.contact is not None and self.contact.measured is not None
+
+    @property
+    def T_s_f_measured(self) -> Array | None:  # noqa: N802  the field's own name
+        """Valid contact pose (4, 4) of the newest frame by itself, or None."""
+        if self.T_s_f is None or self.contact is None or self.contact.measured is None:
+            return self.T_s_f
+        return self.contact.measured.mean
+
     def update(self, observation: Observation) -> None:
         """Update sensor pose and contact from an observation, dropping what is stale."""
         now_ns, limits = observation.now_ns, self._config
@@ -359,7 +371,11 @@ class ContactServo:
 
     def along_z(self, speed_m_s: float) -> Array:
         """Return the twist (6,) of the tool that moves the sensor along its z axis."""
-        V_tcp: Array = self._Ad_tcp_sensor @ np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0])
+        return self.in_tcp(np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0]))
+
+    def in_tcp(self, V_sensor: Array) -> Array:
+        """Return the twist (6,) of the tool, in its frame, that gives the sensor a twist (6,) in its own."""
+        V_tcp: Array = self._Ad_tcp_sensor @ V_sensor
         self._V_tcp = V_tcp
         return V_tcp
 
