@@ -59,6 +59,8 @@ class EdgeFollowingConfig(ServoConfig):
     ki_per_s2: SixGains = (16.0, 0.0, 16.0, 16.0, 16.0, 16.0)
     max_turn_deg_s: PositiveFloat = 180.0
     max_integral_turn_deg_s: PositiveFloat = 60.0
+    max_accel_mm_s2: PositiveFloat = 550.0
+    max_turn_accel_deg_s2: PositiveFloat = 1100.0
     bend_window_mm: PositiveFloat = 5.0
     speed_mm_s: Annotated[PositiveFloat, SPEED] = 30.0
     distance_mm: PositiveFloat = 100.0

@@ -35,7 +35,7 @@ def answerable(data: Mapping[str, Any]) -> dict[str, Any]:
         return dict(interlocks) if isinstance(interlocks, Mapping) else {}
     kinds = {_kind(sensor.get("estimator")) for sensor in sensors.values() if isinstance(sensor, Mapping)}
     unanswered = set() if kinds & set(_TRUTH_OF) else set(_OF_NETWORKS)
-    if not kinds & {*_TRUTH_OF, "known_surface"}:
+    if not kinds & {*_TRUTH_OF, "known_surface", "true_edge"}:
         unanswered |= _OF_IMAGES
     return {name: entry for name, entry in interlocks.items() if _kind(entry) not in unanswered}
 
