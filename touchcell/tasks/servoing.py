@@ -207,6 +207,7 @@ class ServoTask(MachineTask):
         self._stop_seen = False
         self._finished_run = False
         self._prepared = _Preparation.FIRST_ZERO
+        self._resumed = context.resumed
         self._stood_s = 0.0
         self._zero: frozenset[str] = frozenset()
         self._zero_seq: dict[str, int] = {}
@@ -376,6 +377,8 @@ class ServoTask(MachineTask):
             # Until a frame has come after the zero frame, what is known still compares with what was before it.
             return
         match self._prepared:
+            case _Preparation.FIRST_ZERO if self._resumed and any(servo.in_contact for servo in servos):
+                self._post("ready")
             case _Preparation.FIRST_ZERO:
                 if touching := next(
                     (servo.sensor for servo in servos if not servo.has_zero and servo.in_contact), None
