@@ -108,6 +108,20 @@ def test_a_contact_whose_depth_is_not_estimated_counts_as_none_deep() -> None:
     assert press(3.1, None, contact=True) is not None
 
 
+def test_a_contact_that_is_seen_to_begin_begins_at_no_depth_whatever_is_estimated() -> None:
+    press = Press()
+    assert press(0.0, None) is None
+    assert press(0.0, 1.0) is None
+    assert press(2.5, 0.0) is None
+    assert press(3.1, 0.0) is not None
+
+
+def test_it_may_disagree_for_its_time() -> None:
+    press = Press(hold_ms=20)
+    press.touch()
+    assert [press(3.5, 0.0) is None for _ in range(3)] == [True, True, False]
+
+
 def test_going_in_is_no_slide() -> None:
     press = Press()
     press.touch()

@@ -45,7 +45,8 @@ def _foil() -> Array:
     x = 0.5 * (1.0 + np.cos(np.linspace(0.0, math.pi, 60)))
     half = 1.25 * (0.2969 * np.sqrt(x) - 0.1260 * x - 0.3516 * x**2 + 0.2843 * x**3 - 0.1036 * x**4)
     outline = np.concatenate([np.stack([x, half], 1), np.stack([x, -half], 1)[-2:0:-1]])
-    return 120.0 * (outline - np.array([0.4, 0.0]))
+    foil: Array = 120.0 * (outline - np.array([0.4, 0.0]))
+    return foil
 
 
 def _leaf() -> Array:

@@ -48,6 +48,7 @@ class KeeperBus:
                 f"a keeper holds {channel}",
                 hint="it lowers the arm of a client that died, and ends when the arm rests: wait, then connect again",
             )
+        self._path = path
         self._process = _start(device, settings, path)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.connect(str(path))
@@ -107,6 +108,8 @@ class KeeperBus:
         self._socket.close()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
+            # Nothing happened that somebody would have to read of.
+            self._path.with_suffix(".log").unlink(missing_ok=True)
 
 
 def _socket_path(interface: str, channel: str) -> Path:
