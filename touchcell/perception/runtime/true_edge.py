@@ -44,6 +44,10 @@ class NoisyEdgeSource:
         """Wait for the camera's first frame. Raises DeviceError."""
         self._camera.latest()
 
+    def take_zero(self) -> bool:
+        """Return False: no frame is compared with one out of contact."""
+        return False
+
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
         """Pass the pose on."""
         self._truth.record_pose(t_ns, T_base_sensor)
