@@ -36,7 +36,8 @@ _CORNER_S: Final = 0.35
 def _polar(radius: Any, count: int = 180) -> Array:
     angle = np.arange(count) * 2.0 * math.pi / count
     r = radius(angle)
-    return np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1)
+    outline: Array = np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1)
+    return outline
 
 
 def _foil() -> Array:
