@@ -40,5 +40,13 @@ setup(
             extra_compile_args=["-O3"],
             optional=True,
         ),
+        Extension(
+            "touchcell.simulation.meshes._mesh",
+            sources=["touchcell/simulation/meshes/_mesh.c"],
+            include_dirs=[numpy.get_include()],
+            extra_compile_args=["-O3", "-ffp-contract=off"],
+            # Without a compiler every face is compared with every point, in NumPy.
+            optional=True,
+        ),
     ]
 )

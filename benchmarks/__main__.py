@@ -23,7 +23,9 @@ BENCHMARKS = {
     "fuzz-cells": "tests.fault_injection.fuzz_cells",
     "fuzz-recordings": "tests.fault_injection.fuzz_recordings",
     "gdn-vs-cnn": "benchmarks.gdn_vs_cnn",
+    "keeper": "benchmarks.keeper",
     "mutation": "benchmarks.mutation",
+    "hil-mutation": "benchmarks.hil_mutation",
     "phantom": "benchmarks.phantom",
     "kinematics": "benchmarks.kinematics",
     "safety": "tests.fault_injection.safety",
@@ -33,6 +35,7 @@ BENCHMARKS = {
     "structure": "benchmarks.structure",
     "soak": "tests.fault_injection.soak",
     "tuning": "benchmarks.tuning",
+    "world-faults": "benchmarks.world_faults",
 }
 
 

@@ -29,7 +29,8 @@ from touchcell.cell.analysis.run_folder import RunFolder, object_poses, scene_ti
 from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_cell
-from touchcell.cell.recording.mcap import RECORDING, Recorder
+from touchcell.cell.recording.mcap import RECORDING
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.run_result import Outcome

@@ -17,7 +17,7 @@ from touchcell.cell.config.armed import REQUIRED_OF_ARMS, REQUIRED_OF_SENSORS
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.true_contact import put_on_true_contact
-from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.geometry import gaussian, se3

@@ -10,22 +10,29 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from touchcell.cell.bench.provenance import provenance
+from touchcell.cell.cli.workers import add_workers, workers_of
+from touchcell.cell.experiments.executors import EXECUTORS, Lost
 from touchcell.drivers.replay.dataset import read_split
 from touchcell.geometry.types import Array
+from touchcell.perception.errors import TrainingError
 from touchcell.perception.models.architecture import Architecture
 from touchcell.perception.models.labels import xi_from_contact
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.dataset import LabelledImages, default_cache, load_reduced
 from touchcell.perception.networks.scores import SCORE_NAMES, Scores
 
-KINDS: tuple[Literal["gdn", "cnn"], ...] = ("gdn", "cnn")
+Kind: TypeAlias = Literal["gdn", "cnn"]
+KINDS: tuple[Kind, ...] = ("gdn", "cnn")
+_LIMIT_S = 86_400
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
@@ -41,12 +48,19 @@ def run(arguments: Sequence[str], out: Path) -> None:
     preprocessing = Preprocessing(input_size=(first.shape[0], first.shape[1]), output_size=(options.size, options.size))
     sets = {name: _images(options.data, name, preprocessing) for name in ("train", "val")}
     rows: dict[str, list[dict[str, float]]] = {kind: [] for kind in KINDS}
+    networks = [(kind, seed) for seed in range(options.seeds) for kind in KINDS]
+    models = {
+        (kind, seed): options.networks / f"{kind}_{options.size}px_{options.epochs}epochs_{seed}.safetensors"
+        for kind, seed in networks
+    }
+    _train_missing(
+        _TrainNetwork(sets["train"], sets["val"], preprocessing, options.epochs),
+        {network: path for network, path in models.items() if not path.exists()},
+        options,
+    )
     for seed in range(options.seeds):
         for kind in KINDS:
-            model = options.networks / f"{kind}_{options.size}px_{options.epochs}epochs_{seed}.safetensors"
-            if not model.exists():
-                _train(sets["train"], sets["val"], model, preprocessing, kind, seed, options)
-            row = _scores(model, sets["val"])
+            row = _scores(models[kind, seed], sets["val"])
             rows[kind].append(row)
             print(
                 f"{kind:<8} seed {seed}  " + "  ".join(f"{name} {value:.3f}" for name, value in row.items()), flush=True
@@ -81,6 +95,7 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--epochs", type=int, default=6)
     parser.add_argument("--size", type=int, default=64, help="side of the networks' input, px")
     parser.add_argument("--networks", type=Path, default=Path("runs/gdn-vs-cnn"), help="folder for trained networks")
+    add_workers(parser, time_limit_s=_LIMIT_S, what="training")
     return parser.parse_args(arguments)
 
 
@@ -91,29 +106,49 @@ def _images(data: Path, split: str, preprocessing: Preprocessing) -> LabelledIma
     )
 
 
-def _train(
-    training: LabelledImages,
-    validation: LabelledImages,
-    model: Path,
-    preprocessing: Preprocessing,
-    kind: Literal["gdn", "cnn"],
-    seed: int,
-    options: argparse.Namespace,
-) -> None:
-    import torch
+@dataclass(frozen=True, slots=True)
+class _TrainNetwork:
+    """Trains one network on one thread and returns the bytes of its model file; picklable."""
 
-    from touchcell.perception.networks.training import Settings, train_on_arrays
+    training: LabelledImages
+    validation: LabelledImages
+    preprocessing: Preprocessing
+    epochs: int
 
-    torch.set_num_threads(1)
-    # The jitter is the same in millimetres of the sensor.
-    train_on_arrays(
-        training,
-        validation,
-        model,
-        preprocessing=preprocessing,
-        architecture=Architecture(kind=kind, input_size=preprocessing.output_size),
-        settings=Settings(seed=seed, epochs=options.epochs, shift_px=0.15 * options.size / 128),
-    )
+    def __call__(self, network: tuple[Kind, int]) -> bytes:
+        import torch
+
+        from touchcell.perception.networks.training import Settings, train_on_arrays
+
+        kind, seed = network
+        torch.set_num_threads(1)
+        size = self.preprocessing.output_size
+        with tempfile.TemporaryDirectory() as folder:
+            model = Path(folder) / "network.safetensors"
+            # The jitter is the same in millimetres of the sensor.
+            train_on_arrays(
+                self.training,
+                self.validation,
+                model,
+                preprocessing=self.preprocessing,
+                architecture=Architecture(kind=kind, input_size=size),
+                settings=Settings(seed=seed, epochs=self.epochs, shift_px=0.15 * size[0] / 128),
+            )
+            return model.read_bytes()
+
+
+def _train_missing(train: _TrainNetwork, missing: dict[tuple[Kind, int], Path], options: argparse.Namespace) -> None:
+    networks = list(missing)
+    name, _, address = options.executor.partition(":")
+    workers = replace(workers_of(options), address=address)
+    for index, model in EXECUTORS.load(name).run(train, networks, workers):
+        if isinstance(model, Lost):
+            raise TrainingError(f"{networks[index]}: {model.reason}")
+        path = missing[networks[index]]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_suffix(".unfinished")
+        unfinished.write_bytes(model)
+        unfinished.replace(path)
 
 
 def _scores(model: Path, validation: LabelledImages) -> dict[str, float]:

@@ -20,6 +20,7 @@ EXTENSIONS: Final = {
     "touchcell.drivers.v4l2._jpegc": "damage inside a camera's JPEG frame is not noticed, only a missing end",
     "touchcell.perception._kernelsc": "image filters are OpenCV's, slower; marker estimators cannot be used",
     "touchcell.simulation._paint": "simulated images are drawn in Python, slower",
+    "touchcell.simulation.meshes._mesh": "nearest points of meshes are searched in Python, about 1000 times slower",
 }
 """Module name -> what its absence costs."""
 

@@ -42,11 +42,14 @@ class PluginSection:
         registry: of the plug-ins.
         tag: key that names the plug-in.
         default: plug-in of a section without that key; None if the key is required.
+        nested: the section is one within a plug-in of the same kind: schemas name its plug-in and leave its keys out,
+            which would contain themselves.
     """
 
     registry: Registry[Any]
     tag: str = "kind"
     default: str | None = None
+    nested: bool = False
 
     def model_of(self, section: Mapping[str, Any]) -> type[BaseModel]:
         """Return the model of ``section``. Raises ConfigError for a plug-in that does not exist or is broken."""
@@ -76,6 +79,9 @@ class PluginSection:
         )
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        if self.nested:
+            tag = {"type": "string", "enum": list(self.registry.names())}
+            return {"type": "object", "properties": {self.tag: tag}, "required": [self.tag]}
         models = [self.registry.load(name).config for name in self.registry.names()]
         for model in models:
             model.model_rebuild()

@@ -114,4 +114,4 @@ def test_an_interrupted_run_continues_at_its_end(
     assert not (tmp_path / faults.PART).exists()
     report = json.loads((tmp_path / "faults.json").read_text())
     assert len(report["cases"]) == sum(not rule for place, rule in places("franka", tmp_path) if place.state == "press")
-    assert "as expected: 12 of 12 places tried" in capsys.readouterr().out
+    assert "as expected: 13 of 13 places tried" in capsys.readouterr().out

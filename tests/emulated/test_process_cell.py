@@ -24,6 +24,7 @@ from touchcell.cell.cli.main import main
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.config.yaml_file import InvalidCell
+from touchcell.cell.recording.message_types import Encoded
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
@@ -373,7 +374,7 @@ class Topics:
     def __init__(self) -> None:
         self.told: set[str] = set()
 
-    def add(self, topic: str, t_ns: int, data: bytes) -> None:
+    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
         self.told.add(topic)
 
 

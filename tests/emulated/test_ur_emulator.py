@@ -9,12 +9,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain
 from touchcell.drivers.ur.codec import Value
 from touchcell.drivers.ur.emulator import kinematics as ur_model
 from touchcell.drivers.ur.emulator import program as ur_program
 from touchcell.drivers.ur.emulator.controller import Controller
 from touchcell.drivers.ur.emulator.motion import Trapezoid
-from touchcell.drivers.ur.emulator.program import PERIOD_S
+from touchcell.drivers.ur.emulator.program import (
+    DONE,
+    JOINTS_IN_LIMITS,
+    PERIOD_S,
+    POSE_IN_LIMITS,
+    ControlProgram,
+    ProgramError,
+)
 from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyMode
 
 SCRIPT = "def rtde_control():\n rtde_set_watchdog()\nend\n"
@@ -218,3 +226,69 @@ def test_travel_counts_the_way_of_the_tool(controller: Controller) -> None:
     run(controller, 0.5)
     assert controller.arm.travel_m == pytest.approx(0.025, abs=2e-4)
     assert math.isfinite(controller.last_input_age_s)
+
+
+def program_on(controller: Controller) -> ControlProgram:
+    """Return a control program that runs on ``controller`` and has done its first step."""
+    program = ControlProgram(controller, 0)
+    assert program.step()
+    return program
+
+
+@pytest.mark.parametrize("command", [7, 18, 20, 57, 6, 26])
+def test_a_command_that_is_not_emulated_ends_the_program_and_is_not_answered_done(command: int) -> None:
+    controller = Controller()
+    program = program_on(controller)
+    controller.write_inputs({"input_int_register_0": command})
+    with pytest.raises(ProgramError, match=str(command)):
+        program.step()
+    assert controller.outputs["output_int_register_0"] != DONE
+
+
+@pytest.mark.parametrize(("q", "within"), [([0.0, -1.5, 1.0, 0.0, 1.0, 0.0], 1), ([10.0] * 6, 0)])
+def test_safety_limits_of_joints_are_answered_truly(q: list[float], within: int) -> None:
+    controller = Controller()
+    program = program_on(controller)
+    controller.write_inputs({f"input_double_register_{i}": value for i, value in enumerate(q)})
+    controller.write_inputs({"input_int_register_0": JOINTS_IN_LIMITS})
+    program.step()
+    assert controller.outputs["output_int_register_1"] == within
+
+
+@pytest.mark.parametrize(("x_m", "within"), [(0.4, 1), (3.0, 0)])
+def test_safety_limits_of_poses_are_answered_truly(x_m: float, within: int) -> None:
+    controller = Controller()
+    program = program_on(controller)
+    pose = [x_m, -0.13, 0.48, *ur_model.pose_vector(controller.arm.T_base_tcp)[3:]]
+    controller.write_inputs({f"input_double_register_{i}": value for i, value in enumerate(pose)})
+    controller.write_inputs({"input_int_register_0": POSE_IN_LIMITS})
+    program.step()
+    assert controller.outputs["output_int_register_1"] == within
+
+
+def test_slider_and_outputs_are_set_as_masked() -> None:
+    controller = Controller()
+    controller.write_inputs({"speed_slider_mask": 1, "speed_slider_fraction": 0.5})
+    controller.write_inputs({"standard_digital_output_mask": 0b11, "standard_digital_output": 0b01})
+    controller.write_inputs({"standard_digital_output_mask": 0b10, "standard_digital_output": 0b11})
+    values = controller.values()
+    assert values["speed_scaling"] == 0.5
+    assert values["actual_digital_output_bits"] == 0b11
+
+
+@pytest.mark.parametrize("name", sorted(ur_model.MODELS))
+def test_every_model_is_the_one_of_its_shipped_chain(name: str) -> None:
+    chain = SerialChain(ChainDescription.shipped(name))
+    q = np.array([0.3, -1.2, 1.0, -0.4, 0.7, 0.2])
+    T, J = ur_model.forward(q, np.eye(4), ur_model.MODELS[name])
+    np.testing.assert_allclose(T, chain.forward(q), atol=1e-6)
+    np.testing.assert_allclose(J, chain.jacobian(q), atol=1e-6)
+
+
+def test_a_paused_program_stands_and_plays_on() -> None:
+    controller = Controller()
+    controller.play_foreign_program()
+    assert controller.pause()
+    assert controller.runtime_state is RuntimeState.PAUSED
+    assert not controller.pause()
+    assert controller.play()

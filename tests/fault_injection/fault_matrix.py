@@ -6,6 +6,7 @@ The matrix is generated: faults are listed once, states come from the tasks' own
 from __future__ import annotations
 
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -204,13 +205,27 @@ def cells() -> dict[str, dict[str, Any]]:
     return {data["task"]["name"]: data for data in tasks}
 
 
-def matrix(
-    folder: Path, devices: Sequence[str] = ("arm", "camera"), tasks: Sequence[str] | None = None
-) -> Iterator[Case]:
-    """Run every case of the matrix and yield the results.
+@dataclass(frozen=True, slots=True)
+class Place:
+    """One fault of one device in one state of a task; picklable.
+
+    Attributes:
+        cell: content of the cell file.
+        fault: name.
+        device: role of the device.
+        state: of the task.
+    """
+
+    cell: Mapping[str, Any]
+    fault: str
+    device: str
+    state: str
+
+
+def places(devices: Sequence[str] = ("arm", "camera"), tasks: Sequence[str] | None = None) -> Iterator[Place]:
+    """Return every case of the matrix.
 
     Args:
-        folder: for cell files and collected data.
         devices: kinds of device with faults; those of cameras need a model, those of arms run on the true contact.
         tasks: names; None for all.
     """
@@ -218,15 +233,28 @@ def matrix(
         if tasks is not None and task not in tasks:
             continue
         for kind in devices:
-            path = folder / f"{task}_{kind}.yaml"
-            path.write_text(yaml.safe_dump(on_true_contact(data) if kind == "arm" else data))
-            probe = compose(plan_anew(path))
+            cell = on_true_contact(data) if kind == "arm" else data
+            with tempfile.TemporaryDirectory() as folder:
+                probe = compose(plan_anew(_written(cell, Path(folder))))
             assert isinstance(probe.task, MachineTask)
             targets = probe.plan.arm_roles if kind == "arm" else probe.cameras
             for fault in (fault for fault in FAULTS if fault.device == kind):
                 for device in targets:
                     for state in probe.task.states:
-                        yield run_case(path, fault, device, state)
+                        yield Place(cell, fault.name, device, state)
+
+
+def run_place(place: Place) -> Case:
+    """Run one case of the matrix."""
+    [fault] = [fault for fault in FAULTS if fault.name == place.fault]
+    with tempfile.TemporaryDirectory() as folder:
+        return run_case(_written(place.cell, Path(folder)), fault, place.device, place.state)
+
+
+def _written(cell: Mapping[str, Any], folder: Path) -> Path:
+    path = folder / "cell.yaml"
+    path.write_text(yaml.safe_dump(dict(cell)))
+    return path
 
 
 def on_true_contact(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -22,7 +22,8 @@ from mcap.records import Chunk
 from touchcell.cell.analysis.report import summarise
 from touchcell.cell.analysis.run_data import load_run
 from touchcell.cell.errors import RecordingError
-from touchcell.cell.recording.mcap import Damage, Recorder, follow, read
+from touchcell.cell.recording.mcap import Damage, follow, read
+from touchcell.cell.recording.recorder import Recorder
 
 _MESSAGES = 1000
 _MAGIC = b"\x89MCAP0\r\n"

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from tests.fault_injection.two_arms import pushing_plan, two_arm_plan
-from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose

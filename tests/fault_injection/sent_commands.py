@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from touchcell.cell.recording.message_types import Encoded
 from touchcell.cell.runtime.run_record import Box
 
 
@@ -16,12 +17,12 @@ class SentCommands:
         self._box = box
         self._last_ns: int | None = None
 
-    def add(self, topic: str, t_ns: int, data: bytes) -> None:
+    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
         """Take in one message."""
         if topic.endswith("/command"):
             self._last_ns = t_ns
         if self._box is not None:
-            self._box.add(topic, t_ns, data)
+            self._box.add(topic, t_ns, message)
 
     def since(self, t_ns: int) -> bool:
         """Return True if a command was sent at ``t_ns`` or later."""

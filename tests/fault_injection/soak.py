@@ -23,7 +23,7 @@ import yaml
 from tests.fault_injection.fault_matrix import FAULTS, Fault, on_true_contact, plan_anew
 from tests.fault_injection.sent_commands import SentCommands
 from touchcell.cell.bench.provenance import provenance
-from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose

@@ -10,6 +10,7 @@ import signal
 import sys
 
 from touchcell.cell.cli.main import main
+from touchcell.cell.recording.message_types import Encoded
 from touchcell.cell.runtime.black_box import BlackBox
 
 
@@ -18,9 +19,9 @@ def run(messages: int, number: signal.Signals, cell: str, out: str) -> int:
     add = BlackBox.add
     count = 0
 
-    def add_and_die(box: BlackBox, topic: str, t_ns: int, data: bytes) -> None:
+    def add_and_die(box: BlackBox, topic: str, t_ns: int, message: Encoded) -> None:
         nonlocal count
-        add(box, topic, t_ns, data)
+        add(box, topic, t_ns, message)
         count += 1
         if count == messages:
             os.kill(os.getpid(), number)

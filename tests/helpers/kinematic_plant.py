@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -36,6 +37,7 @@ class KinematicPlant:
         broken: the arm reports an invalid pose.
         seen: ``T_f_s`` (4, 4) of the latest cycle.
         operator_stop: whether the operator requests the end.
+        force_n: the arm's measurement of the force on its tip for an indentation in mm; None measures none.
         image: difference of the image in free air from the gate's first reference; None for a plant without images.
             A depth of 1 mm changes it by 0.1.
         knocked: further difference, as of a camera that has been moved.
@@ -55,6 +57,7 @@ class KinematicPlant:
         self.in_range = True
         self.broken = False
         self.operator_stop = False
+        self.force_n: Callable[[float], float] | None = None
         self.image: float | None = None
         self.knocked = 0.0
         self.zeros = 0
@@ -102,7 +105,11 @@ class KinematicPlant:
             self._seq += 1
             self._contact = self._estimate()
         contacts = {} if self._contact is None else {"sensor": self._contact}
-        return Observation(self.now_ns, {"arm": self._state}, contacts, self.operator_stop)
+        wrenches = {}
+        if self.force_n is not None:
+            force_n = self.force_n(max(1e3 * float(self.seen[2, 3]), 0.0))
+            wrenches["arm"] = Stamped(np.array([0.0, 0.0, force_n, 0.0, 0.0, 0.0]), self.now_ns, self._seq)
+        return Observation(self.now_ns, {"arm": self._state}, contacts, self.operator_stop, wrenches=wrenches)
 
     def _raw_image(self) -> float:
         assert self.image is not None
@@ -126,4 +133,4 @@ class KinematicPlant:
             self.T_w_f = se3.compose(self.T_w_f, se3.from_euler_mm_deg(shear))
             self._anchored = True
         belief = PoseGaussian(se3.inverse(self.sensor_in_surface()), COVARIANCE)
-        return replace(nothing, in_contact=True, belief=belief, in_range=self.in_range)
+        return replace(nothing, in_contact=True, belief=belief, in_range=self.in_range, measured=belief)

@@ -112,3 +112,42 @@ def test_mistakes_are_named(cell: CellFactory, following: CellUnderTest) -> None
     with pytest.raises(AssertionError, match=r"still in|ended in"):
         following.run_until("nowhere", limit_s=0.1)
     assert replace(ArmFaults(), stale=True) != ArmFaults()
+
+
+PRESS_BY_FORCE = {
+    "task.steps": [{"move": {"by_mm_deg": [0, 0, 30], "speed_mm_s": 5, "until": {"force_n": 3}}}],
+    "interlocks.contact_lost.states": ["move_1"],
+}
+
+
+def test_a_step_waits_for_the_force_that_the_arm_measures(cell: CellFactory) -> None:
+    pressing = cell("steps_bench.yaml", on="sim", set=PRESS_BY_FORCE)
+    assert pressing.finish().outcome.value == "done"
+    # The simulated skin has 1.5 N/mm, so 3 N are 2 mm.
+    assert pressing.values("/task", "depth_mm")[-1] == pytest.approx(2.0, abs=0.5)
+
+
+def test_an_arm_that_measures_no_force_is_refused_for_such_a_step(cell: CellFactory) -> None:
+    steps = [{"move": {"by_mm_deg": [0, 0, 30], "until": {"force_n": 3}}}]
+    with pytest.raises(ConfigError, match=r"until\.force_n, but sim_arm measures no force"):
+        cell("steps_sim.yaml", set={"task.steps": steps})
+
+
+def test_states_that_are_not_finite_fault_a_stand_in_as_its_driver_does(cell: CellFactory) -> None:
+    following = cell("surface_follow_bench.yaml", on="sim", set={"task.distance_mm": 20})
+    following.run_until("run")
+    following.inject("arm", nan_state=True)
+    following.run_until_trip(limit_s=1.0)
+    assert following.first_cause is not None
+    assert following.first_cause.interlock == "device"
+
+
+def test_the_ground_truth_tells_how_long_an_arm_moved_that_its_driver_cannot_see(cell: CellFactory) -> None:
+    following = cell("surface_follow_bench.yaml", on="sim", set={"task.distance_mm": 20})
+    following.run_until("run")
+    following.run_for(0.3)
+    following.inject("arm", stale=True)
+    following.run_until_trip(limit_s=1.0)
+    with pytest.raises(AssertionError, match="declared"):
+        following.assert_stopped_as_declared()
+    following.assert_truly_stopped_as_declared()

@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import TcpSource
 from touchcell.drivers.core.samples import Stamped
-from touchcell.drivers.core.scene import ContactState, SceneSection, SceneSpec
+from touchcell.drivers.core.scene import ContactState, SceneBody, SceneSection, SceneSpec
 from touchcell.errors import ConfigError, TouchcellError
+from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.plugin_section import Section
+from touchcell.simulation.bodies import scene_bodies
+from touchcell.simulation.closed_forms import Box, Cylinder, Saddle
 from touchcell.simulation.contact import ContactLaw
+from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.objects import ObjectConfig, TableConfig
 from touchcell.simulation.quasi_static import QuasiStaticWorld
+from touchcell.simulation.relief import felt_relief
 from touchcell.simulation.shape_spec import SurfaceConfig, SurfaceSection, SurfaceSpec
 from touchcell.simulation.surfaces import Dome, Plane, Ramp, Shape, Sphere, Surface
 from touchcell.simulation.timeline import DEFAULT_STEP_S, Phase, Restore, Timeline
@@ -102,10 +107,21 @@ class Scene:
         world: physics of the scene; its time counts from the construction of the scene.
         clock: injected clock.
         step_s: step of the simulation grid.
+        surfaces: those of the world, for what only pictures and edges need of them.
+        tip_radius_m: of every tip.
     """
 
-    def __init__(self, world: World, clock: Clock, step_s: float = DEFAULT_STEP_S) -> None:
+    def __init__(
+        self,
+        world: World,
+        clock: Clock,
+        step_s: float = DEFAULT_STEP_S,
+        surfaces: Sequence[Surface] = (),
+        tip_radius_m: float = 0.020,
+    ) -> None:
         self.world = world
+        self.surfaces = tuple(surfaces)
+        self.tip_radius_m = tip_radius_m
         self.timeline = Timeline(clock, step_s)
         self._start_ns = self.timeline.t_ns
         self._poses: dict[str, Callable[[], Array]] = {}
@@ -160,6 +176,35 @@ class Scene:
         contacts[at] = computed(state)
         return Stamped(state, seq * step_ns, seq)
 
+    def relief(self, sensor: str, directions: Array, t_ns: int | None = None) -> Array | None:
+        """Return (samples,) m what the tip of ``sensor`` feels besides a tangent plane, at the time of ``contact``.
+
+        None where it touches a plane, an object or nothing. See ``relief.felt_relief``.
+        """
+        contact = self.contact(sensor, t_ns)
+        if not contact.value.in_contact or not self.surfaces:
+            return None
+        T_world_s = contact.value.T_world_f @ contact.value.T_f_s
+        t_s = self.seconds(contact.t_ns)
+        found = [(each.nearest(T_world_s[:3, 3], t_s).distance_m, each) for each in self.surfaces]
+        distance_m, surface = min(found, key=lambda each: each[0])
+        if distance_m >= self.tip_radius_m:
+            return None
+        return felt_relief(surface, T_world_s, t_s, directions, self.tip_radius_m)
+
+    def edge(self, sensor: str, t_ns: int | None = None) -> Stamped[Array] | None:
+        """Return T_s_e (4, 4) of the edge nearest to the tip of ``sensor``, at the time that ``contact`` would.
+
+        None where no surface has edges. See ``SceneTruth.edge`` for its frame.
+        """
+        contact = self.contact(sensor, t_ns)
+        T_world_s = contact.value.T_world_f @ contact.value.T_f_s
+        t_s = self.seconds(contact.t_ns)
+        T_world_e = nearest_edge(self.surfaces, T_world_s, t_s, self.tip_radius_m)
+        if T_world_e is None:
+            return None
+        return Stamped(se3.compose(se3.inverse(T_world_s), T_world_e), contact.t_ns, contact.seq)
+
     def objects(self) -> Stamped[Mapping[str, Array]]:
         """Return the present T_world_object (4, 4) of every free object."""
         t_ns = self.timeline.advance()
@@ -176,6 +221,10 @@ class Scene:
             ConfigError: a sensor was mounted since.
         """
         return self.timeline.snapshot()
+
+    def begin_now(self) -> None:
+        """Let the motions of the scene begin at the present step, not at its construction."""
+        self._start_ns = self.timeline.t_ns
 
     def seconds(self, t_ns: int) -> float:
         """Return the time of the world at ``t_ns``."""
@@ -273,6 +322,56 @@ class SphereConfig(SurfaceConfig):
         return Sphere(self.radius_mm * 1e-3)
 
 
+class BoxConfig(SurfaceConfig):
+    """A box that stands on z = 0 of its pose, its centre on the z axis.
+
+    Attributes:
+        size_mm: along x, y and z.
+    """
+
+    kind: Literal["box"]
+    size_mm: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+
+    def shape(self) -> Shape:
+        """Return the shape in its own frame."""
+        x, y, z = self.size_mm
+        return Box((1e-3 * x, 1e-3 * y, 1e-3 * z))
+
+
+class CylinderConfig(SurfaceConfig):
+    """A cylinder about z that stands on z = 0 of its pose.
+
+    Attributes:
+        radius_mm: radius of the cylinder.
+        height_mm: its height.
+    """
+
+    kind: Literal["cylinder"]
+    radius_mm: float = Field(gt=0.0)
+    height_mm: float = Field(gt=0.0)
+
+    def shape(self) -> Shape:
+        """Return the shape in its own frame."""
+        return Cylinder(1e-3 * self.radius_mm, 1e-3 * self.height_mm)
+
+
+class SaddleConfig(SurfaceConfig):
+    """A saddle without end: hollow along the pose's x, a ridge along its y; see ``closed_forms.Saddle``.
+
+    Attributes:
+        hollow_radius_mm: radius of the hollow section at the origin.
+        ridge_radius_mm: radius of the other section there.
+    """
+
+    kind: Literal["saddle"]
+    hollow_radius_mm: float = Field(gt=0.0)
+    ridge_radius_mm: float = Field(gt=0.0)
+
+    def shape(self) -> Shape:
+        """Return the shape in its own frame."""
+        return Saddle(1e-3 * self.hollow_radius_mm, 1e-3 * self.ridge_radius_mm)
+
+
 class TipLawConfig(Section):
     """Contact law of every simulated tip of the scene; see ``contact.ContactLaw``.
 
@@ -340,16 +439,32 @@ class SceneConfig(Section, SceneSection):
             raise ValueError(f"step_ms {self.step_ms:g} is not a multiple of physics_step_ms {self.physics_step_ms:g}")
         return self
 
+    def bodies(self) -> Sequence[SceneBody]:
+        """Return the table, surfaces and objects to draw."""
+        return scene_bodies(self.surfaces, self.objects, self.table)
+
     def build(self, clock: Clock) -> Scene:
         """Build the scene; its motions start now."""
-        return Scene(self._world(), clock, self.step_ms * 1e-3)
-
-    def modules(self) -> Mapping[str, str]:
-        """Return MuJoCo for dynamic scenes."""
-        return {"mujoco": "physics"} if self.physics == "dynamic" else {}
-
-    def _world(self) -> World:
         surfaces = {name: config.build() for name, config in self.surfaces.items()}
+        return Scene(
+            self._world(surfaces), clock, self.step_ms * 1e-3, list(surfaces.values()), 1e-3 * self.tip.radius_mm
+        )
+
+    def modules(self) -> Mapping[str, tuple[str, str]]:
+        """Return MuJoCo for dynamic scenes, and what the surfaces need."""
+        found = {"mujoco": ("physics", "pip install 'touchcell[physics]'")} if self.physics == "dynamic" else {}
+        for name, surface in self.surfaces.items():
+            found.update({module: (f"surfaces.{name}", how) for module, how in surface.modules().items()})
+        return found
+
+    def problems(self) -> Iterable[ConfigError]:
+        """Yield what is wrong with the files of the surfaces."""
+        for name, surface in self.surfaces.items():
+            for problem in surface.problems():
+                key = f"surfaces.{name}.{problem.key}"
+                yield ConfigError(problem.reason, key=key, value=problem.value, hint=problem.hint)
+
+    def _world(self, surfaces: Mapping[str, Surface]) -> World:
         if self.physics == "kinematic":
             return KinematicWorld(surfaces, self.tip.build())
         if self.physics == "quasi_static":
@@ -381,3 +496,6 @@ PLANE = SurfaceSpec("plane", "a flat plate", PlaneConfig)
 RAMP = SurfaceSpec("ramp", "a flat that bends over an arc to an incline", RampConfig)
 DOME = SurfaceSpec("dome", "a hemisphere on a plane", DomeConfig)
 SPHERE = SurfaceSpec("sphere", "a ball", SphereConfig)
+BOX = SurfaceSpec("box", "a box", BoxConfig)
+CYLINDER = SurfaceSpec("cylinder", "a cylinder", CylinderConfig)
+SADDLE = SurfaceSpec("saddle", "a saddle without end", SaddleConfig)

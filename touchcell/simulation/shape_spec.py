@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.plugin_section import PluginSection, Section
@@ -92,6 +94,14 @@ class SurfaceConfig(Section):
     def shape(self) -> Shape:
         """Return the shape in its own frame."""
         raise NotImplementedError(f"{type(self).__name__} has no shape")
+
+    def problems(self) -> Iterable[ConfigError]:
+        """Return what is wrong with the files that it names; ``key`` of each is relative to this section."""
+        return ()
+
+    def modules(self) -> Mapping[str, str]:
+        """Return the optional modules that it needs, each with how to install it."""
+        return {}
 
     def build(self) -> Surface:
         """Build the surface; its motion starts now."""

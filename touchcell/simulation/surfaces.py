@@ -13,6 +13,8 @@ import numpy as np
 
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
+from touchcell.simulation.meshes import primitives
+from touchcell.simulation.meshes.smoothing import TriangleMesh
 from touchcell.simulation.motions import Motion, Still
 
 
@@ -24,11 +26,22 @@ class SurfacePoint:
         distance_m: from the surface to the query point, negative below the surface.
         normal: (3,) outward unit normal there.
         point: (3,) m.
+        curvatures_per_m: the larger and the smaller principal curvature there, 1/m, positive where the surface is
+            convex; None where they are not known, as on a crease.
     """
 
     distance_m: float
     normal: Array
     point: Array
+    curvatures_per_m: tuple[float, float] | None = None
+
+
+_FLAT = (0.0, 0.0)
+
+
+def _lengths(points: Array) -> Array:
+    lengths: Array = np.sqrt(np.einsum("kc,kc->k", points, points))
+    return lengths
 
 
 class Shape(Protocol):
@@ -45,7 +58,7 @@ class Plane:
 
     def nearest(self, p: Array) -> SurfacePoint:
         """Return the nearest surface point to ``p`` (3,) m."""
-        return SurfacePoint(float(p[2]), np.array([0.0, 0.0, 1.0]), np.array([p[0], p[1], 0.0]))
+        return SurfacePoint(float(p[2]), np.array([0.0, 0.0, 1.0]), np.array([p[0], p[1], 0.0]), _FLAT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +71,16 @@ class Sphere:
         """Return the nearest surface point to ``p`` (3,) m; for the centre itself, the top."""
         length = math.sqrt(float(p @ p))
         normal = p / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
-        return SurfacePoint(length - self.radius_m, normal, self.radius_m * normal)
+        curvature = 1.0 / self.radius_m
+        return SurfacePoint(length - self.radius_m, normal, self.radius_m * normal, (curvature, curvature))
+
+    def distances(self, points: Array) -> Array:
+        """Return the (k,) signed distances of ``points`` (k, 3) m."""
+        return _lengths(points) - self.radius_m
+
+    def drawn(self) -> TriangleMesh:
+        """Return the ball as a mesh."""
+        return primitives.ball(self.radius_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +93,10 @@ class Dome:
         """Return the nearest surface point to ``p`` (3,) m; exact outside the body, where a tip's centre always is."""
         on_cap = Sphere(self.radius_m).nearest(p)
         return on_cap if on_cap.distance_m < p[2] else Plane().nearest(p)
+
+    def distances(self, points: Array) -> Array:
+        """Return the (k,) signed distances of ``points`` (k, 3) m."""
+        return np.minimum(_lengths(points) - self.radius_m, points[:, 2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +127,13 @@ class Ramp:
         if along >= 0.0:
             distance = (z - end_z) * cos - (x - end_x) * sin
             point = np.array([end_x + along * cos, y, end_z + along * sin])
-            return SurfacePoint(distance, np.array([-sin, 0.0, cos]), point)
+            return SurfacePoint(distance, np.array([-sin, 0.0, cos]), point, _FLAT)
         # The arc's centre is above a hollow bend and below a rounded edge; outwards is towards it or away from it.
         from_centre = math.hypot(x, z - sign * R)
         normal = np.array([-sign * x / from_centre, 0.0, -sign * (z - sign * R) / from_centre])
         distance = sign * (R - from_centre)
-        return SurfacePoint(distance, normal, np.array([x, y, z]) - distance * normal)
+        curvatures = (0.0, -1.0 / R) if sign > 0.0 else (1.0 / R, 0.0)
+        return SurfacePoint(distance, normal, np.array([x, y, z]) - distance * normal, curvatures)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,4 +153,4 @@ class Surface:
         T = self.motion.pose(t_s)
         R, origin = T[:3, :3], T[:3, 3]
         found = self.shape.nearest((p_world - origin) @ R)
-        return SurfacePoint(found.distance_m, R @ found.normal, R @ found.point + origin)
+        return SurfacePoint(found.distance_m, R @ found.normal, R @ found.point + origin, found.curvatures_per_m)

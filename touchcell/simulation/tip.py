@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from touchcell.geometry.types import Array
+from touchcell.simulation.relief import ReliefKernel
 
 _MM = 1e-3
 _DEG = math.pi / 180.0
@@ -112,17 +113,27 @@ class Tip:
         self._direction = np.stack(direction, axis=1)
         self._free = 1.0 - p.rim_clamp * (polar / (p.ring_step_rad * p.rings)) ** 2
         self._rest = p.marker_radius_m * self._direction
+        self._relief: ReliefKernel | None = None
+
+    @property
+    def relief(self) -> ReliefKernel:
+        """Where the skin feels the shape of a surface, and how markers follow."""
+        if self._relief is None:
+            self._relief = ReliefKernel(self._direction)
+        return self._relief
 
     @property
     def rest_positions(self) -> Array:
         """Return (markers, 3) m, undeformed, in the sensor frame."""
         return self._rest.copy()
 
-    def marker_positions(self, T_f_s: Array) -> Array:
+    def marker_positions(self, T_f_s: Array, relief: Array | None = None) -> Array:
         """Return marker positions in the sensor frame in contacts ``T_f_s``.
 
         Args:
             T_f_s: (..., 4, 4) contact poses after slip; those of negative depth leave the skin undeformed.
+            relief: (..., samples) m, by how much further than a plane the surface presses into the skin at each of the
+                samples of ``relief``; None for a plane.
 
         Returns:
             (..., markers, 3) m.
@@ -164,6 +175,11 @@ class Tip:
         body = -sunk * axis * np.array([p.lean_follow, p.lean_follow, p.sink_follow])
         moved += (0.5 + 0.5 * self._direction[:, 2])[:, None] * body[..., None, :]
         moved[..., 2] += p.rock * ahead * grip
+        if relief is not None:
+            # The skin follows what it feels beyond a plane as it follows the plane, and its slope swings the pins.
+            felt = p.dent_follow * relief
+            moved -= self.relief.values(felt)[..., None] * axis[..., None, :]
+            moved -= p.pin_lever_m / p.marker_radius_m * self.relief.slopes(felt)
         return moved
 
     def project(self, positions: Array) -> Array:
@@ -178,9 +194,10 @@ class Tip:
         v = p.centre_px[1] + scale * (sin * x + cos * y)
         return np.stack([u, v], axis=-1)
 
-    def pixels(self, T_f_s: Array) -> Array:
-        """Return (..., markers, 2) px in the 640x480 frame, of contacts ``T_f_s`` (..., 4, 4)."""
-        return self.project(self.marker_positions(T_f_s))
+    def pixels(self, T_f_s: Array, relief: Array | None = None) -> Array:
+        """Return (..., markers, 2) px in the 640x480 frame, of contacts ``T_f_s`` (..., 4, 4); see
+        ``marker_positions``."""
+        return self.project(self.marker_positions(T_f_s, relief))
 
 
 def _tilt(alpha: float, beta: float) -> Array:

@@ -123,6 +123,11 @@ class ContactServoConfig(TaskConfig):
         )
 
 
+_BACK_M = 0.5e-3
+_BACK_RAD = math.radians(1.0)
+_BACK_PER_S = 5.0
+
+
 def _six(linear_mm: float, angular_deg: float) -> Array:
     return np.repeat([1e-3 * linear_mm, np.radians(angular_deg)], 3)
 
@@ -137,6 +142,9 @@ class ContactServo:
         reference_mm_deg: contact to hold, (6,) Euler components of ``T_f_s``.
         run: behavior once settled.
         context: of the cell.
+        running_axes: components x, y, z, alpha, beta, gamma of the sensor's twist that the behavior leaves to the
+            controller; the others are held at rest once the contact has settled.
+        decoupled: see ``TactileServo``.
 
     Attributes:
         T_base_sensor: (4, 4) pose of the sensor; None where it is unknown or too old.
@@ -154,19 +162,27 @@ class ContactServo:
         reference_mm_deg: Six,
         run: Behavior,
         context: TaskContext,
+        running_axes: tuple[bool, bool, bool, bool, bool, bool] = (True, True, True, True, True, True),
+        *,
+        decoupled: bool = False,
     ) -> None:
         self.arm = arm
         self.sensor = sensor
         self.run = run
         self._config = config
         self._T_tcp_sensor = context.T_tcp_sensor[sensor]
+        self._running_axes = None if all(running_axes) else np.array(running_axes, np.float64)
         self._Ad_tcp_sensor = se3.adjoint(self._T_tcp_sensor)
         T_f_sref = se3.from_euler_mm_deg(np.array(reference_mm_deg))
-        self.controller = TactileServo(se3.inverse(T_f_sref), self._T_tcp_sensor, config.gains(), 1.0 / context.rate_hz)
+        self.controller = TactileServo(
+            se3.inverse(T_f_sref), self._T_tcp_sensor, config.gains(), 1.0 / context.rate_hz, decoupled=decoupled
+        )
         self.T_base_sensor: Array | None = None
         self.contact: ContactEstimate | None = None
         self._before: Array | None = None
         self._start: Array | None = None
+        self._felt: Array | None = None
+        self._back: Array | None = None
         self._period_s = 1.0 / context.rate_hz
         self._V_tcp = np.zeros(6)
         self._touched = False
@@ -242,6 +258,18 @@ class ContactServo:
             return None
         return None if self.contact.belief is None else self.contact.belief.mean
 
+    @property
+    def is_estimated(self) -> bool:
+        """True if a model measured the newest contact, rather than a simulator or a label."""
+        return self.contact is not None and self.contact.measured is not None
+
+    @property
+    def T_s_f_measured(self) -> Array | None:  # noqa: N802  the field's own name
+        """Valid contact pose (4, 4) of the newest frame by itself, or None."""
+        if self.T_s_f is None or self.contact is None or self.contact.measured is None:
+            return self.T_s_f
+        return self.contact.measured.mean
+
     def update(self, observation: Observation) -> None:
         """Update sensor pose and contact from an observation, dropping what is stale."""
         now_ns, limits = observation.now_ns, self._config
@@ -252,8 +280,32 @@ class ContactServo:
         self.contact = observation.contacts.get(self.sensor)
         if self.contact is not None and not 0.0 <= now_ns - self.contact.t_frame_ns <= 1e6 * limits.max_frame_age_ms:
             self.contact = None
+        if self.T_base_sensor is not None and self.in_contact:
+            self._felt = self.T_base_sensor
         if self.contact is not None:
             self._watch_touch()
+
+    def aim_back(self, lift_m: float) -> None:
+        """Aim at the pose in which the contact was last felt, withdrawn along the sensor's axis by ``lift_m``."""
+        felt = self.T_base_sensor if self._felt is None else self._felt
+        self._back = None if felt is None else se3.compose(felt, se3.exp([0.0, 0.0, -lift_m, 0.0, 0.0, 0.0]))
+
+    def is_back(self) -> bool:
+        """Return True at the pose that ``aim_back`` has set."""
+        if self._back is None or self.T_base_sensor is None:
+            return False
+        way = se3.log(se3.compose(se3.inverse(self.T_base_sensor), self._back))
+        return bool(np.linalg.norm(way[:3]) < _BACK_M and np.linalg.norm(way[3:]) < _BACK_RAD)
+
+    def way_back(self, speed_m_s: float) -> Array:
+        """Return the twist (6,) of the tool towards that pose, at most ``speed_m_s`` and the angular rate allowed."""
+        if self._back is None or self.T_base_sensor is None:
+            return np.zeros(6)
+        V = _BACK_PER_S * se3.log(se3.compose(se3.inverse(self.T_base_sensor), self._back))
+        rate = np.radians(self._config.max_turn_deg_s)
+        fastest = max(float(np.linalg.norm(V[:3])) / speed_m_s, float(np.linalg.norm(V[3:])) / rate, 1.0)
+        V_tcp: Array = self._Ad_tcp_sensor @ (V / fastest)
+        return V_tcp
 
     def start_approach(self) -> None:
         """Measure the travelled distance from the current pose, from which the sensor approaches."""
@@ -319,13 +371,19 @@ class ContactServo:
 
     def along_z(self, speed_m_s: float) -> Array:
         """Return the twist (6,) of the tool that moves the sensor along its z axis."""
-        V_tcp: Array = self._Ad_tcp_sensor @ np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0])
+        return self.in_tcp(np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0]))
+
+    def in_tcp(self, V_sensor: Array) -> Array:
+        """Return the twist (6,) of the tool, in its frame, that gives the sensor a twist (6,) in its own."""
+        V_tcp: Array = self._Ad_tcp_sensor @ V_sensor
         self._V_tcp = V_tcp
         return V_tcp
 
-    def servo_step(self, V_ff: Array) -> Array | None:
+    def servo_step(self, V_ff: Array, *, running: bool = True) -> Array | None:
         """Return the twist (6,) of the tool that holds the contact; None while there is no valid estimate."""
         V_tcp = self.controller.step(self.T_s_f, 0 if self.contact is None else self.contact.t_ns, V_ff)
+        if running and self._running_axes is not None:
+            V_tcp = self._Ad_tcp_sensor @ (self._running_axes * np.linalg.solve(self._Ad_tcp_sensor, V_tcp))
         if self.T_s_f is None:
             self._V_tcp = np.zeros(6)
             return None

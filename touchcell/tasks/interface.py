@@ -17,6 +17,7 @@ from touchcell.drivers.core.protocols import require_protocols
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.perception.runtime.estimator_spec import Feature
 from touchcell.registry import Registry
 
 
@@ -58,6 +59,7 @@ class Observation:
         devices: newest reading of each other device that is read, by role or, without one, by name.
         operator_stop: True if the operator requested an orderly end.
         ended: True if no sensor will deliver further frames, because the recordings have ended.
+        wrenches: (6,) N and N m on the tool centre point along base axes, of each arm of which the task needs it.
     """
 
     now_ns: int
@@ -66,6 +68,7 @@ class Observation:
     operator_stop: bool = False
     ended: bool = False
     devices: Mapping[str, Stamped[Mapping[str, float]]] = field(default_factory=dict)
+    wrenches: Mapping[str, Stamped[Array]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +164,9 @@ class TaskSpec(Generic[TaskConfigT]):
         build: builds the task from its parameters and the context.
         labels_frames: True if it labels frames, which the cell has to store.
         devices: roles of other devices, and the Protocols that each driver must provide.
+        forces: returns roles of arms whose wrench a configuration needs, each with the key that needs it; their drivers
+            must provide WrenchSource.
+        feature: what the contacts of its sensors must be of.
     """
 
     name: str
@@ -171,6 +177,12 @@ class TaskSpec(Generic[TaskConfigT]):
     build: Callable[[TaskConfigT, TaskContext], Task]
     labels_frames: bool = False
     devices: Mapping[str, frozenset[type]] = field(default_factory=dict)
+    forces: Callable[[TaskConfigT], Mapping[str, str]] | None = None
+    feature: Feature = "surface"
+
+    def needs_wrenches(self, config: TaskConfigT) -> Mapping[str, str]:
+        """Return roles of arms whose wrench ``config`` needs, each with the key that needs it."""
+        return {} if self.forces is None else self.forces(config)
 
     def __post_init__(self) -> None:
         for protocols in (*self.arms.values(), *self.devices.values()):

@@ -15,6 +15,7 @@ from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Sidestepping, Six
 from touchcell.tasks.interface import SPEED, Action, Observation, TaskContext, TaskSpec, TransitionRecord
+from touchcell.tasks.sensor_check import SensorCheck
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
 from touchcell.tasks.state_machine_task import MachineTask
 
@@ -22,6 +23,8 @@ ARM: Final = "arm"
 """Role of the arm in tasks with one arm."""
 SENSOR: Final = "sensor"
 """Role of the tactile sensor that it carries."""
+_RETURN_S: Final = 10.0
+"""Longest return to where a contact was lost; the way is that of a few frames."""
 
 
 _START_CHANGE: Final = 0.02
@@ -49,10 +52,17 @@ class ServoConfig(ContactServoConfig):
             one that changes was in contact.
         approach_speed_mm_s: speed towards the surface, along the sensor's z axis.
         approach_distance_mm: the approach fails when no contact was made within it.
+        check_s: duration of the motion after first contact whose measured answer must agree with the arm's before the
+            arm servos on a model's estimates (``sensor_check``); 0 leaves it out.
+        check_press_mm: depth that this motion adds.
+        check_shift_mm: its largest shift along the surface.
+        check_tilt_deg: its largest tilt.
         settle_time_s: the contact has settled when errors were below the tolerances for this long.
         settle_timeout_s: settling fails when it takes longer.
         retract_mm: distance to withdraw at the end.
         retract_speed_mm_s: speed of that.
+        return_lift_mm: before a contact that was lost while the behavior ran is searched for again, the sensor returns
+            to where it was last felt, less deep by this much; none searches from where the sensor is.
         max_reapproach: number of times that a lost contact is searched for again.
         stale_timeout_s: the task trips when the arm has been stopped for lack of a valid estimate for this long.
         prepare_timeout_s: longest wait for the first frame and arm state.
@@ -61,10 +71,15 @@ class ServoConfig(ContactServoConfig):
     back_off_mm: PositiveFloat = 2.0
     approach_speed_mm_s: Annotated[PositiveFloat, SPEED] = 10.0
     approach_distance_mm: PositiveFloat = 50.0
+    check_s: NonNegativeFloat = 1.0
+    check_press_mm: NonNegativeFloat = 0.5
+    check_shift_mm: PositiveFloat = 0.3
+    check_tilt_deg: PositiveFloat = 1.0
     settle_time_s: NonNegativeFloat = 0.3
     settle_timeout_s: PositiveFloat = 10.0
     retract_mm: PositiveFloat = 20.0
     retract_speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
+    return_lift_mm: PositiveFloat | None = None
     max_reapproach: NonNegativeInt = 2
     stale_timeout_s: PositiveFloat = 0.5
     prepare_timeout_s: PositiveFloat = 5.0
@@ -75,8 +90,10 @@ class ServoState(Enum):
 
     PREPARE = auto()
     APPROACH = auto()
+    CHECK = auto()
     SETTLE = auto()
     RUN = auto()
+    RETURN = auto()
     SIDESTEP = auto()
     RETRACT = auto()
     DONE = auto()
@@ -86,7 +103,9 @@ class ServoState(Enum):
     FAULTED = auto()
 
 
-def servo_table(task: str, config: ServoConfig, run_timeout_s: float, *, sidesteps: bool = False) -> Table:
+def servo_table(
+    task: str, config: ServoConfig, run_timeout_s: float, *, sidesteps: bool = False, servos: int = 1
+) -> Table:
     """Return the states and transitions of a servoing task; motions time out after twice their nominal duration.
 
     Args:
@@ -94,17 +113,21 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float, *, sideste
         config: its parameters.
         run_timeout_s: longest time in ``run``.
         sidesteps: whether a contact may be given up for another beside it.
+        servos: number of sensors, which are checked one after another.
     """
     s = ServoState
     approach_s = 2.0 * config.approach_distance_mm / config.approach_speed_mm_s + 1.0
+    check_s = 2.0 * servos * config.check_s + 1.0
     retract_s = 2.0 * config.retract_mm / config.retract_speed_mm_s + 1.0
     return Table(
         task,
         (
             StateDef(s.PREPARE, config.prepare_timeout_s, "timeout"),
             StateDef(s.APPROACH, approach_s, "timeout", on_enter="start_approach"),
+            StateDef(s.CHECK, check_s, "timeout", on_enter="start_check"),
             StateDef(s.SETTLE, config.settle_timeout_s, "timeout", on_enter="start_settle"),
             StateDef(s.RUN, run_timeout_s, "timeout", on_enter="start_run"),
+            StateDef(s.RETURN, _RETURN_S, "timeout", on_enter="start_return"),
             *((StateDef(s.SIDESTEP, config.settle_timeout_s, "timeout", on_enter="start_sidestep"),) * sidesteps),
             StateDef(s.RETRACT, retract_s, "timeout", on_enter="start_retract"),
             StateDef(s.DONE, terminal=True),
@@ -118,13 +141,18 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float, *, sideste
             TransitionDef("touching", s.PREPARE, s.FAILED),
             TransitionDef("timeout", s.PREPARE, s.FAILED),
             TransitionDef(STOP, s.PREPARE, s.STOPPED),
+            TransitionDef("contact", s.APPROACH, s.CHECK, guard="must_check"),
             TransitionDef("contact", s.APPROACH, s.SETTLE),
             TransitionDef("no_contact", s.APPROACH, s.RETRACT),
+            TransitionDef("agrees", s.CHECK, s.SETTLE),
+            TransitionDef("lost", s.CHECK, s.APPROACH, guard="may_reapproach"),
+            TransitionDef("lost", s.CHECK, s.RETRACT),
             TransitionDef("settled", s.SETTLE, s.RUN),
             TransitionDef("lost", s.SETTLE, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.SETTLE, s.RETRACT),
             TransitionDef("finished", s.RUN, s.RETRACT),
             TransitionDef("missed", s.RUN, s.RETRACT),
+            TransitionDef("lost", s.RUN, s.RETURN, guard="may_return"),
             *(
                 (TransitionDef("aside", s.RUN, s.SIDESTEP), TransitionDef("placed", s.SIDESTEP, s.APPROACH))
                 if sidesteps
@@ -132,6 +160,7 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float, *, sideste
             ),
             TransitionDef("lost", s.RUN, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.RUN, s.RETRACT),
+            TransitionDef("returned", s.RETURN, s.APPROACH),
             TransitionDef("retracted", s.RETRACT, s.STOPPED, guard="was_stopped"),
             TransitionDef("retracted", s.RETRACT, s.DONE, guard="has_finished"),
             TransitionDef("retracted", s.RETRACT, s.FAILED),
@@ -149,7 +178,8 @@ class ServoTask(MachineTask):
 
     While the contact servos search for the surface or hold it, they move only on fresh frames, fresh arm states and
     valid estimates, all of them or none. When they retract, away from the surface, a fresh arm state suffices. A servo
-    that has made its contact holds it until the others have made theirs.
+    that has made its contact holds it until the others have made theirs; until its sensor was checked it stands still.
+    The sensors are checked one after another, once.
 
     Args:
         name: the task's name.
@@ -167,7 +197,9 @@ class ServoTask(MachineTask):
         self._servos = servos
         timeout_s = min(servo.run.timeout_s for servo in servos)
         sidesteps = any(isinstance(servo.run, Sidestepping) for servo in servos)
-        self._machine = TaskMachine(servo_table(name, config, timeout_s, sidesteps=sidesteps), self)
+        self._machine = TaskMachine(servo_table(name, config, timeout_s, sidesteps=sidesteps, servos=len(servos)), self)
+        self._checks: list[SensorCheck] = []
+        self._unchecked = config.check_s > 0.0
         self._now_ns = 0
         self._steady_s = 0.0
         self._blind_s = 0.0
@@ -199,9 +231,17 @@ class ServoTask(MachineTask):
             {servo.arm: self._command(servo, V) for servo, V in twists}, self._telemetry(observation), zero=zero
         )
 
+    def must_check(self) -> bool:
+        """Guard: a sensor's contact is estimated by a model, and the sensors have not been checked yet."""
+        return self._unchecked and any(servo.is_estimated for servo in self._servos)
+
     def may_reapproach(self) -> bool:
         """Guard: a lost contact may be searched for again."""
         return self._reapproaches < self._config.max_reapproach
+
+    def may_return(self) -> bool:
+        """Guard: a lost contact is searched for again, from where it was last felt."""
+        return self.may_reapproach() and self._config.return_lift_mm is not None
 
     def was_stopped(self) -> bool:
         """Guard: the operator requested a stop."""
@@ -216,6 +256,22 @@ class ServoTask(MachineTask):
         self._reapproaches += record.event == "lost"
         for servo in self._servos:
             servo.start_approach()
+        self._blind_s = 0.0
+
+    def start_return(self, record: TransitionRecord) -> None:
+        """On entry: aim at where each contact was last felt."""
+        self._reapproaches += 1
+        for servo in self._servos:
+            servo.aim_back(1e-3 * (self._config.return_lift_mm or 0.0))
+        self._blind_s = 0.0
+
+    def start_check(self, record: TransitionRecord) -> None:
+        """On entry: begin the motion of the first sensor."""
+        c = self._config
+        self._checks = [
+            SensorCheck(c.check_s, press_mm=c.check_press_mm, shift_mm=c.check_shift_mm, tilt_deg=c.check_tilt_deg)
+            for _ in self._servos
+        ]
         self._blind_s = 0.0
 
     def start_settle(self, record: TransitionRecord) -> None:
@@ -260,6 +316,9 @@ class ServoTask(MachineTask):
                     self._post("contact")
                 elif max(servo.travelled_m() for servo in searching) >= 1e-3 * self._config.approach_distance_mm:
                     self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
+            case ServoState.CHECK:
+                self._watch_contact(dt_s)
+                self._watch_check()
             case ServoState.SETTLE:
                 self._watch_contact(dt_s)
                 steady = all(servo.steady() for servo in servos)
@@ -276,6 +335,10 @@ class ServoTask(MachineTask):
                         self._post("missed", missed)
                     else:
                         self._post("finished")
+            case ServoState.RETURN:
+                self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in servos))
+                if all(servo.is_back() for servo in servos):
+                    self._post("returned")
                 elif any(isinstance(s.run, Sidestepping) and s.run.sidestep_m is not None for s in servos):
                     self._post("aside", "the object is pushed beside its centre")
             case ServoState.SIDESTEP:
@@ -285,6 +348,26 @@ class ServoTask(MachineTask):
             case ServoState.RETRACT:
                 if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in servos):
                     self._post("retracted")
+
+    def _watch_check(self) -> None:
+        """Record what the sensors measure, and judge it when all have moved."""
+        for check, servo in zip(self._checks, self._servos, strict=True):
+            if servo.T_base_sensor is not None:
+                check.record_pose(self._now_ns, servo.T_base_sensor)
+            contact, T_s_f = servo.contact, servo.T_s_f_measured
+            if contact is not None and T_s_f is not None and check is self._moving_check():
+                check.record_contact(contact.seq, contact.t_frame_ns, T_s_f)
+        if self._moving_check() is not None:
+            return
+        for check, servo in zip(self._checks, self._servos, strict=True):
+            if wrong := check.verdict():
+                self._post(TRIP, f"{servo.sensor}: {wrong}")
+                return
+        self._unchecked = False
+        self._post("agrees")
+
+    def _moving_check(self) -> SensorCheck | None:
+        return next((check for check in self._checks if not check.finished), None)
 
     def _prepare(self) -> None:
         """Take a zero frame, back off a little, and take another, unless the first motion changes the image."""
@@ -347,6 +430,12 @@ class ServoTask(MachineTask):
         if state is ServoState.RETRACT:
             speed_m_s = -1e-3 * self._config.retract_speed_mm_s
             return [(servo, servo.along_z(speed_m_s)) for servo in self._servos if servo.T_base_sensor is not None]
+        if state is ServoState.CHECK:
+            return self._check_twists()
+        if state is ServoState.RETURN:
+            if not all(servo.has_fresh_data for servo in self._servos):
+                return []
+            return [(servo, servo.way_back(1e-3 * self._config.approach_speed_mm_s)) for servo in self._servos]
         if state is ServoState.PREPARE:
             speed_m_s = -1e-3 * self._config.approach_speed_mm_s
             backing = self._prepared is _Preparation.BACK_OFF and all(servo.has_fresh_data for servo in self._servos)
@@ -373,11 +462,22 @@ class ServoTask(MachineTask):
             V_tcp: Array | None
             if searching and not servo.touches:
                 V_tcp = servo.along_z(1e-3 * self._config.approach_speed_mm_s)
+            elif searching and self._unchecked and servo.is_estimated:
+                V_tcp = None
             else:
-                V_tcp = servo.servo_step(servo.run.feedforward if state is ServoState.RUN else np.zeros(6))
+                running = state is ServoState.RUN
+                V_tcp = servo.servo_step(servo.run.feedforward if running else np.zeros(6), running=running)
             if V_tcp is not None:
                 twists.append((servo, V_tcp))
         return twists
+
+    def _check_twists(self) -> list[tuple[ContactServo, Array]]:
+        if not all(servo.has_fresh_data and servo.T_s_f is not None for servo in self._servos):
+            return []
+        for check, servo in zip(self._checks, self._servos, strict=True):
+            if not check.finished:
+                return [(servo, servo.in_tcp(check.step(self._period_s)))]
+        return []
 
     def _command(self, servo: ContactServo, V_tcp: Array) -> TwistCommand:
         return TwistCommand(

@@ -1,4 +1,7 @@
-"""Follow a surface: slide over it at constant depth, normal to it, in one direction (paper 5, surface following)."""
+"""Follow a surface: slide over it at constant depth, normal to it (paper 5, surface following).
+
+Either in one direction of the sensor, as in the paper, or along a planned path that is projected onto the surface.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import SixGains
 from touchcell.tasks.interface import DEPTH, DISTANCE, SPEED
 from touchcell.tasks.servoing import ServoConfig, one_arm_task
+from touchcell.tasks.surface_path import Guide, PathConfig
 
 
 class SurfaceFollowingConfig(ServoConfig):
@@ -22,6 +26,8 @@ class SurfaceFollowingConfig(ServoConfig):
         speed_mm_s: tangential speed of the sensor.
         direction_deg: direction of travel, from the sensor's x axis towards its y axis.
         distance_mm: distance that the sensor travels.
+        path: path to follow in place of a direction and a distance; see ``surface_path``.
+        lookahead_mm: how far ahead on the path the sensor heads.
     """
 
     depth_mm: Annotated[PositiveFloat, DEPTH] = 3.0
@@ -30,6 +36,9 @@ class SurfaceFollowingConfig(ServoConfig):
     speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
     direction_deg: float = 0.0
     distance_mm: Annotated[PositiveFloat, DISTANCE] = 100.0
+    path: PathConfig | None = None
+    lookahead_mm: PositiveFloat = 2.0
+    return_lift_mm: PositiveFloat | None = 3.0
 
 
 class Follow:
@@ -69,10 +78,51 @@ class Follow:
         return {}
 
 
+class FollowPath:
+    """Behavior of surface following along a planned path."""
+
+    def __init__(self, config: SurfaceFollowingConfig, path: PathConfig) -> None:
+        self._guide = Guide(path.points(), 1e-3 * config.lookahead_mm)
+        self._speed_m_s = 1e-3 * config.speed_mm_s
+        self._feedforward = np.zeros(6)
+        # A path over a surface is longer than in its plane: up to three times where it is steep.
+        self._timeout_s = 3.0 * self._guide.length_m / self._speed_m_s + 5.0
+
+    @property
+    def feedforward(self) -> Array:
+        """Twist (6,) in the desired sensor frame."""
+        return self._feedforward
+
+    @property
+    def timeout_s(self) -> float:
+        """Three times the duration on a plane, plus five seconds."""
+        return self._timeout_s
+
+    def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
+        """Head for the next point of the path; return True at its end."""
+        self._feedforward = np.concatenate([self._speed_m_s * self._guide.direction(now), np.zeros(3)])
+        return self._guide.along_m >= self._guide.length_m
+
+    def shortfall(self) -> str:
+        """Return nothing: it finishes at the end of its path."""
+        return ""
+
+    def telemetry(self) -> Mapping[str, float]:
+        """Return how much of the path is left, and how far beside it the sensor is."""
+        return {
+            "path_left_mm": 1e3 * max(self._guide.length_m - self._guide.along_m, 0.0),
+            "cross_track_error_mm": 1e3 * self._guide.cross_track_error_m,
+        }
+
+
+def _behavior(config: SurfaceFollowingConfig) -> Follow | FollowPath:
+    return Follow(config) if config.path is None else FollowPath(config, config.path)
+
+
 SPEC = one_arm_task(
     "surface_following",
     "slide over an unknown surface at constant depth and normal to it",
     SurfaceFollowingConfig,
-    Follow,
+    _behavior,
     lambda config: (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0),
 )

@@ -35,8 +35,8 @@ def cell() -> Iterator[CellFactory]:
     """Makes running cells: ``cell("cell.yaml", on="sim", set={"task.depth_mm": 2}, faults={...})``."""
     # Imported where it is used: a test session that needs no cell pays nothing for this plugin.
     from touchcell.cell.config.find import find_cell
-    from touchcell.cell.runtime.worlds import cell_in_world
     from touchcell.testing.cell_under_test import CellUnderTest
+    from touchcell.testing.emulation.world import running_emulators
 
     with ExitStack() as cells:
 
@@ -50,7 +50,7 @@ def cell() -> Iterator[CellFactory]:
             if on != "emulated":
                 return cells.enter_context(CellUnderTest(file, on=on, set=set, faults=faults))
             settings = {"on_trip": "wait_for_reset", **(set or {})}
-            plan = cells.enter_context(cell_in_world(find_cell(Path(file)), on, settings=settings))
-            return cells.enter_context(CellUnderTest(plan, faults=faults))
+            emulated = cells.enter_context(running_emulators(find_cell(Path(file)), settings=settings))
+            return cells.enter_context(CellUnderTest(emulated.plan, faults=faults, emulated=emulated))
 
         yield running

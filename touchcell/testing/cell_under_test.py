@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from os import PathLike
@@ -17,6 +16,7 @@ from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_in_world
 from touchcell.cell.config.worlds import WorldName
+from touchcell.cell.recording.message_types import Encoded
 from touchcell.cell.runtime.compose import AnyInterlock, compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorRequest
@@ -30,6 +30,7 @@ from touchcell.control.interlocks.violation import Violation
 from touchcell.control.proof import prove
 from touchcell.drivers.core.device import Device
 from touchcell.errors import ConfigError, suggest
+from touchcell.testing.emulation.world import EmulatedCell
 from touchcell.testing.shown_interlock import Shown, shown
 
 OPERATOR: Final = "test"
@@ -44,17 +45,17 @@ class Message:
     Attributes:
         topic: e.g. "/arms/arm/command".
         t_ns: time on the cell's clock.
-        encoded: content as JSON.
+        encoded: content as it is recorded.
     """
 
     topic: str
     t_ns: int
-    encoded: bytes
+    encoded: Encoded
 
     @property
     def data(self) -> Mapping[str, Any]:
         """Content, units in the keys."""
-        content: Mapping[str, Any] = json.loads(self.encoded)
+        content: Mapping[str, Any] = self.encoded.decode()
         return content
 
 
@@ -69,6 +70,7 @@ class CellUnderTest:
         on: the world that it runs in; None as the file is written.
         set: values in place of the file's own, by dotted key.
         faults: faults from the start, by device: ``{"arm": {"stale": True}}``.
+        emulated: the emulators of the plan, running.
 
     Raises:
         ConfigError: the cell is not valid, runs in real time, or has no such device or fault.
@@ -81,7 +83,10 @@ class CellUnderTest:
         on: WorldName | None = None,
         set: Mapping[str, Any] | None = None,
         faults: Mapping[str, Mapping[str, Any]] | None = None,
+        emulated: EmulatedCell | None = None,
     ) -> None:
+        self._emulated = emulated
+        self._first_faults = dict(faults or {})
         if isinstance(file, CellPlan):
             self.plan = file
         else:
@@ -102,11 +107,13 @@ class CellUnderTest:
         self._channel = OperatorChannel()
         self._loop = RunLoop(self.cell, None, box=self, stop=self._stop, channel=self._channel)
         self._going = True
-        for device, values in (faults or {}).items():
-            self.inject(device, **values)
+        for device in self._first_faults:
+            self._device(device)
 
     def __enter__(self) -> Self:
         self.cell.__enter__()
+        for device, values in self._first_faults.items():
+            self.inject(device, **values)
         self._loop.begin()
         return self
 
@@ -121,9 +128,9 @@ class CellUnderTest:
     def __repr__(self) -> str:
         return f"<CellUnderTest {self.plan.cell.name!r}: {self.state} after {self.t_s:.3f} s>"
 
-    def add(self, topic: str, t_ns: int, data: bytes) -> None:
+    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
         """Keep one message; called by the run loop."""
-        self.messages.append(Message(topic, t_ns, data))
+        self.messages.append(Message(topic, t_ns, message))
 
     # What is the case.
 
@@ -237,10 +244,15 @@ class CellUnderTest:
     def inject(self, device: str, **faults: Any) -> None:
         """Begin faults of a device, by the device's name in the cell; see ``touchcell.simulation.faults``.
 
+        They have the same names and effects on simulated devices and on emulators.
+
         Raises:
             ConfigError: no such device, it has no faults to inject, or no such fault.
         """
         found = self._device(device)
+        if self._emulated is not None:
+            self._emulated.inject(device, faults)
+            return
         present = getattr(found, "faults", None)
         if present is None:
             raise ConfigError("has no faults that can be injected", key=device, hint="use a simulated device")
@@ -253,6 +265,9 @@ class CellUnderTest:
     def clear(self, device: str) -> None:
         """End all faults of a device."""
         found = self._device(device)
+        if self._emulated is not None:
+            self._emulated.clear(device)
+            return
         if (present := getattr(found, "faults", None)) is not None:
             found.faults = type(present)()  # type: ignore[attr-defined]
 
@@ -340,6 +355,30 @@ class CellUnderTest:
         for role, report in self.stops.items():
             assert report.kept, f"{role}: rest after {report.time_s} s, {report.distance_m} m; declared {report}"
         assert self.at_rest, "an arm still moves"
+
+    def true_stop_s(self) -> Mapping[str, float]:
+        """Return for each arm, by name, how long after the trip it truly moved, by the ground truth of its simulation.
+
+        It also holds where a driver cannot see its arm, as when no state arrives.
+
+        Raises:
+            AssertionError: nothing has tripped.
+        """
+        cause = self.first_cause
+        assert cause is not None, "nothing has tripped"
+        if self._emulated is None:
+            moved = {arm.name: getattr(arm, "moved_ns", 0) for arm in self.cell.arms.values()}
+        else:
+            moved = self._emulated.process.state()["moved_ns"]
+        return {name: max(0.0, 1e-9 * (t_ns - cause.t_ns)) for name, t_ns in moved.items()}
+
+    def assert_truly_stopped_as_declared(self) -> None:
+        """Fail the test unless every arm truly stood within its declared stopping time, whatever its driver saw."""
+        names = {role: arm.name for role, arm in self.cell.arms.items()}
+        true_s = self.true_stop_s()
+        for role, report in self.stops.items():
+            limit_s = report.declared_s + 1.0 / self.cell.rate_hz
+            assert true_s[names[role]] <= limit_s, f"{role}: moved for {true_s[names[role]]:.3f} s, declared {limit_s}"
 
     def assert_nothing_sent_since_trip(self) -> None:
         """Fail the test if a command was sent in or after the cycle that tripped."""

@@ -44,6 +44,7 @@ class _World:
 
     file: Path
     name: str
+    pace: float = 1.0
     stack: ExitStack = field(default_factory=ExitStack)
     started: CellPlan | None = None
 
@@ -60,7 +61,7 @@ class _World:
         if self.started is None:
             from touchcell.cell.runtime.worlds import cell_in_world
 
-            settings = {"on_trip": "wait_for_reset"}
+            settings = {"on_trip": "wait_for_reset", "emulated_pace": self.pace}
             self.started = self.stack.enter_context(cell_in_world(self.file, self.name, settings=settings))  # type: ignore[arg-type]
         return self.started
 
@@ -71,9 +72,10 @@ _EVIDENCE: Final = pytest.StashKey[Any]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add ``--on`` and ``--hil-report``."""
+    """Add ``--on``, ``--pace`` and ``--hil-report``."""
     group = parser.getgroup("touchcell")
     group.addoption("--on", choices=("sim", "emulated"), default="sim", help="world of generated tests (default: sim)")
+    group.addoption("--pace", type=float, default=1.0, help="emulated seconds in each second of this machine, up to 1")
     group.addoption("--hil-report", type=Path, metavar="FILE", help="write evidence of generated tests as HTML")
 
 
@@ -98,7 +100,7 @@ def _world(config: pytest.Config, module: Path, cell: str) -> _World:
     from touchcell.cell.config.find import find_cell
 
     file = find_cell((module.parent / cell).resolve())
-    return config.stash[_WORLDS].setdefault(file, _World(file, _world_name(config)))
+    return config.stash[_WORLDS].setdefault(file, _World(file, _world_name(config), config.getoption("--pace")))
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -155,7 +157,7 @@ def hil_cell(request: pytest.FixtureRequest) -> Iterator[CellUnderTest]:
     with ExitStack() as fresh:
         if world.name == "emulated":
             # Emulated arms stay where the test before has left them.
-            world = fresh.enter_context(_World(world.file, world.name))
+            world = fresh.enter_context(_World(world.file, world.name, world.pace))
         running = fresh.enter_context(CellUnderTest(world.plan()))
         request.node.stash[_CELL] = running
         yield running

@@ -6,6 +6,7 @@ skips the question. Installed as an entry point of ``pytest11``; without ``--cel
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -93,7 +94,8 @@ class CellModule(pytest.Module):
 def _rig_of(plan: CellPlan, device: DevicePlan) -> FixtureFactory:
     """Build a device fixture with no emulator and no ground truth."""
     from touchcell.cell.runtime.devices import build_devices
-    from touchcell.drivers.core.clock import MonotonicClock, VirtualClock
+    from touchcell.drivers.core.clock import VirtualClock
+    from touchcell.drivers.core.paced_clock import emulated_clock
     from touchcell.testing.emulation.rig import DeviceFixture
 
     def rig(folder: Path, address: int) -> DeviceFixture:
@@ -104,7 +106,7 @@ def _rig_of(plan: CellPlan, device: DevicePlan) -> FixtureFactory:
             energising=None,
             position=None,
             state_rate_hz=getattr(device.config, "rate_hz", None) or _scene_rate_hz(plan, device),
-            clock=VirtualClock if plan.cell.time == "simulated" else MonotonicClock,
+            clock=VirtualClock if plan.cell.time == "simulated" else emulated_clock,
             process=False,
         )
 
@@ -141,7 +143,12 @@ def rig_in(file: Path, plan: Callable[[], CellPlan], device: str, world: str) ->
             started = plan()
             return _rig_of(started, started.devices[device])(folder, address).build(clock)
 
-        return replace(found, build=build)
+        def clock() -> Clock:
+            # The emulators' time begins with them.
+            plan()
+            return found.clock()
+
+        return replace(found, build=build, clock=clock)
 
     return rig
 
@@ -150,8 +157,11 @@ def ask(config: pytest.Config, device: str, what: str = _SHORT_MOVES) -> None:
     """Ask the operator before a device is powered; end the session where nobody agrees."""
     capture = config.pluginmanager.getplugin("capturemanager")
     with capture.global_and_fixture_disabled():
-        print(f"\n{device} will be powered {what}.")
-        print("Is the space around it free, are people away, and is a hand on the emergency stop? Type yes: ", end="")
+        if sys.stdin is not None and sys.stdin.isatty():
+            print(f"\n{device} will be powered {what}.")
+            print(
+                "Is the space around it free, are people away, and is a hand on the emergency stop? Type yes: ", end=""
+            )
         try:
             answer = input()
         except (EOFError, OSError):

@@ -16,7 +16,8 @@ from touchcell.cell.analysis.contact_images import contact_pictures
 from touchcell.cell.analysis.web_viewer import Page, play
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT
 from touchcell.cell.cli.main import main
-from touchcell.cell.recording.mcap import RECORDING, Recorder, follow, read
+from touchcell.cell.recording.mcap import RECORDING, follow, read
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.geometry import se3
 from touchcell.paths import CONFIGS

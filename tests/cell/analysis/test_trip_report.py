@@ -13,11 +13,15 @@ import yaml
 from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_TRIPPED
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.true_contact import put_on_true_contact
-from touchcell.cell.recording.mcap import encode, read
+from touchcell.cell.recording.mcap import read
+from touchcell.cell.recording.message_types import Encoder
+from touchcell.cell.recording.messages import declared_type
 from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.paths import CONFIGS
 from touchcell.simulation.devices.arm import SimArm
 from touchcell.simulation.faults import ArmFaults
+
+ENCODER = Encoder(declared_type)
 
 SHIPPED = CONFIGS / "surface_follow_sim.yaml"
 
@@ -37,7 +41,7 @@ def run_into_the_wall(folder: Path, **arm: Any) -> Path:
 def test_the_ring_keeps_ten_seconds() -> None:
     with BlackBox() as box:
         for k in range(3000):
-            box.add("/task", k * 10_000_000, encode({"k": k}))
+            box.add("/task", k * 10_000_000, ENCODER.encode("/task", {"k": k}))
         # Both ends included.
         assert [message.data["k"] for message in box.messages()] == list(range(1999, 3000))
 

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from touchcell.cell.cli.main import main
-from touchcell.cell.recording.mcap import RECORDING, Recorder
+from touchcell.cell.recording.mcap import RECORDING
+from touchcell.cell.recording.recorder import Recorder
 
 
 def run_folder(folder: Path, x: float, timing: int) -> Path:

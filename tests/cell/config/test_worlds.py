@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import pty
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import yaml
 
 from touchcell.cell.config.layers import explain, load_layers
 from touchcell.cell.config.schema import EMULATED_CAMERAS, plan_cell, plan_in_world
+from touchcell.drivers.core.bench_address import is_pseudo_terminal, is_virtual_can
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
@@ -23,6 +26,28 @@ def bench(tmp_path: Path) -> Path:
     path = tmp_path / "bench.yaml"
     path.write_text(BENCH.read_text())
     return path
+
+
+@pytest.mark.parametrize("host", ["127.0.0.2", "localhost", "::1", "0.0.0.0"])
+def test_an_emulators_address_is_refused_on_the_bench_by_its_key(bench: Path, host: str) -> None:
+    with pytest.raises(ConfigError, match="leads to an emulator") as caught:
+        plan_in_world(bench, "bench", settings={"arms.arm.host": host})
+    assert caught.value.key == "arms.arm.host"
+    assert plan_in_world(bench, None, settings={"arms.arm.host": host}).arms
+
+
+def test_virtual_buses_and_pseudo_terminals_lead_to_no_device_of_a_bench() -> None:
+    near, far = pty.openpty()
+    try:
+        assert is_pseudo_terminal(os.ttyname(far))
+    finally:
+        os.close(near)
+        os.close(far)
+    assert not is_pseudo_terminal("/dev/serial/by-id/usb-adapter")
+    assert is_virtual_can("socketcan", "vcan0")
+    assert is_virtual_can("touchcell_hub", "/run/hub")
+    assert not is_virtual_can("socketcan", "can0")
+    assert not is_virtual_can("slcan", "/dev/ttyACM0")
 
 
 @pytest.mark.parametrize("cell", CELLS)

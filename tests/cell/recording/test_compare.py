@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from touchcell.cell.recording.compare import compare_recordings
-from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.recording.recorder import Recorder
 
 Messages = Sequence[tuple[str, int, dict[str, Any]]]
-BASE: Messages = [("/a", 1, {"x": 0.1, "y": [1, 2.5]}), ("/a", 2, {"x": 0.2, "y": []}), ("/b", 2, {"name": "n"})]
+BASE: Messages = [("/a", 1, {"x": 0.1, "y": [1, 2.5]}), ("/a", 2, {"x": 0.2, "y": [3.5]}), ("/b", 2, {"name": "n"})]
 
 
 def recorded(path: Path, messages: Messages) -> Path:
@@ -37,12 +37,12 @@ def test_the_same_is_identical_and_durations_do_not_count(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("change", "topic", "difference"),
     [
-        (("/a", 2, {"x": 0.2 + 2**-55, "y": []}), "/a", "x is 0.2, then 0.20000000000000004"),
-        (("/a", 3, {"x": 0.2, "y": []}), "/a", "at 2 ns, then at 3 ns"),
-        (("/a", 2, {"x": 0.2}), "/a", "y is only in the first"),
-        (("/a", 2, {"x": 0.2, "y": [], "z": 1}), "/a", "z is only in the second"),
-        (("/a", 2, {"x": 0.2, "y": [1]}), "/a", "y is [], then [1]"),
-        (("/a", 2, {"x": "0.2", "y": []}), "/a", "x is 0.2, then '0.2'"),
+        (("/a", 2, {"x": 0.2 + 2**-55, "y": [3.5]}), "/a", "x is 0.2, then 0.20000000000000004"),
+        (("/a", 3, {"x": 0.2, "y": [3.5]}), "/a", "at 2 ns, then at 3 ns"),
+        (("/a", 2, {"y": [3.5]}), "/a", "x is only in the first"),
+        (("/a", 2, {"x": 0.2, "y": [3.5], "z": 1}), "/a", "z is only in the second"),
+        (("/a", 2, {"x": 0.2, "y": []}), "/a", "y is [3.5], then []"),
+        (("/a", 2, {"x": "0.2", "y": [3.5]}), "/a", "x is 0.2, then '0.2'"),
     ],
 )
 def test_the_first_difference_is_named(

@@ -13,11 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
 from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
 
 from tests.fault_injection.fuzz_recordings import lz4_bomb, original, try_mutants
 from touchcell.cell.errors import RecordingError
-from touchcell.cell.recording.mcap import CHUNK_BYTES, Damage, Recorder, follow, read
+from touchcell.cell.recording.mcap import Damage, follow, read
+from touchcell.cell.recording.recorder import CHUNK_BYTES, Recorder
 
 
 def test_round_trip(tmp_path: Path) -> None:
@@ -43,7 +46,7 @@ def test_kill_minus_nine_loses_at_most_the_open_chunk(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     program = (
         "import os, signal, pathlib\n"
-        "from touchcell.cell.recording.mcap import Recorder\n"
+        "from touchcell.cell.recording.recorder import Recorder\n"
         f"recorder = Recorder(pathlib.Path({str(path)!r}))\n"
         "for i in range(2000):\n"
         "    recorder.write('/x', i, {'i': i, 'pad': 'p' * 80})\n"
@@ -183,7 +186,7 @@ def test_a_length_beyond_all_memory_is_damage(tmp_path: Path) -> None:
     assert kept[-1] == 999
 
 
-def test_the_schema_of_a_channel_has_the_typed_fields_of_its_first_message(tmp_path: Path) -> None:
+def test_the_schema_of_a_channel_has_a_typed_field_for_every_key(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with Recorder(path) as recorder:
         recorder.write("/a/b", 1, {"x_mm": 1.5, "on": True, "name": "n", "gone": float("nan"), "twist": [None, 2.0]})
@@ -192,13 +195,67 @@ def test_the_schema_of_a_channel_has_the_typed_fields_of_its_first_message(tmp_p
         summary = make_reader(stream).get_summary()
     assert summary is not None
     (schema,) = summary.schemas.values()
-    assert (schema.name, schema.encoding) == ("a.b", "jsonschema")
-    assert json.loads(schema.data) == {
-        "type": "object",
-        "properties": {
-            "x_mm": {"type": "number"},
-            "on": {"type": "boolean"},
-            "name": {"type": "string"},
-            "twist": {"type": "array", "items": {"type": "number"}},
-        },
+    assert (schema.name, schema.encoding) == ("touchcell.AB", "protobuf")
+    (file,) = FileDescriptorSet.FromString(schema.data).file
+    (message,) = file.message_type
+    kinds = {field.name: (field.type, field.label == field.LABEL_REPEATED) for field in message.field}
+    assert kinds == {
+        "x_mm": (FieldDescriptorProto.TYPE_DOUBLE, False),
+        "on": (FieldDescriptorProto.TYPE_BOOL, False),
+        "name": (FieldDescriptorProto.TYPE_STRING, False),
+        "gone": (FieldDescriptorProto.TYPE_DOUBLE, False),
+        "twist": (FieldDescriptorProto.TYPE_DOUBLE, True),
     }
+
+
+def test_fields_that_come_later_keep_the_numbers_of_those_before_them(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path) as recorder:
+        recorder.write("/task", 1, {"state": "approach"})
+        recorder.write("/task", 2, {"state": "run", "error_z_mm": 1, "a.b": {"c": [1, [2.5]]}})
+        recorder.write("/task", 3, {"state": "run", "error_z_mm": 0.5})
+        recorder.write("/task", 4, {"state": "done"})
+    messages = list(read(path))
+    assert [message.data for message in messages] == [
+        {"state": "approach"},
+        {"state": "run", "error_z_mm": 1, "a.b": {"c": [1, [2.5]]}},
+        {"state": "run", "error_z_mm": 0.5},
+        {"state": "done"},
+    ]
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    numbers = [
+        {field.name: field.number for field in FileDescriptorSet.FromString(schema.data).file[-1].message_type[0].field}
+        for _, schema in sorted(summary.schemas.items())
+    ]
+    assert numbers[0] == {"state": 1}
+    assert all(later.items() >= numbers[0].items() for later in numbers)
+
+
+def test_stamps_are_of_the_wall_clock_for_viewers_and_of_the_cells_clock_for_us(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path, wall_offset_ns=1_700_000_000_000_000_000) as recorder:
+        recorder.write("/x", 5, {"i": 1})
+    assert [message.t_ns for message in read(path)] == [5]
+    with path.open("rb") as stream:
+        assert [message.log_time for _, _, message in make_reader(stream).iter_messages()] == [
+            1_700_000_000_000_000_005
+        ]
+
+
+def test_recordings_of_earlier_versions_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "old.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
+        writer.start(profile="", library="touchcell")
+        schema = writer.register_schema("task", "jsonschema", b'{"type":"object"}')
+        channel = writer.register_channel("/task", "json", schema)
+        for i in range(100):
+            writer.add_message(channel, i, json.dumps({"state": "run", "gone": None, "twist": [1, 2.5]}).encode(), i)
+        writer.finish()
+    damage: list[Damage] = []
+    messages = list(read(path, damage))
+    assert damage == []
+    assert [message.t_ns for message in messages] == list(range(100))
+    assert messages[0].data == {"state": "run", "gone": None, "twist": [1, 2.5]}

@@ -16,7 +16,7 @@ from touchcell.cell.cli import run as run_command
 from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_TASK_FAILED, EXIT_TRIPPED
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.errors import RecordingError
-from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.black_box import BlackBox
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose

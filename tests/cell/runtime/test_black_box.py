@@ -20,10 +20,14 @@ from touchcell.cell.cli.main import main
 from touchcell.cell.config.true_contact import put_on_true_contact
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording import mcap
-from touchcell.cell.recording.mcap import encode, read
+from touchcell.cell.recording.mcap import read
+from touchcell.cell.recording.message_types import Encoder
+from touchcell.cell.recording.messages import declared_type
 from touchcell.cell.recording.ring import RingWriter, read_ring
 from touchcell.cell.runtime.black_box import ABOUT, CRASH, MESSAGES, RING, BlackBox, read_left_ring
 from touchcell.paths import CONFIGS
+
+ENCODER = Encoder(declared_type)
 
 DIE_AT = 900
 
@@ -44,7 +48,7 @@ def numbers(messages: list[mcap.Message]) -> list[int]:
 def test_a_ring_returns_what_was_added_in_order(tmp_path: Path) -> None:
     ring = RingWriter(tmp_path / "ring", 1 << 20, {"cell": "x"})
     for k in range(500):
-        ring.add("/task", k - 5, encode({"k": k}))
+        ring.add("/task", k - 5, ENCODER.encode("/task", {"k": k}))
     ring.close()
     about, messages = read_ring(tmp_path / "ring")
     assert about == {"cell": "x"}
@@ -56,7 +60,7 @@ def test_a_ring_returns_what_was_added_in_order(tmp_path: Path) -> None:
 def test_a_ring_that_is_full_keeps_the_newest_without_a_gap(lengths: list[int]) -> None:
     ring = RingWriter(None, 0, {})
     for k, length in enumerate(lengths):
-        ring.add("/x", k, encode({"k": k, "pad": "p" * length}))
+        ring.add("/x", k, ENCODER.encode("/x", {"k": k, "pad": "p" * length}))
     kept = numbers(ring.messages())
     ring.close()
     fitting = [k for k, length in enumerate(lengths) if length < 16_000]
@@ -71,7 +75,7 @@ def test_the_file_of_a_ring_never_grows(tmp_path: Path) -> None:
     before = os.stat(tmp_path / "ring")
     assert before.st_blocks * 512 >= 1 << 20
     for k in range(20_000):
-        ring.add("/x", k, encode({"k": k, "pad": "p" * 100}))
+        ring.add("/x", k, ENCODER.encode("/x", {"k": k, "pad": "p" * 100}))
     ring.close()
     after = os.stat(tmp_path / "ring")
     assert (after.st_size, after.st_blocks) == (before.st_size, before.st_blocks)
@@ -86,7 +90,7 @@ def test_damage_to_a_ring_loses_messages_and_invents_none(data: st.DataObject) -
         path = Path(folder) / "ring"
         ring = RingWriter(path, 0, {"cell": "x"})
         for k in range(3000):
-            ring.add("/x", k, encode({"k": k}))
+            ring.add("/x", k, ENCODER.encode("/x", {"k": k}))
         ring.close()
         content = bytearray(path.read_bytes())
         for at in data.draw(st.lists(st.integers(0, len(content) - 1), min_size=1, max_size=20)):
@@ -111,13 +115,13 @@ def test_a_disk_without_room_for_a_ring_is_named(tmp_path: Path, monkeypatch: py
 
 def test_a_ring_whose_disk_fails_raises_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ring = RingWriter(tmp_path / "ring", 0, {})
-    ring.add("/x", 0, b"{}")
+    ring.add("/x", 0, ENCODER.encode("/x", {}))
 
     def broken(*_: Any) -> int:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setattr(os, "pwrite", broken)
-    ring.add("/x", 1, b"{}")
+    ring.add("/x", 1, ENCODER.encode("/x", {}))
     assert ring.failed
     assert len(ring.messages()) == 1
     ring.close()
@@ -163,7 +167,7 @@ def test_a_disk_that_fills_up_leaves_the_recording_the_black_box_and_a_result(
         room -= len(data)
         return write(fd, data)
 
-    monkeypatch.setattr(mcap.os, "write", limited)
+    monkeypatch.setattr(os, "write", limited)
     out = tmp_path / "run"
     assert main(["run", str(true_contact_cell(tmp_path)), "--out", str(out), "--quiet"]) != EXIT_OK
     assert json.loads((out / "result.json").read_text())["outcome"] == "error"

@@ -18,7 +18,8 @@ import yaml
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.true_contact import put_on_true_contact
-from touchcell.cell.recording.mcap import Recorder, read
+from touchcell.cell.recording.mcap import read
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop

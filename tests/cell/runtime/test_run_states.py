@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.helpers.operated_run import OperatedRun, waiting_cell
+from touchcell.cell.recording.message_types import Encoded
 from touchcell.cell.runtime import diagrams
 from touchcell.cell.runtime.operator_channel import OperatorRequest
 from touchcell.cell.runtime.run_result import Outcome
@@ -140,7 +141,7 @@ class Watched:
         self.run.arm._body.follow = followed  # type: ignore[method-assign]
         self.run.arm.stop = stopped  # type: ignore[method-assign]
 
-    def add(self, topic: str, t_ns: int, data: bytes) -> None:
+    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
         if self.state() is STOPPING and self.while_stopping is not None:
             stimulus, self.while_stopping = self.while_stopping, None
             stimulus()

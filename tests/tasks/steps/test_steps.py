@@ -90,6 +90,37 @@ def test_each_condition_ends_a_move(until: dict[str, Any], reason: str) -> None:
     assert task.transitions[-1].reason.startswith(reason)
 
 
+def weighed(gap_mm: float) -> KinematicPlant:
+    """A plant whose arm measures the force on its tip, besides the weight of a tool."""
+    plant = KinematicPlant(gap_mm=gap_mm, tilt_deg=(0.0, 0.0))
+    plant.force_n = lambda depth_mm: 4.0 + 1.5 * depth_mm
+    return plant
+
+
+def test_a_force_ends_a_move_whatever_the_tool_weighs() -> None:
+    task = task_of({"move": {"by_mm_deg": [0, 0, 30], "speed_mm_s": 5, "until": {"force_n": 3}}})
+    plant = weighed(2)
+    plant.run(task)
+    assert task.succeeded
+    assert task.transitions[-1].reason.startswith("force 3.")
+    assert depth_mm(plant) == pytest.approx(2.0, abs=0.15)
+
+
+def test_a_move_that_should_feel_a_force_and_does_not_fails() -> None:
+    task = task_of({"move": {"by_mm_deg": [0, 0, 3], "until": {"force_n": 3}}})
+    weighed(30).run(task)
+    assert task.state == "failed"
+    assert "force of 3 N" in next(record.reason for record in task.transitions if record.event == "unmet")
+
+
+def test_without_a_fresh_force_the_arm_does_not_move_towards_it() -> None:
+    task, plant = task_of({"move": {"by_mm_deg": [0, 0, 30], "until": {"force_n": 3}}}), KinematicPlant()
+    before = plant.T_w_s
+    plant.run(task)
+    assert task.state == "tripped"
+    np.testing.assert_allclose(plant.T_w_s, before, atol=1e-12)
+
+
 def test_contact_false_ends_a_move_when_the_sensor_is_free() -> None:
     task = task_of(TOUCH, {"move": {"velocity_mm_deg_s": [0, 0, -10, 0, 0, 0], "until": {"contact": False}}})
     plant = KinematicPlant()

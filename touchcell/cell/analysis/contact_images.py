@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from pydantic import ValidationError
 
 from touchcell.cell.recording.mcap import Message, read
+from touchcell.cell.recording.recorded_images import ImageDecoder
 from touchcell.geometry.types import ImageArray
 from touchcell.perception.errors import ImageError
 from touchcell.perception.markers.figures import draw_contact, write_markers
@@ -56,6 +55,7 @@ def contact_pictures(messages: Iterable[Message]) -> Iterator[ContactPicture]:
     """
     chains: dict[str, Preprocessing] = {}
     trackers: dict[str, MarkerTracker] = {}
+    decoder = ImageDecoder()
     for message in messages:
         parts = message.topic.split("/")
         if len(parts) != 4 or parts[1] != "sensors":
@@ -66,10 +66,13 @@ def contact_pictures(messages: Iterable[Message]) -> Iterator[ContactPicture]:
                 chains[role] = Preprocessing.model_validate(message.data).in_full_resolution()
             except ValidationError:
                 continue
-        if leaf != "image" or role not in chains:
+        if role not in chains:
             continue
         try:
-            image = chains[role].reduce(_decoded(message.data))
+            recorded = decoder.decode(message)
+            if recorded is None:
+                continue
+            image = chains[role].reduce(recorded.image)
             if role not in trackers:
                 trackers[role] = MarkerTracker(image)
             markers = trackers[role].update(image)
@@ -116,11 +119,3 @@ def write_strip(recording: Path, run: Run, role: str, path: Path) -> Path | None
         first.spacing_px,
     )
     return path
-
-
-def _decoded(data: dict[str, Any]) -> ImageArray:
-    encoded = np.frombuffer(base64.b64decode(data["data"]), np.uint8)
-    image = cv2.imdecode(encoded, cv2.IMREAD_ANYCOLOR)
-    if image is None:
-        raise ImageError("content", data["format"], "no image")
-    return np.asarray(image, dtype=np.uint8)

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from touchcell.cell.analysis.run_data import Run, tip_points
 from touchcell.cell.recording.messages import COMPONENTS
+from touchcell.cell.scene.description import ARM_COLOURS, Part, SceneDescription
+from touchcell.cell.scene.frames import object_frame
+from touchcell.geometry.solids import triangulated
 from touchcell.geometry.types import Array
 
 _TITLES = dict(
@@ -26,7 +28,7 @@ _PANELS = ("z_mm", "alpha_deg", "beta_deg", "x_mm", "y_mm", "gamma_deg")
 # Radius of a TacTip: ticks of this length from the tip's centre trace the surface that it is pressed on.
 _TIP_RADIUS_MM = 20.0
 _LEAST_EXTENT_MM = 1.0
-_STATE_COLOURS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52", "#8172b3", "#937860", "#da8bc3", "#8c8c8c")
+_OBJECT_COLOUR, _TARGET_COLOUR = "#937860", "#d62728"
 
 
 def plot_contact(run: Run, sensor: str, path: Path, *, last_s: float | None = None) -> Path:
@@ -48,7 +50,7 @@ def plot_contact(run: Run, sensor: str, path: Path, *, last_s: float | None = No
             axis.plot(truth.t_s, truth.column(name), color="#dd8452", lw=1.0, label="true")
         if task is not None and np.isfinite(reference := task.column(f"reference_{name}")).any():
             axis.plot(task.t_s, reference, color="black", lw=0.8, ls="--", label="reference")
-        _limit(axis, value, truth.column(name) if truth is not None else value)
+        _limit(axis, value, truth.column(name) if truth is not None else value, 2 * sigma)
         axis.set_title(_TITLES[name])
         axis.grid(alpha=0.3)
         _shade_states(axis, run)
@@ -94,52 +96,64 @@ def plot_agreement(run: Run, sensor: str, path: Path) -> Path:
     return path
 
 
-def plot_trajectory(run: Run, path: Path, mounts: Mapping[str, tuple[Array, Array]]) -> Path:
-    """Plot the arms' paths in side and top view with the sensor's axis, coloured by the task's state.
+def plot_trajectory(
+    run: Run, path: Path, mounts: Mapping[str, tuple[Array, Array]], scene: SceneDescription | None = None
+) -> Path:
+    """Plot the paths of the arms' sensors and of objects in side and top view, with the target and the planned path.
 
     Args:
         run: its recording.
         path: PNG to write.
         mounts: by arm, the poses (4, 4) of its base in the world and of its sensor in its tool; None means that both
             are the identity.
+        scene: what the cell looks like, for objects, target and path.
     """
     figure = Figure(figsize=(15, 6), layout="constrained")
     axes = figure.subplots(1, 2)
-    states = _states(run)
-    colours = {state: _STATE_COLOURS[i % len(_STATE_COLOURS)] for i, state in enumerate(states)}
-    for arm in run.roles("arms", "tcp"):
+    paths: dict[str, tuple[Array, Array]] = {}
+    order = {arm: k for k, arm in enumerate(mounts)}
+    for arm in sorted(run.roles("arms", "tcp"), key=lambda each: order.get(each, len(order))):
         series = run.series(f"/arms/{arm}/tcp")
         assert series is not None
         T_world_base, T_tcp_sensor = mounts.get(arm, (np.eye(4), np.eye(4)))
-        T = T_world_base @ tip_points(series) @ T_tcp_sensor
-        points = 1e3 * T[:, :3, 3]
-        # The side view is along the horizontal axis in which the path is narrowest.
-        along = int(np.argmax(np.ptp(points[:, :2], axis=0)))
-        for axis, (i, j) in zip(axes, ((along, 2), (0, 1)), strict=True):
-            _draw_path(axis, run, series.t_s, points[:, [i, j]], colours)
-            _draw_axes(axis, T, points, (i, j))
-            axis.set_xlabel("xyz"[i] + " (mm)")
-            axis.set_ylabel("xyz"[j] + " (mm)")
-            axis.set_aspect("equal", adjustable="datalim")
+        paths[arm] = series.t_s, T_world_base @ tip_points(series) @ T_tcp_sensor
+    every = np.concatenate([T[:, :2, 3] for _, T in paths.values()]) if paths else np.zeros((1, 2))
+    # The side view is along the horizontal axis in which the paths are narrowest.
+    along = int(np.argmax(np.ptp(every, axis=0)))
+    for axis, view in zip(axes, ((along, 2), (0, 1)), strict=True):
+        if scene is not None:
+            _draw_scene(axis, run, scene, view)
+        for k, (arm, (t_s, T)) in enumerate(paths.items()):
+            colour = ARM_COLOURS[k % len(ARM_COLOURS)][:3]
+            points = 1e3 * T[:, :3, 3]
+            running = run.during(t_s, "run")
+            axis.plot(*points[:, list(view)].T, color=colour, lw=0.9, ls=":")
+            axis.plot(*np.where(running[:, None], points[:, list(view)], np.nan).T, color=colour, lw=2.0, label=arm)
+            axis.plot(*points[0, list(view)], "o", ms=5, color=colour)
+            _draw_axes(axis, T, points, view)
             # A path straight along the view has no extent of its own.
-            axis.update_datalim([points[0, [i, j]] - _LEAST_EXTENT_MM, points[0, [i, j]] + _LEAST_EXTENT_MM])
-            axis.grid(alpha=0.3)
+            axis.update_datalim([points[0, list(view)] - _LEAST_EXTENT_MM, points[0, list(view)] + _LEAST_EXTENT_MM])
+        axis.set_xlabel("xyz"[view[0]] + " (mm)")
+        axis.set_ylabel("xyz"[view[1]] + " (mm)")
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.grid(alpha=0.3)
     axes[0].set_title("from the side; ticks show the sensor's axis as far as its tip")
     axes[1].set_title("from above")
-    handles = [Line2D([], [], color=colour, lw=2, label=state) for state, colour in colours.items()]
-    axes[0].legend(handles=handles, fontsize=9, loc="best")
+    axes[1].legend(fontsize=9, loc="best", title="solid while the task runs, dot at the start", title_fontsize=8)
     figure.savefig(path, dpi=100)
     return path
 
 
-def plot_budget(stages_ms: Mapping[str, Array], path: Path, title: str) -> Path:
-    """Plot median and 99th percentile of the duration of each stage, as bars in the given order."""
+def plot_budget(stages_ms: Mapping[str, Array], path: Path, title: str, budget_ms: float | None = None) -> Path:
+    """Plot median and 99th percentile of the duration of each stage, as bars in the given order, and their budget."""
     figure = Figure(figsize=(9, 0.5 * len(stages_ms) + 1.5), layout="constrained")
     axis = figure.subplots()
     position = np.arange(len(stages_ms))
     for percentile, colour in ((99, "#c6d3ea"), (50, "#4c72b0")):
         widths = [float(np.percentile(times, percentile)) for times in stages_ms.values()]
         axis.barh(position, widths, color=colour, label="median" if percentile == 50 else "p99")
+    if budget_ms is not None:
+        axis.axvline(budget_ms, color="#c44e52", lw=1.4, ls="--", label=f"one cycle: {budget_ms:g} ms")
     axis.set_yticks(position, list(stages_ms))
     axis.invert_yaxis()
     axis.set_xlabel("ms")
@@ -150,16 +164,36 @@ def plot_budget(stages_ms: Mapping[str, Array], path: Path, title: str) -> Path:
     return path
 
 
-def _states(run: Run) -> list[str]:
-    task = run.series("/task")
-    return list(dict.fromkeys(str(row.get("state")) for row in task.rows)) if task is not None else ["run"]
+def _draw_scene(axis: Axes, run: Run, scene: SceneDescription, view: tuple[int, int]) -> None:
+    """Draw objects where they began and ended, the way between, the target and the planned path."""
+    for topic, series in run.topics.items():
+        if not topic.startswith("/objects/"):
+            continue
+        name, poses = topic.rpartition("/")[2], tip_points(series)
+        parts = [part for part in scene.parts if part.frame == object_frame(name)]
+        points = np.concatenate([_points(part) for part in parts]) if parts else np.zeros((1, 3))
+        for T, style, label in ((poses[0], ":", None), (poses[-1], "-", name)):
+            outline = _outline(1e3 * (points @ T[:3, :3].T + T[:3, 3])[:, list(view)])
+            axis.plot(*outline.T, color=_OBJECT_COLOUR, lw=1.2, ls=style, label=label)
+        axis.plot(*(1e3 * poses[:, list(view), 3]).T, color=_OBJECT_COLOUR, lw=1.0)
+    if scene.path is not None:
+        axis.plot(*(1e3 * scene.path[:, list(view)]).T, color=_TARGET_COLOUR, lw=1.0, ls="--", label="planned path")
+    if scene.target is not None:
+        place = 1e3 * scene.target[list(view)]
+        axis.plot(*place, "o", ms=10, mfc="none", mec=_TARGET_COLOUR, mew=1.5, ls="none", label="target")
 
 
-def _draw_path(axis: Axes, run: Run, t_s: Array, points: Array, colours: dict[str, str]) -> None:
-    for state, colour in colours.items():
-        inside = run.during(t_s, state)
-        shown = np.where(inside[:, None], points, np.nan)
-        axis.plot(shown[:, 0], shown[:, 1], color=colour, lw=1.6)
+def _points(part: Part) -> Array:
+    vertices = triangulated(part.solid).vertices_m
+    placed: Array = vertices @ part.T_frame_solid[:3, :3].T + part.T_frame_solid[:3, 3]
+    return placed
+
+
+def _outline(points: Array) -> Array:
+    import cv2
+
+    hull = cv2.convexHull(points.astype(np.float32))[:, 0].astype(np.float64)
+    return np.concatenate([hull, hull[:1]])
 
 
 def _draw_axes(axis: Axes, T: Array, points: Array, view: tuple[int, int]) -> None:
@@ -180,9 +214,13 @@ def _shade_states(axis: Axes, run: Run) -> None:
     )
 
 
-def _limit(axis: Axes, value: Array, truth: Array) -> None:
-    """Set axis limits from the values, not from the wide uncertainty at first contact."""
+def _limit(axis: Axes, value: Array, truth: Array, band: Array) -> None:
+    """Set axis limits that hold values, truth and the usual band; that of the first contact is wider for a moment."""
+    edges = np.concatenate([value - band, value + band])
+    edges = edges[np.isfinite(edges)]
     finite = np.concatenate([value[np.isfinite(value)], truth[np.isfinite(truth)]])
     if len(finite):
-        margin = 0.15 * max(float(np.ptp(finite)), 0.2)
-        axis.set_ylim(float(finite.min()) - margin, float(finite.max()) + margin)
+        usual = np.percentile(edges, [3, 97]) if len(edges) else finite[:0]
+        shown = np.concatenate([finite, usual])
+        margin = 0.1 * max(float(np.ptp(shown)), 0.2)
+        axis.set_ylim(float(shown.min()) - margin, float(shown.max()) + margin)

@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell import compiled
+from touchcell.cell.analysis.limits import close_calls
 from touchcell.cell.analysis.run_data import STAGES, Run, Series
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.recording.messages import COMPONENTS
-from touchcell.errors import ConfigError
+from touchcell.cell.scene.description import SceneDescription, describe_scene
+from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry.types import Array
 
 
@@ -31,8 +33,9 @@ def write_report(folder: Path) -> str:
     result_file = folder / "result.json"
     result = json.loads(result_file.read_text()) if result_file.exists() else {}
     plan = _plan(source)
+    calls = {} if plan is None else {"close_calls": close_calls(run, plan)}
     truth = {"truth": dict(plan.truth)} if plan is not None and plan.truth else {}
-    summary = {**_push_errors(source), **truth, **summarise(run)}
+    summary = {**_push_errors(source), **calls, **truth, **summarise(run)}
     (folder / "summary.json").write_text(json.dumps({**result, **summary}, indent=1) + "\n")
     text = _text(folder, result, summary, _pictures(source), run)
     (folder / "summary.txt").write_text(text + "\n")
@@ -65,14 +68,25 @@ def _pictures(source: RunFolder) -> list[Path]:
         if not moved and run.series(f"/sensors/{sensor}/truth") is not None:
             pictures.append(plot_agreement(run, sensor, folder / f"agreement_{sensor}.png"))
     if moved:
-        pictures.append(plot_trajectory(run, folder / "trajectory.png", _mounts(source)))
+        pictures.append(plot_trajectory(run, folder / "trajectory.png", _mounts(source), _scene(source)))
     for sensor in run.roles("sensors", "preprocessing"):
         strip = write_strip(folder / RECORDING, run, sensor, folder / f"markers_{sensor}.png")
         pictures += [strip] if strip is not None else []
     if stages_ms := _stages_ms(run):
         title = "duration of each stage of a control cycle, in the cycles in which it ran"
-        pictures.append(plot_budget(stages_ms, folder / "budget.png", title))
+        plan = _plan(source)
+        budget_ms = None if plan is None else 1e3 / plan.cell.rate_hz
+        pictures.append(plot_budget(stages_ms, folder / "budget.png", title, budget_ms))
     return pictures
+
+
+def _scene(source: RunFolder) -> SceneDescription | None:
+    """Return what the cell of a run looks like; None where that cannot be read."""
+    plan = _plan(source)
+    try:
+        return None if plan is None else describe_scene(plan)
+    except TouchcellError:
+        return None
 
 
 def _mounts(source: RunFolder) -> dict[str, tuple[Array, Array]]:
@@ -197,6 +211,7 @@ def _text(folder: Path, result: dict[str, Any], summary: dict[str, Any], picture
         if result["reason"]:
             lines.append(f"  {result['reason']}")
     lines += [f"  {_ENDED[name].format(summary[name])}" for name in _ENDED if name in summary]
+    lines += [f"  {line}" for line in summary.get("close_calls", ())]
     for sensor, kinds in summary["errors"].items():
         lines.append(f"{sensor}, error RMS    " + "".join(f"{name:>11}" for name in COMPONENTS))
         for kind, statistics in kinds.items():

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from touchcell.cell.recording.mcap import Damage, Message, read
 from touchcell.cell.recording.messages import COMPONENTS
+from touchcell.cell.recording.recorded_images import is_image
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
@@ -80,7 +81,7 @@ class Run:
 def load_run(path: Path) -> Run:
     """Read a recording; images are left out. Raises RecordingError."""
     damage: list[Damage] = []
-    messages = [message for message in read(path, damage) if not message.topic.endswith("/image")]
+    messages = [message for message in read(path, damage) if not is_image(message.topic)]
     return run_of(messages, damage)
 
 

@@ -9,7 +9,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from touchcell.cell.analysis.limits import WatchedQuantity, tripped_quantity
 from touchcell.cell.analysis.run_data import Run, Series, load_run, run_of
+from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.config.yaml_file import load
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import RECORDING
@@ -89,10 +91,20 @@ def explain(folder: Path) -> str:
 
         moment = "trip" if causes else "end"
         try:
-            lines.append(f"plot: {plot_trip(run, end_s, causes[0] if causes else None, folder / 'why.png', moment)}")
+            tripped = _tripped(folder, run, causes[0]) if causes else None
+            cause = causes[0] if causes else None
+            lines.append(f"plot: {plot_trip(run, end_s, cause, folder / 'why.png', moment, tripped)}")
         except OSError as error:
             lines.append(f"no plot: {error.strerror}")
     return "\n".join(lines)
+
+
+def _tripped(folder: Path, run: Run, cause: dict[str, Any]) -> WatchedQuantity | None:
+    """Return the quantity that tripped; None where its limit is unknown."""
+    try:
+        return tripped_quantity(run, RunFolder(folder).plan, cause)
+    except (ConfigError, OSError):
+        return None
 
 
 _DIED: Final = "the run's process ended without a result: it was killed, crashed, or there was no memory left"

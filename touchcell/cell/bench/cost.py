@@ -102,7 +102,7 @@ if what == "run":
     from touchcell.cell.runtime.compose import compose
     from touchcell.cell.config.schema import plan_cell
     from touchcell.cell.runtime.loop import RunLoop
-    from touchcell.cell.recording.mcap import Recorder
+    from touchcell.cell.recording.recorder import Recorder
     cell = compose(plan_cell(Path(path)))
     trim_heap()
     with Recorder(Path(path).with_name("run.mcap")) as recorder, cell:

@@ -17,7 +17,7 @@ import numpy as np
 from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_cell
-from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 

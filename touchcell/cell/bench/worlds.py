@@ -1,17 +1,21 @@
 """``touchcell bench worlds``: one bench cell for each shipped task, run in every world that a desk has.
 
-For each cell and world: how the run ended, how long it took, and the depth that was felt against what was wanted; where
-a cell ran in both, how far the tools were apart: the RMS distance while the task was at work, at equal times from its
-begin. A lag of ``t`` s at ``v`` mm/s shows as ``v t``.
+For each cell and world: how the run ended, how long it took, the depth that was felt against what was wanted, the
+median time from exposure to command, and the share of control cycles that came late. Where a cell ran in both worlds,
+how far apart the tools were while the task was at work: RMS at equal times from its begin, the time shift of the
+emulated motion that brings them closest, and RMS after it. A lag of ``t`` s at ``v`` mm/s shows as ``v t``. For the
+bench the file is checked, and nothing is connected.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,8 +24,10 @@ import numpy as np
 from touchcell.cell.analysis.run_data import Run, load_run
 from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.config.find import find_cell
+from touchcell.cell.config.schema import plan_in_world
 from touchcell.cell.config.worlds import WorldName
 from touchcell.cell.recording.mcap import RECORDING
+from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
 from touchcell.paths import CONFIGS
 
@@ -29,33 +35,68 @@ _WORLDS: Final[tuple[WorldName, ...]] = ("sim", "emulated")
 _WORK: Final = ("run", "press", "touch")
 """States in which a task is at work, the first that it has."""
 _FELT: Final = ("run", "press", "settle")
+_LATE_PERIODS: Final = 1.5
+_SHIFTS_S: Final = np.arange(-0.2, 0.2001, 0.005)
 _COLUMNS: Final = (
-    f"{'cell':<24}{'world':<10}{'ended':<9}{'after s':>8}{'depth mm':>10}{'error RMS':>10}{'tools apart mm':>16}"
+    f"{'cell':<24}{'world':<10}{'ended':<9}{'after s':>8}{'depth mm':>10}{'error RMS':>10}{'latency ms':>11}"
+    f"{'late %':>7}{'apart mm':>10}{'shift ms':>9}{'then mm':>8}"
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Apart:
+    """How far the tools of two runs were apart.
+
+    Attributes:
+        rms_mm: at equal times.
+        shift_s: by which the second comes later than the first.
+        shifted_rms_mm: at equal times once that is taken out.
+    """
+
+    rms_mm: float
+    shift_s: float
+    shifted_rms_mm: float
+
+
 def run(arguments: Sequence[str], out: Path) -> None:
-    """Run the cells (all shipped ``*_bench.yaml``, or those named) and print a table; write ``worlds.json``."""
-    names = list(arguments) or sorted(path.name for path in CONFIGS.glob("*_bench.yaml"))
+    """Run the cells and print a table; write ``worlds.json`` and ``worlds.txt`` into ``out``."""
+    parser = argparse.ArgumentParser(prog="touchcell bench worlds", description=__doc__.partition("\n")[0])
+    parser.add_argument("cells", nargs="*", help="bench cells (default: all that ship)")
+    parser.add_argument("--pace", type=float, default=1.0, help="emulated seconds in each second of this machine")
+    options = parser.parse_args(arguments)
+    names = options.cells or sorted(path.name for path in CONFIGS.glob("*_bench.yaml"))
     rows: list[dict[str, Any]] = []
-    print(_COLUMNS)
+    title = f"emulated at {options.pace:g} of this machine's time"
+    print(f"{title}\n{_COLUMNS}", flush=True)
     for name in names:
-        ways: dict[str, dict[str, Array]] = {}
+        path = find_cell(Path(name))
+        recordings: dict[str, Run] = {}
         for world in _WORLDS:
-            row = _run(find_cell(Path(name)), world, ways)
-            if len(ways) == len(_WORLDS):
-                row["tools_apart_mm"] = apart_mm(ways["sim"], ways["emulated"])
-            rows.append(row)
-            print(_line(row), flush=True)
-    (out / "worlds.json").write_text(json.dumps({**provenance(), "rows": rows}, indent=1) + "\n")
-    (out / "worlds.txt").write_text("\n".join([_COLUMNS, *map(_line, rows)]) + "\n")
+            rows.append(_run(path, world, options.pace, recordings))
+            if len(recordings) == len(_WORLDS) and (found := apart(*map(_ways, recordings.values()))) is not None:
+                rows[-1] |= {"apart_mm": found.rms_mm, "shift_s": found.shift_s, "shifted_mm": found.shifted_rms_mm}
+            print(_line(rows[-1]), flush=True)
+        rows.append({"cell": path.stem, "world": "bench", **_checked(path)})
+        print(_line(rows[-1]), flush=True)
+    report = {**provenance(), "emulated_pace": options.pace, "rows": rows}
+    (out / "worlds.json").write_text(json.dumps(report, indent=1) + "\n")
+    (out / "worlds.txt").write_text("\n".join([title, _COLUMNS, *map(_line, rows)]) + "\n")
 
 
-def _run(path: Path, world: WorldName, ways: dict[str, dict[str, Array]]) -> dict[str, Any]:
+def _checked(path: Path) -> dict[str, str]:
+    try:
+        plan_in_world(path, "bench")
+    except ConfigError as error:
+        return {"ended": "refused", "reason": str(error)}
+    return {"ended": "checked", "reason": "no devices here"}
+
+
+def _run(path: Path, world: WorldName, pace: float, recordings: dict[str, Run]) -> dict[str, Any]:
     row: dict[str, Any] = {"cell": path.stem, "world": world}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         command = [sys.executable, "-m", "touchcell", "run", str(path), "--on", world, "--out", str(folder / "run")]
+        command += ["--set", f"emulated_pace={pace}"]
         if "collect:" in path.read_text():
             command += ["--data", str(folder / "collected")]
         done = subprocess.run([*command, "--quiet"], capture_output=True, text=True, check=False)
@@ -64,7 +105,8 @@ def _run(path: Path, world: WorldName, ways: dict[str, dict[str, Array]]) -> dic
         ended = json.loads((folder / "run" / "result.json").read_text())
         recording = load_run(folder / "run" / RECORDING)
     row |= {"ended": ended["outcome"], "reason": ended["reason"], "duration_s": ended.get("duration_s")}
-    ways[world] = _ways(recording)
+    recordings[world] = recording
+    row |= {"latency_ms": _latency_ms(recording), "late_percent": _late_percent(recording)}
     wanted = _depths(recording)
     if len(wanted):
         row["depth_mm"] = float(np.mean(wanted[:, 0]))
@@ -72,6 +114,24 @@ def _run(path: Path, world: WorldName, ways: dict[str, dict[str, Array]]) -> dic
         if np.isfinite(off).all():
             row["error_rms_mm"] = float(np.sqrt(np.mean(off**2)))
     return row
+
+
+def _latency_ms(recording: Run) -> float | None:
+    """Return the median time from the exposure of a frame to a command that used it; None without such commands."""
+    found = []
+    for role in recording.roles("arms", "command"):
+        series = recording.series(f"/arms/{role}/command")
+        if series is not None and any("sensor_to_command_ms" in row for row in series.rows):
+            found.append(series.column("sensor_to_command_ms"))
+    return float(np.nanmedian(np.concatenate(found))) if found else None
+
+
+def _late_percent(recording: Run) -> float | None:
+    timing = recording.series("/timing")
+    if timing is None or len(timing.t_s) < 2:
+        return None
+    steps = np.diff(timing.t_s)
+    return float(100.0 * np.mean(steps > _LATE_PERIODS * np.median(steps)))
 
 
 def _depths(recording: Run) -> Array:
@@ -108,24 +168,41 @@ def _ways(recording: Run) -> dict[str, Array]:
     return found
 
 
-def apart_mm(one: dict[str, Array], other: dict[str, Array]) -> float | None:
-    """Return the RMS distance between the ways of the tools at equal times; None where neither moved."""
-    distances = []
-    for role in one.keys() & other.keys():
-        a, b = one[role], other[role]
-        t_s = a[a[:, 0] <= b[-1, 0], 0]
-        at = [np.column_stack([np.interp(t_s, way[:, 0], way[:, k]) for k in (1, 2, 3)]) for way in (a, b)]
-        distances.append(np.linalg.norm(at[0] - at[1], axis=1))
-    return float(np.sqrt(np.mean(np.concatenate(distances) ** 2))) if distances else None
+def apart(one: dict[str, Array], other: dict[str, Array]) -> Apart | None:
+    """Return how far the ways of the tools were apart; None where no tool moved in both.
+
+    Args:
+        one, other: by arm (n, 4) [t s, x y z mm].
+    """
+    roles = one.keys() & other.keys()
+    if not roles:
+        return None
+    found = [_rms_mm([(one[role], other[role]) for role in roles], shift_s) for shift_s in _SHIFTS_S]
+    best = int(np.argmin(found))
+    return Apart(_rms_mm([(one[role], other[role]) for role in roles], 0.0), float(_SHIFTS_S[best]), found[best])
+
+
+def _rms_mm(ways: Sequence[tuple[Array, Array]], shift_s: float) -> float:
+    """Return the RMS distance between pairs of ways, the second of each taken ``shift_s`` later."""
+    squares = []
+    for a, b in ways:
+        margin_s = float(_SHIFTS_S[-1])
+        within = (a[:, 0] >= margin_s) & (a[:, 0] <= min(a[-1, 0], b[-1, 0]) - margin_s)
+        t_s = a[within, 0]
+        other = np.column_stack([np.interp(t_s + shift_s, b[:, 0], b[:, k]) for k in (1, 2, 3)])
+        squares.append(np.sum((a[within, 1:] - other) ** 2, axis=1))
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
 def _line(row: dict[str, Any]) -> str:
-    def number(key: str, digits: int) -> str:
+    def number(key: str, digits: int, scale: float = 1.0) -> str:
         value = row.get(key)
-        return "-" if value is None else f"{value:.{digits}f}"
+        return "-" if value is None else f"{scale * value:.{digits}f}"
 
     reason = f"  {row['reason']}" if row.get("reason") else ""
     return (
         f"{row['cell']:<24}{row['world']:<10}{row['ended']:<9}{number('duration_s', 2):>8}"
-        f"{number('depth_mm', 2):>10}{number('error_rms_mm', 3):>10}{number('tools_apart_mm', 2):>16}{reason}"
+        f"{number('depth_mm', 2):>10}{number('error_rms_mm', 3):>10}{number('latency_ms', 0):>11}"
+        f"{number('late_percent', 1):>7}{number('apart_mm', 2):>10}{number('shift_s', 0, 1e3):>9}"
+        f"{number('shifted_mm', 2):>8}{reason}"
     )

@@ -139,7 +139,7 @@ class Peer:
             return ""
 
 
-PEERS: Final[Mapping[str, Peer]] = {
+PEER_CLIENTS: Final[Mapping[str, Peer]] = {
     "ur": Peer("ur-rtde", "rtde_control", "ur-rtde", _UR, lambda config: str(config.host)),
     "franka": Peer("franky", "franky", "franky-control", _FRANKA, lambda config: str(config.host)),
     "damiao_can": Peer("damiao-motor", "damiao_motor", "damiao-motor", _DAMIAO, lambda config: str(config.channel)),

@@ -14,11 +14,9 @@ import re
 import shlex
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -26,8 +24,8 @@ from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.default_scene import start_of
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_cell
-from touchcell.drivers.core.clock import MonotonicClock
-from touchcell.drivers.core.errors import DeviceError
+from touchcell.drivers.core.behaviour import CameraBehaviour
+from touchcell.drivers.core.paced_clock import emulated_clock
 from touchcell.drivers.v4l2.emulator.server import V4l2Emulator
 from touchcell.drivers.v4l2.shim import environment
 from touchcell.errors import ConfigError
@@ -36,47 +34,47 @@ from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.scene import Scene, SceneConfig
 from touchcell.simulation.tip import Tip
 from touchcell.testing.emulation.base import Emulator
-from touchcell.testing.emulation.in_cell import EMULATED
+from touchcell.testing.emulation.in_cell import EMULATED, TcpOfJoints
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.ticker import Ticker
 
+_MOVED_RAD: Final = 2e-5
 _CAMERA = re.compile(r"/dev/(?:video|v4l/by-id/usb-TacTip_)(\d+)(?:-video-index0)?")
-# What an arm was asked less long ago than this is not asked again: scenes take their steps in bursts.
-_FRESH_NS = 2_000_000
 
 
 class EmulatedArm:
-    """An emulated arm as what carries a sensor through a scene; once it is gone, it is where it was last.
+    """An emulated arm that carries a sensor through a scene; once it is gone, it is where it was last.
 
     Args:
         process: its emulator, running.
-        T_base_tcp: (4, 4) where its tool is, from its state.
+        T_base_tcp: returns the pose (4, 4) of its tool for its joint angles (n,) rad.
         T_world_base: (4, 4) where its base stands.
+
+    Attributes:
+        moved_ns: scene's time at which it was last seen to have moved; 0 before.
     """
 
     def __init__(
         self,
         process: EmulatorProcess,
-        T_base_tcp: Callable[[Mapping[str, Any]], Array],
+        T_base_tcp: TcpOfJoints,
         T_world_base: Array,
     ) -> None:
         self._process = process
         self._T_base_tcp = T_base_tcp
         self._T_world_base = T_world_base
-        self._T_world_tcp = self._ask()
-        self._asked_ns = time.monotonic_ns()
+        self._q = process.joints()
+        self.moved_ns = 0
+
+    def watch(self, t_ns: int) -> None:
+        """Note whether it has moved since the last call; ``t_ns`` is the scene's time."""
+        q = self._process.joints()
+        if np.abs(q - self._q).max() > _MOVED_RAD:
+            self._q, self.moved_ns = q, t_ns
 
     def T_world_tcp(self) -> Array:  # noqa: N802  the field's own name
         """(4, 4) where its tool truly is."""
-        now_ns = time.monotonic_ns()
-        if now_ns - self._asked_ns > _FRESH_NS:
-            self._asked_ns = now_ns
-            with suppress(DeviceError, OSError):
-                self._T_world_tcp = self._ask()
-        return self._T_world_tcp
-
-    def _ask(self) -> Array:
-        T: Array = self._T_world_base @ self._T_base_tcp(self._process.state())
+        T: Array = self._T_world_base @ self._T_base_tcp(self._process.joints())
         return T
 
 
@@ -103,6 +101,7 @@ class CellEmulator(Emulator):
         self._arms: dict[str, EmulatedArm] = {}
         self._cameras = {name: self._camera(name, folder) for name in plan.sensors}
         self._scene: Scene | None = None
+        self._waits_for_an_arm = bool(plan.arms) and self._scene_config.physics == "kinematic"
         self._ticker: Ticker | None = None
         self._tip = Tip()
         self._renderers = {
@@ -114,10 +113,10 @@ class CellEmulator(Emulator):
         for process in self._arm_processes.values():
             process.start()
         self._arms = {name: self._arm(name) for name in self._arm_processes}
-        scene = self._scene = self._scene_config.build(MonotonicClock())
+        scene = self._scene = self._scene_config.build(emulated_clock())
         for name in self._cameras:
             scene.mount(name, self._sensor_pose(name))
-        self._ticker = Ticker(scene.timeline.step_ns, lambda late: _advance(scene))
+        self._ticker = Ticker(scene.timeline.step_ns, lambda _: self._advance(scene))
         for camera in self._cameras.values():
             await camera.start()
         if self._command:
@@ -131,6 +130,26 @@ class CellEmulator(Emulator):
         for process in self._arm_processes.values():
             process.stop()
 
+    def begin(self, fault: str, value: Any = True) -> None:
+        """Inject the fault ``DEVICE.FAULT`` of one of the devices. Raises ConfigError for an unknown one."""
+        device, _, name = fault.partition(".")
+        if device in self._arm_processes:
+            self._arm_processes[device].fault(name, value)
+        elif device in self._cameras:
+            self._cameras[device].begin(name, value)
+        else:
+            super().begin(fault, value)
+
+    def end(self, fault: str) -> None:
+        """End the fault ``DEVICE.FAULT`` of one of the devices."""
+        device, _, name = fault.partition(".")
+        if device in self._arm_processes:
+            self._arm_processes[device].clear(name)
+        elif device in self._cameras:
+            self._cameras[device].end(name)
+        else:
+            super().end(fault)
+
     def state(self) -> dict[str, Any]:
         """What is true: where objects and sensors are, and what these touch; cameras as their own emulators report."""
         scene = self._scene
@@ -141,16 +160,27 @@ class CellEmulator(Emulator):
         return {
             "t_ns": objects.t_ns,
             "objects": {name: T.tolist() for name, T in objects.value.items()},
+            "moved_ns": {name: arm.moved_ns for name, arm in self._arms.items()},
             "sensors": {name: self._sensor_pose(name)().tolist() for name in self._cameras},
             "contacts": {name: state.T_f_s.tolist() if state.in_contact else None for name, state in felt.items()},
             "cameras": {name: camera.state() for name, camera in self._cameras.items()},
         }
 
+    def _advance(self, scene: Scene) -> None:
+        """Take the steps that are due. Surfaces begin to move when the first arm does: with the cell, not with us."""
+        t_ns = scene.timeline.advance()
+        for arm in self._arms.values():
+            arm.watch(t_ns)
+        if self._waits_for_an_arm:
+            scene.begin_now()
+            self._waits_for_an_arm = not any(arm.moved_ns for arm in self._arms.values())
+
     def _arm(self, name: str) -> EmulatedArm:
         device = self._plan.arms[name]
         where = EMULATED.load(device.spec.name).T_base_tcp
         assert where is not None
-        return EmulatedArm(self._arm_processes[name], where(device.config), self._plan.cell.arms[name].T_world_base)
+        process = self._arm_processes[name]
+        return EmulatedArm(process, where(device.config, process.state()), self._plan.cell.arms[name].T_world_base)
 
     def _camera(self, name: str, folder: Path) -> V4l2Emulator:
         device = self._plan.sensors[name]
@@ -167,7 +197,9 @@ class CellEmulator(Emulator):
                 value=node,
                 hint="/dev/v4l/by-id/usb-TacTip_0000-video-index0, or another number",
             )
-        return V4l2Emulator(folder, int(found[1]), show=lambda number: self._picture(name, number))
+        behaviour = device.spec.behaviour(device.config) if device.spec.behaviour is not None else None
+        latency_s = behaviour.latency_s if isinstance(behaviour, CameraBehaviour) else 0.0
+        return V4l2Emulator(folder, int(found[1]), show=lambda number: self._picture(name, number), latency_s=latency_s)
 
     def _sensor_pose(self, name: str) -> Callable[[], Array]:
         section = self._plan.cell.sensors[name]
@@ -192,10 +224,6 @@ def _arm_process(plan: CellPlan, name: str) -> EmulatorProcess:
         raise _not_emulated("arms", name, device.spec.name, ", ".join(arms))
     q = None if given is None else start_of(plan, name, given).q
     return start(device.config, None if q is None else np.degrees(q).tolist())
-
-
-def _advance(scene: Scene) -> None:
-    scene.timeline.advance()
 
 
 def _not_emulated(kind: str, name: str, driver: str, known: str) -> ConfigError:

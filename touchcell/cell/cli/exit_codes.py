@@ -13,7 +13,7 @@ EXIT_INTERRUPTED: Final = 130
 
 MEANING: Final = {
     EXIT_OK: "done, or stopped on request",
-    EXIT_TASK_FAILED: "the task failed, or recordings differ",
+    EXIT_TASK_FAILED: "the task failed, recordings differ, or doctor found a fault",
     EXIT_BAD_INPUT: "bad input: a command, a file or a setting; nothing has moved",
     EXIT_TRIPPED: "an interlock tripped",
     EXIT_DEVICE_LOST: "a device or a process was lost, or did not answer",

@@ -8,10 +8,12 @@ import sys
 from pathlib import Path
 
 from touchcell.cell.cli.arguments import Subparsers, add_command, positive, whole
-from touchcell.cell.cli.exit_codes import EXIT_OK
+from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED
+from touchcell.cell.cli.workers import add_workers, workers_of
 from touchcell.cell.config.find import find_cell
 
 _SIMULATED_KINDS = ("gdn", "cnn", "markers")
+_TRAINING_LIMIT_S = 86_400
 _CANDIDATES = {
     "mean": "mean of the labels",
     "affine": "affine map",
@@ -35,13 +37,19 @@ def add_parser(commands: Subparsers) -> None:
 
 def _add_training(commands: Subparsers) -> None:
     train = add_command(commands, "train", _train, "train an estimator on labelled images")
-    _add_data(train, "data set folder with train/ and val/")
-    _add_out(train, "model file to write (.safetensors)")
+    train.add_argument(
+        "--data", type=Path, nargs="+", required=True, metavar="DIR", help="data set folder with train/ and val/"
+    )
+    _add_out(train, "model file to write (.safetensors); of several trainings the folder for them")
     train.add_argument(
         "--kind",
-        default="gdn",
+        nargs="+",
+        default=["gdn"],
         metavar="TRAINER",
-        help="such as gdn, cnn or markers, see `touchcell list` (default: %(default)s)",
+        help="such as gdn, cnn or markers, see `touchcell list` (default: gdn)",
+    )
+    train.add_argument(
+        "--seeds", metavar="FIRST..LAST", help="a training for each seed, kind and data set, and a table"
     )
     train.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
     train.add_argument("--rings", type=positive, help="of a marker estimator's lattice (default: 10)")
@@ -61,6 +69,7 @@ def _add_training(commands: Subparsers) -> None:
     )
     _add_seed(train)
     train.add_argument("--fresh", action="store_true", help="start again instead of resuming")
+    add_workers(train, time_limit_s=_TRAINING_LIMIT_S, what="training")
 
     train_sim = add_command(commands, "train-sim", _train_sim, "train the estimator that ships, on simulated images")
     _add_out(train_sim, "model file to write (.safetensors)")
@@ -70,6 +79,9 @@ def _add_training(commands: Subparsers) -> None:
     )
     train_sim.add_argument("--tip", metavar="TIP", help="tip file of `calibrate-sim`, or the name of one that ships")
     train_sim.add_argument("--processed", action="store_true", help="for images as the public data have them")
+    train_sim.add_argument(
+        "--feature", choices=("surface", "edge"), default="surface", help="what is touched (default: %(default)s)"
+    )
     train_sim.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
     _add_seed(train_sim)
 
@@ -136,18 +148,33 @@ def _train(options: argparse.Namespace) -> int:
         "rings": options.rings,
         "short_side_px": options.short_side,
     }
+    settings = {**{key: value for key, value in named.items() if value is not None}, **parse_settings(options.set)}
+    if options.seeds is not None or len(options.data) > 1 or len(options.kind) > 1:
+        return _train_many(options, settings)
     train(
-        options.data,
+        options.data[0],
         options.out,
-        kind=options.kind,
+        kind=options.kind[0],
         seed=options.seed,
         resume=not options.fresh,
-        settings={
-            **{key: value for key, value in named.items() if value is not None},
-            **parse_settings(options.set),
-        },
+        settings=settings,
     )
     return EXIT_OK
+
+
+def _train_many(options: argparse.Namespace, settings: dict[str, object]) -> int:
+    from touchcell.cell.sweeps.factors import grid_values
+    from touchcell.cell.trainings.trainings import train_all, trainings, trainings_table
+
+    seeds = [options.seed] if options.seeds is None else grid_values("--seeds", options.seeds)
+    wanted = trainings(options.kind, [path.absolute() for path in options.data], seeds, settings)
+    done = train_all(
+        wanted, options.out, workers=workers_of(options), executor=options.executor, live=sys.stdout.isatty()
+    )
+    text = trainings_table(done)
+    print(text)
+    (options.out / "summary.txt").write_text(text + "\n")
+    return EXIT_TASK_FAILED if any(each.reason for each in done) else EXIT_OK
 
 
 def _train_sim(options: argparse.Namespace) -> int:
@@ -161,6 +188,7 @@ def _train_sim(options: argparse.Namespace) -> int:
         processed=options.processed,
         epochs=options.epochs,
         seed=options.seed,
+        feature=options.feature,
     )
     return EXIT_OK
 

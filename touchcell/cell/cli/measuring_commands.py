@@ -40,6 +40,7 @@ def add_parser(commands: Subparsers) -> None:
         help="folder with one for each (default: %(default)s)",
     )
     add_workers(experiment)
+    _add_keep_stale(experiment)
     experiment.add_argument("--trials", type=positive, help="repetitions of each row (default: the experiment's own)")
     experiment.add_argument("--quick", action="store_true", help="the least that still shows every kind of row")
 
@@ -65,6 +66,11 @@ def add_parser(commands: Subparsers) -> None:
         "--out", type=Path, metavar="DIR", help="folder; the same command goes on in it (default: runs/sweeps/NAME)"
     )
     add_workers(sweep)
+    _add_keep_stale(sweep)
+
+
+def _add_keep_stale(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--keep-stale", action="store_true", help="keep finished trials of other code or packages, too")
 
 
 def _bench(options: argparse.Namespace) -> int:

@@ -14,24 +14,23 @@ if TYPE_CHECKING:
 _TIME_LIMIT_S: Final = 3600
 
 
-def add_workers(parser: argparse.ArgumentParser) -> None:
+def add_workers(parser: argparse.ArgumentParser, *, time_limit_s: int = _TIME_LIMIT_S, what: str = "trial") -> None:
     """Declare the options."""
-    parser.add_argument("--jobs", type=positive, help="trials at a time (default: one for each core)")
+    parser.add_argument("--jobs", type=positive, help=f"{what}s at a time (default: one for each core)")
     parser.add_argument(
         "--executor",
         default="local",
         metavar="NAME[:ADDRESS]",
-        help="what runs the trials; `touchcell list executors` names them (default: %(default)s)",
+        help=f"what runs the {what}s; `touchcell list executors` names them (default: %(default)s)",
     )
     parser.add_argument(
         "--time-limit-s",
         type=positive,
-        default=_TIME_LIMIT_S,
+        default=time_limit_s,
         metavar="S",
-        help="longest time for one trial; it is ended then, and the others go on (default: %(default)s)",
+        help=f"longest time for one {what}; it is ended then, and the others go on (default: %(default)s)",
     )
-    parser.add_argument("--memory-limit-mb", type=positive, metavar="MB", help="address space of one trial's process")
-    parser.add_argument("--keep-stale", action="store_true", help="keep finished trials of other code or packages, too")
+    parser.add_argument("--memory-limit-mb", type=positive, metavar="MB", help=f"address space of one {what}'s process")
 
 
 def workers_of(options: argparse.Namespace) -> Workers:

@@ -183,10 +183,11 @@ class RecordingSection(_Section):
     """What is kept of a run besides numbers.
 
     Attributes:
-        frames: whether camera images are recorded, and how they are compressed.
+        frames: whether camera images are recorded, and how they are compressed: ``video`` is H.264 (needs the extra
+            ``video``), ``jpeg`` keeps each image by itself, ``png`` loses nothing.
     """
 
-    frames: Literal["none", "jpeg", "png"] = "none"
+    frames: Literal["none", "video", "jpeg", "png"] = "none"
 
 
 class PairSection(_Section):
@@ -233,6 +234,8 @@ class CellFile(_Section):
         name: name of the cell, which names its run folders.
         world: ``sim`` puts simulated stand-ins in place of real drivers, ``emulated`` runs them on emulators, ``bench``
             refuses all that is simulated; ``--on`` sets it.
+        emulated_pace: seconds that pass in the emulated world in each second of the machine: less than 1 on a machine
+            that is too busy, or has too few cores, to run a cell and its emulators in real time.
         time: ``simulated`` runs as fast as it can on a virtual clock, ``real`` in real time.
         rate_hz: control cycles per second.
         processes: ``separate`` runs devices in processes of their own with a watchdog, in real time only.
@@ -261,6 +264,7 @@ class CellFile(_Section):
     schema_: Literal[1] = Field(alias="schema")
     name: Annotated[str, AfterValidator(_folder_name)]
     world: Literal["sim", "emulated", "bench"] | None = None
+    emulated_pace: float = Field(default=1.0, ge=0.01, le=1.0)
     time: Literal["simulated", "real"]
     rate_hz: Annotated[float, Field(gt=0, le=1000)]
     processes: Literal["one", "separate"] = "one"
@@ -346,8 +350,12 @@ class CellPlan:
         return {**self.arms, **self.sensors, **self.auxiliaries}
 
     def text(self) -> str:
-        """The cell file as it is planned: the file itself, or YAML of what comes of it and of what it extends."""
+        """The cell file as it is planned: the file itself, or YAML of what comes of it and of what it extends.
+
+        Files of its scene have absolute paths, as a run folder is read from elsewhere.
+        """
         merged = load_layers(self.file, self.settings, self.world_settings)
-        if not merged.sources:
+        if not merged.sources and merged.data.get("scene") == self.cell.scene:
             return self.file.read_text()
-        return yaml.safe_dump(merged.data, sort_keys=False, allow_unicode=True)
+        data = {key: self.cell.scene if key == "scene" else value for key, value in merged.data.items()}
+        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)

@@ -33,6 +33,7 @@ def unfeasible(file: YamlFile, plan: CellPlan) -> list[ConfigError]:
     return [
         *_models(file, plan),
         *_scene(file, plan),
+        *_features(file, plan),
         *_interlock_sensors(file, plan),
         *_depths(file, plan),
         *_speeds(file, plan),
@@ -72,10 +73,32 @@ def _scene(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                 yield file.problem((kind, device.name, "driver"), f"{device.spec.name} needs a scene", hint=hint)
         return
     section = scene_section().model_validate(plan.cell.scene)
-    for module, key in section.modules().items():
+    missing = False
+    for module, (key, hint) in section.modules().items():
         if importlib.util.find_spec(module) is None:
-            hint = "pip install 'touchcell[physics]'"
-            yield file.problem(("scene", key), f"needs {module}, which is not installed", hint=hint)
+            missing = True
+            yield file.problem(("scene", *key.split(".")), f"needs {module}, which is not installed", hint=hint)
+    if not missing:
+        for problem in section.problems():
+            at = ("scene", *problem.key.split("."))
+            yield file.problem(at, problem.reason, value=problem.value, hint=problem.hint)
+
+
+def _features(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
+    for name in plan.sensor_roles.values():
+        estimator, wanted = plan.cell.sensors[name].estimator, plan.task.feature
+        if estimator.feature != wanted:
+            reason = f"{estimator.kind} estimates the pose of {_a(estimator.feature)}, and {plan.task.name} needs it of"
+            yield file.problem(
+                ("sensors", name, "estimator", "kind"),
+                f"{reason} {_a(wanted)}",
+                value=estimator.kind,
+                hint="kind: true_edge in a simulated scene" if wanted == "edge" else "kind: network",
+            )
+
+
+def _a(word: str) -> str:
+    return f"{'an' if word[0] in 'aeiou' else 'a'} {word}"
 
 
 def _interlock_sensors(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:

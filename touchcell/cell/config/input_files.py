@@ -32,6 +32,21 @@ def with_input_files(file: YamlFile, model: M, at: KeyPath = ()) -> tuple[M, lis
     return _replaced(file, model, at, problems), problems
 
 
+def with_paths(data: Mapping[str, Any], model: Any, found: Any) -> dict[str, Any]:
+    """Return a copy of ``data``, which ``model`` was built from, with the paths that ``found`` has instead."""
+    changed = dict(data)
+    for key, value in data.items():
+        before, after = _part(model, key), _part(found, key)
+        if before is after:
+            continue
+        changed[key] = with_paths(value, before, after) if isinstance(value, Mapping) else after
+    return changed
+
+
+def _part(section: Any, key: str) -> Any:
+    return section[key] if isinstance(section, Mapping) else getattr(section, key)
+
+
 def _replaced(file: YamlFile, value: Any, at: KeyPath, problems: list[ConfigError]) -> Any:
     if isinstance(value, BaseModel):
         changes = {}

@@ -27,7 +27,7 @@ from touchcell.cell.config.cell_plan import (
     SensorSection,
 )
 from touchcell.cell.config.feasibility import unfeasible
-from touchcell.cell.config.input_files import with_input_files
+from touchcell.cell.config.input_files import with_input_files, with_paths
 from touchcell.cell.config.layers import load_layers
 from touchcell.cell.config.stopping_distance import StoppingDistance, combined, overshoot
 from touchcell.cell.config.truth import SampledTruth, sample
@@ -36,7 +36,7 @@ from touchcell.cell.config.yaml_file import InvalidCell, KeyPath, YamlFile
 from touchcell.control.interlocks.boundary import WorkspaceConfig
 from touchcell.control.interlocks.clearance import ClearanceConfig
 from touchcell.drivers.core.arm import LimitsConfig
-from touchcell.drivers.core.protocols import JointSource, ReadingSource, protocol_names
+from touchcell.drivers.core.protocols import JointSource, ReadingSource, WrenchSource, protocol_names
 from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DRIVERS, AnyDriver, DriverConfig
 from touchcell.drivers.core.stand_in import STAND_INS, Placement
@@ -83,7 +83,7 @@ def plan_cell(
     if model is not None and isinstance(sensors := file.data.get("sensors"), dict):
         for sensor in sensors.values():
             estimator = sensor.get("estimator") if isinstance(sensor, dict) else None
-            if isinstance(estimator, dict) and estimator.get("kind") == "network":
+            if isinstance(estimator, dict) and estimator.get("kind") in ("network", "edge_network"):
                 estimator["model"] = model
     plan = _Planner(file, overrides, settings or {}, to_run=to_run).plan()
     return plan if world is None else replace(plan, world_settings=world.settings, notes=tuple(world.notes))
@@ -146,7 +146,7 @@ class _Planner:
             collect["data"] = self._overrides["data"]
         cell = self._with_input_files(file.validate(CellFile, file.data), ())
         cell = self._in_truth(cell)
-        self._require_scene_fits(cell)
+        cell = self._with_scenes(cell)
         task, task_config = self._task(cell)
         arm_roles = self._roles(cell, "arms", task.arms, cell.arms) if task else {}
         sensor_roles = self._roles(cell, "sensors", task.sensors, cell.sensors) if task else {}
@@ -171,6 +171,8 @@ class _Planner:
             self._require_collection(cell, task)
             self._require_protocols(task, "arms", task.arms, arm_roles, arms)
             self._require_protocols(task, "devices", task.devices, auxiliary_roles, others)
+            if task_config is not None:
+                self._require_forces(cell, task, task_config, arm_roles, arms)
             self._require_processes(cell, task, arm_roles)
             self._require_data_is_used(cell, {**arms, **sensors})
         self._require_guarded_arms(cell, {*arm_roles, *(set(arms) - set(arm_roles.values()))})
@@ -228,13 +230,17 @@ class _Planner:
             self._add(("truth", *at, key), f"{spec.name} has no {key!r}", hint="leave it out")
         return {**given, **true}
 
-    def _require_scene_fits(self, cell: CellFile) -> None:
+    def _with_scenes(self, cell: CellFile) -> CellFile:
+        """Return ``cell`` with its scenes checked, and the files that they name found."""
         if cell.world == "bench":
             self._require_nothing_simulated(cell)
-        if cell.scene is not None:
-            self._validated(scene_section(), cell.scene, ("scene",))
-        if cell.emulated_scene is not None:
-            self._validated(scene_section(), cell.emulated_scene, ("emulated_scene",))
+        found = {}
+        for key in ("scene", "emulated_scene"):
+            data = getattr(cell, key)
+            section = None if data is None else self._validated(scene_section(), data, (key,))
+            if section is not None:
+                found[key] = with_paths(data, section, self._with_input_files(section, (key,)))
+        return cell.model_copy(update=found)
 
     def _require_nothing_simulated(self, cell: CellFile) -> None:
         if cell.enabling_device == "simulated":
@@ -360,6 +366,10 @@ class _Planner:
         config = self._validated(spec.config, given, at)
         if config is None:
             return None
+        if cell.world == "bench" and (key := config.emulated_address()) is not None:
+            reason = "leads to an emulator on this machine, and the cell is to run on the bench"
+            hint = "give the device's own address, or run --on emulated"
+            self._add((*at, key), reason, value=getattr(config, key, None), hint=hint)
         if cell.reduced_speed:
             config = _at_reduced_speed(config)
         return DevicePlan(at[1], spec, self._with_input_files(config, at))
@@ -553,6 +563,29 @@ class _Planner:
                     value=devices[name].spec.name,
                     hint="choose another driver; `touchcell list` names all",
                 )
+
+    def _require_forces(
+        self,
+        cell: CellFile,
+        task: AnyTask,
+        config: TaskConfig,
+        names: Mapping[str, str],
+        arms: Mapping[str, DevicePlan],
+    ) -> None:
+        for role, key in task.needs_wrenches(config).items():
+            if cell.processes == "separate":
+                reason = f"{task.name} waits for {key}, which no other process passes on"
+                self._add(("processes",), reason, value=cell.processes, hint="leave out `processes:`")
+            name = names.get(role)
+            if name is None or name not in arms or WrenchSource in arms[name].spec.capabilities.provides:
+                continue
+            driver = arms[name].spec.name
+            self._add(
+                ("task",),
+                f"a step waits for {key}, but {driver} measures no force",
+                value=driver,
+                hint=f"use depth_mm or contact, or an arm with a force sensor for arms.{name}.driver",
+            )
 
     def _require_use_of_data(self, cell: CellFile, devices: Mapping[str, DevicePlan]) -> None:
         reads = any("data" in device.spec.config.model_fields for device in devices.values())

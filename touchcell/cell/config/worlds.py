@@ -62,7 +62,17 @@ def world_changes(plan: CellPlan, world: WorldName) -> WorldChanges:
         _add_scene(plan, world, found)
     if world == "sim":
         _to_virtual_time(plan, found)
+    elif cell.emulated_pace < 1.0:
+        _slow_down(plan, found)
     return found
+
+
+def _slow_down(plan: CellPlan, found: WorldChanges) -> None:
+    pace = plan.cell.emulated_pace
+    if plan.cell.processes == "separate":
+        found.settings["processes"] = "one"
+        found.notes.append("processes: one in place of separate, which run at the machine's own pace only")
+    found.notes.append(f"emulated time runs at {pace:g} of the machine's, so computing counts for {pace:g} of its time")
 
 
 def _needs_scene(plan: CellPlan, world: WorldName) -> bool:

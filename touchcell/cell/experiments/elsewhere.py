@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import shutil
-import tarfile
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,6 +13,7 @@ from typing import Any
 
 from touchcell.cell.analysis.code_identity import CodeIdentity, code_identity
 from touchcell.cell.analysis.run_folder import RunFolder
+from touchcell.cell.experiments.archives import archive_of, extract
 from touchcell.cell.experiments.trials import Finished, Perform, Trial, file_digests, files_named, settings_digest
 from touchcell.errors import TouchcellError
 
@@ -84,17 +83,17 @@ class RunElsewhere:
             data = dict(sent.data)
             for number, (path, archive) in enumerate(sent.files.items()):
                 target = folder / "inputs" / str(number)
-                _extract(archive, target)
+                extract(archive, target)
                 data = _replaced(data, path, str(target / os.path.basename(path)))
             perform = Perform(self.measure, folder, here)
             perform.run(sent.trial, data)
-            return Delivery(_archive(folder / sent.trial.name), here)
+            return Delivery(archive_of(folder / sent.trial.name), here)
 
 
 def parcel(trial: Trial) -> Parcel:
     """Return a trial with the bytes of all files that it names. Raises ConfigError if its cell file is invalid."""
     data = trial.cell_data()
-    files = {str(path): _archive(path, path.name) for path in files_named(data)}
+    files = {str(path): archive_of(path, path.name) for path in files_named(data)}
     return Parcel(trial, data, files, file_digests(data))
 
 
@@ -108,25 +107,12 @@ def unpack(perform: Perform, sent: Parcel, delivery: Delivery) -> Finished:
         raise WorkerDiffers(perform.code, delivery.code)
     folder = perform.root / sent.trial.name
     shutil.rmtree(folder, ignore_errors=True)
-    _extract(delivery.folder, folder)
+    extract(delivery.folder, folder)
     record = json.loads((folder / "trial.json").read_text())
     # The worker's paths are gone with its temporary folder; files are found again by those of this machine.
     record |= {"settings": settings_digest(sent.data, sent.digests), "files": dict(sent.digests)}
     (folder / "trial.json").write_text(json.dumps(record, indent=1) + "\n")
     return Finished.of(sent.trial, RunFolder(folder), record)
-
-
-def _archive(path: Path, name: str = ".") -> bytes:
-    content = io.BytesIO()
-    with tarfile.open(fileobj=content, mode="w") as archive:
-        archive.add(path, name)
-    return content.getvalue()
-
-
-def _extract(content: bytes, folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    with tarfile.open(fileobj=io.BytesIO(content)) as archive:
-        archive.extractall(folder, filter="data")
 
 
 def _replaced(data: Any, old: str, new: str) -> Any:

@@ -27,7 +27,7 @@ from touchcell.cell.config.settings import with_settings
 from touchcell.cell.config.true_contact import answerable
 from touchcell.cell.config.yaml_file import YamlFile
 from touchcell.cell.errors import RecordingError
-from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.run_result import Outcome

@@ -1,38 +1,38 @@
-"""MCAP recordings that survive a kill: small chunks, flushed as they close, and a reader that names damage.
+"""Reader of MCAP recordings, also of those that were cut off or damaged: it takes what is whole and names the rest.
 
-Messages are JSON with a JSON schema, so that Foxglove and the ``mcap`` command line read them without touchcell.
+Messages of this package's own types, images and video come back as mappings; those that only repeat them for viewers
+are left out. Recordings of 0.1.0 and 0.2.0, whose messages are JSON, are read as well.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-import math
-import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Final, Self, cast
+from typing import IO, Any, Final
 
 import lz4.frame
-import numpy as np
 import zstandard
+from google.protobuf.message import DecodeError
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Statistics
-from mcap.writer import CompressionType, Writer
+from mcap.records import Channel, Chunk, Schema, Statistics
 
 from touchcell.cell.errors import RecordingError
+from touchcell.cell.recording.message_types import PACKAGE, UnreadableType, decoder, message_class
 
-# A kill loses at most the open chunk: 16 KiB is a fraction of a second of a cell's usual 100 kB/s.
-CHUNK_BYTES = 16 * 1024
-RECORDING = "run.mcap"
+RECORDING: Final = "run.mcap"
 """Name of the recording in a run folder."""
+CELL_CLOCK: Final = "cell_clock_offset_ns"
+"""Key in the metadata of a channel: wall clock minus the cell's clock, which its stamps contain."""
+IMAGES: Final = frozenset({"foxglove.CompressedImage", "foxglove.CompressedVideo"})
+"""Types of viewers that are read as well."""
 
 _log = logging.getLogger(__name__)
 
@@ -45,8 +45,9 @@ _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 _UNREADABLE: Final = (McapError, struct.error, UnicodeDecodeError, OverflowError, MemoryError)
 _LONGEST_RECORD: Final = 1 << 28
 _LONGEST_CHUNK: Final = 1 << 26
-# Repeated JSON keys shrink to a tenth or so; what expands more is no recording but a trap.
+# Of a chunk beyond a usual one's size: what expands more is no recording but a trap.
 _MOST_EXPANSION: Final = 50
+_USUAL_CHUNK: Final = 1 << 20
 # A chunk's compression, as a prefixed string, and how far it is behind the chunk's first byte.
 _CHUNK_MARK: Final = b"\x03\x00\x00\x00lz4"
 _CHUNK_MARK_AT: Final = _RECORD_HEAD + 8 + 8 + 8 + 4
@@ -70,128 +71,6 @@ class Damage:
 
     def __str__(self) -> str:
         return f"at byte {self.offset}: {self.reason}"
-
-
-class _File:
-    """An unbuffered file: a write reaches the system or raises OSError, and is never repeated later."""
-
-    def __init__(self, path: Path) -> None:
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
-        self._at = 0
-
-    def write(self, data: bytes) -> int:
-        """Write all of ``data``. Raises OSError."""
-        rest = memoryview(data)
-        while rest:
-            written = os.write(self._fd, rest)
-            self._at += written
-            rest = rest[written:]
-        return len(data)
-
-    def tell(self) -> int:
-        """Bytes written so far."""
-        return self._at
-
-    def flush(self) -> None:
-        """Nothing is held back."""
-
-    def fileno(self) -> int:
-        """For fsync."""
-        return self._fd
-
-    def close(self) -> None:
-        """Close it; again does nothing."""
-        if self._fd >= 0:
-            fd, self._fd = self._fd, -1
-            os.close(fd)
-
-
-class Recorder:
-    """Writer of one recording.
-
-    Args:
-        path: the file; overwritten.
-        stream: where to write instead of opening ``path``; the recorder closes it.
-
-    Raises:
-        RecordingError: from any method, when the disk is full or gone. Nothing more is written after the first.
-    """
-
-    def __init__(self, path: Path, *, stream: IO[bytes] | None = None) -> None:
-        self.path = path
-        self._channels: dict[str, int] = {}
-        self._failed = False
-        try:
-            self._stream: IO[bytes] = stream if stream is not None else cast(IO[bytes], _File(path))
-        except OSError as error:
-            raise self._failure(error) from None
-        try:
-            self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
-            self._writer.start(profile="", library="touchcell")
-        except OSError as error:
-            self._stream.close()
-            raise self._failure(error) from None
-
-    @property
-    def failed(self) -> bool:
-        """True if a write has failed; nothing more is written then."""
-        return self._failed
-
-    def write(self, topic: str, t_ns: int, data: Mapping[str, Any]) -> None:
-        """Append one message; numpy values become lists, and what is not finite becomes null."""
-        self.write_encoded(topic, t_ns, encode(data))
-
-    def write_encoded(self, topic: str, t_ns: int, data: bytes) -> None:
-        """Append one message that ``encode`` has made."""
-        if self._failed:
-            raise RecordingError(self.path, "was closed by an earlier failure")
-        try:
-            channel = self._channels.get(topic)
-            if channel is None:
-                channel = self._register(topic, data)
-            # A chunk that is complete leaves the process at once.
-            self._writer.add_message(channel, t_ns, data, t_ns)
-        except OSError as error:
-            raise self._failure(error) from None
-
-    def sync(self) -> None:
-        """Have the disk keep what has left the process: all but the open chunk, which a black box holds too."""
-        if self._failed:
-            return
-        try:
-            os.fsync(self._stream.fileno())
-        except OSError as error:
-            raise self._failure(error) from None
-
-    def close(self) -> None:
-        """Finish the file with its index; after a failure, only close it."""
-        try:
-            if not self._failed:
-                self._writer.finish()
-                self._stream.flush()
-        except OSError as error:
-            raise self._failure(error) from None
-        finally:
-            self._stream.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def _register(self, topic: str, first: bytes) -> int:
-        schema = self._writer.register_schema(topic.strip("/").replace("/", "."), "jsonschema", _schema(first))
-        self._channels[topic] = self._writer.register_channel(topic, "json", schema)
-        return self._channels[topic]
-
-    def _failure(self, error: OSError) -> RecordingError:
-        self._failed = True
-        return RecordingError(
-            self.path, f"cannot be written: {error.strerror}", hint="free some space; what was recorded is readable"
-        )
 
 
 def read(path: Path, damage: list[Damage] | None = None) -> Iterator[Message]:
@@ -248,6 +127,21 @@ class _Damaged(Exception):
     """Bytes that are not what they should be."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Channel:
+    """How to read the messages of a channel.
+
+    Attributes:
+        topic: of the messages.
+        offset_ns: to subtract from their stamps.
+        read: function from bytes to fields; None for messages that only viewers read.
+    """
+
+    topic: str
+    offset_ns: int
+    read: Callable[[bytes], dict[str, Any]] | None
+
+
 class _Reader:
     """Reads records one by one, verifies the checksum of each chunk, and finds the next chunk behind damage.
 
@@ -261,7 +155,8 @@ class _Reader:
         self._stream = stream
         self._wait = wait
         self._damage = damage
-        self._topics: dict[int, str] = {}
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, _Channel] = {}
         self._searched = False
         self._delivered = 0
         self._promised: int | None = None
@@ -309,10 +204,10 @@ class _Reader:
         try:
             if kind == Opcode.CHUNK:
                 yield from self._chunk(content, offset)
-            elif kind == Opcode.CHANNEL:
-                self._register(content)
+            elif kind in (Opcode.CHANNEL, Opcode.SCHEMA):
+                self._register(kind, content)
             elif kind == Opcode.MESSAGE:
-                yield self._message(content, offset)
+                yield from self._message(content, offset)
             elif kind == Opcode.STATISTICS:
                 self._promised = Statistics.read(ReadDataStream(BytesIO(content))).message_count
         except _UNREADABLE as error:
@@ -326,40 +221,59 @@ class _Reader:
             record = data[at + _RECORD_HEAD : end]
             if end > len(data):
                 raise _Damaged("a chunk ends in the middle of a record")
-            if kind == Opcode.CHANNEL:
-                self._register(record)
+            if kind in (Opcode.CHANNEL, Opcode.SCHEMA):
+                self._register(kind, record)
             elif kind == Opcode.MESSAGE:
                 try:
-                    message = self._message(record, offset)
+                    yield from self._message(record, offset)
                 except _Damaged as error:
                     self._note(offset, str(error))
-                else:
-                    yield message
             at = end
 
-    def _register(self, content: bytes) -> None:
+    def _register(self, kind: int, content: bytes) -> None:
+        if kind == Opcode.SCHEMA:
+            schema = Schema.read(ReadDataStream(BytesIO(content)))
+            self._schemas[schema.id] = schema
+            return
         channel = Channel.read(ReadDataStream(BytesIO(content)))
-        self._topics[channel.id] = channel.topic
+        try:
+            offset_ns = int(channel.metadata.get(CELL_CLOCK, 0))
+            self._channels[channel.id] = _Channel(channel.topic, offset_ns, self._reader(channel))
+        except (UnreadableType, ValueError) as error:
+            raise _Damaged(f"the description of {channel.topic} is damaged: {error}") from None
 
-    def _message(self, content: bytes, offset: int) -> Message:
+    def _reader(self, channel: Channel) -> Callable[[bytes], dict[str, Any]] | None:
+        if channel.message_encoding == "json":
+            return _json
+        if channel.message_encoding != "protobuf":
+            return None
+        schema = self._schemas.get(channel.schema_id)
+        if schema is None:
+            raise UnreadableType(f"schema {channel.schema_id} is missing")
+        if schema.name.startswith(f"{PACKAGE}.") or schema.name in IMAGES:
+            return decoder(message_class(schema.name, schema.data))
+        return None
+
+    def _message(self, content: bytes, offset: int) -> Iterator[Message]:
         if len(content) < _MESSAGE_HEAD.size:
             raise _Damaged("a message is too short")
-        channel, _, t_ns, _ = _MESSAGE_HEAD.unpack_from(content)
-        topic = self._topics.get(channel)
-        if topic is None and not self._searched:
+        number, _, t_ns, _ = _MESSAGE_HEAD.unpack_from(content)
+        channel = self._channels.get(number)
+        if channel is None and not self._searched:
             self._searched = True
             self._search_topics(offset)
-            topic = self._topics.get(channel)
-        if topic is None:
-            raise _Damaged(f"a message is of channel {channel}, which nothing describes")
-        try:
-            data = json.loads(content[_MESSAGE_HEAD.size :])
-        except (ValueError, RecursionError):
-            raise _Damaged(f"a message of {topic} is no JSON") from None
-        if not isinstance(data, dict):
-            raise _Damaged(f"a message of {topic} is no JSON object")
-        self._delivered += 1
-        return Message(topic, t_ns, data)
+            channel = self._channels.get(number)
+        if channel is None:
+            raise _Damaged(f"a message is of channel {number}, which nothing describes")
+        if channel.read is not None:
+            try:
+                data = channel.read(content[_MESSAGE_HEAD.size :])
+            except (ValueError, RecursionError, DecodeError):
+                raise _Damaged(f"a message of {channel.topic} cannot be read") from None
+            self._delivered += 1
+            yield Message(channel.topic, t_ns - channel.offset_ns, data)
+        else:
+            self._delivered += 1
 
     def _search_topics(self, offset: int) -> None:
         """Find channels whose first description was damaged: the summary at the end of a finished file repeats all."""
@@ -369,10 +283,10 @@ class _Reader:
             length = int.from_bytes(head[1:], "little")
             if len(head) < _RECORD_HEAD or length > _LONGEST_RECORD or head[0] == Opcode.FOOTER:
                 return
-            if head[0] == Opcode.CHANNEL:
+            if head[0] in (Opcode.CHANNEL, Opcode.SCHEMA):
                 try:
-                    self._register(self._stream.read(length))
-                except _UNREADABLE:
+                    self._register(head[0], self._stream.read(length))
+                except (*_UNREADABLE, _Damaged):
                     return
             offset += _RECORD_HEAD + length
 
@@ -407,10 +321,17 @@ class _Reader:
         self._damage.append(Damage(offset, reason))
 
 
+def _json(content: bytes) -> dict[str, Any]:
+    data = json.loads(content)
+    if not isinstance(data, dict):
+        raise ValueError("no JSON object")
+    return data
+
+
 def _unpacked(chunk: Chunk) -> bytes:
     """The records in a chunk, no longer than it says and no more often what is in the file than a recording can be."""
     size = chunk.uncompressed_size
-    if size > _LONGEST_CHUNK or size > _MOST_EXPANSION * len(chunk.data) + CHUNK_BYTES:
+    if size > _LONGEST_CHUNK or size > _MOST_EXPANSION * len(chunk.data) + _USUAL_CHUNK:
         raise _Damaged(f"a chunk of {len(chunk.data)} bytes claims to hold {size}")
     try:
         if chunk.compression == "lz4":
@@ -426,53 +347,3 @@ def _unpacked(chunk: Chunk) -> bytes:
     if len(data) != size or (chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc):
         raise _Damaged(f"the checksum of a chunk of {size} bytes is wrong")
     return data
-
-
-def encode(data: Mapping[str, Any]) -> bytes:
-    """A message as JSON; numpy values become lists, and what is not finite becomes null."""
-    try:
-        text = json.dumps(data, default=_plain, separators=(",", ":"), allow_nan=False)
-    except ValueError:
-        text = json.dumps(_finite(data), default=_plain, separators=(",", ":"))
-    return text.encode()
-
-
-def _schema(message: bytes) -> bytes:
-    """JSON schema of a topic with the fields of its first message, which viewers need to complete field names.
-
-    Fields that are null in it are left out, since their type is unknown; later messages may have others.
-    """
-    try:
-        described = _described(json.loads(message))
-    except ValueError:
-        described = None
-    return json.dumps(described or {"type": "object"}, separators=(",", ":")).encode()
-
-
-def _described(value: Any) -> dict[str, Any] | None:
-    if isinstance(value, dict):
-        fields = {key: described for key, item in value.items() if (described := _described(item)) is not None}
-        return {"type": "object", "properties": fields}
-    if isinstance(value, list):
-        items = next((described for item in value if (described := _described(item)) is not None), None)
-        return {"type": "array"} if items is None else {"type": "array", "items": items}
-    if value is None:
-        return None
-    return {"type": "boolean" if isinstance(value, bool) else "string" if isinstance(value, str) else "number"}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} cannot be recorded")
-
-
-def _finite(value: Any) -> Any:
-    """Return the value with None in place of what JSON cannot represent."""
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

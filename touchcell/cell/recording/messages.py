@@ -1,25 +1,74 @@
-"""Messages of a recording, in millimetres and degrees, with the unit in every key."""
+"""Messages of a recording, in millimetres and degrees, with the unit in every key, and the types that declare them."""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, Final
 
 import numpy as np
 
+from touchcell.cell.recording.message_types import Kind, MessageType, camel_case
 from touchcell.control.supervisor import Verdict
 from touchcell.drivers.core.commands import Sent, TwistCommand
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.geometry import se3
+from touchcell.geometry.finite import all_finite
 from touchcell.geometry.gaussian import PoseGaussian
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
 
 COMPONENTS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 
+_POSE: Final = dict.fromkeys(COMPONENTS, Kind.REAL)
+_SIGMA: Final = {f"sigma_{name}": Kind.REAL for name in COMPONENTS}
+_SIGMA_UNITS: Final = np.array([1e3] * 3 + [180 / np.pi] * 3)
+_DECLARED: Final = {
+    ("arms", "tcp"): MessageType("Tcp", {"seq": Kind.INTEGER, **_POSE, "speed_mm_s": Kind.REAL}),
+    ("arms", "command"): MessageType(
+        "Command",
+        {
+            "twist": Kind.REALS,
+            "frame": Kind.TEXT,
+            "ttl_s": Kind.REAL,
+            "limited_by": Kind.TEXTS,
+            "asked": Kind.REALS,
+            "allowed": Kind.REALS,
+            "speed_mm_s": Kind.REAL,
+            "sensor_to_command_ms": Kind.REAL,
+        },
+    ),
+    ("sensors", "contact"): MessageType(
+        "Contact",
+        {
+            "seq": Kind.INTEGER,
+            "t_frame_ns": Kind.INTEGER,
+            "in_contact": Kind.FLAG,
+            "in_range": Kind.FLAG,
+            "nis": Kind.REAL,
+            **_POSE,
+            **_SIGMA,
+        },
+    ),
+    ("sensors", "measurement"): MessageType("Measurement", {"seq": Kind.INTEGER, **_POSE, **_SIGMA}),
+    ("sensors", "truth"): MessageType("TrueContact", {"in_contact": Kind.FLAG, **_POSE}),
+    ("objects",): MessageType("ObjectPose", _POSE),
+    ("safety",): MessageType("Verdict", {"allow": Kind.FLAG, "speed": Kind.REAL, "violations": Kind.TEXTS}),
+    ("events",): MessageType("Event", dict.fromkeys(("event", "from", "to", "reason"), Kind.TEXT)),
+    ("task",): MessageType("Task", {"state": Kind.TEXT}),
+    ("timing",): MessageType("Timing", {}),
+}
+
+
+def declared_type(topic: str) -> MessageType:
+    """Return the type of a topic; one without fields, which grows, where none is declared."""
+    kind, *rest = topic.strip("/").split("/")
+    known = _DECLARED.get((kind, *rest[1:]))
+    return known if known is not None else MessageType(camel_case(topic), {})
+
 
 def pose_message(T: Array) -> dict[str, float]:
     """Return a pose (4, 4) as extrinsic-xyz Euler components; NaN for a non-finite pose, so that it is recorded too."""
-    if not np.isfinite(T).all():
+    if not all_finite(T):
         return dict.fromkeys(COMPONENTS, float("nan"))
     return dict(zip(COMPONENTS, se3.to_euler_mm_deg(T).tolist(), strict=True))
 
@@ -29,21 +78,22 @@ def tcp_message(state: Stamped[TcpState]) -> dict[str, Any]:
     return {
         "seq": state.seq,
         **pose_message(state.value.T_base_tcp),
-        "speed_mm_s": 1e3 * float(np.linalg.norm(state.value.twist[:3])),
+        "speed_mm_s": 1e3 * math.hypot(*state.value.twist[:3].tolist()),
     }
 
 
 def command_message(sent: Sent[TwistCommand]) -> dict[str, Any]:
     """Return the command as sent, and the limits that changed it."""
     command = sent.command
+    twist = command.twist.tolist()
     message: dict[str, Any] = {
-        "twist": command.twist,
+        "twist": twist,
         "frame": command.frame.value,
         "ttl_s": command.ttl_s,
         "limited_by": [adjustment.limit for adjustment in sent.adjustments],
         "asked": [adjustment.requested for adjustment in sent.adjustments],
         "allowed": [adjustment.allowed for adjustment in sent.adjustments],
-        "speed_mm_s": 1e3 * float(np.linalg.norm(command.twist[:3])),
+        "speed_mm_s": 1e3 * math.hypot(*twist[:3]),
     }
     if command.t_cause_ns is not None:
         message["sensor_to_command_ms"] = (sent.t_ns - command.t_cause_ns) * 1e-6
@@ -79,7 +129,5 @@ def belief_message(belief: PoseGaussian) -> dict[str, Any]:
     The deviations are those of right perturbations of ``T_f_s``, which are the belief's own up to sign: along and about
     the sensor's axes.
     """
-    sigma = np.sqrt(np.diag(belief.covariance)) * np.array([1e3] * 3 + [180 / np.pi] * 3)
-    return pose_message(se3.inverse(belief.mean)) | {
-        f"sigma_{name}": float(value) for name, value in zip(COMPONENTS, sigma, strict=True)
-    }
+    sigma = (np.sqrt(belief.covariance.diagonal()) * _SIGMA_UNITS).tolist()
+    return pose_message(se3.inverse(belief.mean)) | dict(zip(_SIGMA, sigma, strict=True))

@@ -6,6 +6,8 @@ would be as lasting, but ends the process by SIGBUS where the file is truncated 
 
 The ring is a row of segments. Records follow each other within a segment, each with a running number and a checksum; a
 reader takes a segment's records as long as both fit, so neither torn records nor those of an earlier round are read.
+Before the segments are the types of the messages, which are never overwritten. Rings of 0.2.0, whose messages are JSON
+and have no types, are read as well.
 """
 
 from __future__ import annotations
@@ -14,20 +16,28 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from google.protobuf.message import DecodeError
+
 from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import Message
+from touchcell.cell.recording.message_types import Encoded, MessageType, UnreadableType, decoder, message_class
 
-_MAGIC: Final = b"tchring1"
+_MAGIC: Final = b"tchring2"
+_MAGIC_OF_JSON: Final = b"tchring1"
 _HEAD: Final = struct.Struct("<8sIIII")
 _HEAD_BYTES: Final = 4096
 _RECORD: Final = struct.Struct("<IIQqH")
+_TYPE: Final = struct.Struct("<IHI")
+_TYPES_BYTES: Final = 256 * 1024
+_NUMBER: Final = struct.Struct("<H")
 _SEGMENTS: Final = 16
 _LEAST_SEGMENT: Final = 16 * 1024
 _LONGEST_TOPIC: Final = 0xFFFF
+_SEGMENTS_AT: Final = _HEAD_BYTES + _TYPES_BYTES
 
 
 class RingWriter:
@@ -46,6 +56,9 @@ class RingWriter:
         self.path = path
         self._number = 0
         self._segment = self._at = 0
+        self._types: list[MessageType] = []
+        self._numbers: dict[int, int] = {}
+        self._types_at = 0
         self._failed = False
         try:
             if path is None:
@@ -55,10 +68,10 @@ class RingWriter:
                 disk = os.fstatvfs(self._fd)
                 size = min(size, disk.f_bavail * disk.f_frsize // 4)
             self._segment_bytes = max(size // _SEGMENTS, _LEAST_SEGMENT)
-            os.posix_fallocate(self._fd, 0, _HEAD_BYTES + _SEGMENTS * self._segment_bytes)
-            told = json.dumps(about, default=str).encode()[: _HEAD_BYTES - _HEAD.size]
-            head = _HEAD.pack(_MAGIC, _SEGMENTS, self._segment_bytes, len(told), zlib.crc32(told))
-            os.pwrite(self._fd, head + told, 0)
+            os.posix_fallocate(self._fd, 0, _SEGMENTS_AT + _SEGMENTS * self._segment_bytes)
+            text = json.dumps(about, default=str).encode()[: _HEAD_BYTES - _HEAD.size]
+            head = _HEAD.pack(_MAGIC, _SEGMENTS, self._segment_bytes, len(text), zlib.crc32(text))
+            os.pwrite(self._fd, head + text, 0)
         except OSError as error:
             raise RecordingError(
                 path or Path("memory"), f"cannot be made: {error.strerror}", hint="free some space"
@@ -69,24 +82,46 @@ class RingWriter:
         """Whether a write has failed; nothing more is written then."""
         return self._failed
 
-    def add(self, topic: str, t_ns: int, data: bytes) -> None:
+    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
         """Append one message; one that is longer than a segment, or comes after a failure, is left out."""
         name = topic.encode()[:_LONGEST_TOPIC]
-        length = len(name) + len(data)
+        length = len(name) + _NUMBER.size + len(message.data)
         whole = _RECORD.size + length
         if self._failed or whole > self._segment_bytes:
             return
+        type_number = self._numbers.get(id(message.type))
+        if type_number is None:
+            type_number = self._describe(message.type)
+            if type_number is None:
+                return
         if self._at + whole > self._segment_bytes:
             self._segment, self._at = (self._segment + 1) % _SEGMENTS, 0
         self._number += 1
         head = _RECORD.pack(0, length, self._number, t_ns, len(name))[4:]
-        body = head + name + data
+        body = head + name + _NUMBER.pack(type_number) + message.data
         record = zlib.crc32(body).to_bytes(4, "little") + body
         try:
-            os.pwrite(self._fd, record, _HEAD_BYTES + self._segment * self._segment_bytes + self._at)
+            os.pwrite(self._fd, record, _SEGMENTS_AT + self._segment * self._segment_bytes + self._at)
         except OSError:
             self._failed = True
         self._at += whole
+
+    def _describe(self, type_: MessageType) -> int | None:
+        """Keep a type; None where there is no room for it."""
+        body = type_.full_name.encode() + b"\0" + type_.schema
+        entry = _TYPE.pack(zlib.crc32(body), len(self._types), len(body)) + body
+        if self._types_at + len(entry) > _TYPES_BYTES:
+            return None
+        try:
+            os.pwrite(self._fd, entry, _HEAD_BYTES + self._types_at)
+        except OSError:
+            self._failed = True
+            return None
+        self._types_at += len(entry)
+        # The list keeps the type alive, whose identity is the key.
+        self._numbers[id(type_)] = len(self._types)
+        self._types.append(type_)
+        return len(self._types) - 1
 
     def sync(self) -> None:
         """Have the disk keep it, for the case that the power fails too."""
@@ -98,7 +133,7 @@ class RingWriter:
 
     def messages(self) -> list[Message]:
         """What is in it, oldest first."""
-        return _messages(self._fd, _SEGMENTS, self._segment_bytes)
+        return _messages(self._fd, _SEGMENTS_AT, _SEGMENTS, self._segment_bytes, _typed(self._fd))
 
     def close(self) -> None:
         """Let go of the file, which stays; again does nothing."""
@@ -119,24 +154,32 @@ def read_ring(path: Path) -> tuple[dict[str, Any], list[Message]]:
         raise RecordingError(path, f"cannot be read: {error.strerror}") from None
     try:
         head = os.pread(fd, _HEAD_BYTES, 0)
-        if len(head) < _HEAD.size or not head.startswith(_MAGIC):
+        if len(head) < _HEAD.size or head[: len(_MAGIC)] not in (_MAGIC, _MAGIC_OF_JSON):
             raise RecordingError(path, "is no black box")
         _, segments, segment_bytes, length, check = _HEAD.unpack_from(head)
-        told = head[_HEAD.size : _HEAD.size + length]
-        about = _parsed(told) if zlib.crc32(told) == check else None
-        if segments * segment_bytes > os.fstat(fd).st_size:
+        text = head[_HEAD.size : _HEAD.size + length]
+        about = _parsed(text) if zlib.crc32(text) == check else None
+        typed = head.startswith(_MAGIC)
+        segments_at = _SEGMENTS_AT if typed else _HEAD_BYTES
+        if segments_at - _HEAD_BYTES + segments * segment_bytes > os.fstat(fd).st_size:
             raise RecordingError(path, "is damaged: its head does not fit its size")
-        return about or {}, _messages(fd, segments, segment_bytes)
+        return about or {}, _messages(fd, segments_at, segments, segment_bytes, _typed(fd) if typed else _parsed)
     except OSError as error:
         raise RecordingError(path, f"cannot be read: {error.strerror}") from None
     finally:
         os.close(fd)
 
 
-def _messages(fd: int, segments: int, segment_bytes: int) -> list[Message]:
+def _messages(
+    fd: int,
+    segments_at: int,
+    segments: int,
+    segment_bytes: int,
+    decode: Callable[[bytes], dict[str, Any] | None],
+) -> list[Message]:
     found: list[tuple[int, Message]] = []
     for k in range(segments):
-        segment = os.pread(fd, segment_bytes, _HEAD_BYTES + k * segment_bytes)
+        segment = os.pread(fd, segment_bytes, segments_at + k * segment_bytes)
         at, expected = 0, None
         while at + _RECORD.size <= len(segment):
             check, length, number, t_ns, name_length = _RECORD.unpack_from(segment, at)
@@ -146,11 +189,37 @@ def _messages(fd: int, segments: int, segment_bytes: int) -> list[Message]:
             if zlib.crc32(segment[at + 4 : end]) != check:
                 break
             name, data = segment[at + _RECORD.size :][:name_length], segment[at + _RECORD.size + name_length : end]
-            message = _parsed(data)
+            message = decode(data)
             if message is not None:
                 found.append((number, Message(name.decode(errors="replace"), t_ns, message)))
             at, expected = end, number + 1
     return [message for _, message in sorted(found, key=lambda each: each[0])]
+
+
+def _typed(fd: int) -> Callable[[bytes], dict[str, Any] | None]:
+    """Return what decodes the messages of a ring by the types that it holds; None for what cannot be read."""
+    area = os.pread(fd, _TYPES_BYTES, _HEAD_BYTES)
+    readers: dict[int, Callable[[bytes], dict[str, Any]]] = {}
+    at = 0
+    while at + _TYPE.size <= len(area):
+        check, number, length = _TYPE.unpack_from(area, at)
+        body = area[at + _TYPE.size : at + _TYPE.size + length]
+        at += _TYPE.size + length
+        if not length or zlib.crc32(body) != check:
+            break
+        name, _, schema = body.partition(b"\0")
+        try:
+            readers[number] = decoder(message_class(name.decode(errors="replace"), schema))
+        except UnreadableType:
+            continue
+
+    def decode(data: bytes) -> dict[str, Any] | None:
+        try:
+            return readers[_NUMBER.unpack_from(data)[0]](data[_NUMBER.size :])
+        except (KeyError, struct.error, DecodeError, ValueError, RecursionError):
+            return None
+
+    return decode
 
 
 def _parsed(data: bytes) -> dict[str, Any] | None:

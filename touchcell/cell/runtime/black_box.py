@@ -17,7 +17,10 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from touchcell.cell.errors import RecordingError
-from touchcell.cell.recording.mcap import Message, Recorder, encode
+from touchcell.cell.recording.mcap import Message
+from touchcell.cell.recording.message_types import Encoded, Encoder
+from touchcell.cell.recording.messages import declared_type
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.recording.ring import RingWriter, read_ring
 from touchcell.cell.runtime.run_result import RunResult
 from touchcell.cell.runtime.stopping import StopReport
@@ -49,9 +52,9 @@ class BlackBox:
         self._about = dict(about or {})
         self._ring = RingWriter(None if folder is None else folder / RING, _RING_BYTES, self._about)
 
-    def add(self, topic: str, t_ns: int, data: bytes) -> None:
+    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
         """Keep one message that is encoded as for the recording; never fails."""
-        self._ring.add(topic, t_ns, data)
+        self._ring.add(topic, t_ns, message)
 
     def messages(self) -> list[Message]:
         """Those of the last ten seconds, oldest first."""
@@ -79,7 +82,8 @@ class BlackBox:
             "stops": {role: stop_record(report) for role, report in result.stops.items()},
         }
         messages = self.messages()
-        self._ring.add(_END_TOPIC, messages[-1].t_ns if messages else 0, encode(record))
+        end = Encoder(declared_type).encode(_END_TOPIC, {"json": json.dumps(record)})
+        self._ring.add(_END_TOPIC, messages[-1].t_ns if messages else 0, end)
         self._ring.sync()
         try:
             self._write(folder, messages, record)
@@ -131,7 +135,7 @@ def read_left_ring(folder: Path) -> tuple[dict[str, Any], list[Message]]:
     about, messages = read_ring(folder / RING)
     for message in messages:
         if message.topic == _END_TOPIC:
-            about = message.data
+            about = json.loads(message.data["json"])
     return about, _latest([message for message in messages if message.topic != _END_TOPIC])
 
 

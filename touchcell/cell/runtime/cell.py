@@ -19,7 +19,7 @@ from touchcell.drivers.core.device import Device, Lifecycle
 from touchcell.drivers.core.enabling import EnablingDevice
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import StopCategory
-from touchcell.errors import ConfigError, suggest
+from touchcell.errors import ConfigError
 from touchcell.tasks.interface import Task
 
 _FIRST_READING_NS = 1_000_000_000
@@ -44,12 +44,13 @@ class Cell:
         stop_categories: by which each arm stops when something is wrong, by role.
         holding: roles of arms that keep their power when another's fault stops them.
         watched_joints: roles of arms whose joint angles an interlock reads.
-        watched_wrenches, watched_torques: roles of arms whose wrench, or external torque, an interlock needs.
+        watched_wrenches, watched_torques: roles of arms whose wrench, or external torque, is needed.
         watched_readings: names of devices and of the readings in their health that interlocks limit.
         enabling_device: operator input of a cell whose file names one.
         scene: what is simulated around the arms, as far as it can be looked into; None in a cell of real devices.
         collection: where labelled frames go, None where the task labels none.
         watchdog: stops the arms when the loop falls silent.
+        scene_start_ns: when the scene's own time began.
         require_armed: raises ConfigError unless every interlock trips on the faults that it guards against; called when
             all devices have answered and none is energised.
     """
@@ -74,6 +75,7 @@ class Cell:
     collection: Collection | None = None
     watchdog: Watchdog = field(default_factory=NullWatchdog)
     require_armed: Callable[[], None] = lambda: None
+    scene_start_ns: int = 0
     start_ns: int = 0
     _exit: ExitStack = field(default_factory=ExitStack, init=False)
 
@@ -142,7 +144,7 @@ class Cell:
                         f"{name} reports no {reading!r}",
                         file=str(self.plan.file),
                         key="interlocks",
-                        hint=f"{suggest(reading, sorted(health))}; it reports: {', '.join(sorted(health))}",
+                        hint=f"it reports {', '.join(sorted(health))}",
                     )
                 self.clock.sleep_until_ns(self.clock.now_ns() + _POLL_NS)
 

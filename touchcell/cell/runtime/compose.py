@@ -11,6 +11,7 @@ from touchcell.cell.config.armed import require_armed
 from touchcell.cell.config.cell_plan import REDUCED_SPEED_M_S, CellPlan
 from touchcell.cell.config.planning_scene import build_planning_scene
 from touchcell.cell.recording.dataset_writer import Collection
+from touchcell.cell.recording.frame_compressor import require_video
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.devices import build_devices, build_world
 from touchcell.cell.runtime.enabling import SimulatedEnablingDevice
@@ -54,8 +55,11 @@ def compose(
         ModelError: a model file cannot be used.
         RecordingError: the folder for labelled frames cannot be written.
     """
+    if plan.cell.recording.frames == "video":
+        require_video()
     role_of = _arm_roles(plan)
     world = build_world(plan, role_of, clock)
+    scene_start_ns = world.clock.now_ns()
     wanted = {name: device for name, device in plan.built.items() if name not in world.hosted}
     devices = build_devices(plan, wanted, world.clock, world.scene, world.hosted)
     arms = {role: cast(Arm, devices[name]) for name, role in role_of.items()}
@@ -97,11 +101,12 @@ def compose(
             role_of[pair.follower] for pair in plan.cell.pairs if pair.on_stop == "hold" and pair.follower in role_of
         ),
         watched_joints=frozenset(role for role, body in planning_scene.bodies.items() if body.link_count),
-        watched_wrenches=_watched(plan, role_of, "wrench", WrenchSource),
+        watched_wrenches=_watched_wrenches(plan, role_of),
         watched_torques=_watched(plan, role_of, "external_torque", ExternalTorqueSource),
         watched_readings=frozenset(key for entry in plan.cell.interlocks.values() for key in entry.reads),
         enabling_device=_enabling_device(plan, world.clock, enabling_device),
         scene=world.truth,
+        scene_start_ns=scene_start_ns,
         collection=collection,
         watchdog=world.watchdog,
         require_armed=partial(require_armed, plan, configured, planning_scene),
@@ -120,6 +125,12 @@ def _watched(plan: CellPlan, role_of: Mapping[str, str], measure: str, source: t
     if not any(measure in entry.measures for entry in plan.cell.interlocks.values()):
         return frozenset()
     return frozenset(role for name, role in role_of.items() if source in plan.arms[name].spec.capabilities.provides)
+
+
+def _watched_wrenches(plan: CellPlan, role_of: Mapping[str, str]) -> frozenset[str]:
+    """Roles of arms whose wrench an interlock or the task needs."""
+    of_task = frozenset(plan.task.needs_wrenches(plan.task_config))
+    return of_task | _watched(plan, role_of, "wrench", WrenchSource)
 
 
 def _enabling_device(plan: CellPlan, clock: Clock, given: EnablingDevice | None) -> EnablingDevice | None:

@@ -10,6 +10,7 @@ from touchcell.cell.config.cell_plan import CellPlan, DevicePlan
 from touchcell.cell.runtime.watchdog import NullWatchdog, Watchdog
 from touchcell.drivers.core.clock import Clock, MonotonicClock, VirtualClock
 from touchcell.drivers.core.device import Device
+from touchcell.drivers.core.paced_clock import emulated_clock
 from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DriverContext
 
@@ -85,7 +86,9 @@ def build_devices(
 
 
 def _clock(plan: CellPlan) -> Clock:
-    return VirtualClock() if plan.cell.time == "simulated" else MonotonicClock()
+    if plan.cell.time == "simulated":
+        return VirtualClock()
+    return emulated_clock() if plan.cell.world == "emulated" else MonotonicClock()
 
 
 def _scene(plan: CellPlan, clock: Clock) -> Scene | None:

@@ -37,6 +37,24 @@ class TrueContactSource(ContactSource):
         return ContactEstimate(contact.value.in_contact, belief, contact.t_ns, contact.seq, contact.t_ns)
 
 
+class TrueEdgeSource(ContactSource):
+    """A ``ContactSource`` that asks the scene for the edge under the tip, in place of the surface."""
+
+    def __init__(self, scene: SceneTruth, sensor: str) -> None:
+        self._scene = scene
+        self._sensor = sensor
+
+    def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
+        """The scene knows already."""
+
+    def update(self, now_ns: int) -> ContactEstimate | None:
+        """The edge as it was at ``now_ns``. There is none without a contact."""
+        contact, edge = self._scene.contact(self._sensor, now_ns), self._scene.edge(self._sensor, now_ns)
+        touches = contact.value.in_contact and edge is not None
+        belief = PoseGaussian(edge.value, _COVARIANCE) if touches and edge is not None else None
+        return ContactEstimate(touches, belief, contact.t_ns, contact.seq, contact.t_ns)
+
+
 class LabelledContactSource(ContactSource):
     """A ``ContactSource`` that asks the arm which remembers where the images were taken."""
 

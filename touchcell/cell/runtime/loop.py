@@ -16,7 +16,7 @@ from functools import partial
 from typing import cast
 
 from touchcell.cell.errors import UnexpectedError
-from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.observer import Observer, call_driver
 from touchcell.cell.runtime.operator_channel import OperatorChannel
@@ -228,11 +228,12 @@ class RunLoop:
             operator_stop=self._stop.orderly,
             ended=self._observer.exhausted,
             devices=reading.devices,
+            wrenches=reading.wrenches,
         )
         action = cell.task.tick(observation)
         for role in sorted(action.zero):
             if (zero := cell.sensors[role].take_zero()) is not None:
-                self._record.write(f"/sensors/{role}/zero", *zero, boxed=False)
+                self._record.zero_frame(role, zero.t_ns, zero.value.image)
         thought = time.perf_counter_ns()
         verdict = cell.supervisor.review(self._observer.view(reading, action, self._sent), self._alarms())
         judged = time.perf_counter_ns()
@@ -355,6 +356,8 @@ class RunLoop:
             with _logged(f"{role} was not given back"):
                 self._arms[role].release(lease)
         self._final = self._result()
+        with _logged("the last images were not written"):
+            self._record.close()
         self._record.event("end", self._final.reason, to=self._final.outcome.value)
 
     def _result(self) -> RunResult:

@@ -38,6 +38,7 @@ class Reading:
         contacts: of the sensors that have seen a frame, by role.
         devices: of the other devices that are read, by role.
         health: what devices have just reported about themselves, by name; most cycles have none.
+        wrenches: (6,) N and N m of the arms of which they are needed, by role.
     """
 
     now_ns: int
@@ -45,6 +46,7 @@ class Reading:
     contacts: Mapping[str, ContactEstimate]
     devices: Mapping[str, Stamped[Mapping[str, float]]] = field(default_factory=dict)
     health: Mapping[str, Stamped[Health]] = field(default_factory=dict)
+    wrenches: Mapping[str, Stamped[Array]] = field(default_factory=dict)
 
 
 class Observer:
@@ -80,6 +82,7 @@ class Observer:
         self._times.begin()
         started = time.perf_counter_ns()
         states = {role: call_driver(arm.name, arm.tcp) for role, arm in cell.arms.items()}
+        wrenches = {role: self._wrench(role) for role in cell.watched_wrenches}
         self._times.add("read arms", time.perf_counter_ns() - started)
         contacts = {}
         for role, sensor in cell.sensors.items():
@@ -97,7 +100,7 @@ class Observer:
         if health:
             self._times.add("read health", time.perf_counter_ns() - started)
         # Only now: what a device's own thread brought in the meantime would seem to come from the future.
-        return Reading(cell.clock.now_ns(), states, contacts, devices, health)
+        return Reading(cell.clock.now_ns(), states, contacts, devices, health, wrenches)
 
     def view(
         self,
@@ -121,7 +124,7 @@ class Observer:
                     asked.twists.get(role),
                     sent.get(role),
                     self._joints(role),
-                    self._wrench(role),
+                    reading.wrenches.get(role),
                     self._external_torque(role),
                 )
                 for role, state in reading.states.items()
@@ -151,9 +154,9 @@ class Observer:
         arm = self._cell.arms[role]
         return call_driver(arm.name, arm.joints) if role in self._cell.watched_joints else None
 
-    def _wrench(self, role: str) -> Stamped[Array] | None:
+    def _wrench(self, role: str) -> Stamped[Array]:
         arm = self._cell.arms[role]
-        return call_driver(arm.name, arm.wrench) if role in self._cell.watched_wrenches else None
+        return call_driver(arm.name, arm.wrench)
 
     def _external_torque(self, role: str) -> Stamped[Array] | None:
         arm = self._cell.arms[role]

@@ -3,35 +3,49 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, Final, Protocol
 
 from touchcell.cell.errors import RecordingError, UnexpectedError
-from touchcell.cell.recording.mcap import Recorder, encode
+from touchcell.cell.recording.frame_compressor import FrameCompressor
+from touchcell.cell.recording.message_types import Encoded, Encoder
 from touchcell.cell.recording.messages import (
     command_message,
     contact_message,
+    declared_type,
     pose_message,
     tcp_message,
     verdict_message,
 )
+from touchcell.cell.recording.recorder import Recorder
+from touchcell.cell.recording.viewer_record import ViewerRecord
+from touchcell.cell.recording.well_known import COMPRESSED_IMAGE, image_message
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.observer import Reading
 from touchcell.cell.runtime.timing import CycleTimes
+from touchcell.cell.scene.description import describe_scene
+from touchcell.cell.scene.frames import sensor_frame
 from touchcell.control.supervisor import Verdict
+from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import Sent, TwistCommand
+from touchcell.drivers.core.errors import DeviceError
+from touchcell.drivers.core.protocols import JointSource
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.errors import TouchcellError
+from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.tasks.interface import Action
 
 logger = logging.getLogger(__name__)
 
+_EVENTS: Final = "/events"
+
 
 class Box(Protocol):
     """Something that keeps messages and never fails; see ``touchcell.cell.runtime.black_box``."""
 
-    def add(self, topic: str, t_ns: int, data: bytes) -> None:
+    def add(self, topic: str, t_ns: int, message: Encoded) -> None:
         """Keep one message, encoded as for the recording."""
         ...
 
@@ -49,11 +63,24 @@ class RunRecord:
         self._cell = cell
         self._recorder = recorder
         self._box = box
+        self._encoder = recorder.encoder if recorder is not None else Encoder(declared_type)
         self._transitions_written = 0
+        self._viewers: ViewerRecord | None = None
+        self._frames: FrameCompressor | None = None
+        kind = cell.plan.cell.recording.frames
+        if recorder is not None and kind != "none":
+            self._frames = FrameCompressor(kind, complete=isinstance(cell.clock, VirtualClock))
+        self._jointed: dict[str, JointSource] = {}
+        if recorder is not None:
+            self._for_viewers(recorder)
         self.error: TouchcellError | None = None
 
     def begin(self) -> None:
-        """Note what recorded images need to be understood."""
+        """Note what recorded images need to be understood, and what the cell looks like."""
+        if self._frames is not None:
+            self._frames.start()
+        if self._viewers is not None:
+            self._view(partial(self._viewers.begin, self._cell.clock.now_ns()))
         for role, sensor in self._cell.sensors.items():
             if (about := sensor.about()) is not None:
                 self.write(f"/sensors/{role}/preprocessing", self._cell.clock.now_ns(), about)
@@ -64,7 +91,7 @@ class RunRecord:
 
     def event(self, event: str, reason: str, **more: str) -> None:
         """Record that something happened now."""
-        self.write("/events", self._cell.clock.now_ns(), {"event": event, **more, "reason": reason})
+        self.write(_EVENTS, self._cell.clock.now_ns(), {"event": event, **more, "reason": reason})
 
     def state(self, role: str, state: Stamped[TcpState]) -> None:
         """Record one arm on its way to rest."""
@@ -88,13 +115,17 @@ class RunRecord:
         if self._recorder is None and self._box is None:
             return
         cell, now_ns = self._cell, reading.now_ns
+        if self._frames is not None:
+            self._write_frames(self._frames)
         for role, state in reading.states.items():
             self.write(f"/arms/{role}/tcp", state.t_ns, tcp_message(state))
         for role, estimate in reading.contacts.items():
             self.write(f"/sensors/{role}/contact", now_ns, contact_message(estimate))
         for role, sensor in cell.sensors.items():
             for topic, t_ns, message in sensor.extra_messages(now_ns):
-                self.write(f"/sensors/{role}/{topic}", t_ns, message, boxed=topic != "image")
+                self.write(f"/sensors/{role}/{topic}", t_ns, message)
+            if self._frames is not None and (frame := sensor.new_frame()) is not None:
+                self._frames.add(role, frame.t_ns, frame.value.image)
         for name, health in reading.health.items():
             self.write(f"/health/{name}", health.t_ns, {"seq": health.seq, **health.value})
         for role, sample in reading.devices.items():
@@ -102,19 +133,23 @@ class RunRecord:
         if verdict.allow:
             for role, setting in action.settings.items():
                 self.write(f"/devices/{role}/setting", now_ns, setting)
-        if cell.scene is not None:
-            objects = cell.scene.objects()
+        objects = None if cell.scene is None else cell.scene.objects()
+        if objects is not None:
             for name, T_world_object in objects.value.items():
                 self.write(f"/objects/{name}", objects.t_ns, pose_message(T_world_object))
         for role, command in sent.items():
             self.write(f"/arms/{role}/command", command.t_ns, command_message(command))
         if verdict.violations or not verdict.allow:
             self.write("/safety", now_ns, verdict_message(verdict))
+            if self._viewers is not None:
+                self._view(partial(self._viewers.violations, now_ns, verdict.violations))
         self.write("/task", now_ns, {"state": cell.task.state, **action.telemetry})
         self.write("/timing", now_ns, times.message())
+        if self._viewers is not None:
+            self._view(partial(self._draw, self._viewers, reading, objects))
         for record in cell.task.transitions[self._transitions_written :]:
             self.write(
-                "/events",
+                _EVENTS,
                 record.t_ns,
                 {"event": record.event, "from": record.source, "to": record.target, "reason": record.reason},
             )
@@ -134,34 +169,112 @@ class RunRecord:
             if frame is not None:
                 collection.keep(frame.value.image, T_f_s)
 
-    def write(self, topic: str, t_ns: int, message: Mapping[str, Any], *, boxed: bool = True) -> None:
-        """Record one message, in the black box only if ``boxed``."""
-        boxed = boxed and self._box is not None
-        if not boxed and self._recorder is None:
+    def close(self) -> None:
+        """Write the images that still wait; the run has ended."""
+        frames, self._frames = self._frames, None
+        if frames is None:
+            return
+        frames.close()
+        self._write_frames(frames)
+        if frames.left_out:
+            self.event("images left out", f"{frames.left_out}, since compressing them took longer than they last")
+
+    def write(self, topic: str, t_ns: int, message: Mapping[str, Any]) -> None:
+        """Record one message."""
+        if self._box is None and self._recorder is None:
             return
         try:
-            data = encode(message)
+            encoded = self._encoder.encode(topic, message)
         except Exception as error:
-            # A value of a plug-in's that is no JSON; the rest of the run is recorded.
+            # A value of a plug-in's that is neither number, text, list nor mapping; the rest of the run is recorded.
             logger.exception("a message of %s is left out", topic)
             self.error = self.error or UnexpectedError(error)
             return
-        if boxed and self._box is not None:
+        if self._box is not None:
             try:
-                self._box.add(topic, t_ns, data)
+                self._box.add(topic, t_ns, encoded)
             except Exception:
                 logger.exception("the black box failed and takes no more messages")
                 self._box = None
         if self._recorder is None:
             return
+        if topic == _EVENTS and self._viewers is not None:
+            self._view(partial(self._viewers.event, t_ns, message))
         try:
-            self._recorder.write_encoded(topic, t_ns, data)
+            self._recorder.write_encoded(topic, t_ns, encoded)
         except RecordingError as error:
             self._give_up(error)
         except Exception as error:
             self._give_up(UnexpectedError(error))
 
+    def _for_viewers(self, recorder: Recorder) -> None:
+        cell = self._cell
+        try:
+            scene = describe_scene(cell.plan)
+        except Exception:
+            # A scene or a driver of a plug-in that cannot be drawn is no reason not to run.
+            logger.exception("nothing is drawn in this recording")
+            return
+        self._viewers = ViewerRecord(recorder, scene, cell.scene_start_ns)
+        self._jointed = {
+            role: arm for role, arm in cell.arms.items() if role in scene.chains and isinstance(arm, JointSource)
+        }
+
+    def _draw(self, viewers: ViewerRecord, reading: Reading, objects: Stamped[Mapping[str, Array]] | None) -> None:
+        """Record for viewers where everything is."""
+        for role, state in reading.states.items():
+            viewers.arm(role, state)
+        for role, arm in self._jointed.items():
+            if not viewers.wants_joints(role, reading.now_ns):
+                continue
+            try:
+                joints = arm.joints()
+            except DeviceError:
+                # Its pose is what the run depends on, and is watched.
+                continue
+            viewers.joints(role, joints)
+        for role, estimate in reading.contacts.items():
+            viewers.contact(role, estimate)
+        if objects is not None:
+            viewers.objects(objects)
+        viewers.moving(reading.now_ns)
+        viewers.again(reading.now_ns)
+
+    def zero_frame(self, role: str, t_ns: int, image: ImageArray) -> None:
+        """Record the image out of contact that a sensor compares others with; the arm stands meanwhile."""
+        if self._recorder is None:
+            return
+        import cv2
+
+        data = cv2.imencode(".png", image)[1].tobytes()
+        stamp = t_ns + self._recorder.wall_offset_ns
+        message = image_message(COMPRESSED_IMAGE, stamp, sensor_frame(role), "png", data)
+        try:
+            self._recorder.write_bytes(f"/sensors/{role}/zero", t_ns, COMPRESSED_IMAGE, message)
+        except RecordingError as error:
+            self._give_up(error)
+
+    def _write_frames(self, frames: FrameCompressor) -> None:
+        try:
+            if self._recorder is not None:
+                frames.write_to(self._recorder)
+        except RecordingError as error:
+            self._give_up(error)
+        if frames.error is not None:
+            self._frames = None
+            self._give_up(UnexpectedError(frames.error))
+
+    def _view(self, record: Callable[[], None]) -> None:
+        """Record for viewers; what fails there is no reason to stop."""
+        try:
+            record()
+        except RecordingError as error:
+            self._give_up(error)
+        except Exception:
+            logger.exception("the rest of this run is not drawn")
+            self._viewers = None
+
     def _give_up(self, error: TouchcellError) -> None:
         logger.error("recording ends: %s", error)
-        self._recorder = None
+        self._recorder = self._viewers = None
         self.error = error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -33,6 +32,7 @@ class Sensor:
         arm_role: role of the arm that carries it, None where nothing moves it.
         T_tcp_sensor: (4, 4) its pose in that arm's tool frame.
         truth: what is known to be true: the simulator's own contact, or the label of a replayed image.
+        true_edge: the simulator's own edge, for an estimator of edges.
         frames: how images are recorded.
         watched: whether an interlock looks at the pictures.
     """
@@ -41,6 +41,7 @@ class Sensor:
     arm_role: str | None
     T_tcp_sensor: Array
     truth: ContactSource | None = None
+    true_edge: ContactSource | None = None
     frames: str = "none"
     watched: bool = False
     _recorded_seq: int = field(default=-1, init=False)
@@ -56,12 +57,10 @@ class Sensor:
         """Wait for the first frame, so that no control cycle has to. Raises DeviceError."""
         self.source.await_frame()
 
-    def take_zero(self) -> tuple[int, dict[str, Any]] | None:
-        """Take the newest frame for one out of contact; return its time and image for the recording, None if unused."""
+    def take_zero(self) -> Stamped[Frame] | None:
+        """Take the newest frame for one out of contact, and return it; None from a source that uses none."""
         frame = self.frame
-        if not self.source.take_zero() or frame is None:
-            return None
-        return frame.t_ns, _image_message(frame.value.image, "png", frame.seq, frame.t_ns)
+        return frame if self.source.take_zero() else None
 
     def picture(self) -> tuple[int | None, float | None]:
         """A checksum and the mean grey level of every third pixel of the newest frame; (None, None) if not watched."""
@@ -90,23 +89,27 @@ class Sensor:
             return None
         return self.source.preprocessing.model_dump(mode="json")
 
+    def new_frame(self) -> Stamped[Frame] | None:
+        """Return the newest frame, once, where images are recorded."""
+        frame = self.frame if self.frames != "none" else None
+        if frame is None or frame.seq == self._recorded_seq:
+            return None
+        self._recorded_seq = frame.seq
+        return frame
+
     def extra_messages(self, now_ns: int) -> Iterator[tuple[str, int, dict[str, Any]]]:
-        """What else is recorded of this sensor in this cycle: the frame's own measurement, its image, the truth."""
+        """What else is recorded of this sensor in this cycle: the frame's own measurement, the truth."""
         if isinstance(self.source, ContactPipeline):
             measured = self.source.measurement
             if measured is not None and measured.belief is not None:
                 yield "measurement", measured.t_ns, {"seq": measured.seq, **belief_message(measured.belief)}
-        frame = self.frame
-        if self.frames != "none" and frame is not None and frame.seq != self._recorded_seq:
-            self._recorded_seq = frame.seq
-            yield "image", frame.t_ns, _image_message(frame.value.image, self.frames, frame.seq, frame.t_ns)
-        if self.truth is not None:
-            true = self.truth.update(now_ns)
+        for topic, source in (("truth", self.truth), ("true_edge", self.true_edge)):
+            true = None if source is None else source.update(now_ns)
             if true is not None:
                 message: dict[str, Any] = {"in_contact": true.in_contact}
                 if true.belief is not None:
                     message |= pose_message(se3.inverse(true.belief.mean))
-                yield "truth", true.t_ns, message
+                yield topic, true.t_ns, message
 
 
 def build_sensor(
@@ -128,12 +131,14 @@ def build_sensor(
     section = plan.cell.sensors[name]
     T_tcp_sensor = section.T_tcp_sensor
     truth = _truth(name, devices.get(section.mounted_on or ""), scene, T_tcp_sensor)
-    context = EstimatorContext(name, cast(FrameSource, devices[name]), truth)
+    edge = _true_edge(name, scene) if section.estimator.feature == "edge" else None
+    context = EstimatorContext(name, cast(FrameSource, devices[name]), truth, edge)
     return Sensor(
         source=section.estimator.build(context),
         arm_role=role_of[section.mounted_on] if section.mounted_on else None,
         T_tcp_sensor=T_tcp_sensor,
         truth=truth,
+        true_edge=edge,
         frames=plan.cell.recording.frames,
         watched=any(interlock.kind in ("frame_frozen", "exposure") for interlock in plan.cell.interlocks.values()),
     )
@@ -148,13 +153,7 @@ def _truth(name: str, mount: Device | None, scene: SceneTruth | None, T_tcp_sens
     return LabelledContactSource(mount, T_tcp_sensor) if isinstance(mount, ReplayArm) else None
 
 
-def _image_message(image: Any, kind: str, seq: int, t_ns: int) -> dict[str, Any]:
-    import cv2
+def _true_edge(name: str, scene: SceneTruth | None) -> ContactSource | None:
+    from touchcell.cell.runtime.ground_truth import TrueEdgeSource
 
-    encoded = cv2.imencode(".jpg" if kind == "jpeg" else ".png", image)[1].tobytes()
-    return {
-        "timestamp": {"sec": t_ns // 10**9, "nsec": t_ns % 10**9},
-        "frame_id": str(seq),
-        "format": kind,
-        "data": base64.b64encode(encoded).decode(),
-    }
+    return None if scene is None else TrueEdgeSource(scene, name)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -11,7 +11,9 @@ from pydantic import BaseModel
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.samples import Stamped
+from touchcell.errors import ConfigError
 from touchcell.geometry import se3
+from touchcell.geometry.solids import Solid
 from touchcell.geometry.types import Array
 from touchcell.registry import Registry
 
@@ -65,6 +67,14 @@ class SceneTruth(Protocol):
         """Return T_world_object (4, 4) of every free object."""
         ...
 
+    def edge(self, sensor: str, t_ns: int | None = None) -> Stamped[Array] | None:
+        """Return T_s_e (4, 4) of the edge nearest to the tip of ``sensor``; None where no surface has edges.
+
+        {e} has z along the inward normal of the face that the sensor is over, x away from that face across the edge, y
+        along the edge, and its origin one tip radius outside the edge, as {f} has.
+        """
+        ...
+
 
 class Scene(SceneTruth, Protocol):
     """A scene in this process, in which devices are mounted."""
@@ -74,6 +84,25 @@ class Scene(SceneTruth, Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class SceneBody:
+    """Something in a scene to draw.
+
+    Attributes:
+        name: of the surface or object.
+        solids: its parts, each with its pose (4, 4) in the body's frame.
+        pose: returns its pose in the world (4, 4) at a time of the scene; that at the start for a free object.
+        moves: whether a prescribed motion moves it.
+        free: whether it is a free object, whose pose ``SceneTruth.objects`` gives.
+    """
+
+    name: str
+    solids: tuple[tuple[Solid, Array], ...]
+    pose: Callable[[float], Array]
+    moves: bool = False
+    free: bool = False
+
+
 class SceneSection(BaseModel):
     """Base of the pydantic model of a ``scene:`` section."""
 
@@ -81,9 +110,17 @@ class SceneSection(BaseModel):
         """Build the scene; its motions start now."""
         raise NotImplementedError
 
-    def modules(self) -> Mapping[str, str]:
-        """Return the optional modules that it needs, each with the key that asks for it."""
+    def bodies(self) -> Sequence[SceneBody]:
+        """Return what there is to draw."""
+        return ()
+
+    def modules(self) -> Mapping[str, tuple[str, str]]:
+        """Return the optional modules that it needs, each with the key that asks for it and how to install it."""
         return {}
+
+    def problems(self) -> Iterable[ConfigError]:
+        """Return what is wrong with the files that it names; ``key`` of each is relative to the section."""
+        return ()
 
 
 @dataclass(frozen=True, slots=True)

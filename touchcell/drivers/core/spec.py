@@ -33,6 +33,10 @@ class DriverConfig(BaseModel):
         """
         return None
 
+    def emulated_address(self) -> str | None:
+        """Return the key whose value leads to an emulator on this machine, not to a device of a bench; None if none."""
+        return None
+
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:

@@ -11,18 +11,20 @@ position and disables itself after its own timeout. **An arm without brakes sink
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from touchcell.drivers.core.behaviour import ArmBehaviour
+from touchcell.drivers.core.bench_address import is_virtual_can
 from touchcell.drivers.core.bus_arm import BusArm, BusArmConfig
 from touchcell.drivers.core.bus_reply import Reply
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle, OperatorToken
+from touchcell.drivers.core.diagnosis import Finding, finding_of
 from touchcell.drivers.core.errors import (
     ConnectError,
     DeviceError,
@@ -46,6 +48,7 @@ from touchcell.drivers.core.spec import Capabilities, DriverContext, DriverSpec
 from touchcell.drivers.damiao import codec
 from touchcell.drivers.damiao.bus import TRIES, Address, MotorBus
 from touchcell.drivers.damiao.codec import Feedback, MitCommand, Register
+from touchcell.drivers.damiao.keeper_bus import KeeperBus
 from touchcell.drivers.kinematics.chain import GRAVITY_M_S2, ChainDescription, ChainFile, SerialChain, Vector3
 from touchcell.errors import ConfigError
 from touchcell.geometry.types import Array
@@ -58,6 +61,10 @@ _PCAN_CLOCK_HZ = 80_000_000
 _SAMPLE_POINT_PERCENT = 80.0
 _PLAUSIBLE_JUMP_RAD = 0.1
 _ENABLE_TRIES = 3
+_WARM_C = 70
+_SHORTEST_QUEUE = 100
+_MODE_REPORTS = ("openarm_can 64", "dimos 1897")
+_SCALE_REPORTS = ("openarm_can 146",)
 # While one motor is asked, the others hear nothing: all tries together must not last as long as their watchdog.
 _ASKING_FRACTION = 0.75
 
@@ -107,6 +114,9 @@ class DamiaoCanConfig(BusArmConfig):
         gravity_m_s2: gravity along the axes of the arm's base, for compensation.
         motors: one for each joint, from the base.
         watchdog_s: silence after which a motor lets go by itself: the arm sinks.
+        keeper: a process of its own owns the bus; it holds the arm when this process dies, and lowers it slowly.
+        lower_after_s: time from the death of this process until the keeper begins to lower the arm.
+        lower_speed_mm_s: greatest speed of the tool while it does.
     """
 
     interface: str = "socketcan"
@@ -120,8 +130,16 @@ class DamiaoCanConfig(BusArmConfig):
     gravity_m_s2: Vector3 = GRAVITY_M_S2
     motors: tuple[MotorConfig, ...] = Field(min_length=1)
 
+    keeper: bool = False
+    lower_after_s: Annotated[float, Field(ge=0.0, le=60.0)] = 1.0
+    lower_speed_mm_s: Annotated[float, Field(gt=0.0, le=50.0)] = 40.0
+
     rate_hz: Annotated[float, Field(ge=50.0, le=1000.0)] = 250.0
     watchdog_s: Annotated[float, Field(ge=0.02, le=0.4)] = 0.1
+
+    def emulated_address(self) -> str | None:
+        """Return ``channel`` if it is a virtual bus of this machine."""
+        return "channel" if is_virtual_can(self.interface, self.channel) else None
 
     @property
     def joint_count(self) -> int:
@@ -169,6 +187,7 @@ class DamiaoCanArm(BusArm):
     """
 
     _config: DamiaoCanConfig
+    _keeper: KeeperBus | None
 
     def __init__(self, name: str, config: DamiaoCanConfig, clock: Clock) -> None:
         super().__init__(name, config, clock, SerialChain(config.describe(), config.tool, config.gravity_m_s2))
@@ -180,15 +199,24 @@ class DamiaoCanArm(BusArm):
         self._bus = MotorBus(
             name,
             addresses,
-            partial(open_bus, name, config),
+            self._connect,
             clock,
             max_silence_s=config.max_silence_s,
             answer_s=config.watchdog_s * _ASKING_FRACTION / TRIES,
             fd=config.fd,
         )
 
+    def _connect(self) -> Any:
+        if not self._config.keeper:
+            return open_bus(self.name, self._config)
+        settings = self._config.model_dump(mode="json")
+        keeper = KeeperBus(self.name, self._config.interface, self._config.channel, settings)
+        self._keeper = keeper
+        return keeper
+
     def _reset_state(self) -> None:
         super()._reset_state()
+        self._keeper = None
         self._answers: list[Reply[Feedback] | None] = [None] * len(self._config.motors)
         self._held: tuple[Array, Array] | None = None
         self._turns: Array | None = None
@@ -207,6 +235,7 @@ class DamiaoCanArm(BusArm):
             "bus_state": self._bus.state,
             "bus_error": self._bus.last_error,
             "bus_load": self._config.bus_load,
+            "keeper_pid": 0 if self._keeper is None else self._keeper.pid,
             "turns_added": "" if self._turns is None else " ".join(f"{turn / _TURN_RAD:.0f}" for turn in self._turns),
         }
         readings |= super().health()
@@ -216,6 +245,56 @@ class DamiaoCanArm(BusArm):
                 readings[f"{joint}_mos_c"] = answer.state.mos_c
                 readings[f"{joint}_rotor_c"] = answer.state.rotor_c
         return readings
+
+    def diagnose(self) -> Iterator[Finding]:
+        """Yield what is wrong with motors, bus and adapter; reads registers only."""
+        with self._lock:
+            for index, motor in enumerate(self._config.motors):
+                for check in (self._check_mode, self._check_ranges):
+                    try:
+                        check(index)
+                    except ConfigError as error:
+                        yield finding_of(error, *(_MODE_REPORTS if check == self._check_mode else _SCALE_REPORTS))
+                if not self._bus.read(index, Register.TIMEOUT):
+                    what = f"motor {motor.esc_id} has no timeout: it would obey its last command for ever"
+                    yield Finding(
+                        what, "configure sets it until the next power cycle", ("lerobot 3178",), is_fault=False
+                    )
+        yield from self._diagnose_joints()
+        if self._bus.state != "active":
+            what = f"the CAN controller is {self._bus.state}; it reported: {self._bus.last_error or 'nothing'}"
+            yield Finding(what, "check wiring, termination and bit rates", ("CANopenNode 319", "yarp-devices 246"))
+        if self._bus.counters.not_sent:
+            what = f"the adapter refused {self._bus.counters.not_sent} frames: {self._bus.last_error}"
+            yield Finding(what, "sudo ip link set can0 txqueuelen 1000", ("python-can 1495", "python-can 2004"), False)
+        queue = _transmit_queue(self._config)
+        if queue is not None and queue < _SHORTEST_QUEUE:
+            what = f"the transmit queue of {self._config.channel} holds {queue} frames"
+            remedy = f"sudo ip link set {self._config.channel} txqueuelen 1000"
+            yield Finding(what, remedy, ("python-can 1495", "linux-can/can-utils 400"), is_fault=False)
+
+    def _diagnose_joints(self) -> Iterator[Finding]:
+        for motor, answer in zip(self._config.motors, self._answers, strict=True):
+            if answer is None:
+                continue
+            if (code := codec.fault(answer.state.status)) is not None:
+                yield Finding(f"motor {motor.esc_id}: {code.name}", code.hint, ("arx5-sdk 20",))
+            hottest_c = max(answer.state.mos_c, answer.state.rotor_c)
+            if hottest_c >= _WARM_C:
+                yield Finding(f"motor {motor.esc_id} is at {hottest_c} degrees Celsius", "let it cool down", (), False)
+        if self._turns is not None and self._turns.any():
+            joints = [name for name, turn in zip(self._chain.joint_names, self._turns, strict=True) if turn]
+            what = f"powered up one turn off, and corrected: {', '.join(joints)}"
+            yield Finding(what, "nothing to do", ("axol 208", "i2rt 82"), is_fault=False)
+        if self._joints is not None:
+            q = self._joints.value.q
+            for joint in np.flatnonzero((q < self._chain.lower) | (q > self._chain.upper)):
+                what = (
+                    f"joint {self._chain.joint_names[joint]} is at {np.rad2deg(q[joint]):.0f} deg, outside its limits"
+                )
+                yield Finding(
+                    what, "move it back by hand; only if its angle is wrong, correct offset_deg", ("axol 208",)
+                )
 
     def _open_bus(self) -> None:
         self._bus.open()
@@ -235,14 +314,8 @@ class DamiaoCanArm(BusArm):
 
     def _configure(self) -> None:
         with self._lock:
-            for index, motor in enumerate(self._config.motors):
-                if (mode := self._bus.read(index, Register.CTRL_MODE)) != codec.MIT_MODE:
-                    raise ConfigError(
-                        f"motor {motor.esc_id} is in control mode {mode}, not MIT (1)",
-                        key="motors",
-                        value=mode,
-                        hint="set register 10 to 1 with the manufacturer's tool; a driver does not change modes",
-                    )
+            for index in range(len(self._config.motors)):
+                self._check_mode(index)
                 self._check_ranges(index)
                 self._set_watchdog(index)
 
@@ -263,6 +336,8 @@ class DamiaoCanArm(BusArm):
                 )
             for index in range(len(self._enabled)):
                 self._check_watchdog(index, int(self._bus.read(index, Register.TIMEOUT)))
+            if self._keeper is not None:
+                self._keeper.tell_offsets(self._offset)
             if all(self._enabled):
                 return
             # Motors that are enabled already keep their setpoint, whatever load makes them sag.
@@ -290,6 +365,15 @@ class DamiaoCanArm(BusArm):
         if answer is None or (self._clock.now_ns() - answer.t_ns) * 1e-9 > limit_s:
             raise TransportTimeout(self.name, f"reply of motor {self._config.motors[index].esc_id}", limit_s)
         return answer
+
+    def _check_mode(self, index: int) -> None:
+        if (mode := self._bus.read(index, Register.CTRL_MODE)) != codec.MIT_MODE:
+            raise ConfigError(
+                f"motor {self._config.motors[index].esc_id} is in control mode {mode}, not MIT (1)",
+                key="motors",
+                value=mode,
+                hint="set register 10 to 1 with the manufacturer's tool; a driver does not change modes",
+            )
 
     def _check_ranges(self, index: int) -> None:
         motor, ranges = self._config.motors[index], self._bus.ranges(index)
@@ -500,6 +584,16 @@ class DamiaoCanArm(BusArm):
             for index, ticks in enumerate(self._bus.timeout_ticks):
                 if ticks is not None:
                     self._check_watchdog(index, ticks)
+
+
+def _transmit_queue(config: DamiaoCanConfig) -> int | None:
+    """Return the length of the kernel's transmit queue, or None where there is none."""
+    if config.interface != "socketcan":
+        return None
+    try:
+        return int(Path(f"/sys/class/net/{config.channel}/tx_queue_len").read_text())
+    except (OSError, ValueError):
+        return None
 
 
 def open_bus(device: str, config: DamiaoCanConfig) -> Any:

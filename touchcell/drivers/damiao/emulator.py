@@ -188,6 +188,7 @@ class DamiaoArm(Emulator):
         """Open the hub and start the simulated time."""
         self._start_s = self._now_s()
         self._hub.open()
+        self.publish_joints(self._q)
         self._ticker = asyncio.create_task(self._tick())
 
     async def stop(self) -> None:
@@ -286,6 +287,7 @@ class DamiaoArm(Emulator):
             self._integrate()
             for _ in range(int(self.active.get("chatter", 0))):
                 self._hub.send(can.Message(arbitration_id=0x7FF, is_extended_id=False, data=bytes(8)))
+            self.publish_joints(self._q)
 
     def _check_timeouts(self) -> None:
         now_s = self._now_s()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from touchcell.drivers.damiao import driver as damiao_can
-from touchcell.testing.emulation.in_cell import EmulatedDriver, start_arguments, tcp_of_state
+from touchcell.testing.emulation.in_cell import EmulatedDriver, start_arguments, tcp_of_joints
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
@@ -97,4 +97,4 @@ def _start(config: damiao_can.DamiaoCanConfig, start_deg: Sequence[float] | None
     )
 
 
-EMULATED = EmulatedDriver("damiao_can", _settings, _start, tcp_of_state)
+EMULATED = EmulatedDriver("damiao_can", _settings, _start, tcp_of_joints)

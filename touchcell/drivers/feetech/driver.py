@@ -15,19 +15,22 @@ adjustments of ``Sent`` and in ``health``.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from touchcell.drivers.core.behaviour import ArmBehaviour
+from touchcell.drivers.core.bench_address import is_pseudo_terminal
 from touchcell.drivers.core.bus_arm import BusArm, BusArmConfig
 from touchcell.drivers.core.bus_reply import Reply
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import OperatorToken
+from touchcell.drivers.core.diagnosis import Finding, finding_of
 from touchcell.drivers.core.errors import (
     ConnectError,
     CorruptMessage,
@@ -61,6 +64,10 @@ _SPEED_MARGIN = 1.25
 _SLOWEST_RAD_S = 0.1
 _SHORTEST_RANGE_RAD = np.deg2rad(10.0)
 _MOVED_BY_HAND_TICKS = 20
+_WARM_C = 60
+_OLDEST_FIRMWARE = (3, 10)
+_LONG_DELAY_S = 1e-3
+_SETTING_REPORTS = ("lerobot 1360", "lerobot 1010", "lerobot 526")
 
 
 class ServoConfig(BaseModel):
@@ -128,6 +135,10 @@ class FeetechSerialConfig(BusArmConfig):
     rate_hz: Annotated[float, Field(ge=10.0, le=200.0)] = 50.0
     tracking_error_deg: Annotated[float, Field(gt=0.0, le=20.0)] = 8.0
     torque_limit_percent: Annotated[float, Field(ge=5.0, le=100.0)] = 60.0
+
+    def emulated_address(self) -> str | None:
+        """Return ``port`` if it is a pseudo-terminal of this machine."""
+        return "port" if is_pseudo_terminal(self.port) else None
 
     @property
     def joint_count(self) -> int:
@@ -222,6 +233,44 @@ class FeetechSerialArm(BusArm):
                 readings[f"{joint}_c"] = state.temperature_c
                 readings[f"{joint}_a"] = state.current_a
         return readings
+
+    def diagnose(self) -> Iterator[Finding]:
+        """Yield what is wrong with servos and adapter; reads registers only."""
+        with self._lock:
+            for index in range(len(self._ids)):
+                try:
+                    self._check_servo(index)
+                except ConfigError as error:
+                    yield finding_of(error, *_SETTING_REPORTS)
+            answers = self._fresh_answers()
+        for index, (servo, answer) in enumerate(answers):
+            yield from self._diagnose_state(index, servo, answer.state)
+        firmware = self._bus.firmware
+        if any(_version(each) < _OLDEST_FIRMWARE for each in firmware.split(", ")):
+            what = f"firmware {firmware}: older than 3.10, with which others have had damaged replies"
+            yield Finding(what, "update it with the maker's tool", ("lerobot 1010",), is_fault=False)
+        delay_s = sum(self._bus.identity(servo).return_delay_s for servo in self._ids)
+        if delay_s > _LONG_DELAY_S:
+            what = f"the servos' return delays take {1e3 * delay_s:.1f} ms of each cycle"
+            yield Finding(what, "set register 7 of each servo to 0", ("DynamixelSDK 302",), is_fault=False)
+        latency_ms = _latency_timer_ms(self._config.port)
+        if latency_ms is not None and latency_ms > 1:
+            what = f"the adapter keeps what it has heard for {latency_ms} ms (its latency timer)"
+            remedy = f"echo 1 | sudo tee /sys/class/tty/{Path(self._config.port).resolve().name}/device/latency_timer"
+            yield Finding(what, remedy, ("DynamixelSDK 116",), is_fault=False)
+
+    def _diagnose_state(self, index: int, servo: int, state: ServoState) -> Iterator[Finding]:
+        for bit in codec.faults(state.status):
+            yield Finding(f"servo {servo}: {bit.name}", bit.hint, ("SO-ARM100 174", "lerobot 2819"))
+        if not 0 <= state.position < codec.TICKS_PER_TURN:
+            what = f"servo {servo} is at {state.position} ticks, outside 0 to 4095 by its homing offset"
+            yield Finding(what, "move the joint to the middle of its range by hand", ("lerobot 3348", "lerobot 1296"))
+        elif not self._chain.lower[index] <= (angle := self._angle(index, state.position)) <= self._chain.upper[index]:
+            what = f"joint {self._chain.joint_names[index]} is at {np.rad2deg(angle):.1f} deg, outside its limits"
+            yield Finding(what, "move it back by hand, or calibrate it again", ("lerobot 1360",))
+        if state.temperature_c >= _WARM_C:
+            what = f"servo {servo} is at {state.temperature_c} degrees Celsius"
+            yield Finding(what, "let it cool down", ("interbotix_ros_manipulators 10",), is_fault=False)
 
     def _open_bus(self) -> None:
         self._bus.open()
@@ -485,6 +534,18 @@ class FeetechSerialArm(BusArm):
             if answer is not None and requested >= _MAX_UNANSWERED and (now_ns - answer.t_ns) * 1e-9 > limit_s:
                 self._latch(TransportTimeout(self.name, f"reply of servo {servo}", limit_s))
         self._check_missed()
+
+
+def _version(text: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in text.split(".") if part.isdigit())
+
+
+def _latency_timer_ms(port: str) -> int | None:
+    """Return the latency timer of an FTDI adapter, or None for another."""
+    try:
+        return int((Path("/sys/class/tty") / Path(port).resolve().name / "device/latency_timer").read_text())
+    except (OSError, ValueError):
+        return None
 
 
 def _open_port(device: str, config: FeetechSerialConfig) -> Any:

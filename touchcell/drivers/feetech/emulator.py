@@ -281,6 +281,7 @@ class FeetechArm(Emulator):
     async def start(self) -> None:
         """Open the pseudo-terminal and start the simulated time."""
         self._plug_in()
+        self.publish_joints(self._q())
         self._ticker = asyncio.create_task(self._tick())
 
     async def stop(self) -> None:
@@ -421,6 +422,7 @@ class FeetechArm(Emulator):
         while True:
             await asyncio.sleep(_TICK_S)
             self._integrate()
+            self.publish_joints(self._q())
 
     def _integrate(self) -> None:
         now_s = self._now_s()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from touchcell.drivers.feetech import driver as feetech_serial
-from touchcell.testing.emulation.in_cell import EmulatedDriver, start_arguments, tcp_of_state
+from touchcell.testing.emulation.in_cell import EmulatedDriver, start_arguments, tcp_of_joints
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
@@ -95,4 +95,4 @@ def _start(config: feetech_serial.FeetechSerialConfig, start_deg: Sequence[float
     )
 
 
-EMULATED = EmulatedDriver("feetech_serial", _settings, _start, tcp_of_state)
+EMULATED = EmulatedDriver("feetech_serial", _settings, _start, tcp_of_joints)

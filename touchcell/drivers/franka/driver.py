@@ -9,8 +9,9 @@ the arm with a communication reflex. The Franka Control Interface cannot release
 from __future__ import annotations
 
 import os
+import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -24,10 +25,12 @@ from pydantic import Field
 
 from touchcell.drivers.core.arm import Arm, JointLimitsConfig, LimitsConfig
 from touchcell.drivers.core.behaviour import ArmBehaviour
+from touchcell.drivers.core.bench_address import is_this_machine
 from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.command_checks import finite_array
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
+from touchcell.drivers.core.diagnosis import Finding, finding_of
 from touchcell.drivers.core.errors import (
     CommandRejected,
     ConnectError,
@@ -53,7 +56,7 @@ from touchcell.drivers.core.protocols import (
     StopCategory,
     WrenchSource,
 )
-from touchcell.drivers.core.samples import JointState, Stamped, TcpState
+from touchcell.drivers.core.samples import JointState, Stamped, TcpState, of_other_point
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.franka.errors import BY_NAME, ERRORS, MODES, VendorError
 from touchcell.drivers.franka.reader import PERIOD_S, Reading, StateReader
@@ -73,6 +76,7 @@ CAPABILITIES = Capabilities(
 )
 
 _WATCHDOG_S = 0.02
+_CONNECT_S = 5.0
 _FIRST_STATE_S = 2.0
 _FRESH_S = 0.25
 # Recovery has been seen to take 16 s (franka_ros issue 317).
@@ -118,6 +122,10 @@ class FrankaConfig(DriverConfig):
     flange_to_tcp_mm_deg: tuple[float, float, float, float, float, float] | None = None
     state_timeout_s: float = Field(default=0.5, ge=0.02, le=1.0)
 
+    def emulated_address(self) -> str | None:
+        """Return ``host`` if it is this machine."""
+        return "host" if is_this_machine(self.host) else None
+
     def described_chain(self) -> SerialChain:
         """Return the chain of an FR3 with the configured tool, or with none where Desk has set it."""
         x, y, z, alpha, beta, gamma = self.flange_to_tcp_mm_deg or (0.0,) * 6
@@ -157,6 +165,7 @@ class FrankaArm(Arm):
         )
         self._config = config
         self._franky: Any = None
+        self._tool_is_set = False
         self._robot: Any = None
         self._reader: StateReader | None = None
         self._control_scheduling: _Scheduling | None = None
@@ -166,10 +175,18 @@ class FrankaArm(Arm):
         self._ik = self._kinematics_of(SerialChain(ChainDescription.shipped("fr3")))
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """Return the newest state. Raises StaleData if older than ``max_age_s``, or the fault of the arm."""
+        """Return the newest state. Raises StaleData if older than ``max_age_s``, or the fault of the arm.
+
+        It is that of ``flange_to_tcp_mm_deg``, also before ``configure`` has set this tool in the controller.
+        """
         reading = self._reading("read its pose", max_age_s)
         # The controller's rotation matrix is orthonormal to about 1e-6 only.
-        return _stamped(TcpState(se3.project(reading.T_base_tcp), reading.twist), reading)
+        state = TcpState(se3.project(reading.T_base_tcp), reading.twist)
+        wanted = self._config.flange_to_tcp_mm_deg
+        if wanted is not None and not self._tool_is_set:
+            T_ee_tcp = np.linalg.solve(reading.T_flange_tcp, se3.from_euler_mm_deg(wanted))
+            state = of_other_point(state, se3.compose(state.T_base_tcp, se3.project(T_ee_tcp)))
+        return _stamped(state, reading)
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
         """Return the newest joint state. Raises as ``tcp``."""
@@ -251,6 +268,21 @@ class FrankaArm(Arm):
             "external_force_n": float(np.linalg.norm(reading.wrench[:3])),
         }
 
+    def diagnose(self) -> Iterator[Finding]:
+        """Yield what is wrong with the controller, the network and this machine."""
+        reading = self._newest()
+        if reading.mode not in _OBEYS or reading.errors:
+            yield finding_of(self._fault(reading), "libfranka 37", "franky 7")
+        for name in reading.errors:
+            entry = BY_NAME[name]
+            yield Finding(name, entry.hint, ("libfranka 23", "frankx 22"))
+        if not _has_realtime_kernel():
+            what = "this kernel is not PREEMPT_RT: communication_constraints_violation is likely"
+            yield Finding(what, "boot a real-time kernel", ("libfranka 60", "franky 7"), self._config.enforce_realtime)
+        if self._open_reader().bad:
+            what = f"{self._open_reader().bad} states were unreadable"
+            yield Finding(what, "use a direct cable to the arm's controller", ("libfranka 174",), is_fault=False)
+
     def kinematics(self) -> DifferentialIk:
         """Return the differential inverse kinematics, with the tool set in the controller by ``configure``."""
         return self._ik
@@ -267,15 +299,16 @@ class FrankaArm(Arm):
                 "this kernel is not PREEMPT_RT",
                 hint="boot a real-time kernel, or set enforce_realtime: false and expect communication reflexes",
             )
+        self._tool_is_set = False
         franky = self._franky = _import_franky(self.name)
         realtime = franky.RealtimeConfig.Enforce if config.enforce_realtime else franky.RealtimeConfig.Ignore
         try:
             # libfranka makes the connecting thread a real-time thread, where permitted, and its control threads inherit
             # that. Python must not starve the machine, so it keeps its own scheduling and lends real-time only to those
             # threads.
-            with _scheduled():
-                self._robot = franky.Robot(config.host, realtime_config=realtime)
-                self._control_scheduling = _Scheduling.of_this_thread()
+            self._robot, self._control_scheduling = self._connected(
+                lambda: franky.Robot(config.host, realtime_config=realtime)
+            )
         except (franky.Exception, RuntimeError) as error:
             raise ConnectError(
                 self.name,
@@ -290,6 +323,34 @@ class FrankaArm(Arm):
         self._reader = StateReader(self.name, franky, self._robot, self._clock)
         self._reader.start()
         self._await_reading(_FIRST_STATE_S, "state after connecting")
+
+    def _connected(self, connect: Callable[[], Any]) -> tuple[Any, _Scheduling]:
+        """Return the robot and the scheduling that libfranka gave its thread. Raises what ``connect`` raises.
+
+        Raises:
+            ConnectError: the controller accepts the connection and does not reply; libfranka waits a minute for that.
+        """
+        results: queue.SimpleQueue[tuple[Any, _Scheduling] | BaseException] = queue.SimpleQueue()
+
+        def work() -> None:
+            try:
+                with _scheduled():
+                    results.put((connect(), _Scheduling.of_this_thread()))
+            except BaseException as error:
+                results.put(error)
+
+        threading.Thread(target=work, name=f"{self.name} connection", daemon=True).start()
+        try:
+            result = results.get(timeout=_CONNECT_S)
+        except queue.Empty:
+            raise ConnectError(
+                self.name,
+                f"the controller at {self._config.host} does not reply within {_CONNECT_S:g} s",
+                hint="restart it in Desk, and close other clients",
+            ) from None
+        if isinstance(result, BaseException):
+            raise result
+        return result
 
     def _close(self) -> None:
         if self._reader is not None:
@@ -330,6 +391,7 @@ class FrankaArm(Arm):
             NE_T_tcp = np.linalg.solve(state.F_T_NE.matrix, F_T_tcp)
             self._robot.set_ee(NE_T_tcp.T.ravel())
             self._verify_frame("F_T_EE", F_T_tcp)
+            self._tool_is_set = True
         # The wrench is measured at the stiffness frame: place it at the tool centre point.
         if np.abs(state.EE_T_K.matrix - np.eye(4)).max() > _FRAME_TOLERANCE:
             self._robot.set_k(np.eye(4).ravel())
@@ -397,7 +459,7 @@ class FrankaArm(Arm):
         self._contact.clear()
 
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
-        self._reading("move", _FRESH_S)
+        self._reading("move", self._config.state_timeout_s)
         franky, config = self._franky, self._config
         linear, angular = twist_base[:3], twist_base[3:]
         # For the whole time-to-live, including the ramp to the target; a second waypoint brakes harder than the first.
@@ -472,7 +534,7 @@ class FrankaArm(Arm):
         self._desk.check(lease)
         if self.state is not Lifecycle.ACTIVE:
             raise CommandRejected(self.name, Rejection.MODE, f"device is {self.state.value}, not active")
-        self._reading("move", _FRESH_S)
+        self._reading("move", self._config.state_timeout_s)
         return target
 
     def _goal_factor(self, speed_fraction: float) -> float:
@@ -634,6 +696,7 @@ def behaviour(config: FrankaConfig) -> ArmBehaviour:
         home_deg=HOME_DEG,
         stop_accel_m_s2=config.stop_dynamics_factor * _ACCEL_M_S2,
         stop_rot_accel_rad_s2=config.stop_dynamics_factor * _ROT_ACCEL_RAD_S2,
+        max_state_age_s=config.state_timeout_s,
         watchdog_s=_WATCHDOG_S,
     )
 

@@ -5,13 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from ipaddress import IPv4Address
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.franka.driver import SPEC, FrankaArm, FrankaConfig
-from touchcell.testing.emulation.in_cell import EmulatedDriver, TcpOfState, free_host, start_arguments, tcp_of_joints
+from touchcell.testing.emulation.in_cell import (
+    FOR_EVER_PACKETS,
+    FOR_EVER_S,
+    EmulatedDriver,
+    TcpOfJoints,
+    free_host,
+    start_arguments,
+    tcp_of_joints,
+)
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
@@ -71,11 +79,18 @@ def _start(config: FrankaConfig, start_deg: Sequence[float] | None) -> EmulatorP
     return EmulatorProcess("franka", "--host", config.host, *start_arguments(start_deg))
 
 
-def _tcp(config: FrankaConfig) -> TcpOfState:
+def _tcp(config: FrankaConfig, state: Mapping[str, Any]) -> TcpOfJoints:
     if config.flange_to_tcp_mm_deg is not None:
-        return tcp_of_joints(config)
+        return tcp_of_joints(config, state)
     # The end effector is as it is set in Desk.
-    return lambda state: np.array(state["T_base_ee"], dtype=np.float64)
+    chain, F_T_EE = config.described_chain(), np.array(state["F_T_EE"], dtype=np.float64)
+    return lambda q: chain.forward(q) @ F_T_EE
 
 
-EMULATED = EmulatedDriver("franka", _settings, _start, _tcp)
+_FAULTS: Final = {
+    # A state that never comes leaves the one before it.
+    "stale": ("delay", lambda _: FOR_EVER_S),
+    "nan_state": ("nan", lambda _: FOR_EVER_PACKETS),
+}
+
+EMULATED = EmulatedDriver("franka", _settings, _start, _tcp, _FAULTS)

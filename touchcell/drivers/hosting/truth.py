@@ -93,6 +93,10 @@ class RemoteScene:
         )
         return Stamped(state, int(record["t_ns"]), int(record["seq"]))
 
+    def edge(self, sensor: str, t_ns: int | None = None) -> Stamped[Array] | None:
+        """Return None: edges are not published by other processes."""
+        return None
+
     def objects(self) -> Stamped[Mapping[str, Array]]:
         """Return T_world_object (4, 4) of every free object, as last published."""
         record = self._objects.read()

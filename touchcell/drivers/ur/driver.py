@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from importlib.util import find_spec
 from typing import Annotated, Final, Self
@@ -19,9 +19,11 @@ from pydantic import Field, model_validator
 
 from touchcell.drivers.core.arm import Arm, JointLimitsConfig, LimitsConfig
 from touchcell.drivers.core.behaviour import ArmBehaviour
+from touchcell.drivers.core.bench_address import is_this_machine
 from touchcell.drivers.core.chain_check import require_same_arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import DeactivatePolicy, Lifecycle, OperatorToken
+from touchcell.drivers.core.diagnosis import Finding, finding_of
 from touchcell.drivers.core.errors import (
     CommandRejected,
     ConnectError,
@@ -55,7 +57,7 @@ from touchcell.drivers.ur import codec as ur_codec
 from touchcell.drivers.ur.control import ControlLink
 from touchcell.drivers.ur.dashboard import dashboard
 from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyMode, power_fault, program_fault, safety_fault
-from touchcell.drivers.ur.registers import RtdeWire
+from touchcell.drivers.ur.registers import Registers, RtdeWire
 from touchcell.drivers.ur.state import RATE_HZ, Snapshot, StateReader, StateStream
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
@@ -75,6 +77,7 @@ _STILL_TARGET_RAD_S = 1e-6
 _STILL_ACTUAL_RAD_S = 0.01
 _BEYOND_LIMIT_RAD = 0.1
 _SAME_TOOL = 1e-6
+_WARM_C, _LOW_VOLTAGE_V = 70.0, 43.0
 _TOOL_MM, _CALIBRATION_MM, _TOOL_DEG = 1.0, 20.0, 2.0
 
 _STOPS = frozenset(StopCategory)
@@ -117,6 +120,10 @@ class UrConfig(DriverConfig):
                 f"stop_accel_m_s2 {self.stop_accel_m_s2:g} is less than the acceleration allowed, {self.accel:g}"
             )
         return self
+
+    def emulated_address(self) -> str | None:
+        """Return ``host`` if it is this machine."""
+        return "host" if is_this_machine(self.host) else None
 
     def described_chain(self) -> SerialChain:
         """Return the chain of the named model with the configured tool. Raises ConfigError."""
@@ -261,6 +268,43 @@ class UrArm(Arm):
         if self._tool_warning:
             readings["warning"] = self._tool_warning
         return readings
+
+    def diagnose(self) -> Iterator[Finding]:
+        """Yield what is wrong with the controller and its settings; claims the registers for a moment, writes none."""
+        snapshot = self._fresh()
+        for check, reports in (
+            (self._require_safe, ("ur_modern_driver 353", "airo-mono 143", "Universal_Robots_Client_Library 58")),
+            (self._require_remote_control, ("Universal_Robots_ROS2_Driver 181",)),
+            (self._require_no_program, ("Universal_Robots_ROS_Driver 296",)),
+            (self._require_registers, ("Universal_Robots_ROS_Driver 28",)),
+            (self._require_chain, ("Universal_Robots_ROS_Driver 317",)),
+        ):
+            try:
+                check()
+            except DeviceError as error:
+                yield finding_of(error, *reports)
+        if self._tool_warning:
+            remedy = "set the same tool and its payload on the pendant (Installation > General > TCP)"
+            yield Finding(self._tool_warning, remedy, ("Universal_Robots_ROS_Driver 557",), is_fault=False)
+        if 0.0 < snapshot.speed_fraction < 1.0:
+            what = f"the speed slider is at {snapshot.speed_fraction:.0%}: every motion is slower by that factor"
+            yield Finding(what, "move it to 100 %", ("Universal_Robots_ROS_Driver 737",), is_fault=False)
+        if (hottest_c := float(snapshot.temperatures.max())) >= _WARM_C:
+            yield Finding(f"a joint is at {hottest_c:.0f} degrees Celsius", "let it cool down", (), is_fault=False)
+        if snapshot.voltage_v < _LOW_VOLTAGE_V:
+            yield Finding(f"the arm's supply is at {snapshot.voltage_v:.1f} V, not 48 V", "have the controller checked")
+        if snapshot.robot_mode is not RobotMode.RUNNING:
+            what = f"the arm is {snapshot.robot_mode.name}"
+            yield Finding(what, "activate powers it on and releases its brakes", (), is_fault=False)
+
+    def _require_registers(self) -> None:
+        Registers(self.name, self._config.host, self._config.connect_timeout_s).close()
+
+    def _require_chain(self) -> None:
+        snapshot = self._fresh()
+        if snapshot.tcp_offset is not None:
+            # Only of the flange: the tool is compared by itself.
+            require_same_arm(self.name, self._chain, snapshot.q, self._tool_pose_of(snapshot))
 
     def _tool_pose_of(self, snapshot: Snapshot) -> Array:
         """Return the pose (4, 4) of the configured tool centre point, whatever tool is set in the controller."""

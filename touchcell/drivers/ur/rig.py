@@ -4,13 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.spec import DriverContext
 from touchcell.drivers.ur.driver import SPEC, UrConfig
-from touchcell.testing.emulation.in_cell import EmulatedDriver, free_host, start_arguments, tcp_of_joints
+from touchcell.testing.emulation.in_cell import (
+    FOR_EVER_PACKETS,
+    FOR_EVER_S,
+    EmulatedDriver,
+    free_host,
+    start_arguments,
+    tcp_of_joints,
+)
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
@@ -85,4 +92,10 @@ def _start(config: UrConfig, start_deg: Sequence[float] | None) -> EmulatorProce
     return EmulatorProcess("ur", "--host", config.host, *start_arguments(start_deg))
 
 
-EMULATED = EmulatedDriver("ur", _settings, _start, tcp_of_joints)
+_FAULTS: Final = {
+    # A state that never comes leaves the one before it.
+    "stale": ("delay", lambda _: FOR_EVER_S),
+    "nan_state": ("nan", lambda _: FOR_EVER_PACKETS),
+}
+
+EMULATED = EmulatedDriver("ur", _settings, _start, tcp_of_joints, _FAULTS)

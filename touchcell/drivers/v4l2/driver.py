@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 import os
-import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from touchcell.drivers.core.camera import Camera, CameraConfig, RawFrame, UnsupportedSetting, camera_behaviour
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle
+from touchcell.drivers.core.diagnosis import Finding
 from touchcell.drivers.core.errors import ConnectError, DeviceFault, DeviceGone, FaultClass, Remedy, TransportError
 from touchcell.drivers.core.protocols import FrameSource, HealthSource
 from touchcell.drivers.core.samples import Quality
@@ -79,7 +80,7 @@ class V4l2Camera(Camera):
         self._gain: int | None = None
 
     def _open(self) -> None:
-        if abs(self._clock.now_ns() - time.monotonic_ns()) > _CLOCK_TOLERANCE_NS:
+        if abs(self._clock.now_ns() - self._calls.now_ns()) > _CLOCK_TOLERANCE_NS:
             raise ConnectError(
                 self.name,
                 "the kernel stamps frames on CLOCK_MONOTONIC, but the cell's clock is another",
@@ -291,6 +292,40 @@ class V4l2Camera(Camera):
 
     def _verify(self) -> None:
         self._check_next_setting()
+
+    def diagnose(self) -> Iterator[Finding]:
+        """Yield what is wrong with the camera and the name that it has in the cell file; asks, and sets nothing."""
+        node, config = self._opened(), self._config
+        formats = node.pixel_formats()
+        if config.pixel_format not in formats:
+            what = f"does not offer {config.pixel_format}, only {', '.join(formats)}"
+            yield Finding(what, "set pixel_format to one of them", ("lerobot 1225", "lerobot 1558"))
+        given = node.try_format(config.pixel_format, config.width_px, config.height_px)
+        if (given.pixel_format, given.width_px, given.height_px) != (
+            config.pixel_format,
+            config.width_px,
+            config.height_px,
+        ):
+            what = f"gives {given.pixel_format} {given.width_px} x {given.height_px} for what the cell file asks"
+            yield Finding(what, "`v4l2-ctl --list-formats-ext` shows what it offers", ("lerobot 1225", "lerobot 1558"))
+        if node.is_busy():
+            yield Finding("another program streams from it", "close that program", ("lerobot 3569",))
+        if not is_stable_name(config.device):
+            what = f"{config.device} may be another camera after a restart or a re-plug"
+            yield Finding(what, "use its name under /dev/v4l/by-id or by-path", ("U20CAM-9281M 4", "rosys 69"), False)
+        elif not node.serial and config.expect_bus is None and "/by-id/" in config.device:
+            what = "has no serial number of its own: a second camera of this make may take its name"
+            yield Finding(what, f"set expect_bus: {node.bus}", ("rosys 69", "octoprint_deploy 203"), is_fault=False)
+        for identity, setting, _ in _AUTOMATICS:
+            if node.has_control(identity) and node.control(identity) is None:
+                what = f"its control for {setting} does not answer"
+                yield Finding(what, "try another cable or port, or another camera", ("showmewebcam 213",))
+        if config.exposure_us is None and node.has_control(codec.CID_EXPOSURE_ABSOLUTE):
+            steps = node.control(codec.CID_EXPOSURE_ABSOLUTE)
+            if steps is not None and steps * codec.EXPOSURE_UNIT_US * config.rate_hz > 1e6:
+                exposure_us = steps * codec.EXPOSURE_UNIT_US
+                what = f"its exposure of {exposure_us} us is longer than a frame at {config.rate_hz:g} Hz"
+                yield Finding(what, "set exposure_us", ("autonomous-os 79", "picam 133"))
 
     def _opened(self) -> VideoNode:
         assert self._node is not None, "the lifecycle prevents reading a closed camera"

@@ -8,6 +8,7 @@ import fcntl
 import mmap
 import os
 import select
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,6 +22,10 @@ _GONE = (errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN)
 
 class SystemCalls(Protocol):
     """System calls that a camera needs. Real cameras use ``KernelCalls``; an emulator may provide its own."""
+
+    def now_ns(self) -> int:
+        """Return the time of the clock that frames are stamped with."""
+        ...
 
     def open(self, path: str) -> int:
         """Return a file descriptor, read-write and non-blocking."""
@@ -45,6 +50,9 @@ class SystemCalls(Protocol):
 
 class KernelCalls:
     """System calls of the kernel."""
+
+    def now_ns(self) -> int:
+        return time.monotonic_ns()
 
     def open(self, path: str) -> int:
         return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -146,6 +154,24 @@ class VideoNode:
         self._ask(codec.S_FMT, request, "set the image format")
         pix = request.pix
         return AppliedFormat(codec.fourcc_text(pix.pixelformat), pix.width, pix.height, pix.bytesperline)
+
+    def try_format(self, pixel_format: str, width_px: int, height_px: int) -> AppliedFormat:
+        """Return the format that the device would choose for a request; nothing changes. Raises as ``set_format``."""
+        request = codec.Format(type=codec.VIDEO_CAPTURE)
+        request.pix.width, request.pix.height = width_px, height_px
+        request.pix.pixelformat, request.pix.field = codec.fourcc(pixel_format), codec.FIELD_NONE
+        self._ask(codec.TRY_FMT, request, "try the image format")
+        pix = request.pix
+        return AppliedFormat(codec.fourcc_text(pix.pixelformat), pix.width, pix.height, pix.bytesperline)
+
+    def is_busy(self) -> bool:
+        """Return whether another program holds its buffers; asked by freeing our own, of which there are none."""
+        none = codec.RequestBuffers(type=codec.VIDEO_CAPTURE, memory=codec.MEMORY_MMAP)
+        try:
+            self._calls.ioctl(self._fd, codec.REQBUFS, none)
+        except OSError as error:
+            return error.errno == errno.EBUSY
+        return False
 
     def set_rate(self, rate_hz: float) -> float | None:
         """Request a frame rate and return the one that the device chose, Hz; None if it has no such setting.

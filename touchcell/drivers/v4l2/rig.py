@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from touchcell.drivers.core.camera import CameraConfig
 from touchcell.drivers.core.clock import Clock
@@ -62,4 +62,11 @@ def _settings(config: CameraConfig, folder: Path, number: int) -> Mapping[str, A
     return {"device": f"/dev/v4l/by-id/usb-TacTip_{number:04d}-video-index0", "stall_s": stall_s}
 
 
-EMULATED = EmulatedDriver("v4l2", _settings)
+_FAULTS: Final[Mapping[str, tuple[str, Callable[[Any], Any]]]] = {
+    "frozen": ("freeze_frame", bool),
+    "last_seq": ("pause", lambda _: True),
+    "extra_latency_s": ("delay", float),
+    "gain": ("gain", float),
+}
+
+EMULATED = EmulatedDriver("v4l2", _settings, faults=_FAULTS)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from touchcell.drivers.core.errors import ConnectError
+from touchcell.drivers.core.paced_clock import emulated_clock
 from touchcell.drivers.v4l2.node import KernelCalls
 
 EMULATED_CAMERAS: Final = "TOUCHCELL_V4L2"
@@ -62,6 +63,9 @@ class ShimCalls(KernelCalls):
         self._folder = str(folder).encode()
         self._shim = ctypes.CDLL(str(library()), use_errno=True)
         self._shim.touchcell_v4l2_ioctl.argtypes = (ctypes.c_int, ctypes.c_ulong, ctypes.c_void_p)
+
+    def now_ns(self) -> int:
+        return emulated_clock().now_ns()
 
     def open(self, path: str) -> int:
         name = os.path.basename(path).encode()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final, TypeAlias
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal, TypeAlias
 
 from touchcell.drivers.core.protocols import FrameSource
 from touchcell.plugin_section import PluginSection, Section
@@ -11,6 +11,10 @@ from touchcell.registry import Registry
 
 if TYPE_CHECKING:
     from touchcell.perception.runtime.pipeline import ContactSource
+
+
+Feature: TypeAlias = Literal["surface", "edge"]
+"""What a contact pose is relative to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,11 +25,13 @@ class EstimatorContext:
         sensor: name of the sensor in the cell file.
         camera: its frame source.
         truth: source of the true contact; None where it is not known.
+        true_edge: source of the true edge under the sensor; None where it is not known.
     """
 
     sensor: str
     camera: FrameSource
     truth: ContactSource | None = None
+    true_edge: ContactSource | None = None
 
 
 class EstimatorConfig(Section):
@@ -33,10 +39,12 @@ class EstimatorConfig(Section):
 
     Attributes:
         needs_truth: True if it can only be built where the true contact is known, as in a simulated scene.
+        feature: what its contacts are of: a surface, or an edge of one (docs/explanation/edges.md).
         kind: which estimator.
     """
 
     needs_truth: ClassVar[bool] = False
+    feature: ClassVar[Feature] = "surface"
 
     kind: str
 

@@ -86,6 +86,7 @@ class SimArm(Arm):
             max_state_age_s=config.state_timeout_s,
         )
         self.faults = ArmFaults()
+        self.moved_ns = 0
         self.T_world_base = se3.from_euler_mm_deg(config.base_pose_mm_deg)
         self._timeline = timeline or Timeline(clock)
         self._body = TwistFollower(
@@ -160,6 +161,8 @@ class SimArm(Arm):
         if self.faults.ignores_expiry and self._powered:
             self._body.prolong(t_ns)
         self._body.step(t_ns)
+        if not self._body.at_rest() or self._drift_m_s():
+            self.moved_ns = t_ns
         drift_m_s = self._drift_m_s()
         if drift_m_s:
             T = self._body.T_base_tcp.copy()

@@ -63,7 +63,8 @@ TOOLS = {
 _POSTURES_DEG = {"panda": (0, 20, 0, -120, 0, 140, 45), "ur5e": (0, -90, -90, -90, 90, 0)}
 _READABLE = (Lifecycle.PASSIVE, Lifecycle.READY, Lifecycle.ACTIVE, Lifecycle.FAULTED)
 _SETPOINT_S = 0.01
-_REST_SPEED_RAD_S = 1e-3
+# As the drivers of real arms: a compliant arm that stands yields to what moves against its tip.
+_REST_SPEED_RAD_S = 0.01
 
 
 class SimJointArmConfig(DriverConfig):

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from touchcell.drivers.core.behaviour import CameraBehaviour
 from touchcell.drivers.core.clock import Clock, VirtualClock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.spec import AnyDriver, DriverConfig, DriverContext
@@ -21,6 +22,7 @@ from touchcell.simulation.devices import tactip as sim_tactip
 from touchcell.simulation.devices.arm import SimArm
 from touchcell.simulation.devices.joint_arm import SimJointArm
 from touchcell.simulation.devices.stand_in_arm import StandInArm, stand_in
+from touchcell.simulation.devices.stand_in_camera import stand_in as camera_stand_in
 from touchcell.simulation.faults import FrameFaults
 from touchcell.simulation.scene import SceneConfig
 from touchcell.testing.emulation.rig import DeviceFixture, FixtureFactory
@@ -111,18 +113,28 @@ def _arm_rig(spec: AnyDriver, config: DriverConfig, state_rate_hz: float | None 
 
 def sim_tactip_rig(folder: Path, address: int) -> DeviceFixture:
     """Build a simulated sensor on a simulated arm above a plane."""
+    return _camera_rig(sim_tactip.SPEC, sim_tactip.SimTactipConfig(mounted_on="arm"))
+
+
+def camera_stand_in_of(spec: AnyDriver, config: DriverConfig) -> DeviceFixture:
+    """Build the simulated stand-in for the camera of another driver, on a simulated arm above a plane."""
+    found = camera_stand_in(spec, Placement(mounted_on="arm"))
+    behaviour = None if spec.behaviour is None else spec.behaviour(config)
+    assert isinstance(behaviour, CameraBehaviour)
+    return _camera_rig(found, config, behaviour.rate_hz)
+
+
+def _camera_rig(spec: AnyDriver, config: DriverConfig, state_rate_hz: float | None = None) -> DeviceFixture:
     cameras: list[sim_tactip.SimTactip] = []
-    clocks: list[Clock] = []
 
     def build(clock: Clock) -> Device:
         scene = SceneConfig.model_validate({"surfaces": {"table": {"kind": "plane"}}}).build(clock)
         context = DriverContext(clock, scene=scene)
         arm = sim_arm.SPEC.build("arm", sim_arm.SimArmConfig(start_pose_mm_deg=_START), context)
-        config = sim_tactip.SimTactipConfig(mounted_on="arm")
-        context = DriverContext(clock, {"arm": arm}, scene)
-        cameras.append(sim_tactip.SPEC.build("tip", config, context))
-        clocks.append(clock)
-        return cameras[-1]
+        camera = spec.build("tip", config, DriverContext(clock, {"arm": arm}, scene))
+        assert isinstance(camera, sim_tactip.SimTactip)
+        cameras.append(camera)
+        return camera
 
     def pause(value: Any) -> None:
         last = cameras[-1].latest().seq if value is not None else None
@@ -132,7 +144,7 @@ def sim_tactip_rig(folder: Path, address: int) -> DeviceFixture:
         cameras[-1].faults = FrameFaults(extra_latency_s=value or 0.0)
 
     return DeviceFixture(
-        spec=sim_tactip.SPEC,
+        spec=spec,
         start=lambda: StandIn(faults={"pause": pause, "delay": delay}),
         build=build,
         energising=None,
@@ -140,6 +152,7 @@ def sim_tactip_rig(folder: Path, address: int) -> DeviceFixture:
         faults={"pause": (True, "stale"), "delay": (0.5, "stale")},
         clock=VirtualClock,
         process=False,
+        state_rate_hz=state_rate_hz,
     )
 
 

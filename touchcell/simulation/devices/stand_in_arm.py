@@ -14,12 +14,12 @@ from touchcell.drivers.core.arm import JointLimitsConfig, LimitsConfig
 from touchcell.drivers.core.behaviour import ArmBehaviour
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Lifecycle, OperatorToken
-from touchcell.drivers.core.errors import StaleData
+from touchcell.drivers.core.errors import CorruptMessage, StaleData
 from touchcell.drivers.core.joint_arm import JointArm
 from touchcell.drivers.core.joint_setpoint import JointSetpoint
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.core.protocols import ExternalTorqueSource, NativeWatchdog, StopCategory, WrenchSource
-from touchcell.drivers.core.samples import JointState, Stamped, TcpState
+from touchcell.drivers.core.samples import JointState, Stamped
 from touchcell.drivers.core.spec import AnyDriver, Capabilities, DriverConfig, DriverContext
 from touchcell.drivers.core.stand_in import Placement
 from touchcell.drivers.kinematics.chain import DifferentialIk, SerialChain
@@ -50,6 +50,9 @@ class StandInArm(JointArm):
 
     ``faults`` may be set at any time.
 
+    Attributes:
+        moved_ns: end of the last step in which it truly moved; 0 before the first.
+
     Raises:
         ConfigError: the start pose is out of reach.
     """
@@ -74,6 +77,7 @@ class StandInArm(JointArm):
             max_state_age_s=behaviour.max_state_age_s,
         )
         self.faults = ArmFaults()
+        self.moved_ns = 0
         self._behaviour = behaviour
         self._chain = chain
         joint_limits: JointLimitsConfig = getattr(config, "joint_limits", JointLimitsConfig())
@@ -108,8 +112,8 @@ class StandInArm(JointArm):
         sample = self._joints
         assert sample is not None
         if self.faults.nan_state:
-            nothing = np.full(self._chain.joint_count, np.nan)
-            sample = Stamped(JointState(nothing, nothing, nothing), sample.t_ns, sample.seq)
+            # As real drivers do after some bad states in a row.
+            raise self._to_faulted(CorruptMessage(self.name, "states with numbers that are not finite"))
         if self.faults.stale and self._reported is not None:
             sample = self._reported
         self._reported = sample
@@ -118,16 +122,11 @@ class StandInArm(JointArm):
             raise StaleData(self.name, age_s, max_age_s, sample.seq)
         return sample
 
-    def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """Return tool pose and twist of the newest state that the arm has sent. Raises StaleData."""
-        if not self.faults.nan_state:
-            return super().tcp(max_age_s)
-        sample = self.joints(max_age_s)
-        return Stamped(TcpState(np.full((4, 4), np.nan), np.full(6, np.nan)), sample.t_ns, sample.seq)
-
     def at_rest(self) -> bool:
-        """Return whether it is at rest with no motion pending."""
+        """Return whether it is at rest with no motion pending, as far as the newest state that it has sent shows."""
         self._timeline.advance()
+        if self.faults.stale and self._reported is not None:
+            return not self._reported.value.dq.any()
         return not (self._setpoint.moving or self._on_the_way or self._drift_m_s())
 
     def go_to_joints(self, q: Array, lease: Lease, *, speed_fraction: float = 0.1) -> None:
@@ -161,7 +160,8 @@ class StandInArm(JointArm):
     def _stream_twist(self, twist_base: Array, ttl_s: float, now_ns: int) -> None:
         self._timeline.advance()
         expires_ns = now_ns + round(ttl_s * 1e9)
-        self._on_the_way.add(twist_base, now_ns + self._latency_ns, expires_ns)
+        # The device counts a command's time-to-live from its arrival, as ``sim_arm`` does.
+        self._on_the_way.add(twist_base, now_ns + self._latency_ns, expires_ns + self._latency_ns)
 
     def _begin_stop(self, category: StopCategory) -> None:
         self._timeline.advance()
@@ -183,6 +183,8 @@ class StandInArm(JointArm):
             self._setpoint.q = self._setpoint.q + self._sinking() * (step_ns * 1e-9)
         if t_ns // self._period_ns != self._joints_t_ns // self._period_ns:
             self._joints = self._sample()
+        if self._setpoint.moving or self._drift_m_s():
+            self.moved_ns = t_ns
 
     @property
     def _joints_t_ns(self) -> int:

@@ -57,6 +57,8 @@ class SimTactipConfig(DriverConfig):
         blur_px: standard deviation of a Gaussian blur.
         dropped: share of frames that are lost.
         tip: tip file of ``touchcell calibrate-sim``, or the name of one that ships.
+        feels: ``plane`` draws the skin as on the tangent plane of what it touches, on which the shipped estimator was
+            trained; ``shape`` adds what curvature, edges and pins change (docs/explanation/shapes.md).
         shift_px: shift of the whole image along x and y.
         zoom: magnification of the image.
         camera_tilt_deg: tilt of the camera about the sensor's x and y axes, in addition to that of ``tip``.
@@ -79,6 +81,7 @@ class SimTactipConfig(DriverConfig):
     zoom: float = Field(default=1.0, ge=0.5, le=2.0)
     camera_tilt_deg: tuple[float, float] = (0.0, 0.0)
     output: Literal["raw", "processed"] = "raw"
+    feels: Literal["plane", "shape"] = "plane"
 
     def build_tip(self) -> Tip:
         """Return the tip as this sensor's camera shows it."""
@@ -126,6 +129,7 @@ class SimTactip(Device):
         self.faults = FrameFaults()
         self._scene = scene
         self._processed = config.output == "processed"
+        self._feels_shape = config.feels == "shape"
         self._period_ns = round(1e9 / config.rate_hz)
         self._latency_ns = round(config.latency_ms * 1e6)
         self._first = 0
@@ -207,7 +211,8 @@ class SimTactip(Device):
         return self._newest
 
     def _expose(self, seq: int, t_ns: int) -> Frame:
-        pixels = self._tip.pixels(self._scene.contact(self.name, t_ns).value.T_f_s)
+        relief = self._scene.relief(self.name, self._tip.relief.directions, t_ns) if self._feels_shape else None
+        pixels = self._tip.pixels(self._scene.contact(self.name, t_ns).value.T_f_s, relief)
         image = self._renderer.processed(pixels) if self._processed else self._renderer.raw(pixels, seq)
         if self.faults.gain != 1.0:
             image = np.clip(image * self.faults.gain, 0.0, 255.0).astype(np.uint8)

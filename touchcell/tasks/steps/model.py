@@ -39,25 +39,38 @@ class Until(TaskConfig):
     Attributes:
         contact: the sensor touches (true) or has come free (false).
         depth_mm: indentation reached, measured by the tactile sensor.
+        force_n: force on the tool reached, as the arm measures it, less that at the beginning of the step.
         distance_mm: path of the sensor since the step began.
         time_s: time since the step began.
     """
 
     contact: bool | None = None
     depth_mm: Annotated[PositiveFloat | None, DEPTH] = None
+    force_n: PositiveFloat | None = None
     distance_mm: PositiveFloat | None = None
     time_s: PositiveFloat | None = None
 
     @model_validator(mode="after")
     def _something(self) -> Self:
         if not self.model_fields_set or all(value is None for value in dict(self).values()):
-            raise ValueError("names no condition; give contact, depth_mm, distance_mm or time_s")
+            raise ValueError("names no condition; give contact, depth_mm, force_n, distance_mm or time_s")
         return self
 
     @property
     def needs_touch(self) -> bool:
-        """True if a condition needs the tactile sensor."""
-        return self.contact is not None or self.depth_mm is not None
+        """True if a condition needs something to touch."""
+        return self.contact is not None or self.depth_mm is not None or self.force_n is not None
+
+    def touch(self) -> str:
+        """Return a description of the touch that the conditions wait for."""
+        wanted = []
+        if self.contact is not None:
+            wanted.append("contact")
+        if self.depth_mm is not None:
+            wanted.append(f"depth of {self.depth_mm:g} mm")
+        if self.force_n is not None:
+            wanted.append(f"force of {self.force_n:g} N")
+        return " or ".join(wanted)
 
 
 class _Step(TaskConfig):

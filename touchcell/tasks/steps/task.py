@@ -20,7 +20,7 @@ from touchcell.tasks.servoing import ARM, SENSOR
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, TaskMachine, state_name
 from touchcell.tasks.state_machine_task import MachineTask
 from touchcell.tasks.steps.compiler import compile_steps
-from touchcell.tasks.steps.model import Hold, Leaf, Move, Record, Retract, Servo, StepsConfig, Until
+from touchcell.tasks.steps.model import Hold, Leaf, Move, Record, Retract, Servo, StepsConfig, Until, leaves
 
 _GAIN_PER_S = 10.0
 _SI = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
@@ -85,6 +85,8 @@ class StepsTask(MachineTask):
         self._last_ns: int | None = None
         self._blind_s = 0.0
         self._stop_seen = False
+        self._force: Array | None = None
+        self._first_force: Array | None = None
 
     def tick(self, observation: Observation) -> Action:
         """Advance by one cycle."""
@@ -95,6 +97,7 @@ class StepsTask(MachineTask):
         self._last_ns = now_ns
         try:
             self._sight.update(observation)
+            self._feel(observation)
             for servo in self._servos.values():
                 servo.update(observation)
             telemetry = self._watch(observation, dt_s)
@@ -120,6 +123,7 @@ class StepsTask(MachineTask):
         if record.source != record.target or record.event == "done":
             self._began_ns = record.t_ns
             self._sight.reset_travel()
+            self._first_force = None
         self._goal = None
         self._blind_s = 0.0
         servo = self._servos.get(self._machine.state)
@@ -182,8 +186,8 @@ class StepsTask(MachineTask):
             self._T_base_tcp(), self._goal, 1e-3 * step.tolerance_mm, float(np.radians(step.tolerance_deg))
         ):
             if step.until is not None and step.until.needs_touch:
-                wanted = "contact" if step.until.contact is not None else f"depth of {step.until.depth_mm:g} mm"
-                self._post("unmet", f"arrived without the {wanted} that {state_name(self._machine.state)} waits for")
+                wanted, state = step.until.touch(), state_name(self._machine.state)
+                self._post("unmet", f"arrived without the {wanted} that {state} waits for")
             else:
                 self._post("done", "arrived")
 
@@ -192,7 +196,17 @@ class StepsTask(MachineTask):
         needs_contact = isinstance(step, Servo) or (
             isinstance(step, Move) and step.frame == "contact" and self._goal is None
         )
+        until = step.until if isinstance(step, Move | Servo) else None
+        if until is not None and until.force_n is not None and self._force is None:
+            return False
         return self._sight.has_fresh_data and (not needs_contact or self._sight.T_s_f is not None)
+
+    def _feel(self, observation: Observation) -> None:
+        """Take the force on the tool; none that is too old or not finite."""
+        wrench, self._force = observation.wrenches.get(ARM), None
+        fresh = wrench is not None and 0.0 <= wrench.age_s(observation.now_ns) <= 1e-3 * self._config.max_state_age_ms
+        if wrench is not None and fresh and np.isfinite(wrench.value).all():
+            self._force = wrench.value[:3]
 
     def _watch_data(self, dt_s: float, *, blind: bool) -> None:
         self._blind_s = self._blind_s + dt_s if blind else 0.0
@@ -206,11 +220,21 @@ class StepsTask(MachineTask):
             return "contact" if until.contact else "free"
         if until.depth_mm is not None and sight.T_s_f is not None and 1e3 * self._depth_m() >= until.depth_mm:
             return f"depth {1e3 * self._depth_m():.2f} mm"
+        if until.force_n is not None and (force_n := self._force_n()) is not None and force_n >= until.force_n:
+            return f"force {force_n:.2f} N"
         if until.distance_mm is not None and 1e3 * sight.travelled_m() >= until.distance_mm:
             return f"moved {1e3 * sight.travelled_m():.1f} mm"
         if until.time_s is not None and self._stay_s() >= until.time_s:
             return f"{self._stay_s():.3f} s"
         return ""
+
+    def _force_n(self) -> float | None:
+        """Return by how much the force on the tool has changed since the step began, N; None while it is not known."""
+        if self._force is None:
+            return None
+        if self._first_force is None:
+            self._first_force = self._force
+        return float(np.linalg.norm(self._force - self._first_force))
 
     def _stay_s(self) -> float:
         return ((self._last_ns or 0) - self._began_ns) * 1e-9
@@ -291,6 +315,12 @@ class StepsTask(MachineTask):
         return numbers
 
 
+def _forces(config: StepsConfig) -> Mapping[str, str]:
+    """Return the arm, if a step waits for a force."""
+    waits = (step.until for step in leaves(config.steps) if isinstance(step, Move | Servo))
+    return {ARM: "until.force_n"} if any(until is not None and until.force_n is not None for until in waits) else {}
+
+
 SPEC = TaskSpec(
     name="steps",
     summary="do guarded motions written in the cell file: move, servo, hold, retract, record, repeat",
@@ -298,4 +328,5 @@ SPEC = TaskSpec(
     arms={ARM: SERVO_ARM},
     sensors=frozenset({SENSOR}),
     build=StepsTask,
+    forces=_forces,
 )

@@ -18,7 +18,6 @@ import json
 import os
 import signal
 import sys
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,7 +26,10 @@ from typing import Any, ClassVar
 
 import yaml
 
-from touchcell.errors import ConfigError
+from touchcell.drivers.core.paced_clock import emulated_clock
+from touchcell.errors import ConfigError, TouchcellError
+from touchcell.geometry.types import Array
+from touchcell.testing.emulation.shared_joints import JointsWriter
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class CommandOnset:
     """Time of the last change of motion commands at the emulator, for measuring command latency.
 
     Attributes:
-        t_ns: CLOCK_MONOTONIC time of the last change that followed at least 50 ms without one; 0 before the first.
+        t_ns: time in the emulated world of the last change after at least 50 ms without one; 0 before the first.
     """
 
     _CALM_NS = 50_000_000
@@ -58,7 +60,7 @@ class CommandOnset:
         """Record a motion command; call for each one that arrives."""
         if self._content.get(addressee) == content:
             return
-        now_ns = time.monotonic_ns()
+        now_ns = emulated_clock().now_ns()
         if now_ns - self._changed_ns >= self._CALM_NS:
             self.t_ns = now_ns
         self._content[addressee] = content
@@ -73,6 +75,12 @@ class Emulator(ABC):
 
     def __init__(self) -> None:
         self.active: dict[str, Any] = {}
+        self.joints: JointsWriter | None = None
+
+    def publish_joints(self, q: Array) -> None:
+        """Publish the true joint angles (n,) rad, for a scene that reads them; arms call it at start and each step."""
+        if self.joints is not None:
+            self.joints.publish(q)
 
     @abstractmethod
     async def start(self) -> None:
@@ -203,7 +211,7 @@ def _answer(emulator: Emulator, done: asyncio.Event, line: bytes) -> dict[str, A
         elif "quit" in request:
             done.set()
         return {"ok": True, "state": emulator.state()}
-    except (ConfigError, ValueError, TypeError) as error:
+    except (TouchcellError, ValueError, TypeError) as error:
         return {"ok": False, "error": str(error)}
 
 

@@ -23,53 +23,12 @@ from typing import Any
 import can
 
 from touchcell.drivers.core import can_errors
+from touchcell.drivers.core.can_packets import pack, unpack
 
-_CLASSIC = struct.Struct("=IB3x8s")
-_FD = struct.Struct("=IBB2x64s")
-_EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
 # What the hub makes the adapter of a client do: refuse sends (count, error number or 0 for none), be down (seconds).
 _REFUSE = struct.Struct("=Ii")
 _DOWN = struct.Struct("=4xd")
-_BIT_RATE_SWITCH, _FD_FRAME = 0x01, 0x04
-
-
-def pack(message: can.Message) -> bytes:
-    """Encode a message in SocketCAN's layout."""
-    number = message.arbitration_id
-    number |= _EXTENDED if message.is_extended_id else 0
-    number |= _REMOTE if message.is_remote_frame else 0
-    number |= _ERROR if message.is_error_frame else 0
-    data = bytes(message.data)
-    if message.is_fd:
-        flags = _FD_FRAME | (_BIT_RATE_SWITCH if message.bitrate_switch else 0)
-        return _FD.pack(number, len(data), flags, data)
-    return _CLASSIC.pack(number, message.dlc, data)
-
-
-def unpack(packet: bytes, timestamp_s: float = 0.0) -> can.Message:
-    """Decode a packet of ``pack``. Raises ValueError for a packet of another size or with an impossible length."""
-    if len(packet) == _CLASSIC.size:
-        (number, length, data), flags, longest = _CLASSIC.unpack(packet), 0, 8
-    elif len(packet) == _FD.size:
-        number, length, flags, data = _FD.unpack(packet)
-        longest = 64
-    else:
-        raise ValueError(f"a packet of {len(packet)} bytes is not a CAN frame")
-    if length > longest:
-        raise ValueError(f"a frame cannot carry {length} bytes")
-    is_remote = bool(number & _REMOTE)
-    return can.Message(
-        timestamp=timestamp_s,
-        arbitration_id=number & 0x1FFFFFFF,
-        is_extended_id=bool(number & _EXTENDED),
-        is_remote_frame=is_remote,
-        is_error_frame=bool(number & _ERROR),
-        is_fd=len(packet) == _FD.size,
-        bitrate_switch=bool(flags & _BIT_RATE_SWITCH),
-        dlc=length,
-        data=None if is_remote else data[:length],
-        check=True,
-    )
+_MOST_FRAMES = 256
 
 
 class HubBus(can.BusABC):  # type: ignore[misc]
@@ -249,7 +208,10 @@ class Hub:
         asyncio.get_running_loop().add_reader(client, self._read, client)
 
     def _read(self, client: socket.socket) -> None:
-        while client in self._clients:
+        # Bounded: a client that sends faster than a busy machine reads must not stop everything else.
+        for _ in range(_MOST_FRAMES):
+            if client not in self._clients:
+                return
             try:
                 packet = client.recv(128)
             except BlockingIOError:

@@ -6,12 +6,10 @@ import os
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any, Final, TypeAlias
-
-import numpy as np
 
 from touchcell.drivers.core.errors import ConnectError
 from touchcell.drivers.core.spec import DriverConfig
@@ -25,7 +23,7 @@ _DEVICES: Final = 4
 _PROCESSES: Final = 1_000_000
 
 
-TcpOfState: TypeAlias = Callable[[Mapping[str, Any]], Array]
+TcpOfJoints: TypeAlias = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,14 +36,17 @@ class EmulatedDriver:
             for sockets and links, and the number of the device in the cell.
         start: makes the emulator of an arm, not started yet, from that configuration and the joint angles in degrees at
             which it begins (None for its home); None for a camera, whose picture the scene draws.
-        T_base_tcp: returns for a configuration what computes the pose (4, 4) of an arm's tool in its base from the
-            emulator's state.
+        T_base_tcp: returns for a configuration and the state of the emulator at its start what computes the pose (4, 4)
+            of an arm's tool in its base from the joint angles (n,) rad that the emulator publishes.
+        faults: by a fault of simulated devices (``touchcell.simulation.faults``) the emulator's own that does the same,
+            and its value for a value of the simulated one.
     """
 
     name: str
     settings: Callable[[Any, Path, int], Mapping[str, Any]]
     start: Callable[[Any, Sequence[float] | None], EmulatorProcess] | None = None
-    T_base_tcp: Callable[[Any], TcpOfState] | None = None
+    T_base_tcp: Callable[[Any, Mapping[str, Any]], TcpOfJoints] | None = None
+    faults: Mapping[str, tuple[str, Callable[[Any], Any]]] = field(default_factory=dict)
 
 
 EMULATED: Final = Registry("touchcell.emulated_devices", "emulated device", EmulatedDriver)
@@ -68,23 +69,18 @@ def free_host(port: int, number: int) -> str:
     raise ConnectError("emulator", f"port {port} is taken on {first} and its neighbours")
 
 
-def tcp_of_joints(config: DriverConfig) -> TcpOfState:
-    """Return what computes the tool's pose (4, 4) from the joint angles ``q`` of a state, by the configured chain.
+def tcp_of_joints(config: DriverConfig, state: Mapping[str, Any]) -> TcpOfJoints:
+    """Return what computes the tool's pose (4, 4) from joint angles (n,) rad, by the configured chain.
 
     A controller has the configured tool only once its arm is active; the chain has it from the start.
     """
     chain = config.described_chain()
     assert chain is not None
-
-    def T_base_tcp(state: Mapping[str, Any]) -> Array:  # noqa: N802  standard notation for transforms
-        return chain.forward_and_jacobian(np.array(state["q"], dtype=np.float64))[0]
-
-    return T_base_tcp
+    return chain.forward
 
 
-def tcp_of_state(config: DriverConfig) -> TcpOfState:
-    """Return what takes the tool's pose (4, 4) from a state, of an emulator that was started with the tool."""
-    return lambda state: np.array(state["T_base_tcp"], dtype=np.float64)
+FOR_EVER_S: Final = 3600.0
+FOR_EVER_PACKETS: Final = 1_000_000
 
 
 def start_arguments(start_deg: Sequence[float] | None) -> list[str]:

@@ -14,6 +14,8 @@ from typing import Final, Protocol, runtime_checkable
 from touchcell.errors import ConfigError, suggest
 from touchcell.registry import Registry
 from touchcell.testing.emulation.base import Emulator, read_fault_script, serve
+from touchcell.testing.emulation.paced_loop import PacedLoop
+from touchcell.testing.emulation.shared_joints import JointsWriter
 
 
 @runtime_checkable
@@ -49,14 +51,18 @@ def main(arguments: Sequence[str]) -> int:
         child = parsers.add_parser(name)
         child.add_argument("--control", type=Path, help="UNIX socket of the control channel")
         child.add_argument("--fault-script", type=Path, help="YAML list of faults and when they happen")
+        child.add_argument("--joints", type=int, metavar="FD", help="shared memory for the joint angles of an arm")
         child.add_argument("--lifeline", action="store_true", help="end when standard input closes")
         if name == wanted:
             EMULATORS.load(name).add_arguments(child)
     options = parser.parse_args(arguments)
     script = read_fault_script(options.fault_script) if options.fault_script else ()
     emulator = EMULATORS.load(options.name).build(options)
+    if options.joints is not None:
+        emulator.joints = JointsWriter(options.joints)
     try:
-        asyncio.run(serve(emulator, options.control, script, lifeline=options.lifeline))
+        with asyncio.Runner(loop_factory=PacedLoop) as runner:
+            runner.run(serve(emulator, options.control, script, lifeline=options.lifeline))
     except OSError as error:
         raise ConfigError(
             f"the emulator {options.name!r} cannot open its wire: {error.strerror or error}",

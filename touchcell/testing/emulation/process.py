@@ -17,6 +17,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from touchcell.drivers.core.errors import ConnectError, TransportTimeout
+from touchcell.geometry.types import Array
+from touchcell.testing.emulation.shared_joints import JointsReader, create_joints
 
 
 class EmulatorProcess:
@@ -36,6 +38,7 @@ class EmulatorProcess:
         self._folder = tempfile.TemporaryDirectory(prefix="touchcell-emulator-")
         self._process: subprocess.Popen[bytes] | None = None
         self._channel: socket.socket | None = None
+        self._joints: JointsReader | None = None
 
     @property
     def pid(self) -> int:
@@ -47,18 +50,24 @@ class EmulatorProcess:
         """Start and wait until it is ready. Raises ConnectError with what it printed, or TransportTimeout."""
         control = Path(self._folder.name) / "control"
         log_path = Path(self._folder.name) / "log"
+        joints = create_joints(self._name)
+        self._joints = JointsReader(joints)
         with log_path.open("wb") as log:
             self._process = subprocess.Popen(
                 [
                     *(sys.executable, "-m", "touchcell.testing.emulation", self._name, *self._arguments),
-                    *("--control", str(control), "--lifeline"),
+                    *("--control", str(control), "--joints", str(joints), "--lifeline"),
                 ],
+                pass_fds=(joints,),
+                # A Ctrl-C in the terminal is for the cell, which needs its devices until it has stopped.
+                start_new_session=True,
                 # The kernel closes it when this process dies, for any reason.
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
                 env=os.environ | self._environment,
             )
+        os.close(joints)
         assert self._process.stdout is not None
         with selectors.DefaultSelector() as selector:
             selector.register(self._process.stdout, selectors.EVENT_READ)
@@ -84,6 +93,17 @@ class EmulatorProcess:
     def state(self) -> dict[str, Any]:
         """Return the ground truth of the emulator."""
         return self._ask({"state": True})
+
+    def joints(self) -> Array:
+        """Return the newest true joint angles (n,) rad of an arm, also after it has ended.
+
+        Raises:
+            ConnectError: this emulator publishes none.
+        """
+        q = None if self._joints is None else self._joints.newest()
+        if q is None:
+            raise ConnectError(self._name, "this emulator publishes no joint angles")
+        return q
 
     def wait_for(self, **wanted: Any) -> dict[str, Any]:
         """Poll ``state`` until every named entry has the given value. Raises TransportTimeout."""

@@ -4,19 +4,60 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.schema import EMULATED_CAMERAS, plan_cell, plan_in_world
 from touchcell.cell.runtime.worlds import Emulation
-from touchcell.errors import ConfigError
+from touchcell.drivers.core.paced_clock import pace_variables
+from touchcell.errors import ConfigError, suggest
 from touchcell.testing.emulation.in_cell import EMULATED
 from touchcell.testing.emulation.process import EmulatorProcess
 
 _START_S: Final = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class EmulatedCell:
+    """A cell whose emulators run.
+
+    Attributes:
+        plan: the cell, with the emulators' addresses.
+        process: its emulators; they take faults as ``DEVICE.FAULT``.
+    """
+
+    plan: CellPlan
+    process: EmulatorProcess
+
+    def inject(self, device: str, faults: Mapping[str, Any]) -> None:
+        """Begin faults of a device, by the names that simulated devices have for them.
+
+        Raises:
+            ConfigError: the device's emulator has no such fault.
+        """
+        known = self._faults(device)
+        for name, value in faults.items():
+            if name not in known:
+                raise ConfigError(
+                    f"no fault {name!r} on an emulated {self.plan.devices[device].spec.name}",
+                    key=device,
+                    value=name,
+                    hint=suggest(name, known),
+                )
+            fault, of_value = known[name]
+            self.process.fault(f"{device}.{fault}", of_value(value))
+
+    def clear(self, device: str) -> None:
+        """End all faults of a device."""
+        for fault, _ in self._faults(device).values():
+            self.process.clear(f"{device}.{fault}")
+
+    def _faults(self, device: str) -> Mapping[str, tuple[str, Callable[[Any], Any]]]:
+        return EMULATED.load(self.plan.devices[device].spec.name).faults
 
 
 @contextmanager
@@ -27,6 +68,19 @@ def emulated(
     model: str | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Iterator[CellPlan]:
+    """Start the emulators of a cell and yield its plan; see ``running_emulators``."""
+    with running_emulators(path, overrides, model=model, settings=settings) as cell:
+        yield cell.plan
+
+
+@contextmanager
+def running_emulators(
+    path: Path,
+    overrides: Mapping[str, Any] | None = None,
+    *,
+    model: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> Iterator[EmulatedCell]:
     """Start the emulators of a cell with the scene around them; they end with the context.
 
     Args:
@@ -42,16 +96,25 @@ def emulated(
         plan = plan_emulated(path, folder, overrides, model=model, settings=settings)
         file = folder / "cell.yaml"
         file.write_text(plan.text())
-        with EmulatorProcess("cell", str(file), "--folder", str(folder), timeout_s=_START_S):
-            before = os.environ.get(EMULATED_CAMERAS)
-            os.environ[EMULATED_CAMERAS] = str(folder)
-            try:
-                yield plan
-            finally:
-                if before is None:
-                    del os.environ[EMULATED_CAMERAS]
-                else:
-                    os.environ[EMULATED_CAMERAS] = before
+        variables = {EMULATED_CAMERAS: str(folder), **pace_variables(plan.cell.emulated_pace)}
+        arguments = ("cell", str(file), "--folder", str(folder))
+        with _environment(variables), EmulatorProcess(*arguments, timeout_s=_START_S) as process:
+            yield EmulatedCell(plan, process)
+
+
+@contextmanager
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables within the context, for drivers in this process and for emulators in theirs."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def plan_emulated(

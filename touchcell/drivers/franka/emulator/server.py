@@ -45,7 +45,7 @@ from touchcell.drivers.franka.emulator.codec import (
 from touchcell.drivers.franka.errors import BY_NAME, ERRORS
 from touchcell.errors import ConfigError
 from touchcell.testing.emulation.base import CommandOnset, Emulator
-from touchcell.testing.emulation.ticker import Ticker
+from touchcell.testing.emulation.ticker import Tick, Ticker
 
 _PERIOD_NS = 1_000_000
 _LOST_LIMIT = 20
@@ -113,6 +113,7 @@ class FrankaEmulator(Emulator):
         self._udp.bind((self._host, 0))
         self._udp.setblocking(False)
         self._describe_tool()
+        self.publish_joints(self._arm.q)
         self._ticker = Ticker(_PERIOD_NS, self._tick)
 
     async def stop(self) -> None:
@@ -230,16 +231,18 @@ class FrankaEmulator(Emulator):
             self._client.close()
             self._client, self._client_udp = None, None
 
-    def _tick(self, late: bool) -> None:
+    def _tick(self, tick: Tick) -> None:
         if "pause" in self.active:
             return
-        self._counts["late"] += late
+        self._counts["late"] += tick.late
+        self._coast(tick.coasted)
         self._state.message_id += 1
         if "unplug" not in self.active:
             self._read_requests()
         command = self._read_command()
         if self._move_id is not None:
             self._advance(command)
+        self.publish_joints(self._arm.q)
         self._send_state()
 
     def _read_requests(self) -> None:
@@ -390,6 +393,15 @@ class FrankaEmulator(Emulator):
             return
         if command is not None and (command.finished or command.torque_finished):
             self._finish_move(MoveStatus.SUCCESS, Mode.IDLE)
+
+    def _coast(self, periods: int) -> None:
+        """Move on for periods in which this process did not run; that no command came is not the client's fault."""
+        self._state.message_id += periods
+        try:
+            for _ in range(periods if self._move_id is not None else 0):
+                self._arm.step(None, _PERIOD_NS * 1e-9)
+        except Reflex as reflex:
+            self._reflex(reflex.name, reflex.detail)
 
     def _reflex(self, name: str, detail: str = "") -> None:
         flag = _INDEX[name]

@@ -197,6 +197,7 @@ class UrEmulator(Emulator):
 
     async def start(self) -> None:
         await self._listen()
+        self.publish_joints(self._controller.arm.q)
         self._clock = asyncio.create_task(self._run())
 
     async def stop(self) -> None:
@@ -350,6 +351,7 @@ class UrEmulator(Emulator):
             due_s = max(due_s + PERIOD_S, loop.time() - _MAX_LATE_S)
             await asyncio.sleep(max(0.0, due_s - loop.time()))
             self._controller.step()
+            self.publish_joints(self._controller.arm.q)
             self._steps += 1
             self._stream()
 

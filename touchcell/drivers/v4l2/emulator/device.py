@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+from touchcell.drivers.core.paced_clock import emulated_clock
 from touchcell.drivers.v4l2 import codec
 
 S = TypeVar("S", bound=ctypes.Structure)
@@ -177,7 +177,7 @@ class CameraModel:
             return errno.ENOTTY
         if request in _CHANGING:
             self.settings_changed += 1
-            self.last_command_ns = time.monotonic_ns()
+            self.last_command_ns = emulated_clock().now_ns()
         try:
             if request in _GUARDED and handle.priority < max(other.priority for other in self.handles):
                 raise Refused(errno.EBUSY)
@@ -530,7 +530,7 @@ class CameraModel:
                 self._post(handle, identity, changes)
 
     def _post(self, handle: Handle, identity: int, changes: int) -> None:
-        control, now_ns = self.controls[identity], time.monotonic_ns()
+        control, now_ns = self.controls[identity], emulated_clock().now_ns()
         handle.events.append(
             codec.Event(
                 type=_EVENT_CONTROL,

@@ -17,12 +17,12 @@ import os
 import socket
 import struct
 import sys
-import time
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
+from touchcell.drivers.core.paced_clock import emulated_clock
 from touchcell.drivers.v4l2 import codec
 from touchcell.drivers.v4l2.emulator import picture
 from touchcell.drivers.v4l2.emulator.device import SLOT_BYTES, CameraModel, Handle
@@ -71,6 +71,7 @@ class V4l2Emulator(Emulator):
         minor: number N of its /dev/videoN.
         images: folder of images to show instead of the synthetic ones.
         show: function from a frame's number to the grey image (height, width) to show; replaces both.
+        latency_s: time from a frame's exposure to its delivery.
     """
 
     faults: ClassVar = {
@@ -80,6 +81,7 @@ class V4l2Emulator(Emulator):
         "freeze_frame": "the same image for ever, with fresh timestamps and numbers",
         "corrupt": "number of truncated frames",
         "error_flag": "number of frames that the kernel marks as corrupt",
+        "gain": "factor on the brightness, as of a lamp that fails",
         "exposure_drift": "change of brightness per second, as a fraction",
         "stuck_controls": "controls accept every value and change nothing",
         "no_monotonic": "timestamps on an unknown clock",
@@ -111,8 +113,10 @@ class V4l2Emulator(Emulator):
         minor: int = 0,
         images: Path | None = None,
         show: Callable[[int], ImageArray] | None = None,
+        latency_s: float = 0.0,
     ) -> None:
         super().__init__()
+        self._latency_s = latency_s
         self._show = show
         self._folder = folder
         self._minor = minor
@@ -183,7 +187,7 @@ class V4l2Emulator(Emulator):
         if fault == "restart":
             asyncio.get_running_loop().call_later(float(value), self.end, "restart")
         if fault == "exposure_drift":
-            self._drift_since_s = time.monotonic()
+            self._drift_since_s = 1e-9 * emulated_clock().now_ns()
         if fault == "no_monotonic":
             self.model.stamp_flags &= ~codec.BUF_TIMESTAMP_MASK
         if fault == "reset_controls":
@@ -297,7 +301,7 @@ class V4l2Emulator(Emulator):
                 self._expose()
 
     def _expose(self) -> None:
-        stamp_ns = time.monotonic_ns()
+        stamp_ns = emulated_clock().now_ns()
         self._sequence += 1
         if self.spend("drop"):
             self._counts["dropped"] += 1
@@ -320,7 +324,7 @@ class V4l2Emulator(Emulator):
             stamp_ns -= _OLDER_FRAMES * round(1e9 / self.model.rate_hz)
         if "no_monotonic" in self.active:
             stamp_ns += _FOREIGN_CLOCK_NS
-        stream, delay_s = self._stream, float(self.active.get("delay", 0.0))
+        stream, delay_s = self._stream, self._latency_s + float(self.active.get("delay", 0.0))
         if delay_s > 0.0:
             asyncio.get_running_loop().call_later(delay_s, self._deliver, stream, data, sequence, stamp_ns, flags)
         else:
@@ -373,8 +377,9 @@ class V4l2Emulator(Emulator):
             light *= math.sqrt(controls[codec.CID_EXPOSURE_ABSOLUTE].value / _EXPOSURE_FOR_FULL_LIGHT)
         if "dark" in self.active:
             light *= _DARKNESS
+        light *= float(self.active.get("gain", 1.0))
         drift_per_s = float(self.active.get("exposure_drift", 0.0))
-        return light * max(0.0, 1.0 + drift_per_s * (time.monotonic() - self._drift_since_s))
+        return light * max(0.0, 1.0 + drift_per_s * (1e-9 * emulated_clock().now_ns() - self._drift_since_s))
 
 
 @lru_cache(maxsize=96)

@@ -1,0 +1,128 @@
+"""Mesh files of cell files: read, refused with file, line, key and remedy, repaired on request."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from touchcell.cell.config.schema import plan_cell
+from touchcell.cell.config.yaml_file import InvalidCell
+from touchcell.errors import ConfigError
+from touchcell.simulation.meshes import primitives
+from touchcell.simulation.meshes.load import load_mesh, what_is_open
+from touchcell.simulation.meshes.smoothing import TriangleMesh
+
+trimesh = pytest.importorskip("trimesh")
+
+CELL = """extends: surface_follow_sim.yaml
+name: part
+scene:
+  surfaces:
+    ramp:
+      kind: mesh
+      file: {file}
+      unit: {unit}
+      pose_mm_deg: [0, 0, -20, 0, 0, 0]
+arms:
+  arm: {{start_pose_mm_deg: [0, 0, 45, 180, 0, 0]}}
+"""
+
+
+def export(path: Path, mesh: TriangleMesh, scale: float = 1e3) -> Path:
+    trimesh.Trimesh(scale * mesh.vertices, mesh.faces, process=False).export(path)
+    return path
+
+
+def without(mesh: TriangleMesh, count: int) -> TriangleMesh:
+    return TriangleMesh(mesh.vertices, mesh.faces[:-count])
+
+
+BALL = primitives.ball(0.04, rows=17, sections=32)
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
+def test_stl_obj_and_ply_are_the_same_mesh(tmp_path: Path, suffix: str) -> None:
+    mesh = load_mesh(export(tmp_path / f"ball.{suffix}", BALL), "mm", repair=False)
+    assert len(mesh.faces) == len(BALL.faces)
+    assert len(mesh.vertices) == len(BALL.vertices)
+    assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(0.08, abs=1e-6)
+
+
+def test_a_cell_finds_its_mesh_beside_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "there").mkdir()
+    export(tmp_path / "there" / "ball.stl", BALL)
+    (tmp_path / "there" / "cell.yaml").write_text(CELL.format(file="ball.stl", unit="mm"))
+    monkeypatch.chdir(tmp_path)
+    plan = plan_cell(Path("there/cell.yaml"))
+    assert plan.cell.scene is not None
+    assert Path(plan.cell.scene["surfaces"]["ramp"]["file"]) == tmp_path / "there" / "ball.stl"
+    assert str(tmp_path / "there" / "ball.stl") in plan.text()
+
+
+@pytest.mark.parametrize(
+    ("file", "unit", "key", "line", "part"),
+    [
+        ("missing.stl", "mm", "file", 7, "no such file"),
+        ("ball.stl", "m", "unit", 8, "unit: mm"),
+        ("inches.stl", "mm", "unit", 8, "unit: inch"),
+        ("hole.stl", "mm", "file", 7, "repair: true"),
+        ("flipped.stl", "mm", "file", 7, "repair: true"),
+        ("inside_out.stl", "mm", "file", 7, "repair: true"),
+        ("text.stl", "mm", "file", 7, "export"),
+        ("cut.stl", "mm", "file", 7, "STL"),
+        ("empty.obj", "mm", "file", 7, "empty"),
+        ("points.obj", "mm", "file", 7, "no faces"),
+        ("infinite.obj", "mm", "file", 7, "finite"),
+        ("ball.step", "mm", "file", 7, "STL"),
+    ],
+)
+def test_a_bad_mesh_is_named_with_line_key_and_remedy(
+    tmp_path: Path, file: str, unit: str, key: str, line: int, part: str
+) -> None:
+    whole = export(tmp_path / "ball.stl", BALL).read_bytes()
+    export(tmp_path / "inches.stl", BALL, 1.0 / 25.4e-3)
+    export(tmp_path / "hole.stl", without(BALL, 4))
+    export(tmp_path / "inside_out.stl", TriangleMesh(BALL.vertices, BALL.faces[:, ::-1]))
+    flipped = BALL.faces.copy()
+    flipped[::7] = flipped[::7, ::-1]
+    export(tmp_path / "flipped.stl", TriangleMesh(BALL.vertices, flipped))
+    (tmp_path / "text.stl").write_text("this is no mesh\n")
+    (tmp_path / "cut.stl").write_bytes(whole[:1000])
+    (tmp_path / "empty.obj").write_text("")
+    (tmp_path / "points.obj").write_text("v 0 0 0\nv 50 0 0\n")
+    (tmp_path / "infinite.obj").write_text("v 0 0 0\nv 50 0 nan\nv 0 50 0\nf 1 2 3\n")
+    (tmp_path / "ball.step").write_bytes(whole)
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(CELL.format(file=file, unit=unit))
+    with pytest.raises(InvalidCell) as caught:
+        plan_cell(cell)
+    (problem,) = caught.value.problems
+    assert (problem.key, problem.line, problem.file) == (f"scene.surfaces.ramp.{key}", line, str(cell))
+    assert part in str(problem)
+
+
+def test_the_unit_is_never_guessed(tmp_path: Path) -> None:
+    export(tmp_path / "ball.stl", BALL)
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(CELL.format(file="ball.stl", unit="mm").replace("      unit: mm\n", ""))
+    with pytest.raises(ConfigError) as caught:
+        plan_cell(cell)
+    assert "unit" in str(caught.value)
+
+
+def test_a_repair_closes_small_holes_and_orients_faces(tmp_path: Path) -> None:
+    damaged = without(BALL, 4).faces.copy()
+    damaged[::7] = damaged[::7, ::-1]
+    path = export(tmp_path / "damaged.stl", TriangleMesh(BALL.vertices, damaged))
+    mended = load_mesh(path, "mm", repair=True)
+    assert not what_is_open(mended)
+    a, b, c = (mended.vertices[mended.faces[:, i]] for i in range(3))
+    assert np.einsum("mc,mc->", a, np.cross(b, c)) > 0.0
+
+
+def test_a_repaired_sheet_stays_a_sheet(tmp_path: Path) -> None:
+    side = np.linspace(-0.05, 0.05, 21)
+    sheet = primitives.height_field(np.add.outer(-5.0 * side**2, 5.0 * side**2), float(side[1] - side[0]))
+    mended = load_mesh(export(tmp_path / "saddle.stl", sheet), "mm", repair=True)
+    assert len(mended.faces) == len(sheet.faces)
+    assert np.all(mended.face_normals()[:, 2] > 0.0)

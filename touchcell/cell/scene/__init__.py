@@ -1,0 +1,1 @@
+"""What a cell looks like in three dimensions: one description for recordings, viewers, pictures and pages."""

@@ -1,0 +1,1 @@
+"""Many trainings of estimators, kinds by data sets by seeds, on an executor."""

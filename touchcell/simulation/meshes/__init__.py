@@ -1,0 +1,1 @@
+"""Triangle meshes as surfaces to touch: reading, checking, smoothing, nearest points."""

@@ -1,0 +1,170 @@
+"""Mesh files: read, checked, and repaired where that is asked for. Needs the extra ``mesh``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from touchcell.errors import ConfigError
+from touchcell.simulation.meshes.smoothing import Edges, TriangleMesh
+
+Unit = Literal["mm", "m", "inch"]
+UNITS: Final[dict[str, float]] = {"mm": 1e-3, "m": 1.0, "inch": 25.4e-3}
+"""Metres of one unit of a mesh file, which cannot tell which one it has."""
+
+SUFFIXES: Final = (".stl", ".obj", ".ply")
+SMALLEST_M: Final = 10e-3
+LARGEST_M: Final = 2.0
+MOST_FACES: Final = 1_000_000
+LARGEST_HOLE: Final = 12
+"""Edges around a hole that a repair closes."""
+INSTALL: Final = "pip install 'touchcell[mesh]'"
+
+
+@contextmanager
+def mesh_library(key: str, value: str) -> Iterator[None]:
+    """Guard imports of the mesh library. Raises ConfigError, with what to install, where it is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        reason = f"needs {error.name}, which is not installed"
+        raise ConfigError(reason, key=key, value=value, hint=INSTALL) from None
+
+
+def load_mesh(path: Path, unit: Unit, *, repair: bool) -> TriangleMesh:
+    """Read a mesh file: STL, OBJ or PLY.
+
+    Vertices that coincide are merged and faces without an area dropped, always. A mesh that does not enclose a volume
+    is refused unless ``repair`` asks for small holes to be closed and faces to be oriented; what stays open is a sheet,
+    whose outside is where the normals of its faces point.
+
+    Raises:
+        ConfigError: no mesh, of an unlikely size, with too many faces, or open without ``repair``; its ``key`` is the
+            key to change.
+    """
+    _require_likely_file(path)
+    with mesh_library("file", str(path)):
+        import trimesh
+    try:
+        loaded: Any = trimesh.load_mesh(str(path), process=False)
+    except Exception as error:  # Its readers raise whatever a damaged file makes them stumble over.
+        # Of a damaged file it may try a text format whose optional decoder is not installed.
+        detail = "" if isinstance(error, ImportError) else f": {error}"
+        reason = f"is no {path.suffix[1:].upper()} file that can be read{detail}"
+        raise ConfigError(reason, key="file", value=str(path), hint="it may be cut off; export it again") from None
+    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
+        raise ConfigError("has no faces", key="file", value=str(path), hint="export triangles, not points or curves")
+    if len(loaded.faces) > MOST_FACES:
+        raise ConfigError(
+            f"has {len(loaded.faces)} faces, more than {MOST_FACES}",
+            key="file",
+            value=str(path),
+            hint="decimate it: 100 000 faces describe a hand-sized object to 0.01 mm",
+        )
+    if not np.isfinite(loaded.vertices).all():
+        raise ConfigError("has a vertex that is not finite", key="file", value=str(path), hint="export it again")
+    _require_likely_size(path, loaded.vertices, unit)
+    loaded.merge_vertices(merge_tex=True, merge_norm=True)
+    mesh = _without_empty_faces(_triangles(loaded, unit))
+    if repair:
+        return _repaired(mesh)
+    if problem := what_is_open(mesh):
+        raise ConfigError(
+            f"does not enclose a volume: {problem}",
+            key="file",
+            value=str(path),
+            hint="`repair: true` closes small holes and orients the faces; what stays open is used as a sheet whose "
+            "outside is where its faces' normals point",
+        )
+    if volume_m3(mesh) < 0.0:
+        hint = "`repair: true` turns its faces round"
+        raise ConfigError("is inside out: its normals point inwards", key="file", value=str(path), hint=hint)
+    return mesh
+
+
+def what_is_open(mesh: TriangleMesh) -> str:
+    """Return why a mesh does not enclose a volume; empty if it does."""
+    edges = Edges.of(mesh.faces)
+    counts = (
+        (edges.open_count, "edges of one face only"),
+        (edges.crowded_count, "edges of more than two faces"),
+        (edges.flipped_count, "edges whose faces disagree about the outside"),
+    )
+    return ", ".join(f"{count} {what}" for count, what in counts if count)
+
+
+def volume_m3(mesh: TriangleMesh) -> float:
+    """Return the enclosed volume, negative for a mesh that is inside out."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] - mesh.vertices[0] for i in range(3))
+    return float(np.einsum("mc,mc->", a, np.cross(b, c)) / 6.0)
+
+
+def _require_likely_file(path: Path) -> None:
+    if path.suffix.lower() not in SUFFIXES:
+        known = ", ".join(SUFFIXES)
+        raise ConfigError(f"is none of {known}", key="file", value=str(path), hint="export it as STL, OBJ or PLY")
+    try:
+        empty = not path.stat().st_size
+    except OSError as error:
+        raise ConfigError(f"cannot be read: {error.strerror}", key="file", value=str(path)) from None
+    if empty:
+        raise ConfigError("is empty", key="file", value=str(path), hint="export it again")
+
+
+def _require_likely_size(path: Path, vertices: Any, unit: Unit) -> None:
+    extent = float(np.ptp(np.asarray(vertices), axis=0).max())
+    size_m = extent * UNITS[unit]
+    if SMALLEST_M <= size_m <= LARGEST_M:
+        return
+    likely = [each for each, metres in UNITS.items() if 10e-3 <= extent * metres <= 1.0]
+    others = " or ".join(f"`unit: {each}` ({extent * UNITS[each] * 1e3:.4g} mm)" for each in likely)
+    raise ConfigError(
+        f"{path.name} would be {size_m * 1e3:.4g} mm large, which no tip follows",
+        key="unit",
+        value=unit,
+        hint=f"its size suggests {others}" if others else "export it in millimetres",
+    )
+
+
+def _triangles(loaded: Any, unit: Unit) -> TriangleMesh:
+    return TriangleMesh(
+        np.ascontiguousarray(loaded.vertices, dtype=np.float64) * UNITS[unit],
+        np.ascontiguousarray(loaded.faces, dtype=np.int32),
+    )
+
+
+def _without_empty_faces(mesh: TriangleMesh) -> TriangleMesh:
+    a, b, c = mesh.faces.T
+    kept = mesh.faces[(a != b) & (b != c) & (c != a)]
+    _, first = np.unique(np.sort(kept, axis=1), axis=0, return_index=True)
+    return TriangleMesh(mesh.vertices, np.ascontiguousarray(kept[np.sort(first)]))
+
+
+def _repaired(mesh: TriangleMesh) -> TriangleMesh:
+    import trimesh
+
+    made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    trimesh.repair.fix_winding(made)
+    mended = _with_holes_closed(_without_empty_faces(_triangles(made, "m")))
+    if not what_is_open(mended) and volume_m3(mended) < 0.0:
+        mended = TriangleMesh(mended.vertices, np.ascontiguousarray(mended.faces[:, ::-1]))
+    return mended
+
+
+def _with_holes_closed(mesh: TriangleMesh) -> TriangleMesh:
+    """Close each ring of up to LARGEST_HOLE open edges by a fan; its own border and larger holes stay open."""
+    face, edge = np.nonzero(Edges.of(mesh.faces).other < 0)
+    start, end = mesh.faces[face, edge].tolist(), mesh.faces[face, (edge + 1) % 3].tolist()
+    onwards = dict(zip(start, end, strict=True))
+    lids: list[tuple[int, int, int]] = []
+    while onwards:
+        ring = [next(iter(onwards))]
+        while (after := onwards.pop(ring[-1], None)) is not None and after != ring[0]:
+            ring.append(after)
+        if after is not None and 3 <= len(ring) <= LARGEST_HOLE:
+            lids += [(ring[0], ring[i + 1], ring[i]) for i in range(1, len(ring) - 1)]
+    return TriangleMesh(mesh.vertices, np.concatenate([mesh.faces, np.array(lids, np.int32).reshape(-1, 3)]))

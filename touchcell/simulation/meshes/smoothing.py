@@ -1,0 +1,186 @@
+"""The smooth surface that a triangle mesh stands for: normals and curvature at the corners of its faces.
+
+Faces that meet at no more than the crease angle belong to one smooth piece. Its normals are those of Max (1999), which
+are exact on a sphere whatever its triangles; curvature is the change of these normals over each face, averaged over the
+faces around a corner (Rusinkiewicz 2004).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from touchcell.geometry.types import Array
+
+Indices = NDArray[np.int32]
+
+_UNEVEN: Final = 16.0
+"""Largest over smallest face around a corner from which the largest sets the normal: a flat beside a fine fillet."""
+
+
+@dataclass(frozen=True, slots=True)
+class TriangleMesh:
+    """Vertices and faces.
+
+    Attributes:
+        vertices: (n, 3) m.
+        faces: (m, 3) indices of vertices, counter-clockwise seen from outside.
+    """
+
+    vertices: Array
+    faces: Indices
+
+    def face_normals(self) -> Array:
+        """Return (m, 3) normals, twice as long as the faces' areas."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        return np.cross(b - a, c - a)
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Edges of a mesh; edge i of a face leads from its corner i to its corner i + 1.
+
+    Attributes:
+        other: (m, 3) the face across each edge; -1 where there is none or more than one.
+        other_edge: (m, 3) which edge of that face it is.
+        open_count: number of edges with one face.
+        crowded_count: number of edges with more than two faces.
+        flipped_count: number of edges whose two faces disagree about the outside.
+    """
+
+    other: Indices
+    other_edge: Indices
+    open_count: int
+    crowded_count: int
+    flipped_count: int
+
+    @classmethod
+    def of(cls, faces: Indices) -> Edges:
+        """Return the edges of ``faces`` (m, 3)."""
+        start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
+        key = np.minimum(start, end) * (int(faces.max()) + 1) + np.maximum(start, end)
+        order = np.argsort(key, kind="stable")
+        _, first, count = np.unique(key[order], return_index=True, return_counts=True)
+        pairs = first[count == 2]
+        one, two = order[pairs], order[pairs + 1]
+        agree = start[one] == end[two]
+        other = np.full(len(key), -1, np.int32)
+        other_edge = np.zeros(len(key), np.int32)
+        for here, there in ((one[agree], two[agree]), (two[agree], one[agree])):
+            other[here], other_edge[here] = there // 3, there % 3
+        return cls(
+            other.reshape(-1, 3),
+            other_edge.reshape(-1, 3),
+            int(np.sum(count == 1)),
+            int(np.sum(count > 2)),
+            int(np.sum(~agree)),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class SmoothMesh:
+    """A mesh with what its nearest points need.
+
+    Attributes:
+        mesh: vertices and faces.
+        normals: (m, 3, 3) unit normal of each corner of each face.
+        bends: (m, 3, 6) shape operator xx yy zz xy xz yz at each corner, 1/m, positive where the surface is convex.
+        neighbours: (m, 3) the face across each smooth edge; -1 for creases and borders.
+        edge_normals: (m, 3, 3) sum of the normals of both faces of each edge.
+        vertex_normals: (n, 3) sum of the normals around each vertex, weighted by their angles.
+    """
+
+    mesh: TriangleMesh
+    normals: Array
+    bends: Array
+    neighbours: Indices
+    edge_normals: Array
+    vertex_normals: Array
+
+
+def smooth(mesh: TriangleMesh, crease_rad: float) -> SmoothMesh:
+    """Return ``mesh`` with normals and curvature; edges sharper than ``crease_rad`` stay sharp."""
+    faces, vertices = mesh.faces, mesh.vertices
+    edges = Edges.of(faces)
+    doubled = mesh.face_normals()
+    area = np.linalg.norm(doubled, axis=1)
+    normal = doubled / np.maximum(area, 1e-300)[:, None]
+
+    cos = np.einsum("mec,mc->me", normal[edges.other], normal)
+    is_smooth = (edges.other >= 0) & (cos >= np.cos(crease_rad) - 1e-12)
+    neighbours = np.where(is_smooth, edges.other, -1).astype(np.int32)
+
+    group = _groups(faces, neighbours, edges.other_edge)
+    normals = _corner_normals(vertices, faces, normal, area, group)
+    bends = _corner_bends(vertices, faces, normal, area, normals, group)
+
+    edge_normals = np.where((edges.other >= 0)[..., None], normal[edges.other] + normal[:, None], normal[:, None])
+    vertex_normals = np.zeros_like(vertices)
+    for i in range(3):
+        a, b = (vertices[faces[:, (i + k) % 3]] - vertices[faces[:, i]] for k in (1, 2))
+        angle = np.arctan2(area, np.einsum("mc,mc->m", a, b))
+        np.add.at(vertex_normals, faces[:, i], angle[:, None] * normal)
+    return SmoothMesh(mesh, normals, bends, neighbours, edge_normals, vertex_normals)
+
+
+def _groups(faces: Indices, neighbours: Indices, other_edge: Indices) -> NDArray[np.int64]:
+    """Return (3 m) the group of each corner: corners at one vertex that smooth edges connect."""
+    face, edge = np.nonzero(neighbours >= 0)
+    other, back = neighbours[face, edge], other_edge[face, edge]
+    # Across an edge the start of one face's is the end of the other's.
+    here = np.concatenate([3 * face + edge, 3 * face + (edge + 1) % 3])
+    there = np.concatenate([3 * other + (back + 1) % 3, 3 * other + back])
+    label = np.arange(faces.size)
+    while True:
+        least = label.copy()
+        np.minimum.at(least, here, label[there])
+        least = least[least]
+        if np.array_equal(least, label):
+            return label
+        label = least
+
+
+def _corner_normals(vertices: Array, faces: Indices, normal: Array, area: Array, group: NDArray[np.int64]) -> Array:
+    by_max, by_area = np.zeros((faces.size, 3)), np.zeros((faces.size, 3))
+    largest, smallest = np.zeros(faces.size), np.full(faces.size, np.inf)
+    for i in range(3):
+        a, b = (vertices[faces[:, (i + k) % 3]] - vertices[faces[:, i]] for k in (1, 2))
+        lengths = np.einsum("mc,mc->m", a, a) * np.einsum("mc,mc->m", b, b)
+        own = group[i::3]
+        np.add.at(by_max, own, (area / np.maximum(lengths, 1e-300))[:, None] * normal)
+        np.add.at(by_area, own, (area**2)[:, None] * normal)
+        np.maximum.at(largest, own, area)
+        np.minimum.at(smallest, own, area)
+    total = np.where((largest > _UNEVEN * smallest)[:, None], by_area, by_max)
+    length = np.linalg.norm(total, axis=1)
+    corner = (total / np.maximum(length, 1e-300)[:, None])[group].reshape(-1, 3, 3)
+    return np.ascontiguousarray(np.where((length[group] > 0.0).reshape(-1, 3, 1), corner, normal[:, None]))
+
+
+def _corner_bends(
+    vertices: Array, faces: Indices, normal: Array, area: Array, normals: Array, group: NDArray[np.int64]
+) -> Array:
+    sides = [vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2)]
+    turns = [normals[:, k] - normals[:, 0] for k in (1, 2)]
+    t = sides[0] / np.maximum(np.linalg.norm(sides[0], axis=1), 1e-300)[:, None]
+    basis = np.stack([t, np.cross(normal, t)], axis=2)
+    E = np.stack([np.einsum("mc,mci->mi", side, basis) for side in sides], axis=2)
+    M = np.stack([np.einsum("mc,mci->mi", turn, basis) for turn in turns], axis=2)
+    determinant = E[:, 0, 0] * E[:, 1, 1] - E[:, 0, 1] * E[:, 1, 0]
+    usable = np.abs(determinant) > 1e-300
+    inverse = (
+        np.stack([np.stack([E[:, 1, 1], -E[:, 0, 1]], axis=1), np.stack([-E[:, 1, 0], E[:, 0, 0]], axis=1)], axis=1)
+        / np.where(usable, determinant, 1.0)[:, None, None]
+    )
+    S = np.where(usable[:, None, None], M @ inverse, 0.0)
+    S = 0.5 * (S + S.transpose(0, 2, 1))
+    full = basis @ S @ basis.transpose(0, 2, 1)
+    own = full[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    total, weight = np.zeros((faces.size, 6)), np.zeros(faces.size)
+    for i in range(3):
+        np.add.at(total, group[i::3], area[:, None] * own)
+        np.add.at(weight, group[i::3], area)
+    return np.ascontiguousarray((total / np.maximum(weight, 1e-300)[:, None])[group].reshape(-1, 3, 6))

@@ -1,0 +1,107 @@
+"""What a tip feels of a surface besides its tangent plane.
+
+The deformation of the skin on a plane is calibrated on real images (``tip.py``). Of another shape it is that of the
+tangent plane, plus what the difference adds: at samples of the skin, how much deeper the surface reaches into the
+undeformed sphere than its tangent plane does, spread over the skin by a kernel as wide as its bending stiffness lets
+it bend. On a plane the difference is zero and nothing changes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, Protocol, runtime_checkable
+
+import numpy as np
+
+from touchcell.geometry.types import Array
+from touchcell.simulation.surfaces import Plane, Surface
+
+_RINGS: Final = 6
+_STEP_RAD: Final = math.radians(11.0)
+_WIDTH_RAD: Final = math.radians(11.0)
+_REACH_M: Final = 6e-3
+"""Skin further than this above the tangent plane is not asked about: it touches in narrow hollows only."""
+
+
+@runtime_checkable
+class ManyDistances(Protocol):
+    """A shape that finds the distances of many points at once."""
+
+    def distances(self, points: Array) -> Array:
+        """Return the (k,) signed distances of ``points`` (k, 3) m."""
+        ...
+
+
+class ReliefKernel:
+    """Samples of the skin, and how markers follow what is felt there.
+
+    Args:
+        directions: (markers, 3) unit vectors from the sphere's centre to the markers.
+    """
+
+    def __init__(self, directions: Array) -> None:
+        ring = np.concatenate([np.full(max(6 * k, 1), k) for k in range(_RINGS + 1)])
+        azimuth = np.concatenate([np.arange(max(6 * k, 1)) * 2.0 * np.pi / max(6 * k, 1) for k in range(_RINGS + 1)])
+        polar = _STEP_RAD * ring
+        self.directions = np.stack(
+            [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=1
+        )
+        cos = np.clip(directions @ self.directions.T, -1.0, 1.0)
+        angle = np.arccos(cos)
+        kernel = np.exp(-((angle / _WIDTH_RAD) ** 2))
+        # The gradient of exp(-(angle / width)^2) along the sphere leads towards the sample.
+        steep = kernel * 2.0 / _WIDTH_RAD**2 * np.where(angle > 1e-6, angle / np.maximum(np.sin(angle), 1e-9), 1.0)
+        towards = self.directions[None] - cos[..., None] * directions[:, None]
+        gradient = steep[..., None] * towards
+        # Outside the samples nothing is felt: there the kernel's sum is filled up by zeros.
+        total = np.maximum(kernel.sum(axis=1), 0.5 * kernel.sum(axis=1).max())[:, None]
+        self._weights = kernel / total
+        self._slopes = np.ascontiguousarray(
+            ((gradient - self._weights[..., None] * gradient.sum(axis=1)[:, None]) / total[..., None]).transpose(
+                0, 2, 1
+            )
+        )
+
+    def values(self, felt: Array) -> Array:
+        """Return (..., markers) of values ``felt`` (..., samples)."""
+        values: Array = felt @ self._weights.T
+        return values
+
+    def slopes(self, felt: Array) -> Array:
+        """Return (..., markers, 3) their gradient along the sphere, per radian."""
+        slopes: Array = np.einsum("mck,...k->...mc", self._slopes, felt)
+        return slopes
+
+
+def felt_relief(surface: Surface, T_world_s: Array, t_s: float, directions: Array, tip_radius_m: float) -> Array | None:
+    """Return (samples,) m: how much further than its tangent plane a surface presses into the undeformed tip.
+
+    Args:
+        surface: the surface that is touched.
+        T_world_s: (4, 4) pose of the sensor.
+        t_s: time of the scene.
+        directions: (samples, 3) of the skin, in the sensor frame.
+        tip_radius_m: radius of the tip.
+
+    Returns:
+        None where a plane is touched, or nothing.
+    """
+    shape = surface.shape
+    if isinstance(shape, Plane):
+        return None
+    T_world_b = surface.motion.pose(t_s)
+    R_b_s = T_world_b[:3, :3].T @ T_world_s[:3, :3]
+    centre = T_world_b[:3, :3].T @ (T_world_s[:3, 3] - T_world_b[:3, 3])
+    nearest = shape.nearest(centre)
+    if nearest.distance_m >= tip_radius_m:
+        return None
+    points = centre + tip_radius_m * directions @ R_b_s.T
+    above = (points - nearest.point) @ nearest.normal
+    asked = above < _REACH_M
+    distances = np.full(len(points), np.inf)
+    if isinstance(shape, ManyDistances):
+        distances[asked] = shape.distances(points[asked])
+    else:
+        distances[asked] = [shape.nearest(p).distance_m for p in points[asked]]
+    relief: Array = np.maximum(-distances, 0.0) - np.maximum(-above, 0.0)
+    return relief

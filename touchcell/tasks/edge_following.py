@@ -1,0 +1,166 @@
+"""Follow an edge: glide along it with the tip half over it, turning with it (docs/explanation/edges.md).
+
+The paper names edges as what its method does not cover (section 6.1). The contact is that of the edge frame {e}: depth
+and tilt against the face, lateral offset across the edge, turn about the normal. Along the edge nothing is controlled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Final, Literal
+
+import numpy as np
+from pydantic import Field, PositiveFloat
+
+from touchcell.control.pid import PidGains
+from touchcell.drivers.core.protocols import SERVO_ARM
+from touchcell.geometry.types import Array
+from touchcell.tasks.bend import Bend
+from touchcell.tasks.contact_servo import ContactServo, SixGains
+from touchcell.tasks.interface import DEPTH, SPEED, TaskContext, TaskSpec
+from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
+
+_AXES: Final = {
+    2: (True, True, False, False, False, True),
+    3: (True, True, True, False, False, True),
+    5: (True, True, True, True, True, True),
+}
+"""Components of the sensor's twist that a task of so many dimensions commands."""
+
+
+_BEND_SHARE: Final = 0.6
+"""Of the largest turn that a bend may take, so that corrections have the rest."""
+_FASTEST_TILT_RAD_S: Final = 1.0
+"""Of the tilt that is fed forward."""
+
+
+class EdgeFollowingConfig(ServoConfig):
+    """Parameters of edge following.
+
+    Attributes:
+        depth_mm: indentation to hold, normal to the face beside the edge.
+        offset_mm: distance of the tip beyond the edge; negative on the face.
+        dimensions: 2 steers across the edge and turns with it, in the plane in which the contact settled; 3 holds the
+            depth too, over a curved sheet; 5 also stays normal to the face.
+        direction: forward keeps the face to the left of the travel, seen from above it.
+        speed_mm_s: speed along the edge.
+        distance_mm: length of the edge to follow, at most.
+        close_loop: end where the edge leads back to where it began, and fail where it does not.
+        bend_window_mm: the turn of the edge over this last stretch is fed forward.
+        closing_mm: distance from there at which the loop is closed.
+    """
+
+    depth_mm: Annotated[PositiveFloat, DEPTH] = 3.0
+    offset_mm: float = Field(default=0.0, ge=-10.0, le=10.0)
+    dimensions: Literal[2, 3, 5] = 5
+    direction: Literal["forward", "backward"] = "forward"
+    kp_per_s: SixGains = (8.0, 0.0, 8.0, 8.0, 8.0, 8.0)
+    ki_per_s2: SixGains = (16.0, 0.0, 16.0, 16.0, 16.0, 16.0)
+    max_turn_deg_s: PositiveFloat = 180.0
+    max_integral_turn_deg_s: PositiveFloat = 60.0
+    bend_window_mm: PositiveFloat = 5.0
+    speed_mm_s: Annotated[PositiveFloat, SPEED] = 30.0
+    distance_mm: PositiveFloat = 100.0
+    close_loop: bool = False
+    closing_mm: PositiveFloat = 3.0
+    return_lift_mm: PositiveFloat | None = 3.0
+
+    def gains(self) -> PidGains:
+        """Return gains and limits in SI units; tilt is controlled in five dimensions only."""
+        gains = super().gains()
+        if self.dimensions == 5:
+            return gains
+        used = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 1.0])
+        return PidGains(
+            used * self.kp_per_s,
+            used * self.ki_per_s2,
+            used * self.kd,
+            gains.integral_limit,
+            gains.integral_zone,
+            gains.output_limit,
+        )
+
+
+class FollowEdge:
+    """Behavior of edge following: along the edge until its length is covered or its loop closed."""
+
+    def __init__(self, config: EdgeFollowingConfig) -> None:
+        self._sign = 1.0 if config.direction == "forward" else -1.0
+        self._speed_m_s = 1e-3 * config.speed_mm_s
+        self._feedforward = np.zeros(6)
+        self._turn_bend, self._tilt_bend = Bend(1e-3 * config.bend_window_mm), Bend(2e-3 * config.bend_window_mm)
+        self._fastest_rad_s = math.radians(config.max_turn_deg_s)
+        self._tilts = config.dimensions == 5
+        self._distance_m = 1e-3 * config.distance_mm
+        self._close_loop, self._closing_m = config.close_loop, 1e-3 * config.closing_mm
+        self._timeout_s = 3.0 * config.distance_mm / config.speed_mm_s + 5.0
+        self._start: Array | None = None
+        self._travelled_m = 0.0
+        self._away = False
+        self._closed = False
+
+    @property
+    def feedforward(self) -> Array:
+        """Twist (6,) in the desired sensor frame."""
+        return self._feedforward
+
+    @property
+    def timeout_s(self) -> float:
+        """Three times the nominal duration, for corners, plus five seconds."""
+        return self._timeout_s
+
+    def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
+        """Add up the way along the edge; return True once it is long enough, or its loop is closed.
+
+        Where the edge leads far from where the sensor heads, as at a corner, it turns before it goes on; in a bend it
+        goes no faster than it can turn.
+        """
+        if self._start is None:
+            self._start = now[:3, 3].copy()
+        step = now[:3, :3].T @ (now[:3, 3] - before[:3, 3])
+        self._travelled_m += self._sign * float(step[1])
+        self._turn_bend.update(float(step[1]), now, T_s_f)
+        self._tilt_bend.update(float(step[1]), now, T_s_f)
+        turn = 0.0 if T_s_f is None else math.atan2(T_s_f[1, 0], T_s_f[0, 0])
+        bend = float(self._turn_bend.rad_per_m()[2])
+        speed = min(self._speed_m_s, _BEND_SHARE * self._fastest_rad_s / max(abs(bend), 1e-9))
+        speed *= max(math.cos(min(2.0 * abs(turn), math.pi / 2.0)), 0.0)
+        self._feedforward[1] = self._sign * speed
+        self._feedforward[5] = speed * bend
+        if self._tilts:
+            tilt = speed * self._tilt_bend.rad_per_m()[:2]
+            self._feedforward[3:5] = np.clip(tilt, -_FASTEST_TILT_RAD_S, _FASTEST_TILT_RAD_S)
+        if self._close_loop:
+            from_start = float(np.linalg.norm(now[:3, 3] - self._start))
+            self._away = self._away or from_start > 3.0 * self._closing_m
+            self._closed = self._away and from_start <= self._closing_m
+        return self._closed or self._travelled_m >= self._distance_m
+
+    def shortfall(self) -> str:
+        """Return that a loop that was to be closed is not."""
+        if self._close_loop and not self._closed:
+            return f"the loop is not closed after {1e3 * self._travelled_m:.0f} mm"
+        return ""
+
+    def telemetry(self) -> Mapping[str, float]:
+        """Return the way along the edge so far."""
+        return {"along_edge_mm": 1e3 * self._travelled_m}
+
+
+def _build(config: EdgeFollowingConfig, context: TaskContext) -> ServoTask:
+    reference = (config.offset_mm, 0.0, config.depth_mm, 0.0, 0.0, 0.0)
+    axes = _AXES[config.dimensions]
+    servo = ContactServo(ARM, SENSOR, config, reference, FollowEdge(config), context, axes, decoupled=True)
+    return ServoTask("edge_following", config, context, servo)
+
+
+SPEC = TaskSpec(
+    "edge_following",
+    "glide along an edge, half over it and turning with it, round corners and loops",
+    EdgeFollowingConfig,
+    {ARM: SERVO_ARM},
+    frozenset({SENSOR}),
+    _build,
+    feature="edge",
+)
