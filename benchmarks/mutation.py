@@ -53,7 +53,10 @@ from touchcell.paths import CHECKOUT
 
 Change = Callable[[ast.AST], None]
 
-_OF_INTERLOCKS = ("tests/control/interlocks", "tests/control/test_supervisor.py", "tests/control/test_latch.py")
+_OF_INTERLOCKS = (
+    "tests/control/interlocks",
+    *(f"tests/control/test_{name}.py" for name in ("supervisor", "latch", "proof")),
+)
 _OF_THE_GATE = ("tests/drivers/core/test_gate.py", "tests/drivers/core/test_gate_refusals.py")
 _OF_RUNS = tuple(
     f"tests/cell/runtime/test_{name}.py" for name in ("stopping_measures", "stopping", "reset_procedure", "reset")
@@ -438,7 +441,6 @@ class _Trials(_WithoutShrinking):
         items = {item.nodeid: item for item in session.items}
         for name in names:
             importlib.import_module(_module(MODULES[name][0]))
-        gc.freeze()
         there, here = multiprocessing.get_context("fork").Pipe()
         process = multiprocessing.get_context("fork").Process(target=_trace, args=(list(items.values()), files, here))
         process.start()

@@ -119,3 +119,15 @@ def test_the_terminal_shows_what_was_asked_for(
 def test_the_library_configures_no_logging() -> None:
     assert logging.getLogger(LOGGER).handlers == []
     assert logging.getLogger(LOGGER).level == logging.NOTSET
+
+
+def test_an_unexpected_exception_is_one_line_on_the_terminal_and_whole_in_the_log_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with log_to_terminal(0), log_to_file(tmp_path / "a.log"):
+        try:
+            raise ValueError("covariance")
+        except ValueError as error:
+            logging.getLogger("touchcell.cell").error("running: %s", error, exc_info=error)
+    assert capsys.readouterr().err == "touchcell: ERROR: running: covariance\n"
+    assert "Traceback" in (tmp_path / "a.log").read_text()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
@@ -84,6 +85,15 @@ def log_to_file(path: Path) -> Iterator[None]:
         file.close()
 
 
+class _OneLine(logging.Formatter):
+    """Leaves the traceback of an exception out: it is in the run folder's log file, and on the terminal with -v."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        shown = copy.copy(record)
+        shown.exc_info = shown.exc_text = shown.stack_info = None
+        return super().format(shown)
+
+
 @contextmanager
 def log_to_terminal(verbosity: int) -> Iterator[None]:
     """For a command line: warnings on standard error, with 1 also INFO, with 2 also DEBUG, and nowhere else."""
@@ -93,7 +103,7 @@ def log_to_terminal(verbosity: int) -> Iterator[None]:
     handler = logging.StreamHandler()
     handler.setLevel(level)
     shown = "%(levelname)s %(name)s: %(message)s" if verbosity else "touchcell: %(levelname)s: %(message)s"
-    handler.setFormatter(logging.Formatter(shown))
+    handler.setFormatter(logging.Formatter(shown) if verbosity else _OneLine(shown))
     before, before_propagate = logger.level, logger.propagate
     logger.setLevel(level)
     logger.propagate = False

@@ -198,3 +198,20 @@ def test_the_healthy_cell_is_fresh_at_rest_and_without_contact() -> None:
 def test_a_proof_logs_no_trips(caplog: pytest.LogCaptureFixture) -> None:
     proven(ProvableConfig())
     assert caplog.records == []
+
+
+@pytest.mark.parametrize("by_error", [False, True])
+def test_one_that_raises_in_place_of_comparing_its_limit_is_refused_unless_a_measurement_is_missing(
+    by_error: bool,
+) -> None:
+    class Glare(BrightConfig):
+        def faults(self, facts: CellFacts) -> Iterable[Fault | CannotTrip]:
+            yield Fault("sensor", "glare", "200", partial(_glare, "sensor", 210.0), by_error=by_error)
+
+    def broken(view: CellView) -> None:
+        if view.sensors["sensor"].brightness is not None:
+            raise KeyError("no such arm")
+
+    proof = proven(Glare(), Bright(200.0, judge=broken))
+    assert (proof.problem == "") == by_error
+    assert by_error or "no such arm" in proof.problem

@@ -174,6 +174,17 @@ def test_pose_and_joints_are_true(benches: Callable[..., FrankaHarness]) -> None
     np.testing.assert_allclose(harness.arm.joints(1.0).value.q, truth["q"], atol=1e-6)
 
 
+def test_before_the_tool_is_set_in_the_controller_the_pose_is_that_of_the_configured_one(
+    benches: Callable[..., FrankaHarness],
+) -> None:
+    harness = benches(flange_to_tcp_mm_deg=TOOL_MM_DEG)
+    harness.arm.connect()
+    before = harness.arm.tcp(1.0).value
+    assert np.abs(harness.truth()["F_T_EE"] - se3.from_euler_mm_deg(TOOL_MM_DEG)).max() > 0.01
+    harness.arm.configure()
+    np.testing.assert_allclose(before.T_base_tcp, harness.arm.tcp(1.0).value.T_base_tcp, atol=1e-6)
+
+
 def test_a_pure_rotation_keeps_the_tool_centre_point_in_place(benches: Callable[..., FrankaHarness]) -> None:
     harness = benches(flange_to_tcp_mm_deg=TOOL_MM_DEG)
     lease = harness.active()

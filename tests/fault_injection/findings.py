@@ -1,14 +1,16 @@
-"""What an adversarial audit and a first user found in version 0.1.0, and what each reproduction gives now.
+"""What an adversarial audit and a first user found in version 0.1.0, and what each reproduction gives then and now.
 
-``python -m benchmarks findings [ROW ...]`` runs one small reproduction for each row and prints a table: what was found,
-what 0.1.0 did (recorded then), what happens now. Rows S are of safety, R of reliability and evidence, a of use.
+``python -m benchmarks findings [--against CHECKOUT] [ROW ...]`` runs one small reproduction for each row and prints a
+table: what was found, what 0.1.0 does, what happens now. With a checkout of 0.1.0 that has its own ``.venv``, the same
+is tried there (``tests/earlier``); without, what was recorded then is printed. Rows S are of safety, R of reliability
+and evidence, a of use.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import getpass
-import gzip
 import hashlib
 import io
 import json
@@ -26,8 +28,10 @@ from typing import Any
 import numpy as np
 import yaml
 
+from tests.fault_injection import findings_cells as cells_of
 from tests.fault_injection import fuzz_cells, fuzz_recordings
 from tests.helpers.operated_run import OperatedRun, waiting_cell
+from touchcell.cell.bench.provenance import provenance
 from touchcell.cell.cli.main import main
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.config.true_contact import put_on_true_contact
@@ -41,7 +45,9 @@ from touchcell.control.interlocks.snapshot import CellView, SensorView
 from touchcell.control.latch import Latch
 from touchcell.control.supervisor import Supervisor
 from touchcell.drivers.core.commands import TwistCommand, TwistFrame
+from touchcell.drivers.ur.driver import UrArm
 from touchcell.errors import ConfigError, TouchcellError
+from touchcell.geometry import se3
 from touchcell.paths import CHECKOUT, CONFIGS
 
 
@@ -70,9 +76,9 @@ class Row:
     reproduce: Callable[[Path], Now]
 
 
-def _shipped(cell: str = "surface_follow_sim", **changes: Any) -> dict[str, Any]:
+def _shipped(cell: str = cells_of.FOLLOW) -> dict[str, Any]:
     data: dict[str, Any] = yaml.safe_load((CONFIGS / f"{cell}.yaml").read_text())
-    return data | changes
+    return data
 
 
 def _true_contact(data: dict[str, Any]) -> dict[str, Any]:
@@ -123,64 +129,23 @@ def _refused(folder: Path, cells: Mapping[str, Mapping[str, Any] | str | bytes])
     return Now(text + (f"; accepted: {', '.join(accepted)}" if accepted else ""), not accepted)
 
 
-def _with(data: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """A copy of ``data`` with ``value`` at a dotted key; None removes it."""
-    copy: dict[str, Any] = yaml.safe_load(yaml.safe_dump(data))
-    *path, last = key.split(".")
-    inner = copy
-    for part in path:
-        inner = inner[part]
-    if value is None:
-        del inner[last]
-    else:
-        inner[last] = value
-    return copy
-
-
 # Safety
 
 
 def s1(folder: Path) -> Now:
     """Every moved arm needs bounds of its own, within reason."""
-    both, one = _shipped("dual_push_sim"), _shipped()
-    return _refused(
-        folder,
-        {
-            "no box for the follower": _with(both, "interlocks.follower_box", None),
-            "the other arm's sensor": _with(both, "interlocks.leader_box.sensor", "follower_sensor"),
-            "a box of 2 km": _with(
-                _with(one, "interlocks.workspace.max_mm", [1e6] * 3), "interlocks.workspace.min_mm", [-1e6] * 3
-            ),
-            "100 m/s": _with(one, "interlocks.tcp_speed.limit_m_s", 100),
-            "frames of 1e9 ms": _with(one, "interlocks.stale_frame.limit_ms", 1e9),
-            "depth 500 mm": _with(one, "interlocks.indentation.limit_mm", 500),
-            "no margin": _with(one, "interlocks.workspace.margin_mm", None),
-        },
-    )
+    return _refused(folder, cells_of.unbounded(_shipped))
 
 
 def s2(folder: Path) -> Now:
     """Interlocks that can never trip."""
-    both, one = _shipped("dual_push_sim"), _shipped()
-    truth = _true_contact(_shipped())
-    unfiltered = _with(one, "sensors.sensor.estimator.filter", None)
-    unfiltered["interlocks"]["inconsistent"] = {"kind": "inconsistent", "limit_nis": 22.5, "frames": 5}
-    step = {"kind": "out_of_step", "limit_mm_s": 30, "limit_mm": 4, "hold_ms": 100, "leader": "ledaer"}
-    lost = {"kind": "contact_lost", "limit_ms": 500, "states": ["setle", "rnu"]}
-    return _refused(
-        folder,
-        {
-            "states: [setle, rnu]": _with(one, "interlocks.lost", lost),
-            "leader: ledaer": _with(both, "interlocks.step", step),
-            "inconsistent without a filter": unfiltered,
-            "uncertain on true contact": _with(truth, "interlocks.sure", {"kind": "uncertain", "limit_mm": 1}),
-        },
-    )
+    return _refused(folder, cells_of.inactive(_shipped))
 
 
 def s3(folder: Path) -> Now:
     """A depth limit beyond what the network was taught."""
-    answer = _check(folder, _with(_shipped(), "interlocks.indentation.limit_mm", 9))
+    (data,) = cells_of.too_deep(_shipped).values()
+    answer = _check(folder, data)
     return Now(f"check: {answer}" if answer else "accepted", bool(answer))
 
 
@@ -232,7 +197,7 @@ def s7(folder: Path) -> Now:
     from touchcell.cell.runtime.loop import RunLoop
 
     stop = StopRequest()
-    path = _file(folder, _true_contact(_shipped("dual_push_sim")))
+    path = _file(folder, _true_contact(_shipped(cells_of.PUSH)))
     with contextlib.ExitStack() as stack:
         cell = compose(plan_cell(path))
         stack.enter_context(contextlib.suppress(Exception))
@@ -280,9 +245,7 @@ def r1(folder: Path) -> Now:
 
 
 def _tripping(folder: Path) -> Path:
-    data = _true_contact(_shipped())
-    data["interlocks"]["workspace"]["max_mm"] = [-72, 50, 150]
-    return _file(folder, data, "trip.yaml")
+    return _file(folder, cells_of.tripping(_shipped), "trip.yaml")
 
 
 def r2(folder: Path) -> Now:
@@ -402,8 +365,7 @@ def a1(folder: Path) -> Now:
     program = "import sys; sys.modules['torch'] = None; from touchcell.cell.cli.main import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "train", "--data", str(folder), "--out", str(folder / "m.safetensors")]
     told = subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True, check=False, timeout=120).stderr
-    data = _true_contact(_shipped())
-    data["arms"]["arm"]["start_pose_mm_deg"] = [-80, 0, 120, 180, 0, 0]
+    data = cells_of.over_nothing(_shipped)
     _quiet("run", _file(folder, data), "--out", folder / "o", "--quiet")
     reason = json.loads((folder / "o" / "result.json").read_text())["reason"]
     _, why = _quiet("why", folder / "o")
@@ -417,8 +379,36 @@ def a1(folder: Path) -> Now:
 
 
 def a2(folder: Path) -> Now:
-    """The pose that `probe` prints."""
-    raise NotImplementedError("needs the UR emulator: tests/emulated/test_ur.py")
+    """The pose that `probe` prints, and the one that the run uses."""
+    from touchcell.cell.cli.devices import probe_cell
+    from touchcell.drivers.core.clock import MonotonicClock
+    from touchcell.drivers.ur import rig as ur
+
+    rig = ur.rig(folder, _ADDRESS)
+    assert rig.start is not None
+    emulator = rig.start()
+    try:
+        data = _shipped()
+        data["time"] = "real"
+        data["arms"]["arm"] = {"driver": "ur", "deactivate": "hold", **ur.config_of(_ADDRESS).model_dump(mode="json")}
+        data["sensors"]["sensor"] = {
+            "driver": "v4l2",
+            "device": "/dev/none",
+            "mounted_on": "arm",
+            "estimator": {"kind": "network", "model": "builtin:sim_gdn"},
+        }
+        del data["scene"], data["interlocks"]["inconsistent"]
+        pose = dict(probe_cell(_file(folder, data))[0].readings)["tool at"]
+        arm = rig.build(MonotonicClock())
+        assert isinstance(arm, UrArm)
+        with arm:
+            arm.configure()
+            arm.activate()
+            run_mm = se3.to_euler_mm_deg(arm.tcp().value.T_base_tcp)[:3]
+    finally:
+        emulator.stop()
+    off_mm = float(np.linalg.norm(np.array(json.loads(pose.partition("]")[0] + "]"))[:3] - run_mm))
+    return Now(f"probe and run are {off_mm:.1f} mm apart", off_mm < 0.1)
 
 
 def a3(folder: Path) -> Now:
@@ -432,68 +422,30 @@ def a3(folder: Path) -> Now:
 
 def a4(folder: Path) -> Now:
     """Names that leave the folder of runs."""
-    names = ("../../evil", "", "x" * 400, "a/b", "..")
-    return _refused(folder, {repr(name)[:20]: _shipped(name=name) for name in names})
+    return _refused(folder, cells_of.badly_named(_shipped))
 
 
 def a5(folder: Path) -> Now:
     """Models that are not there."""
-    (folder / "d").mkdir()
-    answers = [
-        _check(folder, _with(_shipped(), "sensors.sensor.estimator.model", model))
-        for model in ("builtin:sim_gnd", "none.safetensors", "d")
-    ]
-    fixed = "sim_gdn" in answers[0] and "train --data DIR --out" in answers[1] and "is no file" in answers[2]
-    return Now("; ".join(answer.partition("model: ")[2][:40] for answer in answers), fixed)
+    answers = [_check(folder, data) for data in cells_of.without_model(_shipped).values()]
+    wanted = ("sim_gdn", "train --data DIR --out", "is no file", "cell.yaml")
+    fixed = all(words in answer for words, answer in zip(wanted, answers, strict=True))
+    return Now("; ".join(answer.partition("model: ")[2][:60] for answer in answers), fixed)
 
 
 def a6(folder: Path) -> Now:
     """The example of the safety page, pasted into the shipped cell."""
     page = next(CHECKOUT.glob("docs/**/safety.md")).read_text()
-    block = next(part for part in page.split("```yaml\n")[1:] if "clear:" in part).partition("```")[0]
-    data, example = _true_contact(_shipped("dual_push_sim")), yaml.safe_load(block)
-    for section in ("arms", "interlocks"):
-        for name, entry in example[section].items():
-            data[section][name] = data[section].get(name, {}) | entry
-    data["obstacles"] = example["obstacles"]
+    data = cells_of.safety_example(_shipped, page)
     if answer := _check(folder, data):
         return Now(f"check: {answer}", False)
     code, told = _quiet("run", folder / "cell.yaml", "--out", folder / "o", "--quiet")
     return Now(_first(told), code == 0)
 
 
-def _bomb() -> bytes:
-    rows = [b"%c: &%c [%s]" % (i, i, b", ".join([b"*%c" % (i - 1)] * 9)) for i in b"bcdefghij"]
-    return b"\n".join([b"a: &a [x]", *rows])
-
-
 def a7(folder: Path) -> Now:
     """Tracebacks."""
-    good = _file(folder, _shipped(), "good.yaml")
-    files: dict[str, bytes] = {
-        "binary": bytes(range(256)),
-        "gzip": gzip.compress(b"schema: 1"),
-        "latin-1": "name: ä".encode("latin-1"),
-        "UTF-16": "name: x".encode("utf-16"),
-        "self": b"loop: &a [*a]",
-        "key": b"? [a, b]\n: c",
-        "bomb": _bomb(),
-    }
-    commands: dict[str, list[object]] = {
-        name: ["check", _file(folder, data, f"{name}.yaml")] for name, data in files.items()
-    }
-    (folder / "file").touch()
-    commands |= {
-        "--out a file": ["run", good, "--out", folder / "file", "--quiet"],
-        "--out no parent": ["run", good, "--out", folder / "file" / "x", "--quiet"],
-        "--port 80000": ["view", folder, "--port", 80000],
-        "--port -5": ["view", folder, "--port", -5],
-        "--jobs -3": ["experiment", "surface_following", "--jobs", -3, "--quick"],
-        "--trials -1": ["experiment", "surface_following", "--trials", -1],
-        "emulate no file": ["emulate", "cell", folder / "none.yaml"],
-        "emulate a simulated cell": ["emulate", "cell", good],
-        "emulate --host 8.8.8.8": ["emulate", "ur", "--host", "8.8.8.8"],
-    }
+    commands = cells_of.broken_commands(folder, _file(folder, _shipped(), "good.yaml"))
     traced = []
     for name, command in commands.items():
         code, told = _cli(*command, folder=folder)
@@ -505,42 +457,12 @@ def a7(folder: Path) -> Now:
 
 def a8(folder: Path) -> Now:
     """What `check` accepted and `run` refused or tripped on."""
-    one = _shipped()
-    gate = {"touch_percent": 2.5, "release_percent": 4}
-    return _refused(
-        folder,
-        {
-            "sensor: sensr": _with(one, "interlocks.workspace.sensor", "sensr"),
-            "no model": _with(one, "sensors.sensor.estimator.model", "none.safetensors"),
-            "a folder as model": _with(one, "sensors.sensor.estimator.model", "."),
-            "text as model": _with(one, "sensors.sensor.estimator.model", "cell.yaml"),
-            "no scene": _with(one, "scene", None),
-            "empty scene": _with(one, "scene", {}),
-            "gate reversed": _with(one, "sensors.sensor.estimator.gate", gate),
-            "depth 8 of 6": _with(one, "task.depth_mm", 8),
-            "500 mm/s": _with(one, "task.speed_mm_s", 500),
-            "start outside": _with(one, "arms.arm.start_pose_mm_deg", [-800, 0, 25, 180, 0, 0]),
-            "1e30 mm": _with(one, "task.distance_mm", 1e30),
-            "no calibration": _with(one, "sensors.sensor.estimator.calibration", "none.yaml"),
-            "rate_hz: yes": yaml.safe_dump(_with(one, "rate_hz", 1)).replace("rate_hz: 1\n", "rate_hz: yes\n"),
-            "seed: 1:30": yaml.safe_dump(_with(one, "seed", 7)).replace("seed: 7\n", "seed: 1:30\n"),
-        },
-    )
+    return _refused(folder, cells_of.doomed(_shipped))
 
 
 def a9(folder: Path) -> Now:
     """Messages with a wrong remedy."""
-    one, text = _shipped(), (CONFIGS / "surface_follow_sim.yaml").read_text()
-    wanted: list[tuple[Mapping[str, Any] | str, str]] = [
-        (_with(one, "arms.arm.start_pose_mm_deg", [1, 2, 3, 4, 5]), "needs six numbers"),
-        (_with(one, "schema", None), "(add `schema: 1`)"),
-        (one | {"schma": 1}, "did you mean 'schema'"),
-        (_with(one, "interlocks.workspace.min_mm", [0, 0, 500]), " interlocks.workspace: min_mm"),
-        (_with(one, "scene.surfaces.ramp.kind", "rampp"), "did you mean 'ramp'"),
-        (_with(one, "interlocks.indentation.kind", "deptth"), "did you mean 'depth'"),
-        (text.replace("    driver: sim_arm", "\tdriver: sim_arm"), "use spaces"),
-        (_with(one, "arms.arm.driver", "sim_tactip"), "not an arm"),
-    ]
+    wanted = cells_of.badly_answered(_shipped, (CONFIGS / f"{cells_of.FOLLOW}.yaml").read_text())
     wrong = [answer for data, words in wanted if words not in (answer := _check(folder, data))]
     return Now(f"{len(wanted) - len(wrong)} of {len(wanted)} right" + "".join(f"; {each}" for each in wrong), not wrong)
 
@@ -561,10 +483,9 @@ def a10(folder: Path) -> Now:
 
 def a11(folder: Path) -> Now:
     """The exit code of a failed run through a pipe."""
-    data = _true_contact(_shipped())
-    data["arms"]["arm"]["start_pose_mm_deg"] = [-80, 0, 120, 180, 0, 0]
+    data = cells_of.over_nothing(_shipped)
     _, told = _cli(
-        "run", _file(folder, data), "--quiet", folder=folder, shell='"$@" | head -1; echo "code ${PIPESTATUS[0]}"'
+        "run", _file(folder, data), "--quiet", folder=folder, shell='"$@" | true; echo "code ${PIPESTATUS[0]}"'
     )
     code = told.split("code ")[-1].split()[0]
     return Now(f"exit {code}", code == "1")
@@ -572,8 +493,7 @@ def a11(folder: Path) -> Now:
 
 def a12(folder: Path) -> Now:
     """Warnings on the user's terminal."""
-    data = _true_contact(_shipped())
-    data["arms"]["arm"]["start_pose_mm_deg"] = [-80, 0, 120, 180, 0, 0]
+    data = cells_of.over_nothing(_shipped)
     _, failed = _cli("run", _file(folder, data), "--quiet", folder=folder)
     _, tripped = _cli("run", _tripping(folder), "--quiet", folder=folder)
     warned = [line for line in (failed + tripped).splitlines() if "Warning" in line]
@@ -630,8 +550,6 @@ def reproduced(row: Row) -> tuple[str, str]:
         logging.disable()
         try:
             now = row.reproduce(Path(folder))
-        except NotImplementedError as error:
-            return "not tried", str(error)
         except Exception as error:
             return "OPEN", f"{type(error).__name__}: {_first(str(error))}"
         finally:
@@ -640,21 +558,52 @@ def reproduced(row: Row) -> tuple[str, str]:
     return ("fixed" if now.fixed else "OPEN"), now.text
 
 
+def reproduced_then(row: Row, checkout: Path) -> str:
+    """What the version in ``checkout`` gives, in a process with its own interpreter and packages."""
+    script = CHECKOUT / "tests" / "earlier" / "findings_0_1_0.py"
+    python = checkout.absolute() / ".venv" / "bin" / "python"
+    with tempfile.TemporaryDirectory() as folder:
+        if row.name == "R8":
+            fuzz_cells.write_mutants(Path(folder) / "mutants", 300, 8, checkout / "configs")
+        environment = {**os.environ, "PYTHONPATH": f"{checkout.absolute()}{os.pathsep}{Path(__file__).parent}"}
+        done = subprocess.run(
+            [str(python), str(script), row.name],
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=600,
+        )
+    return done.stdout.strip() or f"no answer: {done.stderr.strip().splitlines()[-1:]}"
+
+
 def run(arguments: Sequence[str], out: Path) -> None:
     """Print the table of all rows, or of those named; write ``findings.json`` into ``out``."""
-    rows = [row for row in ROWS if not arguments or row.name in arguments]
+    parser = argparse.ArgumentParser(prog="findings", description=__doc__)
+    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="of 0.1.0, with a .venv of its own")
+    parser.add_argument("rows", nargs="*", metavar="ROW")
+    options = parser.parse_args(arguments)
+    rows = [row for row in ROWS if not options.rows or row.name in options.rows]
     found = {}
     for row in rows:
         verdict, text = reproduced(row)
-        found[row.name] = {"title": row.title, "before": row.before, "now": text, "verdict": verdict}
-        print(f"{row.name:<4} {verdict:<10} {row.title}")
-        for label, words in (("0.1.0", row.before), ("now", text)):
+        then = reproduced_then(row, options.against) if options.against else ""
+        found[row.name] = {
+            "title": row.title,
+            "recorded": row.before,
+            "then": then,
+            "now": text,
+            "verdict": verdict,
+        }
+        print(f"{row.name:<4} {verdict:<6} {row.title}")
+        for label, words in (("0.1.0", then or f"{row.before} (recorded)"), ("now", text)):
             print(
                 textwrap.fill(words, 116, initial_indent=f"       {label:<6} ", subsequent_indent=" " * 14), flush=True
             )
-    counts = {
-        verdict: sum(each["verdict"] == verdict for each in found.values())
-        for verdict in ("fixed", "OPEN", "not tried")
-    }
+    counts = {verdict: sum(each["verdict"] == verdict for each in found.values()) for verdict in ("fixed", "OPEN")}
     print(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
-    (out / "findings.json").write_text(json.dumps(found, indent=1) + "\n")
+    (out / "findings.json").write_text(json.dumps({**provenance(), "rows": found}, indent=1) + "\n")
+
+
+_ADDRESS = 43

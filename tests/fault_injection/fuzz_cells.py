@@ -33,17 +33,17 @@ _LINES = (
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """What became of one mutant: "valid", "refused", or what was raised by mistake; and the seconds that it took."""
+    """What became of one mutant: "valid", "refused", or what was raised by mistake; and its CPU seconds."""
 
     content: bytes
     verdict: str
     time_s: float
 
 
-def mutants(seed: int) -> Iterator[bytes]:
+def mutants(seed: int, configs: Path = CONFIGS) -> Iterator[bytes]:
     """Shipped cells with one to four mutations each, for ever."""
     chance = random.Random(seed)
-    shipped = [path.read_text() for path in sorted(CONFIGS.glob("*.yaml"))]
+    shipped = [path.read_text() for path in sorted(configs.glob("*.yaml"))]
     while True:
         text = chance.choice(shipped)
         for _ in range(chance.randint(1, 4)):
@@ -86,6 +86,13 @@ def _mutated(text: str, chance: random.Random) -> str:
     return "\n".join(lines) + "\n"
 
 
+def write_mutants(folder: Path, number: int, seed: int, configs: Path) -> None:
+    """Write mutants of the cells in ``configs``, for another version to try."""
+    folder.mkdir()
+    for k, content in zip(range(number), mutants(seed, configs), strict=False):
+        (folder / f"{k:05d}.yaml").write_bytes(content)
+
+
 def try_mutants(number: int, seed: int) -> Iterator[Tried]:
     """Plan ``number`` mutants, one after another."""
     with tempfile.TemporaryDirectory() as folder:
@@ -94,7 +101,7 @@ def try_mutants(number: int, seed: int) -> Iterator[Tried]:
         files = {str(path), *(str(shipped) for shipped in CONFIGS.glob("*.yaml"))}
         for _, content in zip(range(number), mutants(seed), strict=False):
             path.write_bytes(content)
-            started_s = time.perf_counter()
+            started_s = time.process_time()
             try:
                 plan_cell(path)
                 verdict = "valid"
@@ -102,7 +109,7 @@ def try_mutants(number: int, seed: int) -> Iterator[Tried]:
                 verdict = "refused" if error.file in files else f"refused without its file: {error}"
             except Exception as error:
                 verdict = f"{type(error).__name__}: {error}"
-            yield Tried(content, verdict, time.perf_counter() - started_s)
+            yield Tried(content, verdict, time.process_time() - started_s)
 
 
 def run(arguments: Sequence[str], out: Path) -> None:
@@ -117,4 +124,4 @@ def run(arguments: Sequence[str], out: Path) -> None:
             (out / f"cell_{seed}_{k}.yaml").write_bytes(tried.content)
             print(f"{k}: {tried.time_s:.2f} s: {tried.verdict[:200]}")
     print(f"{number} cells, seed {seed}: " + ", ".join(f"{count} {verdict}" for verdict, count in counts.most_common()))
-    print(f"slowest {slowest_s:.3f} s")
+    print(f"slowest {slowest_s:.3f} s of CPU")

@@ -133,6 +133,8 @@ def _shown(
             return None, f"trips without a fault{_in(state)}: {_said(causes)}"
         if causes[0].interlock != name:
             return None, f"{fault.what}: something else trips{_in(state)}: {_said(causes)}"
+        if causes[0].raised and not fault.by_error:
+            return None, f"{fault.what}: it raises in place of comparing its limit{_in(state)}: {causes[0].reason}"
         return t_s, ""
     raise AssertionError("unreachable")
 

@@ -173,4 +173,4 @@ def _checked(interlock: Interlock, view: CellView) -> Violation | None:
         return interlock.check(view)
     except Exception as error:
         reason = f"the interlock could not be evaluated: {error!r}"
-        return Violation(interlock.name, Severity.FAULT, "cell", reason, view.now_ns)
+        return Violation(interlock.name, Severity.FAULT, "cell", reason, view.now_ns, raised=True)

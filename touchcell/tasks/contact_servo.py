@@ -144,6 +144,7 @@ class ContactServo:
         context: of the cell.
         running_axes: components x, y, z, alpha, beta, gamma of the sensor's twist that the behavior leaves to the
             controller; the others are held at rest once the contact has settled.
+        decoupled: see ``TactileServo``.
 
     Attributes:
         T_base_sensor: (4, 4) pose of the sensor; None where it is unknown or too old.
@@ -162,6 +163,8 @@ class ContactServo:
         run: Behavior,
         context: TaskContext,
         running_axes: tuple[bool, bool, bool, bool, bool, bool] = (True, True, True, True, True, True),
+        *,
+        decoupled: bool = False,
     ) -> None:
         self.arm = arm
         self.sensor = sensor
@@ -171,7 +174,9 @@ class ContactServo:
         self._running_axes = None if all(running_axes) else np.array(running_axes, np.float64)
         self._Ad_tcp_sensor = se3.adjoint(self._T_tcp_sensor)
         T_f_sref = se3.from_euler_mm_deg(np.array(reference_mm_deg))
-        self.controller = TactileServo(se3.inverse(T_f_sref), self._T_tcp_sensor, config.gains(), 1.0 / context.rate_hz)
+        self.controller = TactileServo(
+            se3.inverse(T_f_sref), self._T_tcp_sensor, config.gains(), 1.0 / context.rate_hz, decoupled=decoupled
+        )
         self.T_base_sensor: Array | None = None
         self.contact: ContactEstimate | None = None
         self._before: Array | None = None

@@ -189,3 +189,14 @@ def test_mutated_cells_are_valid_or_refused_by_a_typed_error() -> None:
         if tried.verdict not in ("valid", "refused")
     ]
     assert wrong == []
+
+
+@pytest.mark.parametrize("text", ["1e30", "-1e30", "1.1e9", "1e400"])
+def test_a_number_that_no_unit_explains_is_refused_wherever_it_stands(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text(f"a:\n  b: [0, {text}]\n")
+    with pytest.raises(ConfigError, match="larger than any length") as caught:
+        load(path)
+    assert (caught.value.line, caught.value.key) == (2, "a.b.1")
+    path.write_text("a: 1e9\nseed: 123456789012345678\n")
+    assert load(path).data == {"a": 1e9, "seed": 123456789012345678}

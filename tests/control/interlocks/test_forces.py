@@ -112,6 +112,11 @@ def test_a_wrench_that_is_missing_or_old_is_a_fault(entry: dict[str, Any]) -> No
         assert "no fresh wrench" in found.reason
 
 
+def test_an_external_torque_may_be_held_for_its_time() -> None:
+    run = Run({**TORQUE, "hold_ms": 20})
+    assert [run(torque=(11, 0)) is None for _ in range(3)] == [True, True, False]
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_wrench_or_a_torque_that_is_not_finite_is_found_first(bad: float) -> None:
     for seen in ({"wrench": (0, 0, bad, 0, 0, 0)}, {"torque": (0, bad)}):

@@ -246,7 +246,16 @@ def test_an_unknown_sensor_is_a_config_error():
 
 def test_every_kind_is_listed_with_one_line():
     # The others have test files of their own.
-    elsewhere = {"clearance", "overrun", "depth_disagrees", "wrench", "external_torque", "pressure", "hold_to_run"}
+    elsewhere = {
+        "clearance",
+        "overrun",
+        "depth_disagrees",
+        "wrench",
+        "external_torque",
+        "pressure",
+        "hold_to_run",
+        "reading",
+    }
     assert set(INTERLOCKS.names()) == elsewhere | {entry["kind"] for entry in GOOD.values()}
     for kind in INTERLOCKS.names():
         spec = INTERLOCKS.load(kind)

@@ -285,3 +285,122 @@ def test_a_missing_sensor_is_a_config_error(kind: str) -> None:
     with pytest.raises(ConfigError) as caught:
         rule(kind, **changes)
     assert caught.value.key == f"interlocks.{kind}.{key}"
+
+
+def pushed_apart(held: HeldBox, mm_s: float) -> Callable[[float], None]:
+    def move(t_s: float) -> None:
+        pushed_along(held)(t_s)
+        # Along the surface's normal, which points out of the box.
+        held.offset_mm_deg["follower"] = np.array([0, 0, 3.0 - mm_s * t_s, 0, 0, 0])
+
+    return move
+
+
+def held_by(**changes: Any) -> TimedInterlock:
+    return rule("out_of_step", **{"hold_ms": 0, **changes})
+
+
+def test_the_rate_of_the_gap_is_in_millimetres_per_second_while_the_pair_turns_and_leaves_at_four_fifths() -> None:
+    held = HeldBox()
+    tight = list(watch(held_by(limit_mm_s=1.95, limit_mm=50), held, 0.2, pushed_apart(held, 2.0)))
+    assert tight[1] is not None
+    assert tight[1].value == pytest.approx(2.0, abs=0.15)
+    assert tight[1].reason.startswith("tips close or part at 2")
+    assert tight[1].unit == "mm/s"
+    assert not any(watch(held_by(limit_mm_s=2.05, limit_mm=50), HeldBox(), 0.2, lambda t_s: None))
+    held = HeldBox()
+
+    def slower(t_s: float) -> None:
+        pushed_apart(held, 2.0)(t_s) if t_s < 0.1 else None
+        if t_s >= 0.1:
+            held.offset_mm_deg["follower"] = held.offset_mm_deg["follower"] - np.array([0, 0, 1.7 * DT_S, 0, 0, 0])
+
+    assert list(watch(held_by(limit_mm_s=1.95, limit_mm=50), held, 0.3, slower))[-1] is not None, "1.7 is above 1.56"
+
+
+def test_depths_that_differ_count_in_millimetres_and_leave_at_four_fifths() -> None:
+    held = HeldBox()
+    depths = iter([5.0, 5.1, 4.7, 4.5, 5.0])
+
+    def move(t_s: float) -> None:
+        held.offset_mm_deg["leader"] = np.array([0, 0, next(depths), 0, 0, 0])
+
+    found = [each is not None for each in watch(held_by(limit_mm_s=1e6, limit_mm=2.05), held, 0.05, move)]
+    assert found == [False, True, True, False, False]
+
+
+@pytest.mark.parametrize("missing", ["leader", "follower"])
+def test_one_contact_alone_is_no_pair(missing: str) -> None:
+    held = HeldBox()
+    held.touching[missing] = False
+    assert not any(watch(held_by(limit_mm_s=1e-3, limit_mm=1e-3), held, 0.1, pushed_apart(held, 20.0)))
+
+
+@pytest.mark.parametrize("kind", ["out_of_step", "object_lost", "toppling"])
+def test_in_other_states_of_the_task_nothing_is_judged(kind: str) -> None:
+    held = HeldBox()
+    elsewhere = rule(kind, states=["lift"])
+
+    def move(t_s: float) -> None:
+        held.T_world_box = se3.from_euler_mm_deg(np.array([0, 0, 150.0, 0, 200 * t_s, 0]))
+        held.offset_mm_deg["follower"] = np.array([0, 0, 3.0 - 20 * t_s, 0, 0, 0])
+        held.touching["leader"] = t_s < 0.2
+
+    assert not any(watch(elsewhere, held, 0.6, move))
+    held = HeldBox()
+    held.state = "lift"
+    assert any(watch(elsewhere, held, 0.6, move))
+
+
+def test_a_contact_that_is_too_shallow_is_no_reference_for_leaning() -> None:
+    held = HeldBox()
+
+    def move(t_s: float) -> None:
+        depth_mm = 0.99 if t_s < 0.1 else 1.01
+        held.offset_mm_deg = {arm: np.array([0, 0, depth_mm, 0, 0, 0]) for arm in held.offset_mm_deg}
+        lean_deg = 20.0 if t_s < 0.1 else 0.0
+        held.T_world_box = se3.from_euler_mm_deg(np.array([0, 0, 150.0, 0, lean_deg, 0]))
+
+    assert not any(watch(rule("toppling", hold_ms=0, limit_deg_s=1e6, limit_mm=50), held, 0.3, move))
+
+
+@pytest.mark.parametrize(("lean_deg", "found"), [(4.9, False), (5.1, True), (-5.1, True)])
+def test_leaning_is_in_degrees_from_the_first_contact(lean_deg: float, found: bool) -> None:
+    held = HeldBox()
+
+    def move(t_s: float) -> None:
+        turned = lean_deg if t_s > 0.0 else 0.0
+        held.T_world_box = se3.from_euler_mm_deg(np.array([0, 0, 150.0, 0, turned, 0]))
+
+    violations = list(watch(rule("toppling", hold_ms=0, limit_deg_s=1e6, limit_mm=50), held, 0.05, move))
+    assert (violations[-1] is not None) == found
+    if violations[-1] is not None:
+        assert violations[-1].reason.startswith("leans by 5.1 deg, limit 5 deg")
+
+
+def test_sliding_up_counts_by_the_vertical_part_of_the_shear_in_millimetres() -> None:
+    held = HeldBox()
+    # In the leader's frame, whose x axis points down.
+    for x_mm, y_mm, expected in ((1.9, 5.0, False), (2.1, 0.0, True), (-2.1, 0.0, True), (0.0, 9.0, False)):
+        held.offset_mm_deg = {arm: np.array([x_mm, y_mm, 3.0, 0, 0, 0]) for arm in held.offset_mm_deg}
+        (violation,) = watch(rule("toppling", hold_ms=0, limit_deg=80, limit_deg_s=1e6), held, DT_S)
+        assert (violation is not None) == expected, (x_mm, y_mm)
+        if violation is not None:
+            assert violation.reason == "slides up or down by 2.1 mm, limit 2 mm"
+
+
+def test_fewer_arms_than_sensors_is_a_config_error() -> None:
+    with pytest.raises(ConfigError, match="fewer arms than sensors"):
+        rule("toppling", sensors=["leader_sensor", "follower_sensor"], arms=["leader"])
+
+
+def test_what_a_loss_says_of_the_other_sensor() -> None:
+    held = HeldBox()
+
+    def move(t_s: float) -> None:
+        held.touching["follower"] = t_s < 0.05
+
+    found = list(watch(rule("object_lost"), held, 0.3, move))[-1]
+    assert found is not None
+    assert found.subject == "follower_sensor"
+    assert found.reason.startswith("no contact, and leader_sensor still pushes for ")

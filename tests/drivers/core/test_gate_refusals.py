@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as numpy_strategies
 
 from touchcell.drivers.core.clock import VirtualClock
-from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
+from touchcell.drivers.core.command_checks import finite_array
+from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame, read_only
 from touchcell.drivers.core.device import Lifecycle
 from touchcell.drivers.core.errors import CommandRejected, Rejection
 from touchcell.drivers.core.gate import FIRST_STEP_S, TwistGate, TwistLimits
@@ -432,3 +433,18 @@ def test_a_twist_along_tool_axes_is_turned_whole_and_a_twist_along_base_axes_not
         np.testing.assert_allclose(sent.command.twist, expected, atol=1e-15)
         assert sent.command.frame is TwistFrame.BASE
         assert (sent.command.t_ns, sent.command.t_cause_ns, sent.t_ns) == (command.t_ns, 5, harness.clock.now_ns())
+
+
+def test_a_checked_array_is_a_copy_unless_nothing_can_change_it() -> None:
+    mine = np.array([0.01, 0, 0, 0, 0, 0])
+    checked = finite_array("arm", "twist", mine, (6,))
+    mine[:] = math.nan
+    assert np.isfinite(checked).all()
+    immutable = read_only(np.zeros(6))
+    assert finite_array("arm", "twist", immutable, (6,)) is immutable
+
+
+def test_the_first_command_from_rest_accelerates_for_a_millisecond_at_most() -> None:
+    """The shortest control cycle: 0.5 m/s2 for 1 ms."""
+    speed = float(np.linalg.norm(GateHarness(NO_JERK).send(ttl_s=0.5).command.twist))
+    assert speed == pytest.approx(0.5e-3)

@@ -311,6 +311,9 @@ _MOST_BYTES: Final = 256 * 1024
 _MOST_NODES: Final = 20_000
 _MOST_CHARACTERS: Final = 1_000_000
 _DEEPEST: Final = 40
+_LARGEST: Final = 1e9
+# Infinity and NaN are refused where a number is needed.
+_NO_NUMBER: Final = re.compile(r"[-+]?\.[a-zA-Z]")
 _TOO_DEEP: Final = f"is nested more than {_DEEPEST} levels deep"
 _TOO_DEEP_HINT: Final = "no section of a cell file needs that"
 # What people save by mistake, by its first bytes.
@@ -390,6 +393,7 @@ _SYNTAX_HINTS: Final = {
 
 _TAG: Final = "tag:yaml.org,2002:"
 _STRING: Final = f"{_TAG}str"
+_FLOAT: Final = f"{_TAG}float"
 _MERGE: Final = f"{_TAG}merge"
 
 
@@ -454,6 +458,9 @@ class _Walk:
                 self.visit(item, (*path, index), (*above, id(node)))
         elif node.tag not in (_STRING, self._loader.resolve(yaml.ScalarNode, node.value, (True, False))):
             raise self._error(node, path, f"has the tag {node.tag.replace(_TAG, '!!')!r}", "leave it out")
+        elif node.tag == _FLOAT and not _NO_NUMBER.match(node.value) and abs(float(node.value)) > _LARGEST:
+            reason = f"{node.value} is larger than any length, speed, rate or time of a cell, {_LARGEST:g}"
+            raise self._error(node, path, reason, "check its unit")
 
     def _key(self, node: yaml.Node, path: KeyPath) -> str:
         self._count(node, path)

@@ -323,8 +323,7 @@ def _guard_problem(arm: str, sensor: str | None, facts: CellFacts) -> CannotTrip
 
 def _placed(arm: str, place_m: Array, T_tcp_point: Array) -> Change:
     """Return the change that puts a point of an arm's tool at ``place_m`` (3,) in its base's frame."""
-    T_base_point = np.eye(4)
-    T_base_point[:3, 3] = place_m
+    T_base_point = se3.exp(np.concatenate([place_m, np.zeros(3)]))
     T_base_tcp = T_base_point @ se3.inverse(T_tcp_point)
     return lambda view, t_s: with_motion(view, arm, T_base_tcp)
 

@@ -154,6 +154,8 @@ class Fault:
         covers: roles that are guarded if it trips; the subject if empty.
         key: of the cell file, below the interlock, that decides about it.
         hint: remedy if it does not trip.
+        by_error: True where a measurement that the interlock needs is missing, so that it raises, which is a trip too.
+            Anywhere else an exception would hide that its limit is never compared.
     """
 
     subject: str
@@ -167,6 +169,7 @@ class Fault:
     covers: tuple[str, ...] = ()
     key: str = ""
     hint: str = ""
+    by_error: bool = False
 
 
 @dataclass(frozen=True, slots=True)

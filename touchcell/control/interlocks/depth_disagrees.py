@@ -42,6 +42,7 @@ from touchcell.control.interlocks.timers import (
 )
 from touchcell.control.interlocks.violation import Severity
 from touchcell.drivers.core.samples import Stamped
+from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 TOO_DEEP_M: Final = 0.025
@@ -141,7 +142,7 @@ def _travel(T_base_sensor: Array, reference: tuple[float, ...]) -> tuple[float, 
 
 def _push(arm: ArmView, T_base_sensor: Array, now_ns: int) -> float:
     """Return the force along the sensor's axis into the surface, N. Raises ValueError without a fresh wrench."""
-    if arm.wrench is None or now_ns - arm.wrench.t_ns > _RECONTACT_NS:
+    if arm.wrench is None or not 0 <= now_ns - arm.wrench.t_ns <= _RECONTACT_NS:
         raise ValueError("there is no fresh wrench to compare the depth with")
     return -float(T_base_sensor[:3, 2] @ arm.wrench.value[:3])
 
@@ -184,7 +185,7 @@ class DepthDisagreesConfig(GradedSettings):
                 role,
                 f"travels {1e3 * TOO_DEEP_M:g} mm in, reads {1e3 * estimate_m:.1f} mm",
                 f"{self.limit_mm:g} mm",
-                _pressed(role, sensor, facts, estimate_m),
+                _pressed(role, sensor, facts, estimate_m, 1e3 * (self.stiffness_n_mm or 0.0)),
                 states=states,
                 key="limit_mm",
                 hint=f"lower it below {1e3 * (TOO_DEEP_M - estimate_m):.1f}",
@@ -229,8 +230,8 @@ class DepthDisagreesConfig(GradedSettings):
         )
 
 
-def _pressed(role: str, sensor: SensorFacts, facts: CellFacts, estimate_m: float) -> Change:
-    """Return the change that presses a sensor in at the speed of its gate, with an estimate that stays low."""
+def _pressed(role: str, sensor: SensorFacts, facts: CellFacts, estimate_m: float, stiffness_n_m: float) -> Change:
+    """Return the change that presses a sensor in at the speed of its gate, with estimate and force that stay low."""
     assert sensor.arm is not None
     arm, limits = sensor.arm, facts.arms[sensor.arm].limits
     speed_m_s = 0.1 if limits is None else limits.speed_m_s
@@ -238,9 +239,11 @@ def _pressed(role: str, sensor: SensorFacts, facts: CellFacts, estimate_m: float
 
     def change(view: CellView, t_s: float) -> CellView:
         travel_m = min(speed_m_s * t_s, TOO_DEEP_M)
-        T = np.eye(4)
-        T[:3, 3] = travel_m * axis
-        return with_sensor(with_motion(view, arm, T), role, in_contact=True, depth_m=min(travel_m, estimate_m))
+        T = se3.exp(np.concatenate([travel_m * axis, np.zeros(3)]))
+        read_m = min(travel_m, estimate_m)
+        if stiffness_n_m > 0.0:
+            view = _pushed(role, sensor, stiffness_n_m * read_m)(view, t_s)
+        return with_sensor(with_motion(view, arm, T), role, in_contact=True, depth_m=read_m)
 
     return change
 

@@ -90,7 +90,7 @@ class ExternalTorqueConfig(GradedSettings):
             hint = f"lower it below {LARGEST_NM:g}"
             yield Fault(self.arm, what, f"{limit:g} N m", loaded(torques), free, key="limit_nm", hint=hint)
         silent: Change = lambda view, t_s: with_arm(view, self.arm, external_torque=None)  # noqa: E731
-        yield Fault(self.arm, "reports no external torque", "-", silent, free)
+        yield Fault(self.arm, "reports no external torque", "-", silent, free, by_error=True)
 
     def build(self, name: str, T_tcp_sensor: Mapping[str, Array]) -> TimedInterlock:
         """Return the interlock on external torques."""

@@ -15,7 +15,7 @@ from touchcell.control.interlocks.coverage import (
     role_problem,
     with_arm,
 )
-from touchcell.control.interlocks.snapshot import ArmView
+from touchcell.control.interlocks.snapshot import ArmView, CellView
 from touchcell.drivers.core.samples import Stamped
 from touchcell.geometry.types import Array
 
@@ -64,4 +64,8 @@ def wrench_faults(
         return lambda view, t_s: with_arm(view, arm, wrench=Stamped(wrench, view.now_ns, 0))
 
     yield from faults(pushed, pushed(np.zeros(6)))
-    yield Fault(arm, "reports no wrench", "-", lambda view, t_s: with_arm(view, arm, wrench=None), pushed(np.zeros(6)))
+
+    def silent(view: CellView, t_s: float) -> CellView:
+        return with_arm(view, arm, wrench=None)
+
+    yield Fault(arm, "reports no wrench", "-", silent, pushed(np.zeros(6)), by_error=True)

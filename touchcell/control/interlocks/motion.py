@@ -35,6 +35,7 @@ from touchcell.control.interlocks.timers import (
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
 from touchcell.drivers.kinematics.adjustment import Adjustment
+from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 
@@ -93,9 +94,7 @@ _LIMITED_S = 10.0
 
 def _creeps(role: str, speed_m_s: float) -> Change:
     def change(view: CellView, t_s: float) -> CellView:
-        T = np.eye(4)
-        T[0, 3] = speed_m_s * t_s
-        return with_motion(view, role, T)
+        return with_motion(view, role, se3.exp(np.array([speed_m_s * t_s, 0.0, 0.0, 0.0, 0.0, 0.0])))
 
     return change
 

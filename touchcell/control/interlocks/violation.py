@@ -34,6 +34,7 @@ class Violation:
         unit: of both.
         frame_seq: number of the tactile frame that caused it, where it was one.
         escalates: True if a LIMIT violation that lasts becomes a trip; False if motion may stay slowed indefinitely.
+        raised: True if the interlock raised an exception, which is a fault; ``reason`` is its text.
     """
 
     interlock: str
@@ -46,6 +47,7 @@ class Violation:
     unit: str = ""
     frame_seq: int | None = None
     escalates: bool = True
+    raised: bool = False
 
     def as_error(self) -> SafetyTrip:
         """Return the same as an exception, for callers that must not continue."""

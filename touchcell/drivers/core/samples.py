@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Generic, TypeAlias, TypeVar
 
+import numpy as np
+
 from touchcell.geometry.types import Array, ImageArray
 
 T = TypeVar("T")
@@ -74,3 +76,10 @@ class TcpState:
 
     T_base_tcp: Array
     twist: Array
+
+
+def of_other_point(state: TcpState, T_base_point: Array) -> TcpState:
+    """Return the state of another point of the tool, now at pose ``T_base_point`` (4, 4), from that of one of it."""
+    v, w = state.twist[:3], state.twist[3:]
+    lever = T_base_point[:3, 3] - state.T_base_tcp[:3, 3]
+    return TcpState(T_base_point, np.concatenate([v + np.cross(w, lever), w]))

@@ -12,7 +12,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -99,7 +98,7 @@ class KeeperBus:
         if packet[:1] == _FAILED and len(packet) not in FRAME_SIZES:
             told = json.loads(packet[1:])
             raise can.CanOperationError(told["text"], told["code"])
-        return unpack(packet, time.time())
+        return unpack(packet)
 
     def shutdown(self) -> None:
         """Leave: a keeper whose motors are disabled ends, any other lowers the arm."""

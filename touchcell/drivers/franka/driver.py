@@ -56,7 +56,7 @@ from touchcell.drivers.core.protocols import (
     StopCategory,
     WrenchSource,
 )
-from touchcell.drivers.core.samples import JointState, Stamped, TcpState
+from touchcell.drivers.core.samples import JointState, Stamped, TcpState, of_other_point
 from touchcell.drivers.core.spec import Capabilities, DriverConfig, DriverContext, DriverSpec
 from touchcell.drivers.franka.errors import BY_NAME, ERRORS, MODES, VendorError
 from touchcell.drivers.franka.reader import PERIOD_S, Reading, StateReader
@@ -165,6 +165,7 @@ class FrankaArm(Arm):
         )
         self._config = config
         self._franky: Any = None
+        self._tool_is_set = False
         self._robot: Any = None
         self._reader: StateReader | None = None
         self._control_scheduling: _Scheduling | None = None
@@ -174,10 +175,18 @@ class FrankaArm(Arm):
         self._ik = self._kinematics_of(SerialChain(ChainDescription.shipped("fr3")))
 
     def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """Return the newest state. Raises StaleData if older than ``max_age_s``, or the fault of the arm."""
+        """Return the newest state. Raises StaleData if older than ``max_age_s``, or the fault of the arm.
+
+        It is that of ``flange_to_tcp_mm_deg``, also before ``configure`` has set this tool in the controller.
+        """
         reading = self._reading("read its pose", max_age_s)
         # The controller's rotation matrix is orthonormal to about 1e-6 only.
-        return _stamped(TcpState(se3.project(reading.T_base_tcp), reading.twist), reading)
+        state = TcpState(se3.project(reading.T_base_tcp), reading.twist)
+        wanted = self._config.flange_to_tcp_mm_deg
+        if wanted is not None and not self._tool_is_set:
+            T_ee_tcp = np.linalg.solve(reading.T_flange_tcp, se3.from_euler_mm_deg(wanted))
+            state = of_other_point(state, se3.compose(state.T_base_tcp, se3.project(T_ee_tcp)))
+        return _stamped(state, reading)
 
     def joints(self, max_age_s: float | None = None) -> Stamped[JointState]:
         """Return the newest joint state. Raises as ``tcp``."""
@@ -290,6 +299,7 @@ class FrankaArm(Arm):
                 "this kernel is not PREEMPT_RT",
                 hint="boot a real-time kernel, or set enforce_realtime: false and expect communication reflexes",
             )
+        self._tool_is_set = False
         franky = self._franky = _import_franky(self.name)
         realtime = franky.RealtimeConfig.Enforce if config.enforce_realtime else franky.RealtimeConfig.Ignore
         try:
@@ -381,6 +391,7 @@ class FrankaArm(Arm):
             NE_T_tcp = np.linalg.solve(state.F_T_NE.matrix, F_T_tcp)
             self._robot.set_ee(NE_T_tcp.T.ravel())
             self._verify_frame("F_T_EE", F_T_tcp)
+            self._tool_is_set = True
         # The wrench is measured at the stiffness frame: place it at the tool centre point.
         if np.abs(state.EE_T_K.matrix - np.eye(4)).max() > _FRAME_TOLERANCE:
             self._robot.set_k(np.eye(4).ravel())

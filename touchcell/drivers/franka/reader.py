@@ -34,7 +34,8 @@ class Reading:
     Attributes:
         t_ns: start of the read before the one that found it: it cannot have arrived earlier, so no age is understated.
         device_ms: the controller's own time.
-        T_base_tcp: (4, 4).
+        T_base_tcp: (4, 4), with the end effector that is set in the controller.
+        T_flange_tcp: (4, 4), that end effector.
         twist: (6,) of the tool centre point, from measured joint velocities.
         q, dq, tau: joints (7,).
         wrench: (6,) external wrench on the tool centre point.
@@ -48,6 +49,7 @@ class Reading:
     t_ns: int
     device_ms: int
     T_base_tcp: Array
+    T_flange_tcp: Array
     twist: Array
     q: Array
     dq: Array
@@ -61,7 +63,8 @@ class Reading:
 
     def is_finite(self) -> bool:
         """Return whether every number is finite."""
-        arrays = (self.T_base_tcp, self.twist, self.q, self.dq, self.tau, self.wrench, self.external_torque)
+        poses = (self.T_base_tcp, self.T_flange_tcp)
+        arrays = (*poses, self.twist, self.q, self.dq, self.tau, self.wrench, self.external_torque)
         return all(bool(np.isfinite(array).all()) for array in arrays)
 
 
@@ -200,6 +203,7 @@ class StateReader:
             t_ns=t_ns,
             device_ms=device_ms,
             T_base_tcp=np.asarray(state.O_T_EE.matrix),
+            T_flange_tcp=np.asarray(state.F_T_EE.matrix),
             twist=np.asarray(J @ dq),
             q=np.asarray(state.q),
             dq=dq,

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal, Self
 
 from pydantic import NonNegativeInt, PositiveFloat, model_validator
 
 from touchcell.errors import ConfigError
 from touchcell.input_file import BUILTIN, InputFile, files_in
 from touchcell.paths import MODELS
-from touchcell.perception.runtime.estimator_spec import EstimatorConfig, EstimatorContext, EstimatorSpec
+from touchcell.perception.runtime.estimator_spec import EstimatorConfig, EstimatorContext, EstimatorSpec, Feature
 from touchcell.perception.runtime.filter_spec import FilterSection
 from touchcell.plugin_section import Section
 
@@ -112,9 +112,21 @@ class NetworkEstimator(EstimatorConfig):
         return ContactPipeline(context.camera, model, contact_gate=contact_gate, pose_filter=pose_filter, zero=zero)
 
 
+class EdgeNetworkEstimator(NetworkEstimator):
+    """As ``network``, with a model that was trained on contacts with edges (``touchcell train-sim --feature edge``).
+
+    A filter that holds the contact still does not suit it: the edge frame glides along the edge with the sensor.
+    """
+
+    feature: ClassVar[Feature] = "edge"
+
+    kind: Literal["edge_network"]  # type: ignore[assignment]
+
+
 def model_path(name: str) -> Path:
     """Return the file behind a cell file's ``model:``: a path, or ``builtin:NAME`` for one that ships."""
     return MODELS / f"{name.removeprefix(BUILTIN)}.safetensors" if name.startswith(BUILTIN) else Path(name)
 
 
+EDGE_NETWORK = EstimatorSpec("edge_network", "as network, of the edge under the sensor", EdgeNetworkEstimator)
 NETWORK = EstimatorSpec("network", "trained model, contact gate and filter on the sensor's images", NetworkEstimator)
