@@ -11,8 +11,8 @@ import pytest
 from touchcell.cell.cli.main import main
 from touchcell.geometry import se3
 from touchcell.paths import MODELS
-from touchcell.perception.runtime.contact_gate import ContactGate
 from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.runtime.contact_gate import ContactGate
 from touchcell.perception.runtime.inference import ContactModel
 from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.samples import Variation, contacts
