@@ -11,6 +11,7 @@ import pytest
 from touchcell.cell.cli.main import main
 from touchcell.geometry import se3
 from touchcell.paths import MODELS
+from touchcell.perception.models.architecture import Architecture
 from touchcell.perception.runtime.contact_gate import ContactGate
 from touchcell.perception.runtime.inference import ContactModel
 from touchcell.simulation.render import FrameRenderer
@@ -29,7 +30,10 @@ def test_it_is_small_and_made_by_the_command(model: ContactModel) -> None:
     training = pytest.importorskip("touchcell.cell.cli.train_sim", exc_type=ImportError)
     assert MODEL.stat().st_size < 3_000_000
     assert model.header.preprocessing == training.PREPROCESSING
-    assert model.header.architecture == training.ARCHITECTURE
+    architecture = model.header.architecture
+    assert isinstance(architecture, Architecture)
+    assert architecture.check is not None
+    assert architecture.model_copy(update={"check": None}) == training.ARCHITECTURE
 
 
 def test_it_reads_the_simulated_sensor(model: ContactModel) -> None:
