@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from touchcell.cell.analysis.run_data import Series
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.config.schema import plan_cell
-from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.recording.messages import COMPONENTS
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
