@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from touchcell.cell.analysis.run_data import Series
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.config.schema import plan_cell
-from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.recording.messages import COMPONENTS
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.geometry import se3
