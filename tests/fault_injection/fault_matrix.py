@@ -224,6 +224,14 @@ class Place:
     state: str
 
 
+_NOT_VISITED: Mapping[str, frozenset[str]] = {
+    "arm": frozenset({"check", "return"}),
+    "camera": frozenset({"return"}),
+}
+"""States that these short runs do not come to: on the true contact nothing is checked, and no contact is lost.
+``tests/tasks/test_surface_following.py`` makes every transition from them."""
+
+
 def places(devices: Sequence[str] = ("arm", "camera"), tasks: Sequence[str] | None = None) -> Iterator[Place]:
     """Return every case of the matrix.
 
@@ -243,6 +251,8 @@ def places(devices: Sequence[str] = ("arm", "camera"), tasks: Sequence[str] | No
             for fault in (fault for fault in FAULTS if fault.device == kind):
                 for device in targets:
                     for state in probe.task.states:
+                        if state in _NOT_VISITED[kind]:
+                            continue
                         yield Place(cell, fault.name, device, state)
 
 

@@ -31,6 +31,7 @@ MOVING = (
     "dual_arm_pushing",
     "data_collection",
     "steps",
+    "edge_following",
 )
 
 
