@@ -17,8 +17,8 @@ from rich.table import Table
 
 from touchcell.drivers.replay.dataset import read_image, read_split
 from touchcell.geometry.types import Array, ImageArray
-from touchcell.perception.calibration.zero_frame import find_change
 from touchcell.perception.errors import TrainingError
+from touchcell.perception.markers.zero_frame import find_change
 from touchcell.perception.models.labels import contact_from_xi
 from touchcell.perception.models.model_file import load_model
 from touchcell.perception.models.prediction import ContactEstimator

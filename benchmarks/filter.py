@@ -1,12 +1,13 @@
 """``touchcell bench filter``: accuracy, consistency and cost of the SE(3) filter.
 
-Three parts, each with a table and a plot:
+Four parts, each with a table:
 
 * ``sequences`` (Lloyd & Lepora 2024, 5.3): contacts with known motion, four dynamics noise levels, MAE and predicted
   sigma per component against the single frames, consistency (NEES and NIS), and corrections robust to slip. With
   ``--data`` and ``--model`` on a labelled split in its own and in shuffled orders, else on simulated contacts.
 * ``steps``: one correction by Gauss-Newton, one-step EKF and naively, and one prediction to second and to fourth order,
   run time against error.
+* ``cells``: recordings of shipped cells through the filters and no filter, at equal times, in each component.
 * ``tracking``: the shipped cell behind a moving plate, with the static and with the moving surface model in the loop.
 """
 
@@ -21,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import filter_steps, filter_tracking
+from benchmarks import filter_cells, filter_steps, filter_tracking
 from benchmarks.filter_rivals import SlipFilter, StudentFilter
 from benchmarks.filter_sequences import ContactSequence, Track, filtered, labelled, single_frames, summary, synthetic
 from touchcell.cell.bench.provenance import provenance
@@ -34,7 +35,7 @@ LEVELS = (1.0, 0.3, 0.1, 0.03)
 
 SYNTHETIC_DRIFT = 0.1
 TORN_EVERY = 10
-PARTS = ("sequences", "steps", "tracking")
+PARTS = ("sequences", "steps", "tracking", "cells")
 _ORDER = ("z_mm", "alpha_deg", "beta_deg", "x_mm", "y_mm", "gamma_deg")
 _CORRECTIONS = {"plain": PoseFilter, "Student-t": StudentFilter, "slip inflation": SlipFilter}
 
@@ -56,6 +57,9 @@ def run(arguments: Sequence[str], out: Path) -> None:
         result["update_us"] = filter_steps.updates()
         _print_steps(result)
         _plot_steps(result, out / "filter_steps.png")
+    if "cells" in options.only:
+        result["cells"] = filter_cells.compare()
+        filter_cells.show(result["cells"])
     if "tracking" in options.only:
         result["tracking"] = _tracking(options.seconds, options.sim_model)
         _plot_tracking(result["tracking"], out / "filter_tracking.png")

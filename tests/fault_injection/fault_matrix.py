@@ -183,6 +183,8 @@ def cells() -> dict[str, dict[str, Any]]:
     following, tracking = _shipped("surface_follow_sim.yaml"), _shipped("object_track_sim.yaml")
     following["task"] |= {"distance_mm": 10, "retract_mm": 10}
     tracking["task"] |= {"duration_s": 0.6, "retract_mm": 12}
+    edges = _shipped("edge_follow_sim.yaml")
+    edges["task"] |= {"distance_mm": 15, "close_loop": False, "retract_mm": 10}
     observing = _shipped("surface_follow_sim.yaml")
     observing["task"] = {"name": "observe"}
     of_sensors = ("frame_age", "frame_frozen", "exposure")
@@ -201,7 +203,7 @@ def cells() -> dict[str, dict[str, Any]]:
     stepping["scene"]["surfaces"]["plate"]["pose_mm_deg"] = [0, 0, 13, 0, 0, 0]
     stepping["interlocks"] |= {n: e for n, e in following["interlocks"].items() if e["kind"] in watching}
     stepping["task"] = {"name": "steps", "withdraw_mm": 10, "steps": list(_STEPS)}
-    tasks = (following, tracking, observing, single, dual, collecting, stepping)
+    tasks = (following, tracking, edges, observing, single, dual, collecting, stepping)
     return {data["task"]["name"]: data for data in tasks}
 
 

@@ -133,4 +133,4 @@ class KinematicPlant:
             self.T_w_f = se3.compose(self.T_w_f, se3.from_euler_mm_deg(shear))
             self._anchored = True
         belief = PoseGaussian(se3.inverse(self.sensor_in_surface()), COVARIANCE)
-        return replace(nothing, in_contact=True, belief=belief, in_range=self.in_range)
+        return replace(nothing, in_contact=True, belief=belief, in_range=self.in_range, measured=belief)

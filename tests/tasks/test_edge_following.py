@@ -11,7 +11,7 @@ import pytest
 
 from touchcell.cell.analysis.run_folder import RunFolder, during
 from touchcell.cell.config.schema import plan_cell
-from touchcell.cell.recording.mcap import Recorder
+from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.errors import ConfigError

@@ -131,3 +131,23 @@ def test_an_arm_that_measures_no_force_is_refused_for_such_a_step(cell: CellFact
     steps = [{"move": {"by_mm_deg": [0, 0, 30], "until": {"force_n": 3}}}]
     with pytest.raises(ConfigError, match=r"until\.force_n, but sim_arm measures no force"):
         cell("steps_sim.yaml", set={"task.steps": steps})
+
+
+def test_states_that_are_not_finite_fault_a_stand_in_as_its_driver_does(cell: CellFactory) -> None:
+    following = cell("surface_follow_bench.yaml", on="sim", set={"task.distance_mm": 20})
+    following.run_until("run")
+    following.inject("arm", nan_state=True)
+    following.run_until_trip(limit_s=1.0)
+    assert following.first_cause is not None
+    assert following.first_cause.interlock == "device"
+
+
+def test_the_ground_truth_tells_how_long_an_arm_moved_that_its_driver_cannot_see(cell: CellFactory) -> None:
+    following = cell("surface_follow_bench.yaml", on="sim", set={"task.distance_mm": 20})
+    following.run_until("run")
+    following.run_for(0.3)
+    following.inject("arm", stale=True)
+    following.run_until_trip(limit_s=1.0)
+    with pytest.raises(AssertionError, match="declared"):
+        following.assert_stopped_as_declared()
+    following.assert_truly_stopped_as_declared()

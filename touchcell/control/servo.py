@@ -30,13 +30,18 @@ class TactileServo:
         T_tcp_sensor: pose (4, 4) of the sensor in the tool frame.
         gains: of the controller, on components [x y z alpha beta gamma] of the sensor's twist.
         period_s: time step assumed for the first estimate after a reset.
+        decoupled: position and orientation have errors of their own, the translation of ``E`` and the logarithm of its
+            rotation. Where ``E`` may turn far, as at a corner of an edge, the sensor then moves straight to its place
+            while it turns, in place of along a screw.
 
     Raises:
         GeometryError: an argument is not a pose.
         ControlError: ``period_s`` is not positive.
     """
 
-    def __init__(self, T_sref_f: Array, T_tcp_sensor: Array, gains: PidGains, period_s: float) -> None:
+    def __init__(
+        self, T_sref_f: Array, T_tcp_sensor: Array, gains: PidGains, period_s: float, *, decoupled: bool = False
+    ) -> None:
         if not period_s > 0.0:
             raise ControlError("period_s", f"is {period_s}, not a positive time", period_s)
         self._T_f_sref = se3.inverse(T_sref_f)
@@ -44,6 +49,7 @@ class TactileServo:
         self._free = ~gains.controlled
         self._Ad_tcp_sensor = se3.adjoint(T_tcp_sensor)
         self._period_s = period_s
+        self._decoupled = decoupled
         self._pid = Pid(gains)
         self.reset()
 
@@ -76,7 +82,7 @@ class TactileServo:
 
     def error(self, T_s_f: Array) -> Array:
         """Return the error motion ``e`` (6,), m and rad, in the sensor frame; see the class for its sign."""
-        return se3.log(self._error_pose(T_s_f))
+        return self._error(self._error_pose(T_s_f))
 
     def step(self, T_s_f: Array | None, t_ns: int, V_ff: Array) -> Array:
         """Return the twist (6,) of the tool centre point along tool axes.
@@ -100,13 +106,19 @@ class TactileServo:
             E = self._error_pose(T_s_f)
             dt_s = self._period_s if self._t_ns is None else (t_ns - self._t_ns) * 1e-9
             with np.errstate(invalid="ignore"):  # the controller raises on non-finite arguments, by name
-                V_ff_s = se3.adjoint(E) @ V_ff
-            e = se3.log(E)
+                V_ff_s = (_turned(E) if self._decoupled else se3.adjoint(E)) @ V_ff
+            e = self._error(E)
             V_s = self._pid.step(e, V_ff_s, dt_s)
             self._e = e
             self._V_tcp = self._Ad_tcp_sensor @ V_s
             self._t_ns = t_ns
         return self._V_tcp.copy()
+
+    def _error(self, E: Array) -> Array:
+        e = se3.log(E)
+        if self._decoupled:
+            e[:3] = E[:3, 3]
+        return e
 
     def _error_pose(self, T_s_f: Array) -> Array:
         if not self._free.any():
@@ -114,3 +126,10 @@ class TactileServo:
         measured = se3.to_euler_mm_deg(se3.inverse(T_s_f))
         T_f_sref = se3.from_euler_mm_deg(np.where(self._free, measured, self._reference))
         return se3.compose(T_s_f, T_f_sref)
+
+
+def _turned(E: Array) -> Array:
+    """Return (6, 6): turns both halves of a twist without moving its origin."""
+    turned = np.zeros((6, 6))
+    turned[:3, :3] = turned[3:, 3:] = E[:3, :3]
+    return turned

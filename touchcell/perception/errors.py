@@ -62,6 +62,20 @@ class ModelError(TouchcellError, ValueError):
         self.key = key
 
 
+class CameraError(TouchcellError):
+    """A sensor's camera does not show what the model's own camera would, and no calibration can undo it.
+
+    Attributes:
+        sensor: name of the sensor.
+        reason: what differs.
+    """
+
+    def __init__(self, sensor: str, reason: str, *, hint: str = "") -> None:
+        super().__init__(f"sensor {sensor}: {reason}", hint=hint)
+        self.sensor = sensor
+        self.reason = reason
+
+
 class TrainingError(TouchcellError):
     """A training cannot start or continue; no model was written.
 

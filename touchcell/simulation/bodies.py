@@ -10,6 +10,7 @@ import numpy as np
 from touchcell.drivers.core.scene import SceneBody
 from touchcell.geometry.solids import Cuboid, Cylinder, Mesh, Solid, Sphere, extrude, height_field
 from touchcell.geometry.types import Array
+from touchcell.simulation.meshes.drawing import drawn_shape
 from touchcell.simulation.motions import Still
 from touchcell.simulation.objects import ObjectConfig, TableConfig
 from touchcell.simulation.shape_spec import SurfaceConfig
@@ -54,8 +55,8 @@ def _surface(shape: Shape) -> tuple[tuple[Solid, Array], ...]:
         return plate, (Sphere(shape.radius_m), np.eye(4))
     if isinstance(shape, SphereShape):
         return ((Sphere(shape.radius_m), np.eye(4)),)
-    # A shape of a plug-in says only where its nearest points are.
-    return ()
+    mesh = drawn_shape(shape)
+    return ((Mesh(mesh.vertices, np.asarray(mesh.faces, dtype=np.int64)), np.eye(4)),)
 
 
 def _ramp(ramp: Ramp) -> Mesh:

@@ -28,8 +28,8 @@ def nearest_edge(surfaces: Iterable[Surface], T_world_s: Array, t_s: float, tip_
     """Return T_world_e (4, 4) of the edge nearest to the apex of a tip; None where there is none.
 
     {e} has z along the inward normal of that face of the edge which the sensor's axis is nearer to, x away from that
-    face across the edge, and its origin one tip radius outside the edge. Beyond a convex corner of an outline x leads
-    from the corner to the tip, so that {e} turns steadily while the tip goes round.
+    face across the edge, and its origin one tip radius outside the edge. Beyond a corner of an outline x leads along
+    the line through corner and tip, so that {e} turns steadily while the tip goes round.
     """
     nearest, best = np.inf, None
     for surface in surfaces:
@@ -53,12 +53,12 @@ def _frame(found: EdgePoint, apex: Array, axis: Array, tip_radius_m: float) -> A
     normal = found.normals[over]
     # Faces lie to the left of their own edges; the second face has the edge the other way round.
     out = np.cross(found.tangent, normal) * (1.0 if over == 0 else -1.0)
-    if found.at_end:
+    if found.outwards is not None:
         off = apex - found.point
         off = off - float(off @ normal) * normal
         length = float(np.linalg.norm(off))
-        if length > _AT_A_CORNER_M and off @ out > 0.0:
-            out = off / length
+        if length > _AT_A_CORNER_M:
+            out = off / length * (1.0 if off @ found.outwards >= 0.0 else -1.0)
     out = out / np.linalg.norm(out)
     T = np.eye(4)
     T[:3, 0], T[:3, 1], T[:3, 2] = out, np.cross(-normal, out), -normal

@@ -87,7 +87,7 @@ def contacts(
     middle, law, variation = parameters or TipParameters(), law or ContactLaw(), variation or Variation()
     for start in range(0, n, _IMAGES_PER_TIP):
         count = min(_IMAGES_PER_TIP, n - start)
-        tip = Tip(_scattered(middle, variation, rng))
+        tip = Tip(scattered(middle, variation, rng))
         poses = random_poses(count, rng, depth_mm)
         if rig is None:
             T_f_s = np.stack([contact_at(pose, law).T_f_s for pose in poses])
@@ -124,7 +124,8 @@ def _smooth_fields(rest: Array, pixels: Array, share: float, rng: np.random.Gene
     return fields
 
 
-def _scattered(middle: TipParameters, variation: Variation, rng: np.random.Generator) -> TipParameters:
+def scattered(middle: TipParameters, variation: Variation, rng: np.random.Generator) -> TipParameters:
+    """Return the parameters of a random sensor about ``middle``."""
     changed = {
         each.name: getattr(middle, each.name) * (1.0 + rng.normal(0.0, variation.parameters))
         for each in fields(middle)

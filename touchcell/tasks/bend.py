@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Final
 
@@ -11,6 +12,8 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 
 _FEWEST: Final = 5
+_CORNER_RAD: Final = math.radians(12.0)
+"""From one estimate to the next: no bend but a corner, behind which nothing is known of the bend."""
 
 
 class Bend:
@@ -38,7 +41,10 @@ class Bend:
         if self._R_base_f is not None:
             relative = np.eye(4)
             relative[:3, :3] = self._R_base_f.T @ R_base_f
-            self._turned = self._turned + se3.log(relative)[3:]
+            turn = se3.log(relative)[3:]
+            if float(np.linalg.norm(turn)) > _CORNER_RAD:
+                self._samples.clear()
+            self._turned = self._turned + turn
         self._R_base_f = R_base_f
         self._samples.append((self._way_m, self._turned))
         while self._samples and self._way_m - self._samples[0][0] > self._window_m:

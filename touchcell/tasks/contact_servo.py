@@ -144,6 +144,7 @@ class ContactServo:
         context: of the cell.
         running_axes: components x, y, z, alpha, beta, gamma of the sensor's twist that the behavior leaves to the
             controller; the others are held at rest once the contact has settled.
+        decoupled: see ``TactileServo``.
 
     Attributes:
         T_base_sensor: (4, 4) pose of the sensor; None where it is unknown or too old.
@@ -162,6 +163,8 @@ class ContactServo:
         run: Behavior,
         context: TaskContext,
         running_axes: tuple[bool, bool, bool, bool, bool, bool] = (True, True, True, True, True, True),
+        *,
+        decoupled: bool = False,
     ) -> None:
         self.arm = arm
         self.sensor = sensor
@@ -171,7 +174,9 @@ class ContactServo:
         self._running_axes = None if all(running_axes) else np.array(running_axes, np.float64)
         self._Ad_tcp_sensor = se3.adjoint(self._T_tcp_sensor)
         T_f_sref = se3.from_euler_mm_deg(np.array(reference_mm_deg))
-        self.controller = TactileServo(se3.inverse(T_f_sref), self._T_tcp_sensor, config.gains(), 1.0 / context.rate_hz)
+        self.controller = TactileServo(
+            se3.inverse(T_f_sref), self._T_tcp_sensor, config.gains(), 1.0 / context.rate_hz, decoupled=decoupled
+        )
         self.T_base_sensor: Array | None = None
         self.contact: ContactEstimate | None = None
         self._before: Array | None = None
@@ -252,6 +257,18 @@ class ContactServo:
         if self.contact is None or not (self.contact.in_contact and self.contact.in_range):
             return None
         return None if self.contact.belief is None else self.contact.belief.mean
+
+    @property
+    def is_estimated(self) -> bool:
+        """True if a model measured the newest contact, rather than a simulator or a label."""
+        return self.contact is not None and self.contact.measured is not None
+
+    @property
+    def T_s_f_measured(self) -> Array | None:  # noqa: N802  the field's own name
+        """Valid contact pose (4, 4) of the newest frame by itself, or None."""
+        if self.T_s_f is None or self.contact is None or self.contact.measured is None:
+            return self.T_s_f
+        return self.contact.measured.mean
 
     def update(self, observation: Observation) -> None:
         """Update sensor pose and contact from an observation, dropping what is stale."""
@@ -354,7 +371,11 @@ class ContactServo:
 
     def along_z(self, speed_m_s: float) -> Array:
         """Return the twist (6,) of the tool that moves the sensor along its z axis."""
-        V_tcp: Array = self._Ad_tcp_sensor @ np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0])
+        return self.in_tcp(np.array([0.0, 0.0, speed_m_s, 0.0, 0.0, 0.0]))
+
+    def in_tcp(self, V_sensor: Array) -> Array:
+        """Return the twist (6,) of the tool, in its frame, that gives the sensor a twist (6,) in its own."""
+        V_tcp: Array = self._Ad_tcp_sensor @ V_sensor
         self._V_tcp = V_tcp
         return V_tcp
 

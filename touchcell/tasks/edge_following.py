@@ -29,8 +29,10 @@ _AXES: Final = {
 """Components of the sensor's twist that a task of so many dimensions commands."""
 
 
-_FASTEST_RAD_S: Final = math.radians(150.0)
-"""Of the turn that is fed forward: a corner looks like a very sharp bend."""
+_BEND_SHARE: Final = 0.6
+"""Of the largest turn that a bend may take, so that corrections have the rest."""
+_FASTEST_TILT_RAD_S: Final = 1.0
+"""Of the tilt that is fed forward."""
 
 
 class EdgeFollowingConfig(ServoConfig):
@@ -57,6 +59,8 @@ class EdgeFollowingConfig(ServoConfig):
     ki_per_s2: SixGains = (16.0, 0.0, 16.0, 16.0, 16.0, 16.0)
     max_turn_deg_s: PositiveFloat = 180.0
     max_integral_turn_deg_s: PositiveFloat = 60.0
+    max_accel_mm_s2: PositiveFloat = 550.0
+    max_turn_accel_deg_s2: PositiveFloat = 1100.0
     bend_window_mm: PositiveFloat = 5.0
     speed_mm_s: Annotated[PositiveFloat, SPEED] = 30.0
     distance_mm: PositiveFloat = 100.0
@@ -87,7 +91,9 @@ class FollowEdge:
         self._sign = 1.0 if config.direction == "forward" else -1.0
         self._speed_m_s = 1e-3 * config.speed_mm_s
         self._feedforward = np.zeros(6)
-        self._bend = Bend(1e-3 * config.bend_window_mm)
+        self._turn_bend, self._tilt_bend = Bend(1e-3 * config.bend_window_mm), Bend(2e-3 * config.bend_window_mm)
+        self._fastest_rad_s = math.radians(config.max_turn_deg_s)
+        self._tilts = config.dimensions == 5
         self._distance_m = 1e-3 * config.distance_mm
         self._close_loop, self._closing_m = config.close_loop, 1e-3 * config.closing_mm
         self._timeout_s = 3.0 * config.distance_mm / config.speed_mm_s + 5.0
@@ -109,18 +115,24 @@ class FollowEdge:
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
         """Add up the way along the edge; return True once it is long enough, or its loop is closed.
 
-        Where the edge leads far from where the sensor heads, as at a corner, it turns before it goes on.
+        Where the edge leads far from where the sensor heads, as at a corner, it turns before it goes on; in a bend it
+        goes no faster than it can turn.
         """
         if self._start is None:
             self._start = now[:3, 3].copy()
         step = now[:3, :3].T @ (now[:3, 3] - before[:3, 3])
         self._travelled_m += self._sign * float(step[1])
-        self._bend.update(float(step[1]), now, T_s_f)
+        self._turn_bend.update(float(step[1]), now, T_s_f)
+        self._tilt_bend.update(float(step[1]), now, T_s_f)
         turn = 0.0 if T_s_f is None else math.atan2(T_s_f[1, 0], T_s_f[0, 0])
-        speed = self._sign * self._speed_m_s * max(math.cos(min(2.0 * abs(turn), math.pi / 2.0)), 0.0)
-        self._feedforward[1] = speed
-        rate = abs(speed) * float(self._bend.rad_per_m()[2])
-        self._feedforward[5] = min(max(rate, -_FASTEST_RAD_S), _FASTEST_RAD_S)
+        bend = float(self._turn_bend.rad_per_m()[2])
+        speed = min(self._speed_m_s, _BEND_SHARE * self._fastest_rad_s / max(abs(bend), 1e-9))
+        speed *= max(math.cos(min(2.0 * abs(turn), math.pi / 2.0)), 0.0)
+        self._feedforward[1] = self._sign * speed
+        self._feedforward[5] = speed * bend
+        if self._tilts:
+            tilt = speed * self._tilt_bend.rad_per_m()[:2]
+            self._feedforward[3:5] = np.clip(tilt, -_FASTEST_TILT_RAD_S, _FASTEST_TILT_RAD_S)
         if self._close_loop:
             from_start = float(np.linalg.norm(now[:3, 3] - self._start))
             self._away = self._away or from_start > 3.0 * self._closing_m
@@ -141,7 +153,7 @@ class FollowEdge:
 def _build(config: EdgeFollowingConfig, context: TaskContext) -> ServoTask:
     reference = (config.offset_mm, 0.0, config.depth_mm, 0.0, 0.0, 0.0)
     axes = _AXES[config.dimensions]
-    servo = ContactServo(ARM, SENSOR, config, reference, FollowEdge(config), context, axes)
+    servo = ContactServo(ARM, SENSOR, config, reference, FollowEdge(config), context, axes, decoupled=True)
     return ServoTask("edge_following", config, context, servo)
 
 

@@ -141,11 +141,13 @@ class TaskContext:
         rate_hz: control cycles per second.
         T_tcp_sensor: pose (4, 4) of each sensor role in the tool frame of the arm that carries it.
         kept: number of labelled frames that earlier runs of this cell have stored.
+        resumed: True after a trip of this run: the arms may stand in contact, and its zero frames hold.
     """
 
     rate_hz: float
     T_tcp_sensor: Mapping[str, Array]
     kept: int = 0
+    resumed: bool = False
 
 
 TaskConfigT = TypeVar("TaskConfigT", bound=TaskConfig)

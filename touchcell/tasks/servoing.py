@@ -15,6 +15,7 @@ from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Sidestepping, Six
 from touchcell.tasks.interface import SPEED, Action, Observation, TaskContext, TaskSpec, TransitionRecord
+from touchcell.tasks.sensor_check import SensorCheck
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
 from touchcell.tasks.state_machine_task import MachineTask
 
@@ -51,6 +52,11 @@ class ServoConfig(ContactServoConfig):
             one that changes was in contact.
         approach_speed_mm_s: speed towards the surface, along the sensor's z axis.
         approach_distance_mm: the approach fails when no contact was made within it.
+        check_s: duration of the motion after first contact whose measured answer must agree with the arm's before the
+            arm servos on a model's estimates (``sensor_check``); 0 leaves it out.
+        check_press_mm: depth that this motion adds.
+        check_shift_mm: its largest shift along the surface.
+        check_tilt_deg: its largest tilt.
         settle_time_s: the contact has settled when errors were below the tolerances for this long.
         settle_timeout_s: settling fails when it takes longer.
         retract_mm: distance to withdraw at the end.
@@ -65,6 +71,10 @@ class ServoConfig(ContactServoConfig):
     back_off_mm: PositiveFloat = 2.0
     approach_speed_mm_s: Annotated[PositiveFloat, SPEED] = 10.0
     approach_distance_mm: PositiveFloat = 50.0
+    check_s: NonNegativeFloat = 1.0
+    check_press_mm: NonNegativeFloat = 0.5
+    check_shift_mm: PositiveFloat = 0.3
+    check_tilt_deg: PositiveFloat = 1.0
     settle_time_s: NonNegativeFloat = 0.3
     settle_timeout_s: PositiveFloat = 10.0
     retract_mm: PositiveFloat = 20.0
@@ -80,6 +90,7 @@ class ServoState(Enum):
 
     PREPARE = auto()
     APPROACH = auto()
+    CHECK = auto()
     SETTLE = auto()
     RUN = auto()
     RETURN = auto()
@@ -92,7 +103,9 @@ class ServoState(Enum):
     FAULTED = auto()
 
 
-def servo_table(task: str, config: ServoConfig, run_timeout_s: float, *, sidesteps: bool = False) -> Table:
+def servo_table(
+    task: str, config: ServoConfig, run_timeout_s: float, *, sidesteps: bool = False, servos: int = 1
+) -> Table:
     """Return the states and transitions of a servoing task; motions time out after twice their nominal duration.
 
     Args:
@@ -100,15 +113,18 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float, *, sideste
         config: its parameters.
         run_timeout_s: longest time in ``run``.
         sidesteps: whether a contact may be given up for another beside it.
+        servos: number of sensors, which are checked one after another.
     """
     s = ServoState
     approach_s = 2.0 * config.approach_distance_mm / config.approach_speed_mm_s + 1.0
+    check_s = 2.0 * servos * config.check_s + 1.0
     retract_s = 2.0 * config.retract_mm / config.retract_speed_mm_s + 1.0
     return Table(
         task,
         (
             StateDef(s.PREPARE, config.prepare_timeout_s, "timeout"),
             StateDef(s.APPROACH, approach_s, "timeout", on_enter="start_approach"),
+            StateDef(s.CHECK, check_s, "timeout", on_enter="start_check"),
             StateDef(s.SETTLE, config.settle_timeout_s, "timeout", on_enter="start_settle"),
             StateDef(s.RUN, run_timeout_s, "timeout", on_enter="start_run"),
             StateDef(s.RETURN, _RETURN_S, "timeout", on_enter="start_return"),
@@ -125,8 +141,12 @@ def servo_table(task: str, config: ServoConfig, run_timeout_s: float, *, sideste
             TransitionDef("touching", s.PREPARE, s.FAILED),
             TransitionDef("timeout", s.PREPARE, s.FAILED),
             TransitionDef(STOP, s.PREPARE, s.STOPPED),
+            TransitionDef("contact", s.APPROACH, s.CHECK, guard="must_check"),
             TransitionDef("contact", s.APPROACH, s.SETTLE),
             TransitionDef("no_contact", s.APPROACH, s.RETRACT),
+            TransitionDef("agrees", s.CHECK, s.SETTLE),
+            TransitionDef("lost", s.CHECK, s.APPROACH, guard="may_reapproach"),
+            TransitionDef("lost", s.CHECK, s.RETRACT),
             TransitionDef("settled", s.SETTLE, s.RUN),
             TransitionDef("lost", s.SETTLE, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.SETTLE, s.RETRACT),
@@ -158,7 +178,8 @@ class ServoTask(MachineTask):
 
     While the contact servos search for the surface or hold it, they move only on fresh frames, fresh arm states and
     valid estimates, all of them or none. When they retract, away from the surface, a fresh arm state suffices. A servo
-    that has made its contact holds it until the others have made theirs.
+    that has made its contact holds it until the others have made theirs; until its sensor was checked it stands still.
+    The sensors are checked one after another, once.
 
     Args:
         name: the task's name.
@@ -176,7 +197,9 @@ class ServoTask(MachineTask):
         self._servos = servos
         timeout_s = min(servo.run.timeout_s for servo in servos)
         sidesteps = any(isinstance(servo.run, Sidestepping) for servo in servos)
-        self._machine = TaskMachine(servo_table(name, config, timeout_s, sidesteps=sidesteps), self)
+        self._machine = TaskMachine(servo_table(name, config, timeout_s, sidesteps=sidesteps, servos=len(servos)), self)
+        self._checks: list[SensorCheck] = []
+        self._unchecked = config.check_s > 0.0
         self._now_ns = 0
         self._steady_s = 0.0
         self._blind_s = 0.0
@@ -184,6 +207,7 @@ class ServoTask(MachineTask):
         self._stop_seen = False
         self._finished_run = False
         self._prepared = _Preparation.FIRST_ZERO
+        self._resumed = context.resumed
         self._stood_s = 0.0
         self._zero: frozenset[str] = frozenset()
         self._zero_seq: dict[str, int] = {}
@@ -207,6 +231,10 @@ class ServoTask(MachineTask):
         return Action(
             {servo.arm: self._command(servo, V) for servo, V in twists}, self._telemetry(observation), zero=zero
         )
+
+    def must_check(self) -> bool:
+        """Guard: a sensor's contact is estimated by a model, and the sensors have not been checked yet."""
+        return self._unchecked and any(servo.is_estimated for servo in self._servos)
 
     def may_reapproach(self) -> bool:
         """Guard: a lost contact may be searched for again."""
@@ -236,6 +264,15 @@ class ServoTask(MachineTask):
         self._reapproaches += 1
         for servo in self._servos:
             servo.aim_back(1e-3 * (self._config.return_lift_mm or 0.0))
+        self._blind_s = 0.0
+
+    def start_check(self, record: TransitionRecord) -> None:
+        """On entry: begin the motion of the first sensor."""
+        c = self._config
+        self._checks = [
+            SensorCheck(c.check_s, press_mm=c.check_press_mm, shift_mm=c.check_shift_mm, tilt_deg=c.check_tilt_deg)
+            for _ in self._servos
+        ]
         self._blind_s = 0.0
 
     def start_settle(self, record: TransitionRecord) -> None:
@@ -280,6 +317,9 @@ class ServoTask(MachineTask):
                     self._post("contact")
                 elif max(servo.travelled_m() for servo in searching) >= 1e-3 * self._config.approach_distance_mm:
                     self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
+            case ServoState.CHECK:
+                self._watch_contact(dt_s)
+                self._watch_check()
             case ServoState.SETTLE:
                 self._watch_contact(dt_s)
                 steady = all(servo.steady() for servo in servos)
@@ -310,6 +350,26 @@ class ServoTask(MachineTask):
                 if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in servos):
                     self._post("retracted")
 
+    def _watch_check(self) -> None:
+        """Record what the sensors measure, and judge it when all have moved."""
+        for check, servo in zip(self._checks, self._servos, strict=True):
+            if servo.T_base_sensor is not None:
+                check.record_pose(self._now_ns, servo.T_base_sensor)
+            contact, T_s_f = servo.contact, servo.T_s_f_measured
+            if contact is not None and T_s_f is not None and check is self._moving_check():
+                check.record_contact(contact.seq, contact.t_frame_ns, T_s_f)
+        if self._moving_check() is not None:
+            return
+        for check, servo in zip(self._checks, self._servos, strict=True):
+            if wrong := check.verdict():
+                self._post(TRIP, f"{servo.sensor}: {wrong}")
+                return
+        self._unchecked = False
+        self._post("agrees")
+
+    def _moving_check(self) -> SensorCheck | None:
+        return next((check for check in self._checks if not check.finished), None)
+
     def _prepare(self) -> None:
         """Take a zero frame, back off a little, and take another, unless the first motion changes the image."""
         servos = self._servos
@@ -317,6 +377,8 @@ class ServoTask(MachineTask):
             # Until a frame has come after the zero frame, what is known still compares with what was before it.
             return
         match self._prepared:
+            case _Preparation.FIRST_ZERO if self._resumed and any(servo.in_contact for servo in servos):
+                self._post("ready")
             case _Preparation.FIRST_ZERO:
                 if touching := next(
                     (servo.sensor for servo in servos if not servo.has_zero and servo.in_contact), None
@@ -371,6 +433,8 @@ class ServoTask(MachineTask):
         if state is ServoState.RETRACT:
             speed_m_s = -1e-3 * self._config.retract_speed_mm_s
             return [(servo, servo.along_z(speed_m_s)) for servo in self._servos if servo.T_base_sensor is not None]
+        if state is ServoState.CHECK:
+            return self._check_twists()
         if state is ServoState.RETURN:
             if not all(servo.has_fresh_data for servo in self._servos):
                 return []
@@ -401,12 +465,22 @@ class ServoTask(MachineTask):
             V_tcp: Array | None
             if searching and not servo.touches:
                 V_tcp = servo.along_z(1e-3 * self._config.approach_speed_mm_s)
+            elif searching and self._unchecked and servo.is_estimated:
+                V_tcp = None
             else:
                 running = state is ServoState.RUN
                 V_tcp = servo.servo_step(servo.run.feedforward if running else np.zeros(6), running=running)
             if V_tcp is not None:
                 twists.append((servo, V_tcp))
         return twists
+
+    def _check_twists(self) -> list[tuple[ContactServo, Array]]:
+        if not all(servo.has_fresh_data and servo.T_s_f is not None for servo in self._servos):
+            return []
+        for check, servo in zip(self._checks, self._servos, strict=True):
+            if not check.finished:
+                return [(servo, servo.in_tcp(check.step(self._period_s)))]
+        return []
 
     def _command(self, servo: ContactServo, V_tcp: Array) -> TwistCommand:
         return TwistCommand(

@@ -23,6 +23,7 @@ from touchcell.cell.runtime.operator_channel import OperatorChannel, OperatorReq
 from touchcell.cell.runtime.run_result import RunResult
 from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.cell.runtime.stopping import StopReport
+from touchcell.control.interlocks.boundary import WorkspaceConfig
 from touchcell.control.interlocks.config import InterlocksConfig
 from touchcell.control.interlocks.coverage import CannotTrip, Fault, Provable
 from touchcell.control.interlocks.settings import InterlockSettings
@@ -308,6 +309,11 @@ class CellUnderTest:
             late = proof.tripped_s is not None and proof.tripped_s > after_s + 2.0 / self.cell.rate_hz
             assert not late, f"{interlock} of {proof.subject}: {proof.fault}: {proof.tripped_s} s, expected {after_s} s"
         own = self.plan.cell.interlocks[interlock]
+        if isinstance(own, WorkspaceConfig) and isinstance(expected, WorkspaceConfig):
+            # It is shown a tool as far outside as its margin; a box that has grown by less would trip all the same.
+            grown = any(mine < theirs for mine, theirs in zip(own.min_mm, expected.min_mm, strict=True))
+            grown = grown or any(mine > theirs for mine, theirs in zip(own.max_mm, expected.max_mm, strict=True))
+            assert not grown, f"{interlock}: its box is {own.min_mm} to {own.max_mm} mm, larger than it was"
         assert own.level == expected.level, f"{interlock}: level is {own.level.name}, expected {expected.level.name}"
 
     def _faults(self, interlock: str, settings: Mapping[str, Any] | None) -> Iterator[Fault | CannotTrip]:

@@ -6,6 +6,7 @@ skips the question. Installed as an entry point of ``pytest11``; without ``--cel
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -156,8 +157,11 @@ def ask(config: pytest.Config, device: str, what: str = _SHORT_MOVES) -> None:
     """Ask the operator before a device is powered; end the session where nobody agrees."""
     capture = config.pluginmanager.getplugin("capturemanager")
     with capture.global_and_fixture_disabled():
-        print(f"\n{device} will be powered {what}.")
-        print("Is the space around it free, are people away, and is a hand on the emergency stop? Type yes: ", end="")
+        if sys.stdin is not None and sys.stdin.isatty():
+            print(f"\n{device} will be powered {what}.")
+            print(
+                "Is the space around it free, are people away, and is a hand on the emergency stop? Type yes: ", end=""
+            )
         try:
             answer = input()
         except (EOFError, OSError):

@@ -14,10 +14,10 @@ from tests.perception.models.test_model_file import make_model
 from tests.perception.runtime.test_inference import constant_model
 from touchcell.cell.bench.perception import camera_frame, table, write_simulated
 from touchcell.cell.bench.perception_runtimes import RUNTIMES, installed
-from touchcell.cell.bench.perception_serving import FRAME_SIZE, from_camera
 from touchcell.cell.cli.exit_codes import EXIT_OK
 from touchcell.cell.cli.main import main
 from touchcell.drivers.replay.dataset import read_split
+from touchcell.perception.models.camera_frames import FRAME_SIZE, from_camera
 from touchcell.perception.models.model_file import save_model
 from touchcell.perception.models.preprocessing import Crop, Preprocessing
 from touchcell.perception.networks.evaluate import evaluate

@@ -167,7 +167,7 @@ def test_a_disk_that_fills_up_leaves_the_recording_the_black_box_and_a_result(
         room -= len(data)
         return write(fd, data)
 
-    monkeypatch.setattr(mcap.os, "write", limited)
+    monkeypatch.setattr(os, "write", limited)
     out = tmp_path / "run"
     assert main(["run", str(true_contact_cell(tmp_path)), "--out", str(out), "--quiet"]) != EXIT_OK
     assert json.loads((out / "result.json").read_text())["outcome"] == "error"

@@ -34,8 +34,9 @@ FOR_PEOPLE = {
     ROOT / "touchcell" / "cell" / "runtime" / "bench_lock.py",
     ROOT / "touchcell" / "cell" / "runtime" / "run_directory.py",
     ROOT / "touchcell" / "cell" / "analysis" / "provenance.py",
+    ROOT / "touchcell" / "cell" / "cli" / "run_description.py",
 }
-"""They say since when a bench is taken, name the run folder, and date a figure."""
+"""They say since when a bench is taken, name the run folder, and date a figure or a recording."""
 
 
 def reads(source: str) -> Iterator[str]:

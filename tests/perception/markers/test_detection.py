@@ -8,9 +8,9 @@ from tests.helpers.marker_samples import CORNER, REST, SIZE, simulated
 from touchcell.perception.errors import ImageError
 from touchcell.perception.markers.detection import Discs, detect_markers, lattice, ring_numbers, typical_size
 from touchcell.perception.markers.figures import density_change
+from touchcell.perception.markers.lattice_fit import fit_lattice
 from touchcell.perception.models.marker_architecture import MarkerSize
 from touchcell.perception.models.preprocessing import AdaptiveThreshold, Crop, Preprocessing
-from touchcell.perception.networks.marker_learning import fit_lattice
 from touchcell.simulation.render import FrameRenderer
 
 MARKERS = MarkerSize.of_disc(np.pi * 6.2**2)

@@ -12,8 +12,9 @@ pytest.importorskip("torch")
 
 from touchcell.perception.errors import TrainingError
 from touchcell.perception.markers.detection import Discs, detect_markers
+from touchcell.perception.markers.lattice_fit import fit_lattice
 from touchcell.perception.markers.matching import DisplacementModel, MarkerField, MarkerMatcher
-from touchcell.perception.networks.marker_learning import Learned, fit_lattice, learn_markers
+from touchcell.perception.networks.marker_learning import Learned, learn_markers
 
 
 @pytest.fixture(scope="module")

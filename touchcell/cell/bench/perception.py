@@ -25,7 +25,8 @@ import numpy as np
 
 from touchcell.cell.bench import perception_figures
 from touchcell.cell.bench.perception_runtimes import by_turns, installed
-from touchcell.cell.bench.perception_serving import FRAME_SIZE, OWN, from_camera
+from touchcell.cell.bench.perception_serving import OWN
+from touchcell.cell.bench.perception_validity import validity, validity_lines
 from touchcell.cell.bench.provenance import as_installed, provenance
 from touchcell.cell.bench.quantiles import median_and_p99
 from touchcell.drivers.replay.dataset import IMAGE_COLUMN, IMAGE_FOLDER, LABEL_COLUMNS, LABEL_FILES, read_split
@@ -33,6 +34,7 @@ from touchcell.geometry import se3
 from touchcell.geometry.types import ImageArray
 from touchcell.paths import MODELS
 from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.camera_frames import FRAME_SIZE, from_camera
 from touchcell.perception.models.model_file import Header, load_model
 from touchcell.perception.networks.figures import write_predictions
 from touchcell.perception.networks.scores import SCORE_NAMES, Scores
@@ -67,12 +69,13 @@ def run(arguments: Sequence[str], out: Path) -> None:
         else:
             about = f"{options.data}, split {options.split}"
         rows, scores = _measured(options, Path(scratch))
+        changed = _changed(options)
     turns = {
         path.stem: by_turns(model, options.runtimes, options.frames)
         for path in options.models
         if isinstance((model := load_model(path)).header.architecture, Architecture)
     }
-    text = "\n".join([about, table(rows), *_turn_lines(turns)])
+    text = "\n".join([about, table(rows), *_turn_lines(turns), *validity_lines(changed)])
     print(text)
     (out / "perception.txt").write_text(text + "\n")
     report = {
@@ -81,6 +84,7 @@ def run(arguments: Sequence[str], out: Path) -> None:
         "probabilities": PROBABILITIES,
         "rows": rows,
         "by_turns": turns,
+        "validity": changed,
     }
     (out / "perception.json").write_text(json.dumps(report, indent=1) + "\n")
     perception_figures.write_run_time_against_error(out / "perception.png", rows)
@@ -103,6 +107,7 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--runtimes", nargs="+", choices=installed(), default=installed())
     parser.add_argument("--frames", type=int, default=400, help="camera frames that are timed")
     parser.add_argument("--images", type=int, default=400, help="how many are simulated without --data")
+    parser.add_argument("--changed", type=int, default=50, help="frames to which each change of the image is applied")
     options = parser.parse_args(arguments)
     if options.models is None:
         options.models = [SHIPPED] if options.data is None else sorted(Path("models").glob("*.safetensors"))
@@ -133,7 +138,13 @@ def _measured(options: argparse.Namespace, scratch: Path) -> tuple[list[dict[str
             subprocess.run([*program, *words, str(time.monotonic_ns())], check=True, env=environment)
             with np.load(result) as found:
                 each, camera = (
-                    Scores(labels[which], found[f"{kind}xi"], found[f"{kind}covariance"], found[f"{kind}in_range"])
+                    Scores(
+                        labels[which],
+                        found[f"{kind}xi"],
+                        found[f"{kind}covariance"],
+                        found[f"{kind}in_range"],
+                        _tail(found, kind),
+                    )
                     for kind, which in (("", slice(None)), ("served_", shown))
                 )
                 figures = json.loads(str(found["figures"]))
@@ -162,6 +173,24 @@ def _measured(options: argparse.Namespace, scratch: Path) -> tuple[list[dict[str
                 }
             )
     return rows, scores
+
+
+def _tail(found: Mapping[str, np.ndarray], kind: str) -> float | None:
+    scale = float(found[f"{kind}tail_scale"])
+    return None if np.isnan(scale) else scale
+
+
+def _changed(options: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
+    """Return what each model accepts of changed camera frames."""
+    split = read_split(options.data, options.split)
+    chosen = np.linspace(0, len(split.images) - 1, min(options.changed, len(split.images))).astype(int)
+    images = dataclasses.replace(split, images=tuple(split.images[i] for i in chosen)).read()
+    frames = [camera_frame(image, int(i)) for i, image in zip(chosen, images, strict=True)]
+    found = {}
+    for path in options.models:
+        print(f"{path.stem} on changed frames", file=sys.stderr, flush=True)
+        found[path.stem] = validity(path, frames, split.contact_mm_deg[chosen])
+    return found
 
 
 def _scored(scores: Scores) -> dict[str, Any]:

@@ -20,42 +20,16 @@ import numpy as np
 from touchcell.cell.bench.quantiles import median_and_p99
 from touchcell.geometry.types import ImageArray
 from touchcell.perception.markers.estimator import MarkerEstimator
+from touchcell.perception.models.camera_frames import from_camera
 from touchcell.perception.models.model_file import Model, load_model
 from touchcell.perception.models.prediction import ContactEstimator, Prediction
-from touchcell.perception.models.preprocessing import AdaptiveThreshold, Crop, Preprocessing
 from touchcell.perception.runtime.estimators import estimator_of
 from touchcell.perception.runtime.inference import ContactModel
 
 T = TypeVar("T")
 
-FRAME_SIZE = (480, 640)
-"""(height, width) px of a camera's frame."""
-
-THRESHOLD = AdaptiveThreshold(block_px=61, offset=-5.0)
-MEDIAN_PX = 5
 OWN = "own"
 """Runtime of an estimator that is not a single network: the product's own."""
-
-
-def from_camera(preprocessing: Preprocessing) -> Preprocessing:
-    """Return the preprocessing of a grey 640x480 frame for a model trained on cropped and thresholded images.
-
-    The steps before the model's own are the paper's (Lloyd & Lepora 2024, 3.1.3): a central crop, a 5x5 median and an
-    adaptive threshold. A model that was trained on camera frames keeps its own preprocessing.
-    """
-    height, width = preprocessing.input_size
-    if preprocessing.input_size == FRAME_SIZE or height > FRAME_SIZE[0] or width > FRAME_SIZE[1]:
-        return preprocessing
-    top, left = (FRAME_SIZE[0] - height) // 2, (FRAME_SIZE[1] - width) // 2
-    own = preprocessing.region
-    return preprocessing.model_copy(
-        update={
-            "input_size": FRAME_SIZE,
-            "crop": Crop(left + own.left, top + own.top, left + own.right, top + own.bottom),
-            "median_px": MEDIAN_PX,
-            "threshold": THRESHOLD,
-        }
-    )
 
 
 def main(arguments: list[str]) -> None:
@@ -103,6 +77,7 @@ def _arrays(prefix: str, predictions: Sequence[Prediction]) -> dict[str, Any]:
         f"{prefix}xi": np.stack([prediction.xi for prediction in predictions]),
         f"{prefix}covariance": np.stack([prediction.covariance for prediction in predictions]),
         f"{prefix}in_range": np.array([prediction.in_range for prediction in predictions]),
+        f"{prefix}tail_scale": np.array(predictions[0].tail_scale or np.nan),
     }
 
 

@@ -37,6 +37,7 @@ _NOTICED_S = 4.0
 _SHOWN_S = 3.0
 _STEP_S = 0.01
 _STARTS = 2
+_TRIES = 2
 _SLOW_M_S = 0.002
 _TTL_S = 0.2
 _STILL_DEG = 0.2
@@ -164,12 +165,14 @@ def _try_and_print(row: ZooRow, number: int, *, peers: bool) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="touchcell-zoo-") as name:
         folder = Path(name)
         rig = RIGS.load(row.driver)
-        found, message = try_row(row, rig(folder, _FIRST_ADDRESS + 2 * number))
-        tries = 1
-        if not is_handled(row, found):
-            # A machine that is busy starves emulators and drivers; what is not handled twice is not handled.
-            found, message = try_row(row, rig(folder, _FIRST_ADDRESS + 2 * number))
-            tries = 2
+        tries, found, message = 0, "", ""
+        # A machine that is busy starves emulators and drivers; what is not handled twice is not handled.
+        while tries < _TRIES and not is_handled(row, found):
+            tries += 1
+            try:
+                found, message = try_row(row, rig(folder, _FIRST_ADDRESS + 2 * number))
+            except (TimeoutError, TransportTimeout) as error:
+                found, message = "not tried", f"the emulator did not answer: {error}"
         result = {
             **row.model_dump(),
             "found": found,
@@ -183,7 +186,10 @@ def _try_and_print(row: ZooRow, number: int, *, peers: bool) -> dict[str, Any]:
             else f"NOT HANDLED ({row.expect} expected, {found})"
         )
         if peers:
-            theirs, why = try_peer(row, rig(folder, _FIRST_ADDRESS + 2 * number + 1), folder)
+            try:
+                theirs, why = try_peer(row, rig(folder, _FIRST_ADDRESS + 2 * number + 1), folder)
+            except (TimeoutError, TransportTimeout) as error:
+                theirs, why = "-", f"the emulator did not answer: {error}"
             result |= {"peer": theirs, "peer_message": why, "peer_handled": _peer_handled(row, theirs)}
             verdict = f"{verdict:<12}{_peer_verdict(row, theirs)}"
     print(f"{row.driver:<15}{row.source:<42}{row.failure:<58}{verdict}", flush=True)

@@ -11,7 +11,7 @@ from touchcell.drivers.core.protocols import FrameSource
 from touchcell.drivers.replay.dataset import natural_order, read_image
 from touchcell.errors import ConfigError, DataError
 from touchcell.geometry.types import ImageArray
-from touchcell.perception.calibration.zero_frame import find_change
+from touchcell.perception.markers.zero_frame import find_change
 from touchcell.perception.models.camera_change import CameraChange
 from touchcell.perception.models.model_file import load_model
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from touchcell.cell.cli.arguments import Subparsers, add_cell, add_command, add_settings
+from touchcell.cell.cli.arguments import Subparsers, add_cell, add_command, add_settings, port
 from touchcell.cell.cli.exit_codes import EXIT_OK
 from touchcell.cell.config.find import find_cell
 
@@ -23,6 +23,18 @@ def add_parser(commands: Subparsers) -> None:
     run.add_argument("--model", metavar="FILE", help="model file in place of the one that the cell names")
     run.add_argument("--out", type=Path, metavar="FOLDER", help="run folder (default: runs/NAME-TIME)")
     run.add_argument("--animate", action="store_true", help="also write animation.gif, of a simulated run")
+    run.add_argument(
+        "--live",
+        action="store_true",
+        help="serve what is recorded to Foxglove on this machine while it runs: ws://127.0.0.1:PORT",
+    )
+    run.add_argument(
+        "--live-port",
+        type=port,
+        default=8765,
+        metavar="PORT",
+        help="of --live, 0 for any free one (default: %(default)s)",
+    )
     run.add_argument("--quiet", action="store_true", help="show no live progress line")
 
     check = add_command(commands, "check", _check, "validate a cell file without connecting anything")
@@ -47,6 +59,7 @@ def _run(options: argparse.Namespace) -> int:
         out=options.out,
         live=not options.quiet and sys.stdout.isatty(),
         moving=options.animate,
+        live_port=options.live_port if options.live else None,
     )
 
 

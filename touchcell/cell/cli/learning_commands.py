@@ -79,6 +79,9 @@ def _add_training(commands: Subparsers) -> None:
     )
     train_sim.add_argument("--tip", metavar="TIP", help="tip file of `calibrate-sim`, or the name of one that ships")
     train_sim.add_argument("--processed", action="store_true", help="for images as the public data have them")
+    train_sim.add_argument(
+        "--feature", choices=("surface", "edge"), default="surface", help="what is touched (default: %(default)s)"
+    )
     train_sim.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
     _add_seed(train_sim)
 
@@ -185,6 +188,7 @@ def _train_sim(options: argparse.Namespace) -> int:
         processed=options.processed,
         epochs=options.epochs,
         seed=options.seed,
+        feature=options.feature,
     )
     return EXIT_OK
 

@@ -16,6 +16,7 @@ from typing import Any
 from touchcell.cell.analysis.report import write_report
 from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
 from touchcell.cell.cli.output import say, warn
+from touchcell.cell.cli.run_description import describe_run, wall_clock_ns
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.worlds import WorldName
 from touchcell.cell.recording.mcap import RECORDING
@@ -28,7 +29,6 @@ from touchcell.cell.runtime.heap import trim_heap
 from touchcell.cell.runtime.loop import RunLoop
 from touchcell.cell.runtime.operator_channel import OperatorChannel
 from touchcell.cell.runtime.operator_input import stop_on_keys, stop_on_signals
-from touchcell.cell.runtime.run_description import describe_run, wall_clock_ns
 from touchcell.cell.runtime.run_directory import RunFolderError, run_directory
 from touchcell.cell.runtime.run_result import Outcome, Progress, RunResult
 from touchcell.cell.runtime.stop_request import StopRequest
@@ -87,6 +87,7 @@ def run_cell(
     out: Path | None = None,
     live: bool = True,
     moving: bool = False,
+    live_port: int | None = None,
 ) -> int:
     """Run a cell file to its end and report; returns the exit code.
 
@@ -99,6 +100,7 @@ def run_cell(
         out: run folder, made for this run or empty.
         live: show a progress line.
         moving: also make the animation of a simulated run.
+        live_port: of a server for Foxglove on this machine; None serves nothing.
 
     Raises:
         ConfigError, ModelError, RunFolderError, ConnectError: before anything moves.
@@ -107,7 +109,7 @@ def run_cell(
     with cell_in_world(path, world, overrides, model=model, settings=settings) as plan:
         for note in plan.notes:
             say(f"on {world}: {note}")
-        run = run_plan(plan, out=out, live=live)
+        run = run_plan(plan, out=out, live=live, live_port=live_port)
     if run.summary:
         say(run.summary)
     if moving:
@@ -121,13 +123,16 @@ def run_cell(
     return run.exit_code
 
 
-def run_plan(plan: CellPlan, *, out: Path | None = None, live: bool = False) -> FinishedRun:
+def run_plan(
+    plan: CellPlan, *, out: Path | None = None, live: bool = False, live_port: int | None = None
+) -> FinishedRun:
     """Compose and run a planned cell to its end, and write its run folder.
 
     Args:
         plan: the cell.
         out: run folder, made for this run or empty; None for ``runs/NAME-TIME``.
         live: show a progress line.
+        live_port: of a server for Foxglove on this machine; None serves nothing.
 
     Raises:
         ConfigError, ModelError, RunFolderError, ConnectError: before anything moves.
@@ -137,7 +142,7 @@ def run_plan(plan: CellPlan, *, out: Path | None = None, live: bool = False) -> 
     with run_directory(plan.cell.name, out) as folder, _log_and_result(folder, plan) as result_file:
         logger.info("%s: task %s of %s, in %s", plan.cell.name, plan.task.name, plan.file, folder)
         try:
-            result, leaving = _run(cell, folder, live, result_file)
+            result, leaving = _run(cell, folder, live, result_file, live_port)
         except Exception as error:
             _write_result(result_file, _not_started_json(plan, error))
             raise
@@ -170,11 +175,13 @@ def _report(folder: Path) -> str:
         return ""
 
 
-def _run(cell: Cell, folder: Path, live: bool, result_file: ReservedFile) -> tuple[RunResult, Exception | None]:
+def _run(
+    cell: Cell, folder: Path, live: bool, result_file: ReservedFile, live_port: int | None
+) -> tuple[RunResult, Exception | None]:
     """Run to the end; returns how it ended, and what was raised when the devices were given back."""
     result = None
     try:
-        with _running(cell, folder, live, result_file) as run:
+        with _running(cell, folder, live, result_file, live_port) as run:
             result = run()
     except Exception as error:
         if result is None:
@@ -187,7 +194,9 @@ def _run(cell: Cell, folder: Path, live: bool, result_file: ReservedFile) -> tup
 
 
 @contextlib.contextmanager
-def _running(cell: Cell, folder: Path, live: bool, result_file: ReservedFile) -> Iterator[Callable[[], RunResult]]:
+def _running(
+    cell: Cell, folder: Path, live: bool, result_file: ReservedFile, live_port: int | None
+) -> Iterator[Callable[[], RunResult]]:
     """Within reach of the operator, with everything open and all devices active; yields what runs the task."""
     stop, channel = StopRequest(), OperatorChannel(folder)
     explained = False
@@ -195,6 +204,7 @@ def _running(cell: Cell, folder: Path, live: bool, result_file: ReservedFile) ->
         note_crashes(folder),
         BlackBox(folder, _about(cell, folder)) as box,
         _recorder(folder, cell) as recorder,
+        _served(recorder, cell, live_port),
         cell,
         stop_on_signals(stop),
         stop_on_keys(stop, channel=channel) as look_at_keys,
@@ -241,6 +251,17 @@ def _recorder(folder: Path, cell: Cell) -> Iterator[Recorder]:
     with Recorder(folder / RECORDING, wall_offset_ns=wall_clock_ns() - cell.clock.now_ns()) as recorder:
         describe_run(recorder, cell)
         yield recorder
+
+
+@contextlib.contextmanager
+def _served(recorder: Recorder, cell: Cell, port: int | None) -> Iterator[None]:
+    """Serve what is recorded to viewers on this machine."""
+    if port is None:
+        yield
+        return
+    with recorder.serve(cell.plan.cell.name, port) as address:
+        say(f"live: {address} (Foxglove or Lichtblick: Open connection, Foxglove WebSocket)")
+        yield
 
 
 def _about(cell: Cell, folder: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""``why``, ``report``, ``view``, ``compare``: ended runs; ``stop``, ``reset``, ``resume``: runs in progress."""
+"""``why``, ``report``, ``open``, ``view``, ``compare``: ended runs; ``stop``, ``reset``, ``resume``: others."""
 
 from __future__ import annotations
 
@@ -17,7 +17,21 @@ def add_parser(commands: Subparsers) -> None:
 
     report = add_command(commands, "report", _report, "make a run's summary and plots again from its recording")
     add_run_folder(report)
+    report.add_argument("--latest", action="store_true", help="the newest run below runs/, as without a folder")
+    report.add_argument("--html", action="store_true", help="also write report.html: one file, its plots interactive")
     report.add_argument("--animate", action="store_true", help="also write animation.gif")
+
+    felt = add_command(commands, "felt", _felt, "write the shape that a run has felt as a point cloud (PLY)")
+    add_run_folder(felt)
+    felt.add_argument("--out", type=Path, metavar="FILE", help="PLY file to write (default: felt.ply in the folder)")
+    felt.add_argument("--sensor", default="sensor", metavar="ROLE", help="role of the sensor (default: %(default)s)")
+
+    opened = add_command(commands, "open", _open, "open a run in Foxglove or Rerun, arranged for its cell")
+    add_run_folder(opened)
+    viewer = opened.add_mutually_exclusive_group()
+    viewer.add_argument("--foxglove", action="store_true", help="in Foxglove or Lichtblick, with a layout (default)")
+    viewer.add_argument("--rerun", action="store_true", help="in Rerun, with a blueprint")
+    opened.add_argument("--to", type=Path, metavar="FILE", help="with --rerun: write this .rrd file instead")
 
     view = add_command(commands, "view", _view, "show in a browser what a run's sensors feel, live or recorded")
     add_run_folder(view)
@@ -67,12 +81,31 @@ def _folder(options: argparse.Namespace) -> Path:
 def _report(options: argparse.Namespace) -> int:
     from touchcell.cell.analysis.report import write_report
 
+    if options.latest and options.folder is not None:
+        raise ConfigError("names another run", key="--latest", hint="name a folder or give --latest, not both")
     folder = _folder(options)
     print(write_report(folder))
+    if options.html:
+        from touchcell.cell.analysis.html_report import write_html
+
+        print(write_html(folder))
     if options.animate:
         from touchcell.cell.experiments.animation import animate
 
         print(animate(folder))
+    return EXIT_OK
+
+
+def _open(options: argparse.Namespace) -> int:
+    from touchcell.cell.cli.open_command import open_in_foxglove, open_in_rerun
+
+    folder = _folder(options)
+    if options.to is not None and not options.rerun:
+        raise ConfigError("is for Rerun only", key="--to", value=str(options.to), hint="add --rerun")
+    if options.rerun:
+        open_in_rerun(folder, options.to)
+    else:
+        open_in_foxglove(folder)
     return EXIT_OK
 
 
@@ -90,6 +123,25 @@ def _compare(options: argparse.Namespace) -> int:
         print(f"{len(different)} of {len(topics)} topics differ")
         return EXIT_TASK_FAILED
     print(f"identical bit for bit: {messages} messages of {len(topics)} topics, durations on this machine aside")
+    return EXIT_OK
+
+
+def _felt(options: argparse.Namespace) -> int:
+    from touchcell.cell.analysis.felt_cloud import felt_cloud, write_ply
+    from touchcell.cell.analysis.run_folder import RunFolder
+
+    folder = _folder(options)
+    run = RunFolder(folder)
+    cloud = felt_cloud(run, options.sensor)
+    path = options.out or folder / "felt.ply"
+    write_ply(cloud, path)
+    print(f"{path}: {len(cloud.points)} points with normals and standard deviations")
+    if run.plan.cell.scene is not None:
+        from touchcell.cell.experiments.scenes import distance_to_scene_mm
+
+        off = distance_to_scene_mm(run, cloud.points)
+        rms_mm, worst_mm = float((off**2).mean() ** 0.5), float(abs(off).max())
+        print(f"off the scene's surface: RMS {rms_mm:.3f} mm, at most {worst_mm:.3f} mm")
     return EXIT_OK
 
 

@@ -25,6 +25,8 @@ from touchcell.perception.models.preprocessing import AdaptiveThreshold, Crop, P
 from touchcell.perception.networks.dataset import LabelledImages
 from touchcell.perception.networks.progress import Display, Observer
 from touchcell.perception.networks.training import Settings, train_on_arrays
+from touchcell.perception.runtime.estimator_spec import Feature
+from touchcell.simulation.edge_samples import edge_contacts
 from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.samples import SampledContact, Variation, contacts
 from touchcell.simulation.tip import Tip, TipParameters
@@ -79,10 +81,12 @@ class Imagined:
     Attributes:
         sensor: a real sensor's file, or None for the default tip.
         processed: images as the public data have them, cropped and black and white, rather than raw frames.
+        feature: what the contacts are with.
     """
 
     sensor: TipFile | None = None
     processed: bool = False
+    feature: Feature = "surface"
 
     @property
     def tip(self) -> TipParameters:
@@ -100,6 +104,8 @@ class Imagined:
 
     def contacts(self, samples: int, seed: int) -> Iterator[SampledContact]:
         """Random ones."""
+        if self.feature == "edge":
+            return edge_contacts(samples, seed, variation=VARIATION)
         if self.sensor is None:
             return contacts(samples, seed, depth_mm=DEPTH_MM, variation=VARIATION)
         sensor = self.sensor
@@ -117,6 +123,7 @@ def train_on_simulation(
     processed: bool = False,
     epochs: int | None = None,
     seed: int = 0,
+    feature: Feature = "surface",
 ) -> None:
     """Draw ``samples`` training images and a fifth of that for validation, train, and write the model file.
 
@@ -128,12 +135,13 @@ def train_on_simulation(
         processed: for images as the public data have them rather than raw frames.
         epochs: passes over the samples; None for the kind's default.
         seed: of everything random.
+        feature: ``edge`` for contacts with edges, of the default tip and images that a network sees whole.
 
     Raises:
         ConfigError: the tip file cannot be used.
         TrainingError: as ``touchcell.perception.networks.training.train``.
     """
-    imagined = Imagined(None if tip is None else load_tip(tip), processed)
+    imagined = Imagined(None if tip is None else load_tip(tip), processed, feature)
     with Display() as display:
         if kind == "markers":
             _train_markers(imagined, out, samples, epochs, seed, display)

@@ -206,7 +206,7 @@ def _required(plan: CellPlan, facts: CellFacts) -> Iterator[tuple[str, str, str]
             yield kind, role, "sensor"
         if sensor.arm in moved:
             yield "workspace", role, "sensor"
-        if plan.cell.sensors[plan.sensor_roles[role]].estimator.kind == "network":
+        if plan.cell.sensors[plan.sensor_roles[role]].estimator.kind in ("network", "edge_network"):
             for kind in REQUIRED_OF_NETWORKS:
                 yield kind, role, "sensor"
 

@@ -83,7 +83,7 @@ def plan_cell(
     if model is not None and isinstance(sensors := file.data.get("sensors"), dict):
         for sensor in sensors.values():
             estimator = sensor.get("estimator") if isinstance(sensor, dict) else None
-            if isinstance(estimator, dict) and estimator.get("kind") == "network":
+            if isinstance(estimator, dict) and estimator.get("kind") in ("network", "edge_network"):
                 estimator["model"] = model
     plan = _Planner(file, overrides, settings or {}, to_run=to_run).plan()
     return plan if world is None else replace(plan, world_settings=world.settings, notes=tuple(world.notes))

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 _OF_NETWORKS: Final = frozenset({"uncertain", "out_of_range", "inconsistent", "markers_lost"})
+_TRUTH_OF: Final = {"network": "true_contact", "edge_network": "true_edge"}
+"""Estimator by a network -> the truth that it estimates."""
 _OF_IMAGES: Final = frozenset({"exposure"})
 
 
@@ -16,8 +18,9 @@ def put_on_true_contact(data: dict[str, Any]) -> None:
         data: the cell file, which is changed.
     """
     for sensor in data["sensors"].values():
-        if sensor["estimator"]["kind"] == "network":
-            sensor["estimator"] = {"kind": "true_contact"}
+        replaced = _TRUTH_OF.get(sensor["estimator"]["kind"])
+        if replaced is not None:
+            sensor["estimator"] = {"kind": replaced}
     data["interlocks"] = answerable(data)
 
 
@@ -31,8 +34,8 @@ def answerable(data: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(sensors, Mapping) or not isinstance(interlocks, Mapping):
         return dict(interlocks) if isinstance(interlocks, Mapping) else {}
     kinds = {_kind(sensor.get("estimator")) for sensor in sensors.values() if isinstance(sensor, Mapping)}
-    unanswered = set() if "network" in kinds else set(_OF_NETWORKS)
-    if not kinds & {"network", "known_surface"}:
+    unanswered = set() if kinds & set(_TRUTH_OF) else set(_OF_NETWORKS)
+    if not kinds & {*_TRUTH_OF, "known_surface", "true_edge"}:
         unanswered |= _OF_IMAGES
     return {name: entry for name, entry in interlocks.items() if _kind(entry) not in unanswered}
 

@@ -27,8 +27,8 @@ def plot_pushes(finished: Sequence[Finished], path: Path, *, view: View = ABOVE)
     for axis in axes.flat[len(finished) :]:
         axis.set_axis_off()
     for axis, each in zip(axes.flat, finished, strict=False):
-        error = each.measures.get("error_mm")
-        title = each.trial.row + ("" if error is None else f": {error:.2f} mm")
+        error = each.measures.get("object_error_mm")
+        title = each.trial.row + ("" if error is None or not each.done else f": {error:.2f} mm")
         _draw_push(axis, each.folder, view)
         label_2d(axis, view, title if each.done else f"{title} ({each.outcome})")
     return save(figure, path, dpi=80)
@@ -40,15 +40,17 @@ def plot_errors(finished: Sequence[Finished], path: Path, *, aim_mm: float) -> P
     figure, axis = plt.subplots(figsize=(0.55 * len(rows) + 3.0, 4.6), layout="constrained")
     for i, row in enumerate(rows):
         errors = [
-            each.measures["error_mm"] for each in finished if each.trial.row == row and "error_mm" in each.measures
+            each.measures["object_error_mm"]
+            for each in finished
+            if each.trial.row == row and each.done and "object_error_mm" in each.measures
         ]
-        colour = BLUE if "learned" in row else ORANGE
+        colour = ORANGE if "matched" in row else BLUE
         axis.plot(np.full(len(errors), i), errors, "o", ms=5, color=colour, alpha=0.75)
         if errors:
             axis.plot([i - 0.25, i + 0.25], [np.mean(errors)] * 2, color="black", lw=1.4)
     axis.axhline(aim_mm, color=_RED, ls="--", lw=1.0, label=f"aim: {aim_mm:g} mm")
     axis.set_xticks(range(len(rows)), rows, rotation=40, ha="right", fontsize=8)
-    axis.set_ylabel("target to contact normal (mm)")
+    axis.set_ylabel("object to target (mm)")
     axis.set_ylim(bottom=0.0)
     axis.grid(axis="y", alpha=0.3)
     axis.legend()
@@ -92,3 +94,32 @@ def plot_leans(finished: Mapping[str, Sequence[Finished]], path: Path) -> Path:
     axes[0].set_ylabel("lean from the vertical (deg)")
     axes[-1].legend(fontsize=8, ncols=2)
     return save(figure, path, dpi=80)
+
+
+def plot_map(
+    errors_mm: Sequence[Sequence[float]],
+    columns: Sequence[float],
+    rows: Sequence[float],
+    labels: tuple[str, str],
+    path: Path,
+) -> Path:
+    """Draw the object's error over two quantities; NaN, for a push that did not arrive, as a cross.
+
+    Args:
+        errors_mm: by row and column.
+        columns, rows: values of the quantities.
+        labels: of the columns and of the rows, with units.
+        path: of the picture.
+    """
+    errors = np.array(errors_mm, dtype=np.float64)
+    figure, axes = plt.subplots(figsize=(1.6 + 0.7 * len(columns), 1.4 + 0.5 * len(rows)), layout="constrained")
+    image = axes.imshow(errors, origin="lower", cmap="viridis", vmin=0.0, vmax=2.0, aspect="auto")
+    for i, j in np.ndindex(errors.shape):
+        text, colour = ("x", "red") if np.isnan(errors[i, j]) else (f"{errors[i, j]:.1f}", "white")
+        axes.text(j, i, text, ha="center", va="center", color=colour)
+    axes.set_xticks(range(len(columns)), [f"{value:g}" for value in columns])
+    axes.set_yticks(range(len(rows)), [f"{value:g}" for value in rows] if len(rows) > 1 else [""])
+    axes.set_xlabel(labels[0])
+    axes.set_ylabel(labels[1])
+    figure.colorbar(image, label="object from target, mm")
+    return save(figure, path, dpi=100)

@@ -90,11 +90,14 @@ def trials(scale: Scale) -> list[Trial]:
 def _cell_changes(pushed: Pushed, arms: str) -> dict[str, Any]:
     height_mm = pushed_at_mm(pushed)
     # Both in the same world: the shipped cells differ in this.
-    same = {"scene.step_ms": 5} | _ARMS[arms].around(pushed, "mdf", height_mm)
+    # Slowly, by the paper's controller: fast pushes topple.
+    same = {"scene.step_ms": 5, "task.steering": "bearing", "task.push_speed_mm_s": 20.0}
+    same |= _ARMS[arms].around(pushed, "mdf", height_mm)
     if arms == WITHOUT:
         return same | _boxes_up_to(height_mm, "workspace")
     press_mm, lift_mm = held_with_mm(pushed)
     same["task.reference_mm_deg"] = [press_mm, 0, 0, 0, 0, 0]
+    same["task.follower.active"] = False
     same["task.follower.reference_mm_deg"] = [-lift_mm, 0, _FOLLOWER_MM, 0, 0, 0]
     if pushed.shape["kind"] in _ROUND:
         same |= _FOLLOWER_OF_ROUND

@@ -7,7 +7,8 @@ touchcell.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Final, Protocol, Self
@@ -16,6 +17,7 @@ from touchcell.cell.errors import RecordingError
 from touchcell.cell.recording.mcap import CELL_CLOCK
 from touchcell.cell.recording.message_types import Encoded, Encoder
 from touchcell.cell.recording.messages import declared_type
+from touchcell.errors import ConfigError
 
 if TYPE_CHECKING:
     from foxglove import Context
@@ -23,6 +25,10 @@ if TYPE_CHECKING:
 
 CHUNK_BYTES: Final = 16 * 1024
 """A kill loses at most the open chunk: a fraction of a second of a cell's usual 100 kB/s."""
+
+
+LOOPBACK: Final = "127.0.0.1"
+_BACKLOG: Final = 1024
 
 
 class RecordedType(Protocol):
@@ -50,7 +56,8 @@ class Recorder:
 
     Attributes:
         encoder: encodes messages for it.
-        context: of the channels, for a server that sends the same messages to viewers.
+        context: of the channels.
+        live: whether viewers may join at any time, to whom what stands still has to be sent again.
 
     Raises:
         RecordingError: from any method, when the disk is full or gone. Nothing more is written after the first.
@@ -66,6 +73,7 @@ class Recorder:
         self.context: Context = foxglove.Context()
         self._channels: dict[str, tuple[RecordedType, BaseChannel]] = {}
         self._failed = False
+        self.live = False
         try:
             self._stream = _Stream(_File(path) if stream is None else stream)
         except OSError as error:
@@ -121,6 +129,36 @@ class Recorder:
         self._writer.write_metadata(name, dict(metadata))
         if self._stream.error is not None:
             raise self._failure(self._stream.error)
+
+    @contextmanager
+    def serve(self, name: str, port: int) -> Iterator[str]:
+        """Send every message to viewers on this machine too, by the Foxglove WebSocket; yields the address.
+
+        A viewer that does not keep up loses the oldest of its messages, and holds nothing up.
+
+        Args:
+            name: shown by viewers.
+            port: TCP port on the loopback interface; 0 for any that is free.
+
+        Raises:
+            ConfigError: the port is taken.
+        """
+        import foxglove
+
+        try:
+            server = foxglove.start_server(
+                name=name, host=LOOPBACK, port=port, context=self.context, message_backlog_size=_BACKLOG
+            )
+        except Exception as error:
+            raise ConfigError(
+                f"cannot be served at: {error}", key="--live-port", value=port, hint="--live-port 0 takes a free one"
+            ) from None
+        self.live = True
+        try:
+            yield f"ws://{LOOPBACK}:{server.port}"
+        finally:
+            self.live = False
+            server.stop()
 
     def sync(self) -> None:
         """Have the disk keep what has left the process: all but the open chunk, which a black box holds too."""

@@ -39,6 +39,7 @@ SCENE_TOPIC: Final = "/scene"
 LOG_TOPIC: Final = "/log"
 # Joints, links and moved surfaces are for the eye, which sees no more pictures a second.
 _PICTURE_S: Final = 1.0 / 30.0
+_AGAIN_NS: Final = 1_000_000_000
 _LEVELS: Final[dict[Severity, str]] = {Severity.LIMIT: "WARNING", Severity.TRIP: "ERROR", Severity.FAULT: "FATAL"}
 
 
@@ -59,10 +60,11 @@ class ViewerRecord:
         self._beliefs: dict[str, tuple[str, BeliefMessage]] = {}
         self._joints = {role: JointMessage(chain.joint_names) for role, chain in scene.chains.items()}
         self._joints_ns: dict[str, int] = {}
-        self._moving_ns = -(1 << 62)
+        self._moving_ns = self._begun_ns = -(1 << 62)
 
     def begin(self, t_ns: int) -> None:
         """Write what stands still, and everything that is drawn."""
+        self._begun_ns = t_ns
         for frame in self._scene.frames:
             self._transform(frame.parent, frame.name, t_ns, frame.T_parent_frame)
         parts = sorted(self._scene.parts, key=lambda part: (part.name, part.frame))
@@ -112,6 +114,11 @@ class ViewerRecord:
         """Write where the free objects of the scene are."""
         for name, T_world_object in objects.value.items():
             self._transform(WORLD, object_frame(name), objects.t_ns, T_world_object)
+
+    def again(self, t_ns: int) -> None:
+        """Write what stands still again, every second, for viewers that have joined since."""
+        if self._recorder.live and t_ns >= self._begun_ns + _AGAIN_NS:
+            self.begin(t_ns)
 
     def moving(self, t_ns: int) -> None:
         """Write where the surfaces are that a prescribed motion moves."""

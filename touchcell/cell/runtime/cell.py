@@ -40,7 +40,7 @@ class Cell:
         sensors: by role.
         auxiliaries: devices that are neither arms nor cameras, by role, or by name where they have none.
         task: what the cell does.
-        new_task: makes it anew, in its first state, after a trip.
+        resumed_task: makes it anew, in its first state, after a trip.
         stop_categories: by which each arm stops when something is wrong, by role.
         holding: roles of arms that keep their power when another's fault stops them.
         watched_joints: roles of arms whose joint angles an interlock reads.
@@ -62,7 +62,7 @@ class Cell:
     sensors: Mapping[str, Sensor]
     supervisor: Supervisor
     task: Task
-    new_task: Callable[[], Task]
+    resumed_task: Callable[[], Task]
     auxiliaries: Mapping[str, Device] = field(default_factory=dict)
     stop_categories: Mapping[str, StopCategory] = field(default_factory=dict)
     holding: frozenset[str] = frozenset()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TypeAlias, cast
 
@@ -83,8 +84,8 @@ def compose(
     collection = _collection(plan)
     context = TaskContext(plan.cell.rate_hz, sensor_poses, 0 if collection is None else collection.kept)
 
-    def new_task() -> Task:
-        return plan.task.build(plan.task_config, context)
+    def resumed_task() -> Task:
+        return plan.task.build(plan.task_config, replace(context, resumed=True))
 
     return Cell(
         plan=plan,
@@ -93,8 +94,8 @@ def compose(
         cameras={name: devices[name] for name in plan.sensors},
         sensors=sensors,
         supervisor=Supervisor(interlocks, Latch()),
-        task=new_task(),
-        new_task=new_task,
+        task=plan.task.build(plan.task_config, context),
+        resumed_task=resumed_task,
         auxiliaries={role: devices[name] for role, name in plan.auxiliary_roles.items()},
         stop_categories={role: StopCategory(plan.cell.arms[name].stop_category) for name, role in role_of.items()},
         holding=frozenset(

@@ -168,7 +168,7 @@ class RunLoop:
         """Called on entry to RUNNING: after a reset the task begins anew, from its first state."""
         if record.event == RESUME:
             cell = self._cell
-            cell.task = cell.new_task()
+            cell.task = cell.resumed_task()
             self._record.new_task()
             self._sent = {}
             self._lost = False

@@ -238,6 +238,7 @@ class RunRecord:
         if objects is not None:
             viewers.objects(objects)
         viewers.moving(reading.now_ns)
+        viewers.again(reading.now_ns)
 
     def zero_frame(self, role: str, t_ns: int, image: ImageArray) -> None:
         """Record the image out of contact that a sensor compares others with; the arm stands meanwhile."""

@@ -281,7 +281,8 @@ class Keeper:
                 ),
                 0.0,
                 share * motor.kp_n_m_rad,
-                motor.kd_n_m_s_rad,
+                # An arm that is let go sinks against as much damping as its motors have.
+                motor.kd_n_m_s_rad if share == 1.0 else codec.KD_MAX,
                 float(np.clip(self._direction[index] * tau[index], -strongest, strongest)),
             )
             frames.append(codec.encode_mit(command, ranges))

@@ -12,7 +12,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -49,6 +48,7 @@ class KeeperBus:
                 f"a keeper holds {channel}",
                 hint="it lowers the arm of a client that died, and ends when the arm rests: wait, then connect again",
             )
+        self._path = path
         self._process = _start(device, settings, path)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.connect(str(path))
@@ -99,7 +99,7 @@ class KeeperBus:
         if packet[:1] == _FAILED and len(packet) not in FRAME_SIZES:
             told = json.loads(packet[1:])
             raise can.CanOperationError(told["text"], told["code"])
-        return unpack(packet, time.time())
+        return unpack(packet)
 
     def shutdown(self) -> None:
         """Leave: a keeper whose motors are disabled ends, any other lowers the arm."""
@@ -108,6 +108,8 @@ class KeeperBus:
         self._socket.close()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
+            # Nothing happened that somebody would have to read of.
+            self._path.with_suffix(".log").unlink(missing_ok=True)
 
 
 def _socket_path(interface: str, channel: str) -> Path:

@@ -33,12 +33,14 @@ from touchcell.perception.calibration.transfer_fit import (
     old_sensor,
     with_sigma,
 )
-from touchcell.perception.calibration.zero_frame import similarity
 from touchcell.perception.errors import ModelError, TrainingError
+from touchcell.perception.markers.camera_check import transferred_check
 from touchcell.perception.markers.detection import Discs, detect_markers, typical_size
 from touchcell.perception.markers.estimator import displacement_model_of, matcher_of
+from touchcell.perception.markers.lattice_fit import fit_lattice
 from touchcell.perception.markers.layers import layers_of, mixed
 from touchcell.perception.markers.matching import DisplacementModel, MarkerMatcher
+from touchcell.perception.markers.zero_frame import similarity
 from touchcell.perception.models.camera_change import CameraChange
 from touchcell.perception.models.labels import CONTACT_NAMES, contact_from_xi, shear_direction, xi_from_contact
 from touchcell.perception.models.marker_architecture import MarkerArchitecture, MarkerSize
@@ -46,7 +48,6 @@ from touchcell.perception.models.model_file import Header, Labels, Model, load_m
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.contact_network import Alignment
 from touchcell.perception.networks.displacement_network import DisplacementNetwork, Jitter, displacement_loss
-from touchcell.perception.networks.marker_learning import fit_lattice
 from touchcell.perception.networks.marker_training import LabelledDiscs, preprocessing_for
 from touchcell.perception.networks.sigma_scaling import calibrate
 
@@ -56,6 +57,7 @@ _MATCHED = 0.5
 _MOST_PROCESS_CONTACTS = 400
 _FOLDS, _FEW = 4, 120
 _RIDGE = 0.01
+_TAIL_SCALE = 0.6  # Of models that were calibrated on thousands of contacts.
 _SECTORS = 8
 
 Method = Literal["transfer", "scratch"]
@@ -172,10 +174,15 @@ def adapt_to(
     contacts = contact_from_xi(dataset.xi[matched])
     candidates = _Candidates(old, displacements[matched], contacts, settings)
     method, left_out = candidates.judged()
-    update = {"input_size": preprocessing.output_size, "size": size}
+    update: dict[str, object] = {"input_size": preprocessing.output_size, "size": size}
     architecture = old.header.architecture
     assert isinstance(architecture, MarkerArchitecture)
     labels, tensors = candidates.labels, dict(old.tensors)
+    check, check_tensors = transferred_check(
+        displacement_model_of(old), architecture.rings, displacements[matched].astype(np.float64)
+    )
+    update["camera_check"] = check
+    tensors |= check_tensors
     sigma_scale, sigma_power, transfer = (1.0,) * 6, (1.0,) * 6, None
     if method == "transfer":
         fitted = candidates.transfer()
@@ -193,6 +200,7 @@ def adapt_to(
             labels=labels,
             sigma_scale=sigma_scale,
             sigma_power=sigma_power,
+            tail_scale=_TAIL_SCALE,
             camera=camera,
             transfer=transfer,
             network_labels=None if transfer is None else old.header.labels,

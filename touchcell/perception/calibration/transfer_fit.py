@@ -37,6 +37,7 @@ _PRIOR_SD = (0.6, 1.0, 1.0, 0.6, 1.0, 1.0, 1.0, 0.6, 1.0, 1.0, 1.0, 1.0)
 _STEPS = 80
 _JITTER = 1e-5
 _BANKED = 200
+_CHOSEN = 20.0
 
 
 @dataclass(frozen=True)
@@ -229,7 +230,13 @@ def with_sigma(transfer: Transfer, residual: Array, network: Array, process: Arr
         cost = (np.log(variance) + square / variance).mean(axis=2)
         best = np.unravel_index(int(np.argmin(cost)), cost.shape)
         network_share[i], floor[i] = shares[best[0]], floors[best[1]] * rms
-    update = {"network_share": _six(network_share), "floor": _six(floor)}
+    # Shares and floors were chosen on these residuals, and the fewer they are, the smaller they come out.
+    wider = np.sqrt(1.0 + _CHOSEN / len(residual))
+    update = {
+        "network_share": _six(wider * network_share),
+        "process_share": _six(wider * np.ones(6)),
+        "floor": _six(wider * floor),
+    }
     return replace(transfer, spec=transfer.spec.model_copy(update=update))
 
 

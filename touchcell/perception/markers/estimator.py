@@ -11,6 +11,13 @@ from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception import kernels
 from touchcell.perception.errors import ModelError
+from touchcell.perception.markers.camera_check import (
+    CameraCheck,
+    CameraFinding,
+    TearCheck,
+    fit_functionals,
+    strength_rows,
+)
 from touchcell.perception.markers.detection import Discs, detect_markers
 from touchcell.perception.markers.layers import layers_of, mixed
 from touchcell.perception.markers.matching import DisplacementModel, FirstGuess, MarkerField, MarkerMatcher
@@ -21,6 +28,10 @@ from touchcell.perception.models.prediction import RANGE_TOLERANCE, Prediction
 
 if TYPE_CHECKING:
     from touchcell.perception.models.camera_change import CameraChange
+
+
+_NO_MARKERS = "the markers of the model's sensor were not found"
+_NOISE_PX = 0.5
 
 
 class MarkerEstimator:
@@ -34,6 +45,7 @@ class MarkerEstimator:
         reference: preprocessed image out of contact, or None.
         field: the markers of the last image, None before the first.
         change: between this camera and the one the model was trained with, in pixels of the crop; None for none.
+        camera: what the last image says of its camera; None where its markers were not matched.
     """
 
     def __init__(self, model: Model) -> None:
@@ -49,8 +61,10 @@ class MarkerEstimator:
         self.reference: ImageArray | None = model.reference
         self.field: MarkerField | None = None
         self.change: CameraChange | None = None
+        self.camera: CameraFinding | None = None
         self._size = architecture.size
         self._matcher = matcher_of(model, architecture)
+        self._camera_check = camera_check_of(model, self._matcher.model)
         self._networks = architecture.networks
         self._transferred: TransferredNetworks | None = None
         if model.header.transfer is not None:
@@ -92,8 +106,8 @@ class MarkerEstimator:
     def predict_reduced(self, reduced: ImageArray) -> Prediction:
         """Estimate the contact in an image returned by ``reduce``.
 
-        Where the markers cannot be matched reliably, ``in_range`` is False and the sigmas are as wide as the training
-        range. Where almost none can be matched, the prediction is the centre of that range.
+        Where the markers cannot be matched reliably, or the camera is another one, ``in_range`` is False and the sigmas
+        are as wide as the training range. Where almost none can be matched, the prediction is the centre of that range.
         """
         field = self.match(self.find(reduced))
         return self.decode(field, *self.infer(field))
@@ -131,13 +145,16 @@ class MarkerEstimator:
     def decode(self, field: MarkerField, mean: Array, sigma: Array) -> Prediction:
         """Last step: convert the result of ``infer`` to a Gaussian over xi."""
         labels = self.header.labels
+        self.camera = self._camera_check(field.displacements.ravel(), field.seen) if field.valid else None
+        refusal = _NO_MARKERS if self.camera is None else self.camera.refusal
         if not field.seen.any():
-            return Prediction(*labels.xi_gaussian(mean, sigma), in_range=False, markers=0.0)
-        in_range = field.valid and bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
+            return Prediction(*labels.xi_gaussian(mean, sigma), in_range=False, markers=0.0, refusal=refusal)
+        in_range = not refusal and bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
         calibrated = self.header.calibrated(sigma)
-        # The networks' sigmas are valid only for markers that were matched.
-        xi, covariance = labels.xi_gaussian(mean, calibrated if field.valid else np.maximum(calibrated, 1.0))
-        return Prediction(xi, covariance, in_range, markers=field.score)
+        # The networks' sigmas are valid only for markers that were matched, seen by the model's camera.
+        xi, covariance = labels.xi_gaussian(mean, np.maximum(calibrated, 1.0) if refusal else calibrated)
+        tail_scale = self.header.tail_scale
+        return Prediction(xi, covariance, in_range, markers=field.score, refusal=refusal, tail_scale=tail_scale)
 
     def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:
         """Apply ``predict`` to a camera's sample; the prediction keeps the stamp, number and quality of the frame."""
@@ -153,6 +170,25 @@ def displacement_model_of(model: Model) -> DisplacementModel:
         for name in ("lattice", "displacement.mean", "displacement.basis", "displacement.sd")
     )
     return DisplacementModel(reference, mean, basis, sd)
+
+
+def camera_check_of(model: Model, displacement: DisplacementModel) -> CameraCheck:
+    """Return the camera check of a marker model; for a file without one, that of its displacement model alone."""
+    architecture = model.header.architecture
+    assert isinstance(architecture, MarkerArchitecture)
+    spec = architecture.camera_check
+    if spec is not None:
+        mean = model.tensors["camera.mean"].astype(np.float64)
+        tear = TearCheck(model.tensors["camera.basis"], mean, strength_rows(displacement), spec)
+        return CameraCheck(model.tensors["camera.functionals"], mean, displacement.spacing_px, tear)
+    mean = displacement.mean
+    parts = [(displacement.basis, displacement.sd)]
+    if model.header.transfer is not None:
+        mean = model.tensors["transfer.mean"].astype(np.float64)
+        basis = model.tensors["transfer.basis"].astype(np.float64)
+        parts.append((basis, model.tensors["transfer.scores"].std(axis=0).astype(np.float64)))
+    functionals = fit_functionals(displacement.reference, architecture.rings, mean, parts, _NOISE_PX)
+    return CameraCheck(functionals, mean, displacement.spacing_px)
 
 
 def matcher_of(model: Model, architecture: MarkerArchitecture) -> MarkerMatcher:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from touchcell.perception.models.architecture_spec import ArchitectureConfig
 
@@ -18,6 +20,50 @@ nearly straight."""
 
 LOG_PRECISION_BOUNDS = (-3.0, 7.0)
 """Bounds of the logarithms of its inverse standard deviations: sigma from 20 label half-ranges to a thousandth."""
+
+
+CHECK = "check."
+"""Prefix of the tensors of an image check."""
+
+
+class ImageCheckSpec(BaseModel):
+    """A second, smaller network of the same kind that recognises images of the model's own sensor and camera.
+
+    Its first output is the log-odds of an image of this sensor against anything else; its second, of this camera
+    against one that is turned by a multiple of 60 degrees or mirrored, where the two differ at all.
+
+    Attributes:
+        shrink: side of the squares of pixels that are averaged for its input.
+        channels: features of each block.
+        hidden: units of the hidden layer.
+        least: smallest accepted first output.
+        least_upright: smallest accepted second output; None where the sensor is too regular for it.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
+
+    shrink: int = Field(default=1, gt=0)
+    channels: Annotated[tuple[Annotated[int, Field(gt=0)], ...], Field(min_length=1)] = (8, 16, 24, 32, 32)
+    hidden: int = Field(default=48, gt=0)
+    least: float = Field(allow_inf_nan=False)
+    least_upright: float | None = Field(default=None, allow_inf_nan=False)
+
+    def architecture(self, input_size: tuple[int, int]) -> Architecture:
+        """Return the network's architecture for images (height, width)."""
+        height, width = input_size
+        shrunk = height // self.shrink, width // self.shrink
+        return Architecture(kind="cnn", input_size=shrunk, channels=self.channels, hidden=self.hidden)
+
+
+def shrunk(images: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+    """Return images (..., height, width) with squares of so many pixels averaged; what remains at the border is cut."""
+    if factor == 1:
+        return images
+    height, width = images.shape[-2] // factor, images.shape[-1] // factor
+    parts = images[..., : height * factor, : width * factor]
+    parts = parts.reshape(*images.shape[:-2], height, factor, width, factor)
+    means: NDArray[np.float32] = parts.mean(axis=(-3, -1), dtype=np.float32)
+    return means
 
 
 class Architecture(ArchitectureConfig):
@@ -35,6 +81,7 @@ class Architecture(ArchitectureConfig):
         feature_dropout: rate before the hidden layer.
         mean_dropout: rate before each of the six means.
         precision_dropout: rate before each of the six inverse standard deviations (gdn).
+        check: recognises images of the model's own sensor; None for files without it.
     """
 
     kind: Literal["gdn", "cnn"] = "gdn"
@@ -44,6 +91,7 @@ class Architecture(ArchitectureConfig):
     feature_dropout: Rate = 0.0
     mean_dropout: SixRates = (0.0,) * 6
     precision_dropout: SixRates = (0.0,) * 6
+    check: ImageCheckSpec | None = None
 
     @model_validator(mode="after")
     def _features_remain(self) -> Architecture:
@@ -87,4 +135,7 @@ class Architecture(ArchitectureConfig):
         shapes["hidden.bias"] = (self.hidden,)
         shapes["output.weight"] = (self.outputs, self.hidden)
         shapes["output.bias"] = (self.outputs,)
+        if self.check is not None:
+            own = self.check.architecture(self.input_size).tensor_shapes()
+            shapes |= {f"{CHECK}{name}": shape for name, shape in own.items()}
         return shapes

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.perception.models import onnx_wire
-from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.architecture import CHECK, Architecture
 from touchcell.perception.models.model_file import Model
 
 IMAGES = "images"
@@ -26,7 +26,21 @@ def onnx_model(model: Model) -> bytes:
     architecture = model.header.architecture
     if not isinstance(architecture, Architecture):
         raise TypeError(f"a model of kind {architecture.kind} has no graph")
-    constants: dict[str, NDArray[np.float32]] = dict(model.tensors)
+    return network_graph(architecture, model.tensors)
+
+
+def check_graph(model: Model) -> bytes | None:
+    """Return the serialised ONNX model of an image network's check, likewise; None where it has none."""
+    architecture = model.header.architecture
+    if not isinstance(architecture, Architecture) or architecture.check is None:
+        return None
+    own = {name.removeprefix(CHECK): each for name, each in model.tensors.items() if name.startswith(CHECK)}
+    return network_graph(architecture.check.architecture(architecture.input_size), own)
+
+
+def network_graph(architecture: Architecture, tensors: Mapping[str, NDArray[np.float32]]) -> bytes:
+    """Return the serialised ONNX model of a network with these tensors."""
+    constants = {name: each for name, each in tensors.items() if not name.startswith(CHECK)}
     nodes: list[bytes] = []
     last = IMAGES
 

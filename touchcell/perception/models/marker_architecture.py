@@ -16,6 +16,29 @@ LOG_PRECISION_BOUNDS = (-3.0, 6.0)
 """Bounds of the logarithms of inverse standard deviations, in label half-ranges."""
 
 
+CHECKED = 15
+"""Functionals of a camera check: shift u, shift v, zoom, turn, then one for each of the lattice's eleven symmetries."""
+
+
+class CameraCheckSpec(BaseModel):
+    """Test of marker displacements for another camera and for torn images.
+
+    The logarithm of the markers' root mean square from the principal components of real contacts, px, grows linearly
+    with the strength of the contact, which is the Mahalanobis norm of the first modes.
+
+    Attributes:
+        components: number of principal components.
+        misfit: intercept and slope of that line.
+        most: largest accepted excess over it.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
+
+    components: Count
+    misfit: tuple[Number, Number]
+    most: Number
+
+
 class MarkerArchitecture(ArchitectureConfig):
     """Markers are detected and matched to a lattice, and their displacements are the input of several small networks.
 
@@ -36,6 +59,7 @@ class MarkerArchitecture(ArchitectureConfig):
         most_rms_px: matches with larger residuals are not accepted.
         hidden: units of the layers of each displacement network.
         networks: number of networks.
+        camera_check: detects another camera and torn images (``markers.camera_check``); None for files without it.
     """
 
     reports_markers: ClassVar[bool] = True
@@ -54,6 +78,7 @@ class MarkerArchitecture(ArchitectureConfig):
     most_rms_px: float = Field(gt=0.0, allow_inf_nan=False)
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (384, 512, 512, 256)
     networks: Count = 2
+    camera_check: CameraCheckSpec | None = None
 
     @property
     def markers(self) -> int:
@@ -80,6 +105,10 @@ class MarkerArchitecture(ArchitectureConfig):
             shapes[f"layer{i}.weight"] = (self.networks, before, units)
             shapes[f"layer{i}.bias"] = (self.networks, 1, units)
             before = units
+        if self.camera_check:
+            shapes["camera.mean"] = (2 * m,)
+            shapes["camera.functionals"] = (CHECKED, 2 * m)
+            shapes["camera.basis"] = (self.camera_check.components, 2 * m)
         return shapes
 
 

@@ -151,6 +151,8 @@ class Header(BaseModel):
             standard deviations themselves. In ``labels.sigma_unit``, along ``labels.aligned``. Found on the validation
             split.
         sigma_power: (6,) see ``sigma_scaling.calibrate``.
+        tail_scale: factor of the covariance that makes it the scale of a Student-t with four degrees of freedom, whose
+            tails are those of the errors; None for a Gaussian.
         camera: from the pixels of this model's sensor to those of the one its networks were trained on, where it was
             adapted (``touchcell adapt``).
         label_turn_deg: rotation of its contacts' axes about the sensor's z axis, to those of the networks' training.
@@ -169,6 +171,7 @@ class Header(BaseModel):
     labels: Labels
     sigma_scale: SixPositive
     sigma_power: SixPositive = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    tail_scale: Positive | None = None
     camera: CameraChange | None = None
     label_turn_deg: Finite = 0.0
     transfer: TransferSpec | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,6 +16,10 @@ RANGE_TOLERANCE = 0.05
 """Tolerance, in label half-ranges, by which a prediction may exceed the training range and still count as inside."""
 
 
+SLIP_RATIO = 0.8
+"""Ratio of shear to depth beyond which estimates of shear fall behind the motion, on public data: the skin slips."""
+
+
 @dataclass(frozen=True, slots=True)
 class Prediction:
     """A Gaussian over the exponential coordinates of a contact, xi = log(T_s_f) (docs/glossary.md).
@@ -25,12 +30,17 @@ class Prediction:
         in_range: the mean lies in the model's training range of labels. Outside it, and out of contact, a prediction is
             unreliable.
         markers: fraction of the markers expected in view that were detected, for a marker model.
+        tail_scale: factor of the covariance that makes it the scale of a Student-t with four degrees of freedom, as
+            which large errors are likelier; None for a Gaussian.
+        refusal: why the image does not show the contact as the model's camera would; empty where it does.
     """
 
     xi: Array
     covariance: Array
     in_range: bool
     markers: float | None = None
+    refusal: str = ""
+    tail_scale: float | None = None
 
     @property
     def sigma(self) -> Array:
@@ -41,6 +51,15 @@ class Prediction:
     def pose_mm_deg(self) -> Array:
         """(6,) mean contact T_f_s: shear x, y and depth in mm, tilts alpha, beta and torsion gamma in degrees."""
         return se3.to_euler_mm_deg(se3.inverse(se3.exp(self.xi)))
+
+    @property
+    def slip_probability(self) -> float:
+        """Probability that the skin has slipped: that the shear exceeds ``SLIP_RATIO`` of the depth."""
+        x, y, depth = self.pose_mm_deg[:3]
+        shear = float(np.hypot(x, y))
+        sx, sy, sz = self.sigma_mm_deg[:3]
+        spread = float(np.hypot(np.hypot(sx, sy) / np.sqrt(2.0), SLIP_RATIO * sz))
+        return 0.5 * (1.0 + math.erf((shear - SLIP_RATIO * float(depth)) / (math.sqrt(2.0) * max(spread, 1e-9))))
 
     @property
     def sigma_mm_deg(self) -> Array:

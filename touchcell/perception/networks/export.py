@@ -16,7 +16,7 @@ from touchcell.perception.models.model_file import Header, Labels, Model, save_m
 from touchcell.perception.models.preprocessing import Preprocessing
 from touchcell.perception.networks.checkpoint import Progress, delete_checkpoint
 from touchcell.perception.networks.figures import write_curves, write_predictions
-from touchcell.perception.networks.sigma_scaling import calibrate
+from touchcell.perception.networks.sigma_scaling import calibrate, other_sessions, tail_scale
 
 
 def write_trained(
@@ -44,7 +44,11 @@ def write_trained(
         mean, sigma: (n, 6) of the validation set, in label half-ranges, uncalibrated.
         validation_xi: (n, 6) its labels, m and rad.
     """
-    scale, power = calibrate(labels.aligned(labels.targets(validation_xi) - mean, mean), sigma)
+    targets = labels.targets(validation_xi)
+    residual, which = other_sessions(labels, mean, targets)
+    scale, power = calibrate(residual, sigma[which])
+    served = scale * sigma**power
+    distances = np.square(labels.aligned(targets - mean, mean) / served).sum(axis=1)
     best = progress.history[progress.best_epoch - 1]
     model = Model(
         Header(
@@ -54,6 +58,7 @@ def write_trained(
             labels=labels,
             sigma_scale=tuple(scale.tolist()),
             sigma_power=tuple(power.tolist()),
+            tail_scale=tail_scale(distances),
             training_data=training_data,
             training={
                 **{key: list(value) if isinstance(value, tuple) else value for key, value in metadata.items()},

@@ -24,6 +24,7 @@ from torch import Tensor
 from touchcell.drivers.replay.dataset import Split, read_rest, read_split
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.errors import TrainingError
+from touchcell.perception.markers.camera_check import learn_check
 from touchcell.perception.markers.detection import Discs, detect_markers, typical_size
 from touchcell.perception.markers.figures import write_markers
 from touchcell.perception.markers.layers import mixed
@@ -214,6 +215,9 @@ def train_on_discs(
     labels = label_range(training.xi, validation.xi)
     training_data = training.digest()
     matched = _matched(training, validation, preprocessing.output_size, training_data, settings, cache, observer)
+    check, check_tensors = learn_check(
+        matched.model, settings.rings, matched.training[matched.taught].astype(np.float64)
+    )
     architecture = MarkerArchitecture(
         input_size=preprocessing.output_size,
         size=size,
@@ -228,6 +232,7 @@ def train_on_discs(
         most_rms_px=float(matched.frame[4]),
         hidden=settings.hidden,
         networks=settings.networks,
+        camera_check=check,
     )
     recipe: dict[str, Any] = {
         "data": training_data,
@@ -245,7 +250,7 @@ def train_on_discs(
         architecture=architecture,
         preprocessing=preprocessing,
         labels=labels,
-        tensors={**matched.tensors, **run.average.folded()},
+        tensors={**matched.tensors, **run.average.folded(), **check_tensors},
         reference=reference,
         training_data=training_data,
         metadata={
@@ -278,6 +283,12 @@ class _Matched:
     training: NDArray[np.float32]
     validation: NDArray[np.float32]
     taught: NDArray[np.bool_]
+
+    @property
+    def model(self) -> DisplacementModel:
+        """The displacement model."""
+        names = ("lattice", "displacement.mean", "displacement.basis", "displacement.sd")
+        return DisplacementModel(*(self.tensors[name].astype(np.float64) for name in names))
 
 
 def _matched(
@@ -374,13 +385,7 @@ class _Run:
     progress: Progress = field(default_factory=Progress)
 
     def __post_init__(self) -> None:
-        tensors = {name: tensor.astype(np.float64) for name, tensor in self.matched.tensors.items()}
-        self.model = model = DisplacementModel(
-            tensors["lattice"],
-            tensors["displacement.mean"],
-            tensors["displacement.basis"],
-            tensors["displacement.sd"],
-        )
+        self.model = model = self.matched.model
         settings = self.settings
         self.network = DisplacementNetwork(model, settings.hidden, settings.networks)
         self.average = copy.deepcopy(self.network).eval()

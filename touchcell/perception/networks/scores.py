@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
@@ -36,12 +37,16 @@ class Scores:
         xi: (n, 6) means, m and rad.
         covariance: (n, 6, 6) of xi, m and rad.
         in_range: (n,) as reported by the estimator.
+        tail_scale: factor of the covariances that makes them scales of a Student-t with four degrees of freedom, under
+            which likelihoods are; None for Gaussians. Coverage is that of the Gaussian's intervals, which agree with
+            a Student-t's of the same covariance at 95 %.
     """
 
     contact_mm_deg: Array
     xi: Array
     covariance: Array
     in_range: NDArray[np.bool_]
+    tail_scale: float | None = None
 
     @classmethod
     def of(cls, contact_mm_deg: Array, predictions: Sequence[Prediction]) -> Scores:
@@ -51,6 +56,7 @@ class Scores:
             np.stack([prediction.xi for prediction in predictions]),
             np.stack([prediction.covariance for prediction in predictions]),
             np.array([prediction.in_range for prediction in predictions]),
+            predictions[0].tail_scale if predictions else None,
         )
 
     def __len__(self) -> int:
@@ -58,7 +64,13 @@ class Scores:
 
     def subset(self, chosen: NDArray[np.bool_]) -> Scores:
         """Return the scores of the images for which ``chosen`` (n,) is True."""
-        return Scores(self.contact_mm_deg[chosen], self.xi[chosen], self.covariance[chosen], self.in_range[chosen])
+        return Scores(
+            self.contact_mm_deg[chosen],
+            self.xi[chosen],
+            self.covariance[chosen],
+            self.in_range[chosen],
+            self.tail_scale,
+        )
 
     @property
     def slip_free(self) -> NDArray[np.bool_]:
@@ -105,7 +117,13 @@ class Scores:
     def nll(self) -> Array:
         """(n,) negative log-likelihoods of the labelled xi, nats, with xi in mm and degrees."""
         whitened, log_sigmas = self._whitened()
-        nll: Array = 0.5 * np.square(whitened).sum(axis=1) + log_sigmas + 3.0 * float(np.log(2.0 * np.pi))
+        squares = np.square(whitened).sum(axis=1)
+        if self.tail_scale is None:
+            gaussian: Array = 0.5 * squares + log_sigmas + 3.0 * float(np.log(2.0 * np.pi))
+            return gaussian
+        # Multivariate Student-t with nu = 4 degrees of freedom in 6 dimensions (Kotz & Nadarajah 2004, eq. 1.1).
+        constant = 3.0 * float(np.log(4.0 * np.pi * self.tail_scale)) + math.lgamma(2.0) - math.lgamma(5.0)
+        nll: Array = constant + log_sigmas + 5.0 * np.log1p(squares / (4.0 * self.tail_scale))
         return nll
 
     def mae(self) -> dict[str, float]:

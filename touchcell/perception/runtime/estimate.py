@@ -23,6 +23,8 @@ class ContactEstimate:
         change: how much the newest image differs from the zero frame, 0 to 1, as the contact gate measures it; None
             without a gate.
         markers: fraction of the markers expected in view that were detected, for a marker estimator.
+        measured: Gaussian of the frame by itself, before any filter; None without contact, or without a model.
+        refusal: why the frame does not show the contact as the model's camera would; empty where it does.
     """
 
     in_contact: bool
@@ -33,4 +35,6 @@ class ContactEstimate:
     in_range: bool = True
     nis: float | None = None
     markers: float | None = None
+    measured: PoseGaussian | None = None
+    refusal: str = ""
     change: float | None = None

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.geometry.types import ImageArray
-from touchcell.perception.models.graph import IMAGES, OUTPUTS, onnx_model
+from touchcell.perception.models.architecture import Architecture, shrunk
+from touchcell.perception.models.graph import IMAGES, OUTPUTS, check_graph, onnx_model
 from touchcell.perception.models.model_file import Header, Model, load_model
 from touchcell.perception.models.prediction import RANGE_TOLERANCE, Prediction
 from touchcell.perception.models.preprocessing import scale
@@ -23,6 +24,10 @@ Runner = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 def onnx_runtime(model: Model) -> Runner:
     """Load a model's network in ONNX Runtime, on the calling thread only."""
+    return _session(onnx_model(model))
+
+
+def _session(graph: bytes) -> Runner:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -34,7 +39,7 @@ def onnx_runtime(model: Model) -> Runner:
     # the weights (3 MB).
     options.enable_mem_pattern = False
     options.add_session_config_entry("session.disable_prepacking", "1")
-    session = onnxruntime.InferenceSession(onnx_model(model), options, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
     # The session keeps the serialised model for a fallback provider: 2 to 6 MB, and there is no other provider.
     if hasattr(session, "_model_bytes"):
         session._model_bytes = None
@@ -44,6 +49,10 @@ def onnx_runtime(model: Model) -> Runner:
         return outputs
 
     return run
+
+
+_OTHER = "the image does not show the model's sensor as its camera would"
+_TURNED = "the camera is turned by a multiple of 60 deg, or mirrored"
 
 
 class ContactModel:
@@ -63,6 +72,9 @@ class ContactModel:
         self._preprocessing = model.header.preprocessing
         texture = None if model.reference is None else MarkerTexture(model.reference)
         self._texture = texture if texture is not None and texture.usable else None
+        graph, architecture = check_graph(model), model.header.architecture
+        self._check = None if graph is None else _session(graph)
+        self._spec = architecture.check if isinstance(architecture, Architecture) else None
 
     @classmethod
     def load(cls, path: Path) -> ContactModel:
@@ -88,13 +100,26 @@ class ContactModel:
     def predict_reduced(self, reduced: ImageArray) -> Prediction:
         """Estimate the contact in an image returned by ``reduce``.
 
-        A gate and a prediction can share the preprocessing. Where the model holds an image out of contact, an image
-        without the texture of its markers is not ``in_range``, whatever the network's output.
+        A gate and a prediction can share the preprocessing. An image that is not of the model's own sensor and camera,
+        as far as its file can tell, is not ``in_range``, whatever the network's output.
         """
-        prediction = self.decode(self.infer(reduced))
+        return self._judged(self.decode(self.infer(reduced)), reduced)
+
+    def _judged(self, prediction: Prediction, reduced: ImageArray) -> Prediction:
+        refusal = self._refusal(reduced)
+        return replace(prediction, in_range=False, refusal=refusal) if refusal else prediction
+
+    def _refusal(self, reduced: ImageArray) -> str:
         if self._texture is not None and not self._texture.plausible(reduced):
-            return replace(prediction, in_range=False)
-        return prediction
+            return _OTHER
+        if self._check is None or self._spec is None:
+            return ""
+        own, upright = self._check(shrunk(scale(reduced), self._spec.shrink)[None, None])[0, :2].tolist()
+        if own < self._spec.least:
+            return _OTHER
+        if self._spec.least_upright is not None and upright < self._spec.least_upright:
+            return _TURNED
+        return ""
 
     def infer(self, reduced: ImageArray) -> NDArray[np.float32]:
         """First step of ``predict_reduced``: return the network's outputs."""
@@ -107,13 +132,7 @@ class ContactModel:
             return []
         reduced = [self.reduce(image) for image in images]
         rows = self._run(np.stack([scale(each)[None] for each in reduced]))
-        predictions = [self.decode(row) for row in rows]
-        if self._texture is None:
-            return predictions
-        plausible = map(self._texture.plausible, reduced)
-        return [
-            each if good else replace(each, in_range=False) for each, good in zip(predictions, plausible, strict=True)
-        ]
+        return [self._judged(self.decode(row), each) for row, each in zip(rows, reduced, strict=True)]
 
     def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:
         """Apply ``predict`` to a camera's sample; the prediction keeps the stamp, number and quality of the frame."""
@@ -126,4 +145,5 @@ class ContactModel:
         mean = output[:6].astype(np.float64)
         sigma = np.exp(-output[6:].astype(np.float64)) if len(output) > 6 else np.ones(6)
         xi, covariance = self.header.labels.xi_gaussian(mean, self.header.calibrated(sigma))
-        return Prediction(xi, covariance, in_range=bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE)))
+        in_range = bool(np.all(np.abs(mean) <= 1.0 + RANGE_TOLERANCE))
+        return Prediction(xi, covariance, in_range, tail_scale=self.header.tail_scale)

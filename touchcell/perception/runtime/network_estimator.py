@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal, Self
 
-from pydantic import PositiveFloat, model_validator
+from pydantic import NonNegativeInt, PositiveFloat, model_validator
 
 from touchcell.errors import ConfigError
 from touchcell.input_file import BUILTIN, InputFile, files_in
 from touchcell.paths import MODELS
-from touchcell.perception.runtime.estimator_spec import EstimatorConfig, EstimatorContext, EstimatorSpec
+from touchcell.perception.runtime.estimator_spec import EstimatorConfig, EstimatorContext, EstimatorSpec, Feature
 from touchcell.perception.runtime.filter_spec import FilterSection
 from touchcell.plugin_section import Section
 
@@ -53,14 +53,22 @@ class NetworkEstimator(EstimatorConfig):
     Attributes:
         model: model file, or ``builtin:NAME`` for one that ships.
         calibration: file of ``touchcell calibrate``, where another camera taught the model.
+        from_camera: the camera gives grey 640x480 frames, and the model was trained on images as data sets are
+            published: cropped, black and white.
+        crop_corner_px: with ``from_camera``: left and top of the crop in the frame; none for the frame's centre.
         gate: decides about contact without the network; without it every frame goes through the network.
+        zero_frame: ``compare`` the first frame of a run, out of contact, with the model's own, where there is a gate:
+            a small change of the camera is undone, a large one refused; or ``skip`` that.
         filter: fuses the estimates over time; without it each frame stands by itself.
     """
 
     kind: Literal["network"]
     model: Annotated[str, _MODEL]
     calibration: Annotated[str | None, _CALIBRATION] = None
+    from_camera: bool = False
+    crop_corner_px: tuple[NonNegativeInt, NonNegativeInt] | None = None
     gate: GateConfig | None = None
+    zero_frame: Literal["compare", "skip"] = "compare"
     filter: FilterSection | None = None
 
     def build(self, context: EstimatorContext) -> ContactPipeline:
@@ -72,15 +80,22 @@ class NetworkEstimator(EstimatorConfig):
         """
         import cv2
 
+        from touchcell.perception.models.camera_change import load_change
+        from touchcell.perception.models.camera_frames import served_from_camera
+        from touchcell.perception.models.model_file import load_model
         from touchcell.perception.runtime.contact_gate import ContactGate
-        from touchcell.perception.runtime.estimators import load_estimator
+        from touchcell.perception.runtime.estimators import calibrated
         from touchcell.perception.runtime.pipeline import ContactPipeline
+        from touchcell.perception.runtime.zero import ZeroFrame
 
         # A second thread gains nothing on images of this size, and takes a core from other sensors.
         cv2.setNumThreads(1)
-        calibration = None if self.calibration is None else Path(self.calibration)
-        model = load_estimator(model_path(self.model), calibration)
-        contact_gate = None
+        known = None if self.calibration is None else load_change(Path(self.calibration))
+        stored = load_model(model_path(self.model))
+        if self.from_camera:
+            stored = served_from_camera(stored, corner=self.crop_corner_px)
+        model = calibrated(stored, known)
+        contact_gate, zero = None, None
         if self.gate is not None:
             if model.reference is None:
                 raise ConfigError(
@@ -91,8 +106,21 @@ class NetworkEstimator(EstimatorConfig):
                 )
             enter, leave = self.gate.touch_percent / 100, self.gate.release_percent / 100
             contact_gate = ContactGate(model.reference, enter=enter, leave=leave)
+            if self.zero_frame == "compare":
+                zero = ZeroFrame(context.sensor, stored, known, enter=enter, leave=leave)
         pose_filter = None if self.filter is None else self.filter.build()
-        return ContactPipeline(context.camera, model, contact_gate=contact_gate, pose_filter=pose_filter)
+        return ContactPipeline(context.camera, model, contact_gate=contact_gate, pose_filter=pose_filter, zero=zero)
+
+
+class EdgeNetworkEstimator(NetworkEstimator):
+    """As ``network``, with a model that was trained on contacts with edges (``touchcell train-sim --feature edge``).
+
+    A filter that holds the contact still does not suit it: the edge frame glides along the edge with the sensor.
+    """
+
+    feature: ClassVar[Feature] = "edge"
+
+    kind: Literal["edge_network"]  # type: ignore[assignment]
 
 
 def model_path(name: str) -> Path:
@@ -100,4 +128,5 @@ def model_path(name: str) -> Path:
     return MODELS / f"{name.removeprefix(BUILTIN)}.safetensors" if name.startswith(BUILTIN) else Path(name)
 
 
+EDGE_NETWORK = EstimatorSpec("edge_network", "as network, of the edge under the sensor", EdgeNetworkEstimator)
 NETWORK = EstimatorSpec("network", "trained model, contact gate and filter on the sensor's images", NetworkEstimator)

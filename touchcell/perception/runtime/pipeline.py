@@ -26,6 +26,7 @@ from touchcell.perception.runtime.contact_gate import ContactGate
 from touchcell.perception.runtime.estimate import ContactEstimate
 from touchcell.perception.runtime.filter_spec import ContactFilter
 from touchcell.perception.runtime.motion import PoseHistory
+from touchcell.perception.runtime.zero import ZeroFrame
 
 Timer = Callable[[], int]
 
@@ -90,6 +91,7 @@ class ContactPipeline:
         model: any estimator, with its preprocessing.
         contact_gate: detects contact without the network; None passes every frame through the network.
         pose_filter: None treats each frame independently.
+        zero: compares the first frame with the model's own image out of contact; None accepts any.
         timer: nanosecond counter for stage durations; it never influences an estimate.
     """
 
@@ -100,12 +102,14 @@ class ContactPipeline:
         *,
         contact_gate: ContactGate | None = None,
         pose_filter: ContactFilter | None = None,
+        zero: ZeroFrame | None = None,
         timer: Timer = time.perf_counter_ns,
     ) -> None:
         self._camera = camera
         self._model = model
         self._contact_gate = contact_gate
         self._filter = pose_filter
+        self._zero = zero
         self._timer = timer
         self._poses = PoseHistory()
         self._newest: ContactEstimate | None = None
@@ -127,9 +131,18 @@ class ContactPipeline:
         return self._model.header.preprocessing
 
     def await_frame(self) -> None:
-        """Wait for the camera's first frame, which the next update processes. Raises DeviceError."""
+        """Wait for the camera's first frame, which the next update processes, and compare it with the model's.
+
+        Raises:
+            DeviceError: from the camera.
+            CameraError: the sensor or its camera is not the model's.
+            ImageError: the camera's images do not match the model.
+        """
         with suppress(EndOfStream):
-            self._camera.latest()
+            frame = self._camera.latest()
+            if self._zero is not None and self._contact_gate is not None:
+                zeroed = self._zero(frame.value.image, self._model, self._contact_gate)
+                self._model, self._contact_gate = zeroed.estimator, zeroed.gate
 
     def take_zero(self) -> bool:
         """Let the contact gate compare with the newest frame from now on; False without a gate, or before a frame.
@@ -208,6 +221,8 @@ class ContactPipeline:
             in_range=prediction.in_range,
             nis=nis,
             markers=prediction.markers,
+            measured=observed,
+            refusal=prediction.refusal,
             change=change,
         )
 

@@ -19,13 +19,14 @@ class EdgePoint:
         tangent: (3,) unit vector along the edge.
         normals: (2, 3) unit normals of the two faces that meet there, first that of the face to the left of the
             tangent; twice the same on a border.
-        at_end: it is the end of a piece, as beyond a convex corner.
+        outwards: (3,) sum of the directions away from the facing face, across the pieces that end there; None unless
+            the point is the end of a piece, as at a corner.
     """
 
     point: Array
     tangent: Array
     normals: Array
-    at_end: bool
+    outwards: Array | None
 
 
 class Polylines:
@@ -68,10 +69,26 @@ class Polylines:
             self.starts[i] + share * self._side[i],
             tangent / np.linalg.norm(tangent),
             normals / np.linalg.norm(normals, axis=1, keepdims=True),
-            bool(share <= 0.0 or share >= 1.0),
+            self._outwards_at(self.starts[i] if share <= 0.0 else self.ends[i], facing)
+            if facing is not None and not 0.0 < share < 1.0
+            else None,
         )
 
+    def _outwards_at(self, vertex: Array, facing: Array) -> Array:
+        ends = (np.abs(self.starts - vertex).max(axis=1) < _SAME_M) | (np.abs(self.ends - vertex).max(axis=1) < _SAME_M)
+        normals, sides = self._middle_normals[ends], self._side[ends]
+        towards = normals @ facing
+        over = towards.argmax(axis=1)
+        seen = towards.max(axis=1) >= _FACING_COS
+        rows = np.arange(len(over))
+        # Faces lie to the left of their own edges; the second face has the edge the other way round.
+        outs = np.cross(sides, normals[rows, over]) * np.where(over == 0, 1.0, -1.0)[:, None]
+        outs /= np.linalg.norm(outs, axis=1, keepdims=True)
+        total: Array = outs[seen].sum(axis=0)
+        return total
 
+
+_SAME_M = 1e-9
 _FACING_COS = 0.5
 _CORNER_COS = np.cos(np.radians(35.0))
 

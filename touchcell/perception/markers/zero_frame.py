@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.errors import TrainingError
 from touchcell.perception.markers.detection import Discs, detect_markers, lattice, typical_size
+from touchcell.perception.markers.lattice_fit import fit_lattice
 from touchcell.perception.models.camera_change import CameraChange
 from touchcell.perception.models.marker_architecture import MarkerArchitecture
 from touchcell.perception.models.model_file import Model
 from touchcell.perception.models.preprocessing import Preprocessing
-from touchcell.perception.networks.marker_learning import fit_lattice
 
 _UPSCALED = 4
 _WORST_RMS_PX = 3.0

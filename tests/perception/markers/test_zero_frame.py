@@ -9,8 +9,8 @@ from touchcell.cell.cli.calibrate import calibrate
 from touchcell.errors import ConfigError, DataError
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.paths import MODELS
-from touchcell.perception.calibration.zero_frame import find_change, lattice_turns, similarity
 from touchcell.perception.errors import TrainingError
+from touchcell.perception.markers.zero_frame import find_change, lattice_turns, similarity
 from touchcell.perception.models.camera_change import CameraChange, load_change
 from touchcell.perception.models.model_file import Model
 from touchcell.perception.models.preprocessing import Preprocessing

@@ -1,0 +1,72 @@
+"""``touchcell open`` and ``report --html``: a run in other programs."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+
+from touchcell.cell.cli.main import main
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    target = tmp_path_factory.mktemp("run") / "run"
+    words = ["--set", "task.distance_mm=5", "--quiet", "--out", str(target)]
+    assert main(["run", "configs/surface_follow_sim.yaml", *words]) == 0
+    return target
+
+
+def test_a_foxglove_layout_shows_the_cells_own_topics(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["open", str(folder)]) == 0
+    layout = (folder / "foxglove_layout.json").read_text()
+    json.loads(layout)
+    for wanted in (
+        "/scene",
+        "/log",
+        "/task.state",
+        "/sensors/sensor/contact.z_mm",
+        "/arms/arm/tcp.speed_mm_s",
+        "ThreeDee",
+    ):
+        assert wanted in layout
+    assert str(folder) in capsys.readouterr().out
+
+
+def test_a_run_is_written_for_rerun_with_what_rerun_does_not_draw_itself(folder: Path, tmp_path: Path) -> None:
+    if importlib.util.find_spec("rerun") is None:
+        pytest.skip("rerun-sdk is not installed (pip install 'touchcell[rerun]')")
+    target = tmp_path / "run.rrd"
+    assert main(["open", str(folder), "--rerun", "--to", str(target)]) == 0
+    assert target.stat().st_size > 10_000
+
+
+def test_a_target_without_rerun_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["open", str(folder), "--to", "x.rrd"]) == 2
+    assert "--rerun" in capsys.readouterr().err
+
+
+def test_the_html_report_is_one_file_that_loads_nothing(folder: Path) -> None:
+    pytest.importorskip("plotly", reason="pip install 'touchcell[html]'")
+    assert main(["report", str(folder), "--html"]) == 0
+    page = (folder / "report.html").read_text()
+    assert "surface_following done" in page
+    assert "Contact of sensor" in page
+    assert 'src="http' not in page
+
+
+def test_latest_and_a_folder_contradict_each_other(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", str(folder), "--latest"]) == 2
+    assert "--latest" in capsys.readouterr().err
+
+
+def test_latest_is_the_newest_run(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "last").symlink_to(folder)
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", "--latest"]) == 0
+    assert "surface_following done" in capsys.readouterr().out

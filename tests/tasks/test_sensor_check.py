@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+from touchcell.tasks.sensor_check import SensorCheck
+
+PERIOD_S = 0.01
+NOISE = np.array([5e-5, 5e-5, 5e-5, 0.007, 0.007, 0.01])
+
+
+def _turn(deg: float) -> Array:
+    """Return the map of exponential coordinates of a contact seen by a camera that is turned about its axis."""
+    c, s = np.cos(np.radians(deg)), np.sin(np.radians(deg))
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.kron(np.eye(2), R)
+
+
+def _mirror() -> Array:
+    return np.diag([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+
+
+def _verdict(seen_as: Array, *, drift: Array | None = None, follow: float = 0.0, seed: int = 0) -> str:
+    """Return the verdict on a simulated sensor that measures ``seen_as @ xi`` of its true contact.
+
+    Args:
+        seen_as: (6, 6).
+        drift: (6,) twist of a surface that moves.
+        follow: share of the arm's shift along the surface with which a loose object follows it.
+    """
+    rng = np.random.default_rng(seed)
+    check = SensorCheck(1.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0)
+    T_b_s = se3.from_euler_mm_deg(np.array([100.0, 0.0, 50.0, 180.0, 0.0, 30.0]))
+    T_b_f = se3.compose(T_b_s, se3.from_euler_mm_deg(np.array([0.2, 0.1, -0.5, 3.0, -5.0, 2.0])))
+    cycle = 0
+    while not check.finished:
+        now_ns = round(1e9 * PERIOD_S * cycle)
+        check.record_pose(now_ns, T_b_s)
+        if cycle % 3 == 0:
+            xi = seen_as @ se3.log(se3.compose(se3.inverse(T_b_s), T_b_f))
+            check.record_contact(cycle, now_ns, se3.exp(xi + rng.normal(0.0, NOISE)))
+        V = check.step(PERIOD_S)
+        T_b_s = se3.compose(T_b_s, se3.exp(PERIOD_S * V))
+        along = np.array([follow, follow, 0.0, 0.0, 0.0, 0.0]) * V
+        moved = se3.compose(se3.compose(T_b_s, se3.exp(PERIOD_S * along)), se3.inverse(T_b_s))
+        T_b_f = se3.compose(moved, T_b_f)
+        if drift is not None:
+            T_b_f = se3.compose(T_b_f, se3.exp(PERIOD_S * drift))
+        cycle += 1
+    return check.verdict()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_right_sensor_agrees(seed: int) -> None:
+    assert _verdict(np.eye(6), seed=seed) == ""
+
+
+@pytest.mark.parametrize("turn_deg", [60.0, -60.0, 120.0, 180.0, -120.0, 90.0])
+def test_turned_camera_is_named_with_its_angle(turn_deg: float) -> None:
+    verdict = _verdict(_turn(turn_deg))
+    assert verdict.startswith("camera turned by about")
+    found = float(verdict.split("about ")[1].split(" deg")[0])
+    assert abs((found - turn_deg + 180.0) % 360.0 - 180.0) < 15.0
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 60.0, 150.0])
+def test_mirrored_camera_is_named(turn_deg: float) -> None:
+    assert _verdict(_turn(turn_deg) @ _mirror()).startswith("camera mirrored")
+
+
+def test_model_of_another_convention_is_named() -> None:
+    """The shear of one public data set has the opposite sign of the other's; the tilt has not."""
+    assert _verdict(np.diag([-1.0, -1.0, 1.0, 1.0, 1.0, -1.0])).startswith("another model")
+
+
+def test_estimates_that_follow_nothing_are_those_of_another_model() -> None:
+    assert _verdict(np.diag([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])).startswith("another model")
+
+
+def test_surface_that_moves_evenly_is_no_fault_of_the_sensor() -> None:
+    assert _verdict(np.eye(6), drift=np.array([5e-3, -3e-3, 0.0, 0.0, 0.0, 0.05])) == ""
+
+
+@pytest.mark.parametrize("follow", [0.5, 1.0])
+def test_loose_object_is_no_fault_of_the_sensor(follow: float) -> None:
+    assert _verdict(np.eye(6), follow=follow) == ""
+
+
+def test_too_few_estimates_are_no_agreement() -> None:
+    check = SensorCheck(1.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0)
+    while not check.finished:
+        check.step(PERIOD_S)
+    assert "0 estimates" in check.verdict()
+
+
+def test_motion_ends_where_it_began_but_for_the_press() -> None:
+    check, moved = SensorCheck(1.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0), np.zeros(6)
+    while not check.finished:
+        moved += PERIOD_S * check.step(PERIOD_S)
+    assert moved == pytest.approx([0.0, 0.0, 5e-4, 0.0, 0.0, 0.0], abs=1e-9)

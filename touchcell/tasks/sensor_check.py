@@ -1,0 +1,175 @@
+"""After first contact: a small known motion whose measured answer must agree with it before the arm servos.
+
+A camera that is mounted turned or mirrored, or a model of another sensor, gives estimates that look like any others.
+Servoing on them, the arm runs away: every correction enlarges the error. What tells is motion. The sensor is pressed
+on, then shifted and tilted by amounts that any surface bears, along one axis after the other, and the estimates of
+single frames are regressed on the motion of the arm: answer = a motion + b conj(motion) + c + d t, for shear and tilt
+as complex numbers. A right sensor has a near 1 and b near 0; the angle of a is that of a turned camera; in a mirror b
+takes its place.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
+from touchcell.perception.runtime.motion import PoseHistory
+
+_FEWEST = 6
+_LEAST_GAIN = 0.3
+_MOST_GAIN = 3.0
+_SURE = 2.5
+_MOST_TURN_DEG = 30.0
+_OPPOSITE_DEG = 90.0
+_PRESS_SHARE = 0.15
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Regression of a plane's measured motion on the arm's.
+
+    Attributes:
+        straight: complex gain ``a``.
+        mirrored: complex gain ``b``.
+        deviation: standard deviation of either.
+    """
+
+    straight: complex
+    mirrored: complex
+    deviation: float
+
+    @property
+    def clear(self) -> bool:
+        """True if there is an answer beyond the noise."""
+        return max(abs(self.straight), abs(self.mirrored)) > max(_LEAST_GAIN, _SURE * self.deviation)
+
+    @property
+    def turn_deg(self) -> float:
+        """Angle of the measured motion from the arm's."""
+        return math.degrees(math.atan2(self.straight.imag, self.straight.real))
+
+
+class SensorCheck:
+    """The motion of one sensor, and the judgement of its answer.
+
+    Args:
+        duration_s: of the motion.
+        press_mm: depth that is added first, and kept.
+        shift_mm: largest shear.
+        tilt_deg: largest tilt.
+    """
+
+    def __init__(self, duration_s: float, *, press_mm: float, shift_mm: float, tilt_deg: float) -> None:
+        self._duration_s = duration_s
+        self._press_m, self._shift_m, self._tilt_rad = 1e-3 * press_mm, 1e-3 * shift_mm, math.radians(tilt_deg)
+        self._poses = PoseHistory()
+        self._frames: list[tuple[int, Array, Array]] = []
+        self._seq = -1
+        self._t_s = 0.0
+
+    @property
+    def finished(self) -> bool:
+        """True if the motion is complete."""
+        return self._t_s >= self._duration_s
+
+    def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
+        """Record the sensor's pose."""
+        self._poses.record(t_ns, T_base_sensor)
+
+    def record_contact(self, seq: int, t_ns: int, T_s_f: Array) -> None:
+        """Record the contact pose of a frame, by itself; the same frame counts once."""
+        if seq != self._seq and self._t_s > _PRESS_SHARE * self._duration_s and len(self._poses):
+            self._seq = seq
+            self._frames.append((t_ns, self._poses.at(t_ns), T_s_f))
+
+    def step(self, dt_s: float) -> Array:
+        """Advance by a cycle and return the sensor's twist (6,) in its own frame."""
+        before = self._displacement(self._t_s)
+        self._t_s = min(self._t_s + dt_s, self._duration_s)
+        twist: Array = (self._displacement(self._t_s) - before) / dt_s
+        return twist
+
+    def verdict(self) -> str:
+        """Return what is wrong with the sensor; empty if its answer agrees with the motion."""
+        if len(self._frames) < _FEWEST:
+            return f"the sensor gave {len(self._frames)} estimates during the check, {_FEWEST} are needed"
+        answers = dict(zip(("shear", "tilt"), self.answers(), strict=True))
+        clear = {name: answer for name, answer in answers.items() if answer.clear}
+        if not clear:
+            return "another model: estimated shear and tilt do not follow the arm"
+        for name, answer in clear.items():
+            if abs(answer.mirrored) - abs(answer.straight) > _SURE * answer.deviation:
+                return f"camera mirrored: the estimated {name} moves as in a mirror when the arm moves"
+            if abs(answer.straight) > _MOST_GAIN:
+                return f"another model: the estimated {name} moves {abs(answer.straight):.1f} times as far as the arm"
+        apart = [answer.turn_deg for answer in clear.values()]
+        if abs((apart[0] - apart[-1] + 180.0) % 360.0 - 180.0) > _OPPOSITE_DEG:
+            return f"another model: estimated shear is turned by {apart[0]:.0f} deg, tilt by {apart[-1]:.0f} deg"
+        both = _pooled(list(clear.values()))
+        # The standard deviation of the angle is that of the gain across, over the gain.
+        unsure_deg = math.degrees(math.atan2(_SURE * both.deviation, abs(both.straight)))
+        if abs(both.turn_deg) > _MOST_TURN_DEG + unsure_deg:
+            return f"camera turned by about {both.turn_deg:.0f} deg, by its estimates of {' and '.join(clear)}"
+        return ""
+
+    def answers(self) -> tuple[Answer, Answer]:
+        """Return the regressions of shear and of tilt."""
+        first = self._frames[len(self._frames) // 2]
+        moved, measured = [], []
+        for _, T_base_sensor, T_s_f in self._frames:
+            # The surface is static: a motion of the sensor moves it in the sensor's frame by the inverse.
+            moved.append(se3.log(se3.compose(se3.inverse(T_base_sensor), first[1])))
+            measured.append(se3.log(se3.compose(T_s_f, se3.inverse(first[2]))))
+        t = np.array([each[0] for each in self._frames], dtype=np.float64) * 1e-9
+        return (
+            _regressed(np.array(moved)[:, :2], np.array(measured)[:, :2], t - t.mean()),
+            _regressed(np.array(moved)[:, 3:5], np.array(measured)[:, 3:5], t - t.mean()),
+        )
+
+    def _displacement(self, t_s: float) -> Array:
+        """Return the (6,) displacement of the sensor from its start, m and rad."""
+        press_s = _PRESS_SHARE * self._duration_s
+        pulse_s = 0.5 * (self._duration_s - press_s)
+        first, second = (_pulse((t_s - press_s) / pulse_s - number) for number in (0, 1))
+        return np.array(
+            [
+                self._shift_m * first,
+                self._shift_m * second,
+                self._press_m * min(t_s / press_s, 1.0),
+                self._tilt_rad * first,
+                self._tilt_rad * second,
+                0.0,
+            ]
+        )
+
+
+def _pulse(t: float) -> float:
+    """Return 0 at 0, 1 at 0.5 and 0 at 1 and beyond, smoothly."""
+    return 0.5 * (1.0 - math.cos(2.0 * math.pi * min(max(t, 0.0), 1.0)))
+
+
+def _pooled(answers: list[Answer]) -> Answer:
+    """Return the mean of answers, weighted by their precisions."""
+    weights = [1.0 / max(answer.deviation, 1e-9) ** 2 for answer in answers]
+    total = sum(weights)
+    straight, mirrored = (
+        sum(weight * gain for weight, gain in zip(weights, gains, strict=True)) / total
+        for gains in ([answer.straight for answer in answers], [answer.mirrored for answer in answers])
+    )
+    return Answer(straight, mirrored, 1.0 / math.sqrt(total))
+
+
+def _regressed(moved: Array, measured: Array, t_s: Array) -> Answer:
+    """Regress measured motions (n, 2) in a plane on those of the arm."""
+    x, y = (each @ np.array([1.0, 1.0j]) for each in (moved, measured))
+    terms = np.column_stack([x, x.conj(), np.ones(len(x)), t_s])
+    gains, _, _, _ = np.linalg.lstsq(terms, y, rcond=None)
+    residual = y - terms @ gains
+    variance = float((np.abs(residual) ** 2).sum()) / max(len(x) - 4, 1)
+    spread = np.linalg.pinv(terms.conj().T @ terms)
+    deviation = math.sqrt(max(variance * float(spread[0, 0].real), 0.0))
+    return Answer(complex(gains[0]), complex(gains[1]), deviation)
