@@ -140,8 +140,7 @@ def test_rerun_draws_transforms_images_and_the_log(recorded: tuple[str, Path], t
     places: dict[str, set[str]] = defaultdict(set)
     for count, entity, columns in re.findall(r"with (\d+) rows .*? - (/\S+) - data columns: \[(.*?)\]", printed):
         for component in {column.split(":")[0] for column in columns.split()}:
-            # What a sensor was zeroed with is an image too, but none of the camera's stream.
-            rows[component] += int(count) if not entity.endswith("/zero") else 0
+            rows[component] += int(count)
             places[component].add(entity)
     messages = list(read(folder / "run.mcap"))
     violations = sum(len(message.data["violations"]) for message in messages if message.topic == "/safety")

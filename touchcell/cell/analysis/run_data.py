@@ -81,7 +81,7 @@ class Run:
 def load_run(path: Path) -> Run:
     """Read a recording; images are left out. Raises RecordingError."""
     damage: list[Damage] = []
-    messages = [message for message in read(path, damage) if not _is_picture(message.topic)]
+    messages = [message for message in read(path, damage) if not is_image(message.topic)]
     return run_of(messages, damage)
 
 
@@ -105,10 +105,6 @@ def run_of(messages: Iterable[Message], damage: Iterable[Damage] = ()) -> Run:
 def tip_points(series: Series) -> Array:
     """Return the (n, 4, 4) poses of a pose series."""
     return se3.from_euler_mm_deg(series.poses())
-
-
-def _is_picture(topic: str) -> bool:
-    return is_image(topic) or topic.endswith("/zero")
 
 
 def _number(value: Any) -> float:

@@ -20,12 +20,10 @@ from touchcell.cell.recording.messages import (
 )
 from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.recording.viewer_record import ViewerRecord
-from touchcell.cell.recording.well_known import COMPRESSED_IMAGE, image_message
 from touchcell.cell.runtime.cell import Cell
 from touchcell.cell.runtime.observer import Reading
 from touchcell.cell.runtime.timing import CycleTimes
 from touchcell.cell.scene.description import describe_scene
-from touchcell.cell.scene.frames import sensor_frame
 from touchcell.control.supervisor import Verdict
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.commands import Sent, TwistCommand
@@ -65,6 +63,7 @@ class RunRecord:
         self._box = box
         self._encoder = recorder.encoder if recorder is not None else Encoder(declared_type)
         self._transitions_written = 0
+        self._zeros = 0
         self._viewers: ViewerRecord | None = None
         self._frames: FrameCompressor | None = None
         kind = cell.plan.cell.recording.frames
@@ -247,10 +246,10 @@ class RunRecord:
         import cv2
 
         data = cv2.imencode(".png", image)[1].tobytes()
-        stamp = t_ns + self._recorder.wall_offset_ns
-        message = image_message(COMPRESSED_IMAGE, stamp, sensor_frame(role), "png", data)
+        self._zeros += 1
         try:
-            self._recorder.write_bytes(f"/sensors/{role}/zero", t_ns, COMPRESSED_IMAGE, message)
+            # An attachment: viewers draw every image of a topic, and this is no frame of the stream.
+            self._recorder.attach(f"zero_{role}_{self._zeros}.png", "image/png", data, t_ns)
         except RecordingError as error:
             self._give_up(error)
 
