@@ -6,7 +6,7 @@ The leader pushes and steers; the follower holds the far side and moves along, w
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from pydantic import PositiveFloat
@@ -54,10 +54,13 @@ class DualArmPushingConfig(PushConfig, ServoConfig):
 
     Attributes:
         align_max_mm_s: largest lateral speed: more than for a single arm, since the follower adds drag.
+        steering: as for a single arm. The model of ``predictive`` has one contact: where the arms do not press opposite
+            each other the follower's force makes it estimate a wrong centre, and the push end beside its target.
         follower: parameters of the follower's servo.
     """
 
     align_max_mm_s: PositiveFloat = 15.0
+    steering: Literal["predictive", "bearing"] = "bearing"
     follower: FollowerConfig = FollowerConfig()
 
 
