@@ -10,9 +10,9 @@ import numpy as np
 from touchcell.drivers.core.scene import SceneBody
 from touchcell.geometry.solids import Cuboid, Cylinder, Mesh, Solid, Sphere, extrude, height_field
 from touchcell.geometry.types import Array
-from touchcell.simulation.meshes.drawing import drawn_shape
 from touchcell.simulation.motions import Still
 from touchcell.simulation.objects import ObjectConfig, TableConfig
+from touchcell.simulation.shape_drawing import drawn_shape
 from touchcell.simulation.shape_spec import SurfaceConfig
 from touchcell.simulation.shapes import Ball, Prism
 from touchcell.simulation.shapes import Solid as FreeSolid

@@ -8,11 +8,11 @@ from functools import lru_cache
 
 import numpy as np
 
+from touchcell.geometry.surface_point import SurfacePoint
 from touchcell.geometry.types import Array
 from touchcell.simulation.meshes import primitives
 from touchcell.simulation.meshes.creases import Polylines, creases
 from touchcell.simulation.meshes.smoothing import TriangleMesh, smooth
-from touchcell.simulation.surfaces import SurfacePoint
 
 _CREASE_RAD = math.radians(30.0)
 

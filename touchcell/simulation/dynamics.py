@@ -22,12 +22,13 @@ import numpy as np
 
 from touchcell.drivers.core.scene import ContactState
 from touchcell.errors import ConfigError, TouchcellError
+from touchcell.geometry.surface_point import SurfacePoint
 from touchcell.geometry.types import Array
 from touchcell.simulation.contact import about_z, tilt_of
 from touchcell.simulation.dynamics_model import TipMechanics, build_model, cross, quaternion, rotation
 from touchcell.simulation.objects import FreeObject
 from touchcell.simulation.solids import shape_of
-from touchcell.simulation.surfaces import Surface, SurfacePoint
+from touchcell.simulation.surfaces import Surface
 from touchcell.simulation.timeline import Restore
 from touchcell.simulation.world import DeferredContact
 

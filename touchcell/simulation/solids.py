@@ -8,9 +8,10 @@ from typing import Protocol
 
 import numpy as np
 
+from touchcell.geometry.surface_point import SurfacePoint
 from touchcell.geometry.types import Array
 from touchcell.simulation.shapes import Ball, Prism, Solid, Turned
-from touchcell.simulation.surfaces import Shape, Sphere, SurfacePoint
+from touchcell.simulation.surfaces import Shape, Sphere
 
 
 @dataclass(frozen=True, slots=True)

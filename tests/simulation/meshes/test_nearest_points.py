@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from touchcell.geometry.types import Array
 from touchcell.simulation.closed_forms import Box, Cylinder, Saddle
 from touchcell.simulation.meshes import _plain_mesh, primitives
-from touchcell.simulation.meshes.drawing import drawn_shape
 from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.meshes.smoothing import Edges, TriangleMesh, smooth
+from touchcell.simulation.shape_drawing import drawn_shape
 from touchcell.simulation.surfaces import Ramp, Shape, Sphere
 
 CREASE = math.radians(30.0)

@@ -14,7 +14,7 @@ from touchcell.cell.analysis.felt_cloud import felt_cloud
 from touchcell.cell.analysis.run_folder import RunFolder, during, scene_time, sensor_poses
 from touchcell.cell.experiments.frames import BLUE, GREY, ORANGE, save
 from touchcell.cell.experiments.scenes import distance_to_scene_mm, surface
-from touchcell.simulation.meshes.drawing import drawn_surface
+from touchcell.simulation.shape_drawing import drawn_surface
 
 _COLUMNS = 4
 

@@ -9,11 +9,11 @@ from typing import Protocol, cast
 import numpy as np
 
 from touchcell.compiled import extension
+from touchcell.geometry.surface_point import SurfacePoint
 from touchcell.geometry.types import Array
 from touchcell.simulation.meshes import _plain_mesh
 from touchcell.simulation.meshes.creases import Polylines, creases
 from touchcell.simulation.meshes.smoothing import SmoothMesh, TriangleMesh, smooth
-from touchcell.simulation.surfaces import SurfacePoint
 
 
 class _Search(Protocol):

@@ -6,9 +6,9 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from touchcell.geometry.surface_point import SurfacePoint
 from touchcell.geometry.types import Array
 from touchcell.simulation.shape_spec import SurfaceConfig, SurfaceSpec
-from touchcell.simulation.surfaces import SurfacePoint
 
 
 @dataclass(frozen=True)

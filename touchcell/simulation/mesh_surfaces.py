@@ -17,10 +17,10 @@ from touchcell.geometry.types import Array
 from touchcell.input_file import InputFile
 from touchcell.plugin_section import PluginSection
 from touchcell.simulation.meshes import primitives
-from touchcell.simulation.meshes.drawing import Drawable
 from touchcell.simulation.meshes.load import INSTALL, SUFFIXES, load_mesh, mesh_library, what_is_open
 from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.meshes.smoothing import TriangleMesh
+from touchcell.simulation.shape_drawing import Drawable
 from touchcell.simulation.shape_spec import SURFACES, SurfaceConfig, SurfaceSpec
 
 _LIBRARIES = {"trimesh": INSTALL}
