@@ -55,6 +55,11 @@ class Sidestepping(Protocol):
     """Behavior that may ask for its contact to be made anew beside the present one."""
 
     @property
+    def may_sidestep(self) -> bool:
+        """True if it may ever ask."""
+        ...
+
+    @property
     def sidestep_m(self) -> float | None:
         """Distance to step to the left of the contact normal, as seen from above; None for no step."""
         ...

@@ -156,6 +156,11 @@ class PredictivePush:
         return min(max(-self._settings.lead_m * math.tan(turned), -reach_m), reach_m)
 
     @property
+    def may_sidestep(self) -> bool:
+        """True if the contact may be given up for another."""
+        return self._settings.recontact_m is not None
+
+    @property
     def sidestep_m(self) -> float | None:
         """By how much the contact should be moved to the left, to be opposite the object's centre; None if it is."""
         limit_m = self._settings.recontact_m

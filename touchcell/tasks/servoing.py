@@ -196,7 +196,7 @@ class ServoTask(MachineTask):
         self._period_s = 1.0 / context.rate_hz
         self._servos = servos
         timeout_s = min(servo.run.timeout_s for servo in servos)
-        sidesteps = any(isinstance(servo.run, Sidestepping) for servo in servos)
+        sidesteps = any(isinstance(servo.run, Sidestepping) and servo.run.may_sidestep for servo in servos)
         self._machine = TaskMachine(servo_table(name, config, timeout_s, sidesteps=sidesteps, servos=len(servos)), self)
         self._checks: list[SensorCheck] = []
         self._unchecked = config.check_s > 0.0
@@ -336,12 +336,12 @@ class ServoTask(MachineTask):
                         self._post("missed", missed)
                     else:
                         self._post("finished")
+                elif any(isinstance(s.run, Sidestepping) and s.run.sidestep_m is not None for s in servos):
+                    self._post("aside", "the object is pushed beside its centre")
             case ServoState.RETURN:
                 self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in servos))
                 if all(servo.is_back() for servo in servos):
                     self._post("returned")
-                elif any(isinstance(s.run, Sidestepping) and s.run.sidestep_m is not None for s in servos):
-                    self._post("aside", "the object is pushed beside its centre")
             case ServoState.SIDESTEP:
                 self._watch_sight(dt_s, blind=any(servo.T_base_sensor is None for servo in servos))
                 if not any(servo.sidestepping for servo in servos):

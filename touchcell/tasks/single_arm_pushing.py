@@ -191,6 +191,11 @@ class Push:
         return None if self._predictive is None else self._predictive.motion
 
     @property
+    def may_sidestep(self) -> bool:
+        """True if the contact may be given up for another."""
+        return self._predictive is not None and self._predictive.may_sidestep
+
+    @property
     def sidestep_m(self) -> float | None:
         """Distance to step to the left of the contact normal before the push continues; None for no step."""
         return None if self._predictive is None else self._predictive.sidestep_m
