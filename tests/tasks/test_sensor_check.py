@@ -41,7 +41,7 @@ def _verdict(seen_as: Array, *, drift: Array | None = None, follow: float = 0.0,
         if cycle % 3 == 0:
             xi = seen_as @ se3.log(se3.compose(se3.inverse(T_b_s), T_b_f))
             check.record_contact(cycle, now_ns, se3.exp(xi + rng.normal(0.0, NOISE)))
-        V = check.step(PERIOD_S)
+        V = check.step(PERIOD_S, T_b_s)
         T_b_s = se3.compose(T_b_s, se3.exp(PERIOD_S * V))
         along = np.array([follow, follow, 0.0, 0.0, 0.0, 0.0]) * V
         moved = se3.compose(se3.compose(T_b_s, se3.exp(PERIOD_S * along)), se3.inverse(T_b_s))
@@ -90,13 +90,20 @@ def test_loose_object_is_no_fault_of_the_sensor(follow: float) -> None:
 
 def test_too_few_estimates_are_no_agreement() -> None:
     check = SensorCheck(1.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0)
+    T_b_s = np.eye(4)
     while not check.finished:
-        check.step(PERIOD_S)
+        T_b_s = se3.compose(T_b_s, se3.exp(PERIOD_S * check.step(PERIOD_S, T_b_s)))
     assert "0 estimates" in check.verdict()
 
 
-def test_motion_ends_where_it_began_but_for_the_press() -> None:
-    check, moved = SensorCheck(1.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0), np.zeros(6)
+@pytest.mark.parametrize("inward", [1.0, 0.25])
+def test_motion_ends_where_it_began_but_for_the_press(inward: float) -> None:
+    """Also of an arm that an interlock slows in one direction."""
+    check, T_b_s = SensorCheck(1.0, press_mm=0.5, shift_mm=0.3, tilt_deg=1.0), np.eye(4)
+    turned_deg = 0.0
     while not check.finished:
-        moved += PERIOD_S * check.step(PERIOD_S)
-    assert moved == pytest.approx([0.0, 0.0, 5e-4, 0.0, 0.0, 0.0], abs=1e-9)
+        V = check.step(PERIOD_S, T_b_s)
+        T_b_s = se3.compose(T_b_s, se3.exp(PERIOD_S * (inward if V[0] > 0.0 else 1.0) * V))
+        turned_deg = max(turned_deg, float(np.degrees(np.linalg.norm(se3.log(T_b_s)[3:]))))
+    assert se3.log(T_b_s) == pytest.approx([0.0, 0.0, 5e-4, 0.0, 0.0, 0.0], abs=1e-4)
+    assert turned_deg > 0.8

@@ -26,6 +26,9 @@ _SURE = 2.5
 _MOST_TURN_DEG = 30.0
 _OPPOSITE_DEG = 90.0
 _PRESS_SHARE = 0.15
+_BACK_PER_S = 10.0
+_BACK_S = 0.2
+_BEHIND_M, _BEHIND_RAD = 0.1e-3, math.radians(0.2)
 
 
 @dataclass(frozen=True)
@@ -70,11 +73,12 @@ class SensorCheck:
         self._frames: list[tuple[int, Array, Array]] = []
         self._seq = -1
         self._t_s = 0.0
+        self._start: Array | None = None
 
     @property
     def finished(self) -> bool:
         """True if the motion is complete."""
-        return self._t_s >= self._duration_s
+        return self._t_s >= self._duration_s + _BACK_S
 
     def record_pose(self, t_ns: int, T_base_sensor: Array) -> None:
         """Record the sensor's pose."""
@@ -86,11 +90,19 @@ class SensorCheck:
             self._seq = seq
             self._frames.append((t_ns, self._poses.at(t_ns), T_s_f))
 
-    def step(self, dt_s: float) -> Array:
-        """Advance by a cycle and return the sensor's twist (6,) in its own frame."""
+    def step(self, dt_s: float, T_base_sensor: Array) -> Array:
+        """Advance by a cycle and return the sensor's twist (6,) in its own frame.
+
+        Where the arm falls behind, as where an interlock slows it in one direction, the motion waits for it, so that
+        the sensor moves as far as it should and ends where it began.
+        """
+        if self._start is None:
+            self._start = T_base_sensor
         before = self._displacement(self._t_s)
-        self._t_s = min(self._t_s + dt_s, self._duration_s)
-        twist: Array = (self._displacement(self._t_s) - before) / dt_s
+        behind = se3.log(se3.compose(se3.inverse(T_base_sensor), se3.compose(self._start, se3.exp(before))))
+        if np.linalg.norm(behind[:3]) < _BEHIND_M and np.linalg.norm(behind[3:]) < _BEHIND_RAD:
+            self._t_s = min(self._t_s + dt_s, self._duration_s + _BACK_S)
+        twist: Array = (self._displacement(self._t_s) - before) / dt_s + _BACK_PER_S * behind
         return twist
 
     def verdict(self) -> str:

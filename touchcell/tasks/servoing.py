@@ -117,7 +117,7 @@ def servo_table(
     """
     s = ServoState
     approach_s = 2.0 * config.approach_distance_mm / config.approach_speed_mm_s + 1.0
-    check_s = 2.0 * servos * config.check_s + 1.0
+    check_s = 5.0 * servos * config.check_s + 1.0
     retract_s = 2.0 * config.retract_mm / config.retract_speed_mm_s + 1.0
     return Table(
         task,
@@ -478,8 +478,8 @@ class ServoTask(MachineTask):
         if not all(servo.has_fresh_data and servo.T_s_f is not None for servo in self._servos):
             return []
         for check, servo in zip(self._checks, self._servos, strict=True):
-            if not check.finished:
-                return [(servo, servo.in_tcp(check.step(self._period_s)))]
+            if not check.finished and servo.T_base_sensor is not None:
+                return [(servo, servo.in_tcp(check.step(self._period_s, servo.T_base_sensor)))]
         return []
 
     def _command(self, servo: ContactServo, V_tcp: Array) -> TwistCommand:
