@@ -392,12 +392,13 @@ class ContactServo:
         if self.T_s_f is None:
             self._V_tcp = np.zeros(6)
             return None
-        self._V_tcp = np.concatenate(
-            [
-                _towards(self._V_tcp[:3], V_tcp[:3], 1e-3 * self._config.max_accel_mm_s2 * self._period_s),
-                _towards(self._V_tcp[3:], V_tcp[3:], math.radians(self._config.max_turn_accel_deg_s2) * self._period_s),
-            ]
+        # One factor for all axes: without the motion that goes with it, a turn about the contact would slide the tip.
+        step = (V_tcp - self._V_tcp) / self._period_s
+        excess = max(
+            1e3 * float(np.linalg.norm(step[:3])) / self._config.max_accel_mm_s2,
+            math.degrees(float(np.linalg.norm(step[3:]))) / self._config.max_turn_accel_deg_s2,
         )
+        self._V_tcp = self._V_tcp + self._period_s / max(excess, 1.0) * step
         return self._V_tcp
 
     def telemetry(self, observation: Observation, *, servoing: bool) -> Mapping[str, float]:
@@ -422,13 +423,6 @@ _LONGEST_UNCHANGED_MM = 2.5
 _LEAST_CHANGE = 0.01
 _REACHED_M = 0.5e-3
 _APPROACH_PER_S = 8.0
-
-
-def _towards(start: Array, goal: Array, longest: float) -> Array:
-    """Return ``start`` (3,) moved towards ``goal`` (3,) by at most ``longest``."""
-    step = goal - start
-    length = math.sqrt(float(step @ step))
-    return goal if length <= longest else start + step * (longest / length)
 
 
 _COMPONENTS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
