@@ -384,6 +384,7 @@ def test_the_ground_truth_of_a_scene_in_a_host_is_published_and_recorded(tmp_pat
     data |= {"time": "real", "processes": "separate", "rate_hz": RATE_HZ}
     data["arms"]["arm"]["limits"]["tcp_speed_m_s"] = 0.03
     data["interlocks"]["tcp_speed"]["limit_m_s"] = 0.085
+    data["task"]["push_speed_mm_s"] = 20
     put_on_true_contact(data)
     path = tmp_path / "cell.yaml"
     path.write_text(yaml.safe_dump(data))

@@ -302,9 +302,12 @@ class FrankaEmulator(Emulator):
                 self._finish_move(MoveStatus.PREEMPTED, Mode.IDLE)
             self._reply(encode_reply(request, command_id, SetterStatus.SUCCESS))
         elif request is Request.AUTOMATIC_ERROR_RECOVERY:
-            asyncio.get_running_loop().call_later(
-                float(self.active.get("slow_recovery", 0.0)), self._finish_recovery, command_id
-            )
+            delay_s = float(self.active.get("slow_recovery", 0.0))
+            if delay_s > 0.0:
+                asyncio.get_running_loop().call_later(delay_s, self._finish_recovery, command_id)
+            else:
+                # Within the tick: the state that follows the reply has no errors, on which clients rely.
+                self._finish_recovery(command_id)
         elif request is Request.GET_ROBOT_MODEL:
             self._reply(encode_reply(request, command_id, SetterStatus.SUCCESS, urdf().encode()))
         else:

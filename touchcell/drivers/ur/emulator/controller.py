@@ -213,6 +213,9 @@ class Controller:
         self.safety_mode = mode
         self._stopped_s = self.t_s
         if mode in (SafetyMode.NORMAL, SafetyMode.REDUCED):
+            if self._powering is not None and self._powering[1] is RobotMode.POWER_OFF:
+                # A button that is released before the power is cut does not keep it.
+                self.robot_mode, self._powering = RobotMode.POWER_OFF, None
             return
         if self.motion is not None:
             self.motion = Brake(_SAFETY_DECEL_RAD_S2, linear=False)
