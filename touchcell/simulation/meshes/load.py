@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -47,6 +48,8 @@ def load_mesh(path: Path, unit: Unit, *, repair: bool) -> TriangleMesh:
             key to change.
     """
     _require_likely_file(path)
+    if path.suffix.lower() == ".stl":
+        _require_whole_stl(path)
     with mesh_library("file", str(path)):
         import trimesh
     try:
@@ -101,6 +104,23 @@ def volume_m3(mesh: TriangleMesh) -> float:
     """Return the enclosed volume, negative for a mesh that is inside out."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]] - mesh.vertices[0] for i in range(3))
     return float(np.einsum("mc,mc->", a, np.cross(b, c)) / 6.0)
+
+
+def _require_whole_stl(path: Path) -> None:
+    """Refuse an STL file that ends before its last triangle: libraries read what is there, or nothing."""
+    with path.open("rb") as file:
+        head = file.read(1024)
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - 256))
+        tail = file.read()
+    if head.lstrip().startswith(b"solid") and b"facet" in head:
+        whole = b"endsolid" in tail
+    else:
+        count = int.from_bytes(head[80:84], "little")
+        whole = len(head) >= 84 and size >= 84 + 50 * count
+    if not whole:
+        reason = "is no STL file that can be read: it ends before its last triangle, or is none"
+        raise ConfigError(reason, key="file", value=str(path), hint="it may be cut off; export it again")
 
 
 def _require_likely_file(path: Path) -> None:
