@@ -60,12 +60,12 @@ def shrunk(images: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
     if factor == 1:
         return images
     height, width = images.shape[-2] // factor, images.shape[-1] // factor
-    total = np.zeros((*images.shape[:-2], height, width), np.float32)
+    means: NDArray[np.float32] = np.zeros((*images.shape[:-2], height, width), np.float32)
     # Whole slices: ten times as fast as a mean over axes.
     for row in range(factor):
         for column in range(factor):
-            total += images[..., row : height * factor : factor, column : width * factor : factor]
-    means: NDArray[np.float32] = total / np.float32(factor * factor)
+            means += images[..., row : height * factor : factor, column : width * factor : factor]
+    means *= np.float32(1.0 / (factor * factor))
     return means
 
 
