@@ -226,7 +226,7 @@ class Place:
     state: str
 
 
-NOT_VISITED: Mapping[str, frozenset[str]] = {
+_NOT_VISITED: Mapping[str, frozenset[str]] = {
     "arm": frozenset({"check", "return"}),
     "camera": frozenset({"return"}),
 }
@@ -253,7 +253,7 @@ def places(devices: Sequence[str] = ("arm", "camera"), tasks: Sequence[str] | No
             for fault in (fault for fault in FAULTS if fault.device == kind):
                 for device in targets:
                     for state in probe.task.states:
-                        if state in NOT_VISITED[kind]:
+                        if state in _NOT_VISITED[kind]:
                             continue
                         yield Place(cell, fault.name, device, state)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,8 @@ from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.errors import DeviceError, LifecycleError
 from touchcell.drivers.core.protocols import FrameSource, HealthSource, JointSource, TcpSource
 from touchcell.geometry import se3
+
+ResultT = TypeVar("ResultT")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +69,22 @@ def probe_cell(path: Path, settings: Mapping[str, Any] | None = None, world: Wor
     Raises:
         ConfigError: the cell file is not valid.
     """
+    return look_at_devices(_probe, path, settings, world)
+
+
+def look_at_devices(
+    look: Callable[[Device, str], ResultT],
+    path: Path,
+    settings: Mapping[str, Any] | None = None,
+    world: WorldName | None = None,
+) -> list[ResultT]:
+    """Return what ``look(device, driver)`` returns for every device of a cell file, one after the other.
+
+    The devices are built, not connected. Raises ConfigError as ``probe_cell``.
+    """
     with cell_in_world(path, world, settings=settings) as plan:
         devices = build_devices(plan, plan.devices if world is None else plan.built)
-        return [_probe(device, plan.devices[name].spec.name) for name, device in devices.items()]
+        return [look(device, plan.devices[name].spec.name) for name, device in devices.items()]
 
 
 def print_probes(probes: Sequence[Probe]) -> None:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from touchcell.cell.cli.devices import look_at_devices
 from touchcell.cell.config.worlds import WorldName
-from touchcell.cell.runtime.devices import build_devices
-from touchcell.cell.runtime.worlds import cell_in_world
 from touchcell.drivers.core.device import Device, Lifecycle
 from touchcell.drivers.core.diagnosis import Diagnosable, Finding, finding_of
 from touchcell.drivers.core.errors import DeviceError
@@ -50,9 +49,7 @@ def diagnose_cell(
     Raises:
         ConfigError: the cell file is not valid.
     """
-    with cell_in_world(path, world, settings=settings) as plan:
-        devices = build_devices(plan, plan.devices if world is None else plan.built)
-        return [diagnose(device, plan.devices[name].spec.name) for name, device in devices.items()]
+    return look_at_devices(diagnose, path, settings, world)
 
 
 def diagnose(device: Device, driver: str) -> Diagnosis:

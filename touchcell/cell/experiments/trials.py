@@ -174,7 +174,7 @@ class Perform:
         folder = self.root / trial.name
         folder.mkdir(parents=True, exist_ok=True)
         record = {"outcome": outcome, "reason": reason, "measures": {}, "code": asdict(self.code)}
-        _write_whole(folder / "trial.json", json.dumps(record, indent=1))
+        write_whole(folder / "trial.json", json.dumps(record, indent=1))
         return Finished.of(trial, RunFolder(folder), record)
 
     def kept(self, trial: Trial) -> Finished | None:
@@ -222,7 +222,7 @@ class Perform:
             # Measures that are not finite are left out, as JSON has no number for them.
             "measures": {name: float(value) for name, value in measures.items() if math.isfinite(value)},
         }
-        _write_whole(folder / "trial.json", json.dumps(record, indent=1))
+        write_whole(folder / "trial.json", json.dumps(record, indent=1))
         return record
 
 
@@ -275,7 +275,8 @@ def _with_absolute_paths(file: YamlFile | None, value: Any, at: tuple[str | int,
     return value
 
 
-def _write_whole(path: Path, text: str) -> None:
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file and a line end; an interruption leaves the old file. Raises RecordingError."""
     unfinished = path.with_suffix(".unfinished")
     try:
         unfinished.write_text(text + "\n")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -17,6 +16,7 @@ from touchcell.cell.experiments.archives import archive_of, extract
 from touchcell.cell.experiments.elsewhere import WorkerDiffers
 from touchcell.cell.experiments.executors import EXECUTORS, Lost, Workers
 from touchcell.cell.experiments.table import Column, Row, table
+from touchcell.cell.experiments.trials import write_whole
 from touchcell.errors import ConfigError, TouchcellError
 
 if TYPE_CHECKING:
@@ -298,14 +298,10 @@ class _Record:
         return scores or None
 
     def write(self, scores: Mapping[str, float]) -> None:
-        """Write the file whole."""
-        path = self.folder / f"{self.name}.json"
-        unfinished = path.with_suffix(".unfinished")
+        """Write the file whole. Raises RecordingError."""
         code = asdict(code_identity()) | {"torch": _torch()}
-        unfinished.write_text(
-            json.dumps({"identity": self.identity, "scores": dict(scores), "code": code}, indent=1) + "\n"
-        )
-        os.replace(unfinished, path)
+        record = {"identity": self.identity, "scores": dict(scores), "code": code}
+        write_whole(self.folder / f"{self.name}.json", json.dumps(record, indent=1))
 
     def _content(self) -> dict[str, Any]:
         try:
