@@ -24,4 +24,3 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.is_relative_to(_EMULATED):
             item.add_marker(pytest.mark.emulated)
-            item.add_marker(pytest.mark.flaky(reruns=2))
