@@ -11,6 +11,7 @@ from typing import Any, Final, cast
 from touchcell.drivers.core.camera import CameraConfig
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
+from touchcell.drivers.core.paced_clock import emulated_clock
 from touchcell.drivers.v4l2.driver import SPEC, V4l2Camera, V4l2Config
 from touchcell.drivers.v4l2.emulator import server
 from touchcell.drivers.v4l2.shim import ShimCalls
@@ -61,11 +62,13 @@ def rig(folder: Path, address: int) -> DeviceFixture:
 
 
 class CallsInStep(ShimCalls):
-    """System calls on cameras that share a simulated time with the caller."""
+    """System calls on cameras that share the simulated time of a ``Lockstep`` world with the caller."""
 
-    def __init__(self, folder: Path, world: Lockstep) -> None:
-        super().__init__(folder)
-        self._world = world
+    @property
+    def _world(self) -> Lockstep:
+        world = emulated_clock()
+        assert isinstance(world, Lockstep)
+        return world
 
     def open(self, path: str) -> int:
         return self._world.outside(lambda: ShimCalls.open(self, path))
@@ -85,7 +88,7 @@ def rig_in_step(folder: Path, address: int) -> DeviceFixture:
     arguments = ("--folder", str(folder), "--minor", str(address))
 
     def build(config: V4l2Config, clock: Clock) -> Device:
-        return V4l2Camera("tip", clock, config, CallsInStep(folder, world))
+        return V4l2Camera("tip", clock, config, CallsInStep(folder))
 
     return replace(
         fixture,

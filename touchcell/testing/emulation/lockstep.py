@@ -40,6 +40,7 @@ _START_NS = 1_000_000_000_000
 _READING_NS = 100
 _REPLY_S = 10.0
 _OUTSIDE_S = 20e-6
+_ASKING_NS = 50_000
 
 
 class StuckError(TouchcellError):
@@ -324,13 +325,13 @@ class EmulatorInStep:
     """An emulator in a task of a world, with the operations of ``EmulatorProcess``.
 
     Args:
-        world: the world.
+        world: the world; also an attribute.
         name: for errors.
         build: builds the emulator; called within the world.
     """
 
     def __init__(self, world: Lockstep, name: str, build: Callable[[], Emulator]) -> None:
-        self._world = world
+        self.world = world
         self._name = name
         self._build = build
         self._thread: _Thread | None = None
@@ -341,16 +342,17 @@ class EmulatorInStep:
 
     def start(self) -> Self:
         """Start and wait until it is ready. Raises ConnectError."""
-        self._thread = self._world.threading.Thread(target=self._run, name=self._name)
+        self._emulator = self._failure = None
+        self._thread = self.world.threading.Thread(target=self._run, name=self._name)
         self._thread.start()
-        self._world.wait(lambda: self._emulator is not None or self._failure is not None)
+        self.world.wait(lambda: self._emulator is not None or self._failure is not None)
         if self._failure is not None:
             raise ConnectError(self._name, f"emulator did not start: {self._failure}")
         return self
 
     def _run(self) -> None:
         try:
-            with asyncio.Runner(loop_factory=lambda: _WorldLoop(self._world)) as runner:
+            with asyncio.Runner(loop_factory=lambda: _WorldLoop(self.world)) as runner:
                 runner.run(self._serve())
         except OSError as error:
             self._failure = error
@@ -386,12 +388,12 @@ class EmulatorInStep:
 
     def wait_for(self, **wanted: Any) -> dict[str, Any]:
         """Poll ``state`` until every named entry has the given value. Raises TransportTimeout."""
-        until_ns = self._world.now_ns() + round(_REPLY_S * 1e9)
-        while self._world.now_ns() < until_ns:
+        until_ns = self.world.now_ns() + round(_REPLY_S * 1e9)
+        while self.world.now_ns() < until_ns:
             state = self.state()
             if all(state.get(key) == value for key, value in wanted.items()):
                 return state
-            self._world.sleep_until_ns(self._world.now_ns() + 5_000_000)
+            self.world.sleep_until_ns(self.world.now_ns() + 5_000_000)
         raise TransportTimeout(self._name, f"state {wanted}", _REPLY_S)
 
     def freeze(self) -> None:
@@ -433,12 +435,14 @@ class EmulatorInStep:
             except (TouchcellError, ValueError, TypeError) as error:
                 failures.append(error)
 
-        if not self._world.is_present(self._task):
+        if not self.world.is_present(self._task):
             raise ConnectError(self._name, "the emulator has ended")
         loop.call_soon_threadsafe(answer)
-        until_ns = self._world.now_ns() + round(_REPLY_S * 1e9)
-        if not self._world.wait(lambda: bool(answers or failures), until_ns):
+        until_ns = self.world.now_ns() + round(_REPLY_S * 1e9)
+        if not self.world.wait(lambda: bool(answers or failures), until_ns):
             raise TransportTimeout(self._name, "reply of the emulator", _REPLY_S)
+        # As long as asking another process takes: whoever asks again and again sees the time pass.
+        self.world.sleep_until_ns(self.world.now_ns() + _ASKING_NS)
         if failures:
             raise ConnectError(self._name, str(failures[0]))
         return answers[0]
