@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
+from functools import partial
 from pathlib import Path
 
 from touchcell.cell.cli.arguments import Subparsers, add_command, add_run_folder, add_set
 from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED
+from touchcell.progress import shown_progress
 
 PLOT = "replay.png"
 """Name of the plot in the folder of a replay."""
@@ -33,8 +34,6 @@ def add_parser(commands: Subparsers) -> None:
 
 
 def _replay(options: argparse.Namespace) -> int:
-    from rich.progress import Progress
-
     from touchcell.cell.cli.run_commands import latest_run
     from touchcell.cell.config.settings import parse_settings
     from touchcell.cell.replaying.differences import Tolerance, differences
@@ -44,13 +43,12 @@ def _replay(options: argparse.Namespace) -> int:
 
     folder = latest_run() if options.folder is None else options.folder
     with run_directory(f"{folder.name}-replay", options.out) as out:
-        with Progress(transient=True, disable=not sys.stdout.isatty()) as bar:
-            task = bar.add_task(folder.name, total=None)
+        with shown_progress() as show:
             done = replay(
                 folder,
                 out,
                 settings=parse_settings(options.settings),
-                on_cycle=lambda cycle, of: bar.update(task, completed=cycle, total=of),
+                on_cycle=partial(show, "cycles"),
             )
         found = differences(done, Tolerance(options.tolerance, options.tolerance_twist))
         plot = plot_replay(done, found, out / PLOT)
