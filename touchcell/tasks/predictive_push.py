@@ -205,7 +205,7 @@ class PredictivePush:
     @property
     def may_sidestep(self) -> bool:
         """True if the contact may be given up for another."""
-        return self._settings.recontact_m is not None or self._must_search
+        return self._settings.recontact_m is not None or self._settings.side_width_m is not None
 
     @property
     def wants_sidestep(self) -> bool:
