@@ -1,8 +1,8 @@
 """Find the middle of an object's flat side by touching one of its edges.
 
-A round tip of radius R whose centre is beyond an edge, by less than R, touches the edge itself: the normal turns inwards, and
-the edge is where the tip's surface is, along that normal. With the width of the side it tells where the side's middle is, which
-no touch of the side itself tells.
+A round tip of radius R whose centre is beyond an edge, by less than R, touches the edge itself: the normal turns
+inwards, and the edge is where the tip's surface is, along that normal. With the width of the side it tells where the
+side's middle is, which no touch of the side itself tells.
 """
 
 from __future__ import annotations

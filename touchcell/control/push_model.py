@@ -11,10 +11,11 @@ normal and the centre ``s`` to the left of it, all forces drop out:
 the centre moves along a direction that is fixed in the object, ``atan(s / a)`` left of the normal, whatever the force:
 there the object is a unicycle (a flat output, as the rear axle of a car is). So motion tells ``s`` and ``c``.
 
-Motion does not tell where the object's middle is. It is the centre of friction where the centre of mass is in the middle
-and nothing else presses; a follower with the normal force F and the friction force T at a lever D and a lateral distance
-q moves ``s`` by ``(q F + D T) / (N - F)``, 5 mm for 0.1 mm of shear that is misread. So middle and ``s`` are estimates of
-their own: touch tells the middle (``touchcell.control.edge_search``, or the normal of a round side), motion tells ``s``.
+Motion does not tell where the object's middle is. It is the centre of friction where the centre of mass is in the
+middle and nothing else presses. A follower with the normal force F and the friction force T, at a lever D and beside
+the pusher's N by q, moves ``s`` by ``(q F + D T) / (N - F)``: 5 mm for 0.1 mm of shear that is misread. So middle and
+``s`` are estimates of their own: touch tells the middle (``touchcell.control.edge_search``, or the normal of a round
+side), motion tells ``s``.
 """
 
 from __future__ import annotations
@@ -35,10 +36,12 @@ _HEADING_NOISE_RAD: Final = math.radians(0.3)
 _OFFSET_PRIOR_M: Final = 0.015
 _LEVER_PRIOR: Final = 0.15
 """Standard deviation of ``c^2`` over its first value."""
-_OFFSET_DRIFT_M_PER_SQRT_M: Final = 0.003
-"""Growth of the uncertainty of ``s`` and of the middle over travel: contacts creep."""
-_FOLLOWER_DRIFT_M_PER_SQRT_M: Final = 0.010
-"""Growth of the uncertainty of ``s`` alone where a follower presses, too."""
+_CREEP_M_PER_SQRT_M: Final = 0.003
+"""Growth of the uncertainty of where an object is touched over travel: contacts creep."""
+_FOLLOWED_DRIFT_M_PER_SQRT_M: Final = 0.010
+"""The same of ``s`` where a follower presses, too ..."""
+_FOLLOWED_CREEP_M_PER_SQRT_M: Final = 0.002
+"""... and of the middle: contacts that press opposite each other creep less."""
 _FEWEST_M: Final = 0.002
 _SHORTEST_M: Final = 0.005
 """Travel from which a motion is compared with the model."""
@@ -139,10 +142,13 @@ class PushEstimator:
         self._first_lever_m2 = lever_m2
         self._flat = flat
         self._eccentricity_m = max(eccentricity_m, 1e-6)
-        drift_m = _OFFSET_DRIFT_M_PER_SQRT_M if flat else 0.0
-        # Of offset, lever and middle, per travel: creep moves offset and middle by the same.
-        self._drift = drift_m**2 * np.array([[1.0, 0.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 1.0]])
-        self._drift[0, 0] += _FOLLOWER_DRIFT_M_PER_SQRT_M**2 if followed else 0.0
+        creep = _CREEP_M_PER_SQRT_M**2 if flat else 0.0
+        # Growth of the covariance of offset, lever and middle over travel. Creep moves offset and middle by the same;
+        # from what a follower's force changes the middle must not learn.
+        self._drift = creep * np.array([[1.0, 0.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 1.0]])
+        if followed:
+            creep = _FOLLOWED_CREEP_M_PER_SQRT_M**2 if flat else 0.0
+            self._drift = np.diag([_FOLLOWED_DRIFT_M_PER_SQRT_M**2, 0.0, creep])
         self._mean = np.array([0.0, lever_m2, 0.0])
         self._covariance = np.diag([0.0, (_LEVER_PRIOR * lever_m2) ** 2, 0.0])
         # Of each contact so far: travel, way to the left in the object's frame, heading.

@@ -359,7 +359,8 @@ class ContactServo:
             speed_m_s: in free air.
             feeling_m_s: where the goal is to feel for a contact.
         """
-        assert self.T_base_sensor is not None and self._goal is not None and isinstance(self.run, Sidestepping)
+        assert self.T_base_sensor is not None
+        assert self._goal is not None
         T_base_goal = self._goal.T_base_sensor
         way = T_base_goal[:3, 3] - self.T_base_sensor[:3, 3]
         R = self.T_base_sensor[:3, :3]
@@ -382,7 +383,8 @@ class ContactServo:
         return self._accelerated(self._Ad_tcp_sensor @ V_s)
 
     def _next_goal(self, T_s_f: Array | None) -> None:
-        assert self.T_base_sensor is not None and isinstance(self.run, Sidestepping)
+        assert self.T_base_sensor is not None
+        assert isinstance(self.run, Sidestepping)
         self._goal, self._felt_s = self.run.next_goal(self.T_base_sensor, T_s_f), 0.0
 
     def travelled_m(self) -> float:

@@ -140,7 +140,7 @@ class Follow:
         self._steps = self._step_opposite(T_base_sensor)
 
     def next_goal(self, T_base_sensor: Array, T_s_f: Array | None) -> Goal | None:
-        """Return where the sensor shall go next: away until the leader knows where the middle is, and opposite it then."""
+        """Return where the sensor shall go next: away until the leader knows the middle, then opposite it."""
         return next(self._steps, None)
 
     def _step_opposite(self, T_base_sensor: Array) -> Iterator[Goal]:

@@ -193,7 +193,7 @@ class PredictivePush:
         return min(max(-self._settings.lead_m * math.tan(turned), -reach_m), reach_m)
 
     def velocity_at(self, point: Point) -> tuple[float, float, float]:
-        """Return the velocity that the object is planned to have at a point, m/s along x and y, and its rate of turn."""
+        """Return the planned velocity of the object at a point, m/s along x and y, and its rate of turn, rad/s."""
         if self._contact is None:
             return 0.0, 0.0, 0.0
         contact, motion = self._contact, self.motion
@@ -229,7 +229,7 @@ class PredictivePush:
         """Let go: the object rests where it is until it is touched again."""
         self.pause()
         self.located = None
-        assert self._contact is not None and self._middle is not None
+        assert self._contact is not None
         if self._must_search:
             self._steps = self._feel_edge(T_base_sensor, self._contact)
         else:
@@ -248,7 +248,8 @@ class PredictivePush:
 
     def _step_to(self, T_base_sensor: Array, left_m: float) -> Iterator[Goal]:
         """Step aside, to be opposite the centre of friction."""
-        assert self._contact is not None and self._middle is not None
+        assert self._contact is not None
+        assert self._middle is not None
         contact, heading = self._contact, self._contact.heading_rad
         self._resting = self._middle, self._estimator.middle_sigma_m
         self.located = self._middle
@@ -286,9 +287,8 @@ class PredictivePush:
     def _touched(self, T_base_sensor: Array, T_s_f: Array) -> Contact:
         """Return the point of the object nearest to the tip's centre, whatever shear there is."""
         depth_m = max(0.0, -float(T_s_f[:3, 2] @ T_s_f[:3, 3]))
-        normal = T_base_sensor[:2, :3] @ T_s_f[:3, 2]
-        tip = Pose(float(T_base_sensor[0, 3]), float(T_base_sensor[1, 3]), math.atan2(float(normal[1]), float(normal[0])))
-        at = tip.ahead(self._settings.tip_radius_m - depth_m)
+        normal = T_base_sensor[:3, :3] @ T_s_f[:3, 2]
+        at = _tip_behind(T_base_sensor, heading_of(normal), depth_m - self._settings.tip_radius_m)
         return Contact(at.x, at.y, at.heading)
 
     def pause(self) -> None:

@@ -446,14 +446,7 @@ class ServoTask(MachineTask):
         if state is ServoState.SIDESTEP:
             if not all(servo.has_fresh_data for servo in self._servos):
                 return []
-            aside_m_s = 1e-3 * self._config.sidestep_speed_mm_s
-            feeling_m_s = 1e-3 * self._config.approach_speed_mm_s
-            return [
-                (servo, V)
-                for servo in self._servos
-                if (V := servo.step_aside(aside_m_s, feeling_m_s) if servo.sidestepping else servo.servo_step(np.zeros(6)))
-                is not None
-            ]
+            return [(servo, V) for servo in self._servos if (V := self._aside(servo)) is not None]
         if state not in (ServoState.APPROACH, ServoState.SETTLE, ServoState.RUN):
             return []
         searching = state is ServoState.APPROACH
@@ -474,6 +467,13 @@ class ServoTask(MachineTask):
             if V_tcp is not None:
                 twists.append((servo, V_tcp))
         return twists
+
+    def _aside(self, servo: ContactServo) -> Array | None:
+        """Return the twist (6,) of a tool whose servo steps aside, or holds its contact while another one does."""
+        if not servo.sidestepping:
+            return servo.servo_step(np.zeros(6))
+        c = self._config
+        return servo.step_aside(1e-3 * c.sidestep_speed_mm_s, 1e-3 * c.approach_speed_mm_s)
 
     def _check_twists(self) -> list[tuple[ContactServo, Array]]:
         if not all(servo.has_fresh_data and servo.T_s_f is not None for servo in self._servos):

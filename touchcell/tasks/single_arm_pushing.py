@@ -59,9 +59,9 @@ class PushConfig(ContactServoConfig):
         contact_friction: slope of the friction cone between skin and object that steering may use.
         recontact_mm: where the object is found to be pushed farther than this beside its centre, the arm lets go of it,
             steps aside and touches it again opposite its centre; none: never.
-        side_width_mm: width of the pushed side. With it, an edge of the side is felt before the push, which tells where the
-            object's middle is; without it, a flat side tells nothing of that but that the object is expected on the line
-            of the approach, and the centre of mass is taken for the middle.
+        side_width_mm: width of the pushed side. With it, an edge of the side is felt before the push, which tells where
+            the object's middle is. Without it nothing tells that of a flat side: the centre of friction, which motion
+            tells, is taken for the middle.
         push_accel_mm_s2: acceleration at the start of a predictive push, and deceleration at its end.
         arrival_speed_mm_s: its speed where it arrives.
         arrival_tolerance_mm: the task is done only if the object's middle, where touch and arm pose put it, ends this
@@ -271,8 +271,8 @@ class Push:
             return f"object {distance_mm:.1f} mm from the target, tolerance {1e3 * self._tolerance_m:g} mm"
         if aim.target_distance_m + _SIGMAS * self._sigma_m > self._tolerance_m:
             return (
-                f"object {1e3 * aim.target_distance_m:.1f} mm from the target, but known to {1e3 * self._sigma_m:.1f} mm "
-                f"(standard deviation) only: it may be beyond the tolerance, {1e3 * self._tolerance_m:g} mm"
+                f"object {1e3 * aim.target_distance_m:.1f} mm from the target by its estimate, whose standard deviation "
+                f"is {1e3 * self._sigma_m:.1f} mm: it may be beyond the tolerance, {1e3 * self._tolerance_m:g} mm"
             )
         error_deg = self._heading_error_deg(aim)
         if error_deg is not None and abs(error_deg) > self._tolerance_deg:
