@@ -149,7 +149,9 @@ class PredictivePush:
         self._start_middle_m = 0.0
         self._sidesteps = 0
         self._searches = 0
-        self._must_search = settings.flat and settings.side_width_m is not None
+        self._has_edge = settings.flat and settings.side_width_m is not None
+        # Arms that press beside each other turn what they hold.
+        self._must_place = self._has_edge or settings.followed
         self._approach: float | None = None
         self._contact: Contact | None = None
         self._middle: Pose | None = None
@@ -205,15 +207,16 @@ class PredictivePush:
     @property
     def may_sidestep(self) -> bool:
         """True if the contact may be given up for another."""
-        return self._settings.recontact_m is not None or self._settings.side_width_m is not None
+        return self._settings.recontact_m is not None or self._has_edge or self._settings.followed
 
     @property
     def wants_sidestep(self) -> bool:
         """True if the object should be let go and touched elsewhere."""
-        if self._must_search:
+        if self._must_place:
             return True
         limit_m = self._settings.recontact_m
-        if limit_m is None or self._sidesteps >= _MOST_SIDESTEPS:
+        # A round side's normal points at the middle wherever it is touched.
+        if limit_m is None or not self._settings.flat or self._sidesteps >= _MOST_SIDESTEPS:
             return False
         # The first touch tells only how the side is turned.
         if not (self._known or (self._sidesteps == 0 and self._speed_m_s < self._settings.slowest_m_s)):
@@ -230,8 +233,14 @@ class PredictivePush:
         self.pause()
         self.located = None
         assert self._contact is not None
-        if self._must_search:
-            self._steps = self._feel_edge(T_base_sensor, self._contact)
+        if self._must_place:
+            self._must_place = False
+            model = self._estimator.model
+            self._steps = (
+                self._feel_edge(T_base_sensor, self._contact)
+                if self._has_edge
+                else self._step_to(T_base_sensor, model.middle_m or 0.0)
+            )
         else:
             self._sidesteps += 1
             self._steps = self._step_to(T_base_sensor, self._estimator.model.offset_m)
@@ -247,7 +256,7 @@ class PredictivePush:
         return next(self._steps, None)
 
     def _step_to(self, T_base_sensor: Array, left_m: float) -> Iterator[Goal]:
-        """Step aside, to be opposite the centre of friction."""
+        """Let go and touch again, farther to the left."""
         assert self._contact is not None
         assert self._middle is not None
         contact, heading = self._contact, self._contact.heading_rad
@@ -261,7 +270,6 @@ class PredictivePush:
         """Search for an edge of the side, and then be opposite the middle."""
         settings = self._settings
         assert settings.side_width_m is not None
-        self._must_search = False
         self._searches += 1
         search = EdgeSearch(side, self._estimator.model.middle_m or 0.0, settings.side_width_m, settings.tip_radius_m)
         yield Goal(placed(T_base_sensor, _tip_behind(T_base_sensor, side.heading_rad, _CLEAR_M)))
@@ -377,12 +385,12 @@ class PredictivePush:
     def _touch_again(self, contact: Pose, middle: Pose, sigma_m: float) -> None:
         """Know where the middle is beside a new contact, of an object that has rested meanwhile."""
         turned = math.remainder(contact.heading - middle.heading, 2.0 * math.pi)
-        searched = self._settings.side_width_m is not None and self._settings.flat
-        if searched and abs(turned) > _SIDE_SIGMA_RAD and self._searches < _MOST_SEARCHES and self._path is not None:
+        if self._has_edge and abs(turned) > _SIDE_SIGMA_RAD and self._searches < _MOST_SEARCHES:
             # What was touched at first was an edge, or the object has turned.
-            self._must_search = True
-        middle_m = contact.local((middle.x, middle.y))[1]
-        sigma_m = math.hypot(sigma_m, _TOUCHED_AGAIN_M)
+            self._must_place = True
+        middle_m, sigma_m = contact.local((middle.x, middle.y))[1], math.hypot(sigma_m, _TOUCHED_AGAIN_M)
+        if not self._settings.flat:
+            middle_m = sigma_m = 0.0
         self._start_middle_m += middle_m - (self._estimator.model.middle_m or 0.0)
         self._estimator.move_contact(middle_m, sigma_m, keep_eccentricity=self._sidesteps > 0)
 

@@ -271,7 +271,7 @@ class Push:
             return f"object {distance_mm:.1f} mm from the target, tolerance {1e3 * self._tolerance_m:g} mm"
         if aim.target_distance_m + _SIGMAS * self._sigma_m > self._tolerance_m:
             return (
-                f"object {1e3 * aim.target_distance_m:.1f} mm from the target by its estimate, whose standard deviation "
+                f"object {1e3 * aim.target_distance_m:.1f} mm from the target by an estimate whose standard deviation "
                 f"is {1e3 * self._sigma_m:.1f} mm: it may be beyond the tolerance, {1e3 * self._tolerance_m:g} mm"
             )
         error_deg = self._heading_error_deg(aim)
