@@ -37,11 +37,27 @@ def test_the_middle_is_found_from_20_mm_off_what_is_expected(
     middle_m = expected_m + off_m
     middle = Pose(side.x_m, side.y_m, side.heading_rad).ahead(middle_m, 0.5 * math.pi)
     search = EdgeSearch(Contact(side.x_m, side.y_m, side.heading_rad + turned), expected_m, width_m, RADIUS_M)
-    while search.middle_m is None and not search.failed:
+    while search.middle is None and not search.failed:
         tip = search.tip(CLEAR_M)
         contact = touch(tip, search.direction_rad, middle, width_m)
         search.missed() if contact is None else search.touched(contact)
-    assert search.middle_m == pytest.approx(middle_m, abs=1e-3)
+    assert search.middle is not None
+    assert math.dist((search.middle.x_m, search.middle.y_m), (middle.x, middle.y)) < 1.5e-3
+
+
+@given(st.sampled_from([-1.0, 1.0]), st.floats(0.1, 0.5), st.floats(0.04, 0.1), st.floats(-0.01, 0.01))
+def test_a_first_contact_with_the_edge_itself_is_no_contact_with_the_side(
+    left: float, turned: float, width_m: float, expected_m: float
+) -> None:
+    middle = Pose(0.2, 0.1, -0.2)
+    edge = middle.ahead(left * 0.5 * width_m, 0.5 * math.pi)
+    first = Contact(edge.x, edge.y, middle.heading - left * turned)
+    search = EdgeSearch(first, expected_m - left * 0.02, width_m, RADIUS_M)
+    side = Pose(first.x_m, first.y_m, middle.heading).ahead(-left * 0.6 * width_m, 0.5 * math.pi)
+    search.touched(Contact(side.x, side.y, side.heading))
+    assert search.middle is not None
+    assert math.dist((search.middle.x_m, search.middle.y_m), (middle.x, middle.y)) < 1e-6
+    assert search.middle.heading_rad == pytest.approx(middle.heading)
 
 
 def test_a_side_that_never_ends_is_given_up() -> None:
@@ -49,4 +65,4 @@ def test_a_side_that_never_ends_is_given_up() -> None:
     while not search.failed:
         at = search.tip(0.0)
         search.touched(Contact(0.0, at.y, 0.0))
-    assert search.middle_m is None
+    assert search.middle is None

@@ -21,6 +21,8 @@ _EDGE_RAD: Final = math.radians(4.0)
 """Turn of the normal from which an edge is touched, and not the side."""
 _INWARDS_RAD: Final = math.radians(20.0)
 """Turn of the tip towards the edge's normals: models know tilts to 25 degrees."""
+_APART_M: Final = 0.005
+"""Distance of two contacts from which the line through them tells how their side is turned."""
 _MOST_TOUCHES: Final = 6
 
 
@@ -28,7 +30,7 @@ class EdgeSearch:
     """Search for one edge of a side; touches are made by the caller.
 
     Args:
-        side: a contact with the side.
+        side: a contact with the side, or, unknown to the caller, with one of its edges.
         expected_m: of the side's middle to the left of that contact.
         width_m: of the side.
         tip_radius_m: radius of the tip.
@@ -44,13 +46,13 @@ class EdgeSearch:
         self._flat_m: float | None = None
         self._missed_m: float | None = None
         self._touches = 0
-        self.middle_m: float | None = None
-        """Of the side's middle to the left of the contact; None until the edge has been found."""
+        self.middle: Contact | None = None
+        """The side's middle; None until the edge has been found."""
 
     @property
     def failed(self) -> bool:
         """True if the edge is not where it was searched for."""
-        return self.middle_m is None and self._touches >= _MOST_TOUCHES
+        return self.middle is None and self._touches >= _MOST_TOUCHES
 
     def tip(self, clear_m: float) -> Pose:
         """Return where the tip's centre shall be for the next touch, before it moves on by ``clear_m`` and more."""
@@ -65,13 +67,29 @@ class EdgeSearch:
     def touched(self, contact: Contact) -> None:
         """Take the point that was touched and its normal into account."""
         self._touches += 1
-        outwards = -self._left * math.remainder(contact.heading_rad - self._side.heading, 2.0 * math.pi)
-        if outwards > _EDGE_RAD:
-            edge_m = self._side.local((contact.x_m, contact.y_m))[1]
-            self.middle_m = edge_m - self._left * self._half_m
+        turned = math.remainder(contact.heading_rad - self._side.heading, 2.0 * math.pi)
+        if abs(turned) > _EDGE_RAD and self._lies_on_turned_side(contact, turned):
+            # The first contact was with the edge, whose normal is not the side's.
+            edge, towards = self._side, Pose(contact.x_m, contact.y_m, contact.heading_rad)
+            towards_left = -math.copysign(1.0, towards.local((edge.x, edge.y))[1])
+            self._find(Pose(edge.x, edge.y, towards.heading).ahead(towards_left * self._half_m, 0.5 * math.pi))
+        elif -self._left * turned > _EDGE_RAD:
+            edge = Pose(contact.x_m, contact.y_m, self._side.heading)
+            self._find(edge.ahead(-self._left * self._half_m, 0.5 * math.pi))
         else:
             self._flat_m = self._at_m
             self._step()
+
+    def _lies_on_turned_side(self, contact: Contact, turned: float) -> bool:
+        """Return True if both contacts lie on one straight side with the normal of the second."""
+        ahead, left = self._side.local((contact.x_m, contact.y_m))
+        if abs(left) < _APART_M:
+            return False
+        direction = math.atan2(-ahead * math.copysign(1.0, left), abs(left))
+        return abs(direction - turned) < abs(direction)
+
+    def _find(self, middle: Pose) -> None:
+        self.middle = Contact(middle.x, middle.y, middle.heading)
 
     def missed(self) -> None:
         """Take into account that nothing was touched, or nothing that could be measured."""

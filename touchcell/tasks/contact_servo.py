@@ -65,6 +65,11 @@ class Sidestepping(Protocol):
         """True if it asks now."""
         ...
 
+    @property
+    def only_touches(self) -> bool:
+        """True if the contact shall not be pressed, as it is to be given up."""
+        ...
+
     def begin_sidestep(self, T_base_sensor: Array) -> None:
         """Take note that the contact is given up for another, with the sensor at a pose (4, 4)."""
         ...
@@ -346,6 +351,11 @@ class ContactServo:
             return
         self.run.begin_sidestep(self.T_base_sensor)
         self._goal = self.run.next_goal(self.T_base_sensor, None)
+
+    @property
+    def only_touches(self) -> bool:
+        """True if the contact shall not be pressed, as it is to be given up."""
+        return isinstance(self.run, Sidestepping) and self.run.only_touches
 
     @property
     def sidestepping(self) -> bool:

@@ -132,6 +132,11 @@ class Follow:
         """False: the leader decides."""
         return False
 
+    @property
+    def only_touches(self) -> bool:
+        """True until the arms are opposite each other: what they hold beside each other turns as they press."""
+        return self._push.predictive is not None and self._push.predictive.must_place
+
     def begin_approach(self, T_base_sensor: Array) -> None:
         """Do nothing: the leader knows from where the object is approached."""
 

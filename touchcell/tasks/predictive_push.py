@@ -205,6 +205,11 @@ class PredictivePush:
         return cos * ahead - sin * left - turn * dy, sin * ahead + cos * left + turn * dx, turn
 
     @property
+    def must_place(self) -> bool:
+        """True if the present contact will be given up before the object is pushed."""
+        return self._must_place
+
+    @property
     def may_sidestep(self) -> bool:
         """True if the contact may be given up for another."""
         return self._settings.recontact_m is not None or self._has_edge or self._settings.followed
@@ -273,7 +278,7 @@ class PredictivePush:
         self._searches += 1
         search = EdgeSearch(side, self._estimator.model.middle_m or 0.0, settings.side_width_m, settings.tip_radius_m)
         yield Goal(placed(T_base_sensor, _tip_behind(T_base_sensor, side.heading_rad, _CLEAR_M)))
-        while search.middle_m is None and not search.failed:
+        while search.middle is None and not search.failed:
             clear = search.tip(_CLEAR_M)
             yield Goal(placed(T_base_sensor, clear))
             beyond = clear.ahead(2.0 * _CLEAR_M, search.direction_rad - clear.heading)
@@ -283,11 +288,11 @@ class PredictivePush:
             else:
                 search.touched(self._felt)
             yield Goal(placed(T_base_sensor, clear))
-        found_m = search.middle_m
-        sigma_m = _EDGE_SIGMA_M
-        if found_m is None:
-            found_m, sigma_m = self._estimator.model.middle_m or 0.0, self._estimator.middle_sigma_m
-        at = Pose(side.x_m, side.y_m, side.heading_rad).ahead(found_m, 0.5 * math.pi)
+        if (found := search.middle) is not None:
+            at, sigma_m = Pose(found.x_m, found.y_m, found.heading_rad), _EDGE_SIGMA_M
+        else:
+            at = Pose(side.x_m, side.y_m, side.heading_rad).ahead(self._estimator.model.middle_m or 0.0, 0.5 * math.pi)
+            sigma_m = self._estimator.middle_sigma_m
         middle = at.ahead(self._estimator.model.reach_m)
         self._resting, self.located = (middle, sigma_m), middle
         yield Goal(placed(T_base_sensor, at.ahead(-settings.tip_radius_m - _CLEAR_M)))

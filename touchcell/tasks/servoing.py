@@ -322,7 +322,7 @@ class ServoTask(MachineTask):
                 self._watch_check()
             case ServoState.SETTLE:
                 self._watch_contact(dt_s)
-                steady = all(servo.steady() for servo in servos)
+                steady = all(servo.only_touches or servo.steady() for servo in servos)
                 self._steady_s = self._steady_s + dt_s if steady else 0.0
                 if steady and self._steady_s >= self._config.settle_time_s:
                     self._post("settled")
@@ -459,7 +459,7 @@ class ServoTask(MachineTask):
             V_tcp: Array | None
             if searching and not servo.touches:
                 V_tcp = servo.along_z(1e-3 * self._config.approach_speed_mm_s)
-            elif searching and self._unchecked and servo.is_estimated:
+            elif (searching and self._unchecked and servo.is_estimated) or servo.only_touches:
                 V_tcp = None
             else:
                 running = state is ServoState.RUN

@@ -208,6 +208,11 @@ class Push:
         """True if the object should be let go and touched elsewhere."""
         return self._predictive is not None and self._predictive.wants_sidestep
 
+    @property
+    def only_touches(self) -> bool:
+        """False: the pusher turns with the side that it touches."""
+        return False
+
     def begin_approach(self, T_base_sensor: Array) -> None:
         """Take note of the direction of the approach, in which the object is expected."""
         if self._predictive is not None:
