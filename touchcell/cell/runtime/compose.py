@@ -82,7 +82,12 @@ def compose(
         *_by_switch(plan),
     ]
     collection = _collection(plan)
-    context = TaskContext(plan.cell.rate_hz, sensor_poses, 0 if collection is None else collection.kept)
+    context = TaskContext(
+        plan.cell.rate_hz,
+        sensor_poses,
+        0 if collection is None else collection.kept,
+        T_world_base={role: plan.cell.arms[name].T_world_base for name, role in role_of.items()},
+    )
 
     def resumed_task() -> Task:
         return plan.task.build(plan.task_config, replace(context, resumed=True))
