@@ -76,6 +76,17 @@ def whole(text: str) -> int:
     return 0 if text == "0" else positive_or(text, "must be a whole number of 0 or more")
 
 
+def speed(text: str) -> float:
+    """A speed above 0, at most 250: what ISO 10218-1 allows beside a person."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = 0.0
+    if not 0.0 < number <= 250.0:
+        raise argparse.ArgumentTypeError(f"must be above 0 and at most 250, not {text!r}")
+    return number
+
+
 def positive_or(text: str, message: str) -> int:
     """A whole number of 1 or more; otherwise an error with ``message``."""
     try:
