@@ -83,6 +83,12 @@ def _add_training(commands: Subparsers) -> None:
     train_sim.add_argument(
         "--feature", choices=("surface", "edge"), default="surface", help="what is touched (default: %(default)s)"
     )
+    train_sim.add_argument(
+        "--feels",
+        choices=("plane", "shape"),
+        default="plane",
+        help="surfaces to press on: planes, or such as bend (default: %(default)s)",
+    )
     train_sim.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
     _add_seed(train_sim)
 
@@ -188,6 +194,7 @@ def _train_sim(options: argparse.Namespace) -> int:
         epochs=options.epochs,
         seed=options.seed,
         feature=options.feature,
+        feels=options.feels,
     )
     return EXIT_OK
 
