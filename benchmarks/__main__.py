@@ -24,6 +24,7 @@ BENCHMARKS = {
     "fuzz-recordings": "tests.fault_injection.fuzz_recordings",
     "gdn-vs-cnn": "benchmarks.gdn_vs_cnn",
     "keeper": "benchmarks.keeper",
+    "live": "benchmarks.live",
     "mutation": "benchmarks.mutation",
     "hil-mutation": "benchmarks.hil_mutation",
     "phantom": "benchmarks.phantom",
