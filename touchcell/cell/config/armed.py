@@ -88,7 +88,8 @@ def cell_facts(plan: CellPlan, scene: PlanningScene | None = None) -> CellFacts:
     moved = {role for role, protocols in plan.task.arms.items() if TwistSink in protocols}
     sensors = {role: _sensor_facts(plan, name, role_of) for role, name in plan.sensor_roles.items()}
     poses = {role: sensor.T_tcp_sensor for role, sensor in sensors.items()}
-    task = plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses))
+    carriers = {role: sensor.arm for role, sensor in sensors.items() if sensor.arm is not None}
+    task = plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses, carriers=carriers))
     return CellFacts(
         1.0 / plan.cell.rate_hz,
         tuple(getattr(task, "states", ())),
