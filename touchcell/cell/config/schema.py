@@ -259,6 +259,8 @@ class _Planner:
         except ConfigError as error:
             self._add(("task", "name"), error.reason, value=cell.task.name, hint=error.hint)
             return None, None
+        if spec.of_cell is not None:
+            spec = spec.of_cell(frozenset(cell.task.arms or cell.arms), frozenset(cell.task.sensors or cell.sensors))
         return spec, self._validated(spec.config, cell.task.model_extra or {}, ("task",))
 
     def _roles(
