@@ -21,15 +21,14 @@ _SHARPEST_CURVATURE_PER_M: Final = 20.0
 def random_part(rng: np.random.Generator) -> TriangleMesh:
     """Return a part whose rim is an edge between a face above and a wall below; its face looks towards +z.
 
-    Two thirds of the faces are flat, the others bend both ways with radii down to 50 mm. A third of the walls lean, by
-    up to 25 deg. Outlines are circles, waves round a circle and polygons, stars among them; a quarter are the rims of
-    holes.
+    Half of the faces are flat, the others bend both ways with radii down to 50 mm. Half of the walls lean, by up to
+    25 deg. Outlines are circles, waves round a circle and polygons, stars among them; a quarter are the rims of holes.
     """
     hole = bool(rng.random() < 0.25)
     outline = _outline(rng, hole=hole)
-    curvature = rng.uniform(-_SHARPEST_CURVATURE_PER_M, _SHARPEST_CURVATURE_PER_M, 2) * (rng.random() < 0.35)
+    curvature = rng.uniform(-_SHARPEST_CURVATURE_PER_M, _SHARPEST_CURVATURE_PER_M, 2) * (rng.random() < 0.5)
     turn = rng.uniform(0.0, math.pi)
-    lean = rng.uniform(-_BLUNTEST_RAD, _BLUNTEST_RAD) * (rng.random() < 0.3)
+    lean = rng.uniform(-_BLUNTEST_RAD, _BLUNTEST_RAD) * (rng.random() < 0.5)
     length = np.linalg.norm(outline, axis=1, keepdims=True)
     middle = outline[rng.integers(len(outline))]
     if hole:

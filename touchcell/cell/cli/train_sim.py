@@ -182,9 +182,8 @@ def _train_markers(
 
     settings = MarkerSettings(seed=seed)
     if imagined.of_shapes:
-        # One network in a file of 4 MB, which can ship. Edges of all kinds are harder than surfaces.
-        hidden = (512, 512, 256) if imagined.feature == "edge" else (384, 384, 256)
-        settings = replace(settings, hidden=hidden, networks=1)
+        # One network in a file of 4 MB, which can ship.
+        settings = replace(settings, hidden=(384, 384, 256), networks=1)
     train_on_discs(
         _discs(imagined, samples, seed),
         _discs(imagined, samples // 5, seed + 1_000_000),
