@@ -442,7 +442,7 @@ def test_turns_with_a_surface_that_bends(surface, speed_mm_s):
 def test_meets_the_limits_under_single_frame_noise():
     noise = np.array([0.25e-3, 0.25e-3, 0.06e-3, *np.radians([0.35, 0.35, 0.8])])
     loop = SimulatedLoop(RAMPS[0][0], (-30.0, 0.0, 40.0, 180.0, 0.0, 0.0), noise=noise, latency_s=0.04, seed=1)
-    task = SPEC.build(SurfaceFollowingConfig(curvature_window_mm=20.0), loop.context)
+    task = SPEC.build(SurfaceFollowingConfig(), loop.context)
     log = loop.run(task)
     assert task.succeeded
     assert log.depth_rms_mm(3.0) < 0.1
