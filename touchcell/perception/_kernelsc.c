@@ -274,6 +274,41 @@ static PyObject *py_pair(PyObject *module, PyObject *const *arguments, Py_ssize_
     return ended(&call, done);
 }
 
+static PyObject *py_mean_shift(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "mean_shift"};
+    Py_buffer *image, *places, *levels;
+    double radius, turns;
+    if (!takes(&call, count, 5) || !(image = take_image(&call, arguments[0])) ||
+        !number(&call, "radius_px", arguments[1], 0.5, 256.0, &radius) ||
+        !number(&call, "turns", arguments[2], 1.0, 1000.0, &turns) ||
+        !(places = take(&call, "places", arguments[3], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, (Py_ssize_t)ANY, (Py_ssize_t)2)) ||
+        !(levels = take(&call, "levels", arguments[4], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1, places->shape[0])))
+        return finish(&call, NULL);
+    int done = mean_shift(image->buf, image->strides[0], image->shape[0], image->shape[1], radius, (int)turns,
+                          places->shape[0], places->buf, levels->buf);
+    return ended(&call, done);
+}
+
+static PyObject *py_means_of_neighbours(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "means_of_neighbours"};
+    Py_buffer *values, *known, *neighbours, *means;
+    if (!takes(&call, count, 4) || !(values = take_points(&call, "values", arguments[0])) ||
+        !(known = take(&call, "known", arguments[1], '?', PyBUF_C_CONTIGUOUS, 1, values->shape[0])) ||
+        !(neighbours = take(&call, "neighbours", arguments[2], 'q', PyBUF_C_CONTIGUOUS, 2, values->shape[0], (Py_ssize_t)ANY)) ||
+        !(means = take(&call, "means", arguments[3], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, values->shape[0], (Py_ssize_t)2)))
+        return finish(&call, NULL);
+    const int64_t *other = neighbours->buf;
+    for (Py_ssize_t i = 0; i < neighbours->len / 8; i++)
+        if (other[i] < 0 || other[i] >= values->shape[0]) {
+            refuse(&call, "neighbours", "are not all numbers of places");
+            return finish(&call, NULL);
+        }
+    means_of_neighbours(values->buf, known->buf, other, values->shape[0], neighbours->shape[1], means->buf);
+    return ended(&call, 1);
+}
+
 /* The basis as (2 markers, stride), of which the first columns are the modes. */
 static int take_modes(Call *call, PyObject *value, Py_ssize_t modes, Modes *to)
 {
@@ -408,7 +443,7 @@ static PyObject *py_bytes_apart(PyObject *module, PyObject *const *arguments, Py
 #define FAST(name) {#name, (PyCFunction)(void (*)(void))py_##name, METH_FASTCALL, NULL}
 
 static PyMethodDef METHODS[] = {FAST(median_5), FAST(threshold), FAST(shrink),  FAST(area_means),  FAST(discs),  FAST(pair), FAST(fit),
-                                FAST(settle),   FAST(density),   FAST(bytes_apart), FAST(affine), {NULL, NULL, 0, NULL}};
+                                FAST(settle),   FAST(density),   FAST(bytes_apart), FAST(affine), FAST(mean_shift), FAST(means_of_neighbours), {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "touchcell.perception._kernelsc",
                                     "Compiled kernels of touchcell.perception.kernels.", -1, METHODS};

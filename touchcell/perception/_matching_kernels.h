@@ -360,4 +360,23 @@ WIDE_VECTORS static void affine(const float *restrict weight, const float *restr
             to[j] += x[i] * weight[i * outputs + j];
 }
 
+/* The mean of each place's known neighbours' values (u, v), zero where none is known. Neighbours are numbers of places. */
+static void means_of_neighbours(const double *values, const uint8_t *known, const int64_t *neighbours, ptrdiff_t places,
+                                ptrdiff_t each, double *means)
+{
+    for (ptrdiff_t i = 0; i < places; i++, neighbours += each) {
+        double u = 0.0, v = 0.0, count = 0.0;
+        for (ptrdiff_t j = 0; j < each; j++) {
+            int64_t other = neighbours[j];
+            if (!known[other])
+                continue;
+            u += values[2 * other];
+            v += values[2 * other + 1];
+            count += 1.0;
+        }
+        means[2 * i] = u / fmax(count, 1.0);
+        means[2 * i + 1] = v / fmax(count, 1.0);
+    }
+}
+
 #endif

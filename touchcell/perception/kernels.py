@@ -18,6 +18,7 @@ from touchcell.perception.errors import KernelsMissing
 
 _COLUMNS = 8
 _MOST_OFFSET = 256.0
+_SETTLED_PX = 0.05
 _FACTORS = (4, 8, 16, 32, 64)
 
 
@@ -103,6 +104,66 @@ def discs(image: ImageArray, smallest_px: int, largest_px: int, longest_side_px:
     found = np.frombuffer(_compiled().discs(_in_rows(image), smallest_px, largest_px, longest_side_px))
     n = len(found) // 3
     return found[: 2 * n].reshape(n, 2), found[2 * n :]
+
+
+def mean_shift(image: ImageArray, places: Array, radius_px: float, turns: int) -> tuple[Array, Array]:
+    """Move places to the centroid of the brightness around them, repeatedly, until they stay within 0.05 px.
+
+    Mean shift (Comaniciu & Meer 2002) with weights 1 - (distance / radius)^2; outside of the image everything is black.
+
+    Args:
+        image: uint8 (height, width).
+        places: (m, 2) px, (u, v).
+        radius_px: distance beyond which nothing counts, 0.5 to 256.
+        turns: largest number of moves.
+
+    Returns:
+        (m, 2) px, and (m,) weighted mean grey levels there.
+    """
+    moved, levels = np.array(places, np.float64, order="C"), np.empty(len(places))
+    if _FOUND is None:
+        _shift_in_numpy(image, moved, levels, radius_px, turns)
+    else:
+        _FOUND.mean_shift(_in_rows(image), radius_px, turns, moved, levels)
+    return moved, levels
+
+
+def _shift_in_numpy(image: ImageArray, moved: Array, levels: Array, radius_px: float, turns: int) -> None:
+    reach = math.ceil(radius_px) + 1
+    dark = np.pad(image, 2 * reach)
+    v, u = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, 1, -1)
+    left = np.arange(len(moved))
+    levels[:] = 0.0
+    inside = ((moved >= -radius_px) & (moved <= np.array(image.shape[::-1]) + radius_px)).all(axis=1)
+    left = left[inside]
+    for _ in range(turns):
+        nearest = np.rint(moved[left]).astype(np.int64)
+        du, dv = u - (moved[left] - nearest)[:, :1], v - (moved[left] - nearest)[:, 1:]
+        weight = np.maximum(1.0 - (du * du + dv * dv) / radius_px**2, 0.0)
+        light = weight * dark[nearest[:, 1:] + v + 2 * reach, nearest[:, :1] + u + 2 * reach]
+        total = light.sum(axis=1)
+        levels[left] = total / (0.5 * np.pi * radius_px**2)
+        step = np.column_stack([(light * du).sum(axis=1), (light * dv).sum(axis=1)]) / np.maximum(total, 1e-9)[:, None]
+        moved[left] += step
+        left = left[np.hypot(*step.T) >= _SETTLED_PX]
+        if not len(left):
+            return
+
+
+def means_of_neighbours(values: Array, known: NDArray[np.bool_], neighbours: NDArray[np.int64]) -> Array:
+    """Return the (m, 2) means of the known neighbours' values, zero where none is known.
+
+    Args:
+        values: (m, 2).
+        known: (m,).
+        neighbours: (m, k) numbers of other places.
+    """
+    if _FOUND is None:
+        count = np.maximum(known[neighbours].sum(axis=1), 1)
+        return np.asarray(np.where(known[:, None], values, 0.0)[neighbours].sum(axis=1) / count[:, None])
+    means = np.empty(values.shape)
+    _FOUND.means_of_neighbours(values, known, neighbours, means)
+    return means
 
 
 def pair(places: Array, points: Array) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
@@ -216,6 +277,8 @@ def bytes_apart(rows: NDArray[np.uint8], one: NDArray[np.uint8]) -> NDArray[np.i
 
 def affine(weight: NDArray[np.float32], bias: NDArray[np.float32], x: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return x W + b computed on the calling thread: (outputs,) of a weight (inputs, outputs)."""
+    if _FOUND is None:
+        return np.asarray(np.einsum("i,ij->j", x, weight) + bias, np.float32)
     result = np.empty(len(bias), np.float32)
-    _compiled().affine(weight, bias, x, result)
+    _FOUND.affine(weight, bias, x, result)
     return result
