@@ -601,4 +601,18 @@ static int mean_shift(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t heigh
     return 1;
 }
 
+/* Of all grey levels. */
+WIDE_VECTORS static double sum_of(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width)
+{
+    uint64_t sum = 0;
+    for (ptrdiff_t y = 0; y < height; y++) {
+        const uint8_t *row = image + y * row_bytes;
+        uint32_t in_row = 0;
+        for (ptrdiff_t x = 0; x < width; x++)
+            in_row += row[x];
+        sum += in_row;
+    }
+    return (double)sum;
+}
+
 #endif

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,20 +151,113 @@ def _shift_in_numpy(image: ImageArray, moved: Array, levels: Array, radius_px: f
             return
 
 
-def means_of_neighbours(values: Array, known: NDArray[np.bool_], neighbours: NDArray[np.int64]) -> Array:
-    """Return the (m, 2) means of the known neighbours' values, zero where none is known.
+class Followed(NamedTuple):
+    """Markers next to where they are expected.
+
+    Attributes:
+        expected: (m, 2) px of the crop.
+        off: (m, 2) px, distances of the places found from there.
+        around: (m, 2) px, means of the bright neighbours' distances.
+        seen: (m,) whether there is light, and the distance is like the neighbours'.
+        light: share of the image's light at bright places, in units of their mean grey levels.
+    """
+
+    expected: Array
+    off: Array
+    around: Array
+    seen: NDArray[np.bool_]
+    light: float
+
+
+class Follower:
+    """Search for markers where a polynomial of six numbers expects them.
 
     Args:
-        values: (m, 2).
-        known: (m,).
-        neighbours: (m, k) numbers of other places.
+        weight: (84, 2 m) px of the crop, of the terms.
+        rest: (2 m,) px, beside them.
+        neighbours: (m, k) numbers of each marker's neighbours.
+        px: (2,) size along u and v of a pixel of the image, px of the crop.
+        radius_px, turns: of the mean shift, px of the image.
+        least_level: grey level of a place that is bright.
+        stray_px: largest distance from the neighbours' mean, px of the crop.
+    """
+
+    def __init__(
+        self,
+        weight: NDArray[np.float32],
+        rest: NDArray[np.float32],
+        neighbours: NDArray[np.int64],
+        px: Array,
+        *,
+        radius_px: float,
+        turns: int,
+        least_level: float,
+        stray_px: float,
+    ) -> None:
+        self._weight, self._rest, self._neighbours, self._px = weight, rest, neighbours, px
+        self._radius_px, self._turns, self._least_level, self._stray_px = radius_px, turns, least_level, stray_px
+        self._limits = np.array([*px, radius_px, turns, least_level, stray_px], np.float64)
+        self._nothing = np.zeros((len(neighbours), 2))
+
+    def __call__(self, image: ImageArray, terms: NDArray[np.float32], field: Array | None = None) -> Followed:
+        """Search in a uint8 (height, width) image, ``field`` (m, 2) px from where the 84 ``terms`` put the markers."""
+        field = self._nothing if field is None else field
+        if _FOUND is None:
+            return self._in_numpy(image, terms, field)
+        m = len(field)
+        expected, off, around = np.empty((m, 2)), np.empty((m, 2)), np.empty((m, 2))
+        seen = np.empty(m, np.bool_)
+        light = _FOUND.follow(
+            _in_rows(image),
+            terms,
+            self._weight,
+            self._rest,
+            field,
+            self._neighbours,
+            self._limits,
+            expected,
+            off,
+            around,
+            seen,
+        )
+        return Followed(expected, off, around, seen, light)
+
+    def _in_numpy(self, image: ImageArray, terms: NDArray[np.float32], field: Array) -> Followed:
+        expected = affine(self._weight, self._rest, terms).astype(np.float64).reshape(-1, 2)
+        starts = (expected + field + 0.5) / self._px - 0.5
+        places, levels = mean_shift(image, starts, self._radius_px, self._turns)
+        off = (places + 0.5) * self._px - 0.5 - expected
+        bright = levels >= self._least_level
+        count = np.maximum(bright[self._neighbours].sum(axis=1), 1)
+        around: Array = np.where(bright[:, None], off, 0.0)[self._neighbours].sum(axis=1) / count[:, None]
+        seen = bright & (np.square(off - around).sum(axis=1) < self._stray_px**2)
+        light = float(levels[bright].sum()) / max(float(image.sum(dtype=np.int64)), 1.0)
+        return Followed(expected, off, around, seen, light)
+
+
+def measure_field(
+    off: Array, mean: NDArray[np.float32], rows: NDArray[np.float32], sd: Array, strongest: int, filters: int
+) -> Array:
+    """Return size and roughness of a field of distances, then its products with filters: (2 + filters,).
+
+    Args:
+        off: (m, 2) px.
+        mean: (2 m,) px, subtracted first.
+        rows: (2 m, modes + filters), orthonormal modes and filters as columns.
+        sd: (modes,) standard deviations of the modes.
+        strongest: so many modes make the size, in root mean square standard deviations.
+        filters: how many.
     """
     if _FOUND is None:
-        count = np.maximum(known[neighbours].sum(axis=1), 1)
-        return np.asarray(np.where(known[:, None], values, 0.0)[neighbours].sum(axis=1) / count[:, None])
-    means = np.empty(values.shape)
-    _FOUND.means_of_neighbours(values, known, neighbours, means)
-    return means
+        left = off.ravel() - mean
+        products = np.einsum("i,ij->j", left, rows)
+        modes = products[: len(sd)]
+        size = np.sqrt(np.square(modes / sd)[:strongest].mean())
+        rough = np.sqrt(max(float(left @ left - modes @ modes), 0.0) / len(off))
+        return np.concatenate([[size, rough], products[len(sd) :]])
+    measured = np.empty(2 + filters)
+    _FOUND.measure_field(off, mean, rows, sd, strongest, measured)
+    return measured
 
 
 def pair(places: Array, points: Array) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:

@@ -43,13 +43,13 @@ class SeenMarkers:
 
     Attributes:
         expected: (m, 2) px of the crop, where the estimated contact moves them.
-        places: (m, 2) px of the crop, where they are; of those that are not seen, where the others' field puts them.
+        off: (m, 2) px of the crop, from there to where they are; where not seen, as the others' field has it.
         seen: (m,) whether it is as bright as a marker, and near its neighbours' field.
         light: share of the image's light that lies at markers.
     """
 
     expected: Array
-    places: Array
+    off: Array
     seen: NDArray[np.bool_]
     light: float
 
@@ -85,35 +85,43 @@ class ImageCheck:
         own = {name.removeprefix(CHECK): each for name, each in tensors.items() if name.startswith(CHECK)}
         self._spec = spec
         self._px = px_of_crop(preprocessing)
-        self._rest, self._terms, self._mean = own["rest"].ravel(), own["terms"], own["mean"].astype(np.float64)
-        self._modes, self._sd = own["modes"].astype(np.float64), own["sd"].astype(np.float64)
-        # Products with one vector take a weight of one row for each of its numbers.
+        self._mean, self._sd = own["mean"], own["sd"].astype(np.float64)
+        self._modes = own["modes"].astype(np.float64)
         self._rows = np.ascontiguousarray(np.concatenate([own["modes"], own["filters"]]).T)
-        self._nothing = np.zeros(self._rows.shape[1], np.float32)
         self._limits = np.array(spec.limits)
         rest = own["rest"].astype(np.float64)
         apart = np.linalg.norm(rest[:, None] - rest[None], axis=2)
-        self._neighbours = np.ascontiguousarray(np.argsort(apart, axis=1)[:, 1 : 1 + _NEIGHBOURS], np.int64)
-        nearest = np.take_along_axis(apart, self._neighbours[:, :1], axis=1)
-        self._stray_px = _STRAY * float(np.median(nearest))
+        neighbours = np.ascontiguousarray(np.argsort(apart, axis=1)[:, 1 : 1 + _NEIGHBOURS], np.int64)
+        nearest = np.take_along_axis(apart, neighbours[:, :1], axis=1)
+        self._follow = kernels.Follower(
+            own["terms"],
+            own["rest"].ravel(),
+            neighbours,
+            self._px,
+            radius_px=spec.radius_px,
+            turns=TURNS,
+            least_level=spec.least_level,
+            stray_px=_STRAY * float(np.median(nearest)),
+        )
 
     def find(self, image: ImageArray, mean: NDArray[np.float32]) -> SeenMarkers:
         """Return the markers of a preprocessed image, of which a network made the six means ``mean``."""
         terms = terms_of(mean.astype(np.float64)).astype(np.float32)
-        expected = kernels.affine(self._terms, self._rest, terms).astype(np.float64).reshape(-1, 2)
-        off, around, seen, light = self._next_to(image, expected, expected)
-        if seen.mean() < _ALL_SEEN:
+        found = self._follow(image, terms)
+        around = found.around
+        if np.count_nonzero(found.seen) < _ALL_SEEN * len(found.seen):
             for _ in range(_REFINED):
-                again, _, more, lighter = self._next_to(image, expected, expected + self._field(off, seen))
-                if more.sum() <= seen.sum():
+                again = self._follow(image, terms, self._field(found.off, found.seen))
+                if again.seen.sum() <= found.seen.sum():
                     break
-                off, seen, light = again, more, lighter
-            around = self._field(off, seen)
-        return SeenMarkers(expected, expected + np.where(seen[:, None], off, around), seen, light)
+                found = again
+            around = self._field(found.off, found.seen)
+        off = found.off if found.seen.all() else np.where(found.seen[:, None], found.off, around)
+        return SeenMarkers(found.expected, off, found.seen, found.light)
 
     def refusal(self, found: SeenMarkers) -> str:
         """Return why an image with these markers cannot be used; empty where it can."""
-        if found.seen.mean() < _LEAST_SEEN or found.light < self._spec.least_light:
+        if np.count_nonzero(found.seen) < _LEAST_SEEN * len(found.seen) or found.light < self._spec.least_light:
             return _OTHER
         excess = self.measure(found) - self._limits
         if (excess[2:] > 0.0).any():
@@ -122,19 +130,16 @@ class ImageCheck:
 
     def measure(self, found: SeenMarkers) -> Array:
         """Return size and roughness of the field, then how much of each change of the camera it shows."""
-        off = (found.places - found.expected).ravel() - self._mean
-        products = kernels.affine(self._rows, self._nothing, off.astype(np.float32)).astype(np.float64)
-        modes, filters = products[: len(self._sd)], products[len(self._sd) :]
-        size = np.sqrt(np.square(modes[:STRONGEST] / self._sd[:STRONGEST]).mean())
-        rough = np.sqrt(max(float(off @ off - modes @ modes), 0.0) / len(found.seen))
-        return np.concatenate([[size, rough], filters])
+        filters = self._rows.shape[1] - len(self._sd)
+        return kernels.measure_field(found.off, self._mean, self._rows, self._sd, STRONGEST, filters)
 
     def mended(self, image: ImageArray, found: SeenMarkers) -> ImageArray | None:
         """Return the image with its missing markers drawn in; None where next to none are missing, or too many."""
-        missing = np.flatnonzero(~found.seen)
-        if not _FEW * len(found.seen) < len(missing) < _MANY * len(found.seen):
+        lost = len(found.seen) - np.count_nonzero(found.seen)
+        if not _FEW * len(found.seen) < lost < _MANY * len(found.seen):
             return None
-        places = (found.places[missing] + 0.5) / self._px - 0.5
+        missing = np.flatnonzero(~found.seen)
+        places = ((found.expected + found.off)[missing] + 0.5) / self._px - 0.5
         reach = int(np.ceil(self._spec.disc_px)) + 1
         v, u = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, 1, -1)
         nearest = np.rint(places).astype(np.int64)
@@ -145,19 +150,6 @@ class ImageCheck:
         drawn = image.copy()
         np.maximum.at(drawn, (rows[inside], columns[inside]), np.rint(255.0 * disc[inside]).astype(np.uint8))
         return drawn
-
-    def _next_to(
-        self, image: ImageArray, expected: Array, starts: Array
-    ) -> tuple[Array, Array, NDArray[np.bool_], float]:
-        """Return the (m, 2) px distances of the markers next to ``starts``, the neighbours' means, seen ones, and light."""
-        places, levels = kernels.mean_shift(image, (starts + 0.5) / self._px - 0.5, self._spec.radius_px, TURNS)
-        off = (places + 0.5) * self._px - 0.5 - expected
-        bright = levels >= self._spec.least_level
-        light = float(levels[bright].sum()) / max(float(image.sum(dtype=np.int64)), 1.0)
-        # A missing marker's neighbour may have been taken for it.
-        around = kernels.means_of_neighbours(off, bright, self._neighbours)
-        apart = off - around
-        return off, around, bright & (np.einsum("ij,ij->i", apart, apart) < self._stray_px**2), light
 
     def _field(self, off: Array, seen: NDArray[np.bool_]) -> Array:
         """Return the (m, 2) px most probable distances of all markers, given those of the seen ones."""

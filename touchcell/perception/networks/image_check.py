@@ -174,7 +174,7 @@ def _fitted(
     """Return a check whose terms and modes are fitted to the markers that ``check`` finds in images (n, h, w)."""
     rest = tensors[f"{CHECK}rest"].astype(np.float64)
     markers = [check.find(image, mean) for image, mean in zip(images, means, strict=True)]
-    off = np.stack([(each.places - rest).ravel() for each in markers])
+    off = np.stack([(each.expected + each.off - rest).ravel() for each in markers])
     used = np.flatnonzero(degree >= _DEGREES)
     terms = terms_of(means.astype(np.float64))[:, used]
     coefficients = np.zeros((len(_DEGREES), rest.size))
@@ -191,7 +191,7 @@ def _fitted(
 
 
 def _field(markers: SeenMarkers) -> Array:
-    return (markers.places - markers.expected).ravel()
+    return markers.off.ravel()
 
 
 def _changed_fields(
