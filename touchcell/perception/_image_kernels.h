@@ -615,4 +615,28 @@ WIDE_VECTORS static double sum_of(const uint8_t *image, ptrdiff_t row_bytes, ptr
     return (double)sum;
 }
 
+WIDE_VECTORS static uint32_t row_apart(const uint8_t *restrict one, const uint8_t *restrict other, ptrdiff_t width)
+{
+    uint32_t sum = 0;
+    for (ptrdiff_t x = 0; x < width; x++)
+        sum += (uint32_t)(one[x] > other[x] ? one[x] - other[x] : other[x] - one[x]);
+    return sum;
+}
+
+/* Mean absolute difference of two images in each of blocks x blocks parts. */
+static void block_changes(const uint8_t *one, ptrdiff_t one_row, const uint8_t *other, ptrdiff_t other_row,
+                          ptrdiff_t height, ptrdiff_t width, ptrdiff_t blocks, double *means)
+{
+    for (ptrdiff_t i = 0; i < blocks; i++) {
+        ptrdiff_t top = i * height / blocks, bottom = (i + 1) * height / blocks;
+        for (ptrdiff_t j = 0; j < blocks; j++) {
+            ptrdiff_t left = j * width / blocks, right = (j + 1) * width / blocks;
+            uint64_t sum = 0;
+            for (ptrdiff_t y = top; y < bottom; y++)
+                sum += row_apart(one + y * one_row + left, other + y * other_row + left, right - left);
+            means[i * blocks + j] = (double)sum / (double)((bottom - top) * (right - left));
+        }
+    }
+}
+
 #endif

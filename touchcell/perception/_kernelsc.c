@@ -290,6 +290,23 @@ static PyObject *py_mean_shift(PyObject *module, PyObject *const *arguments, Py_
     return ended(&call, done);
 }
 
+static PyObject *py_block_changes(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "block_changes"};
+    Py_buffer *one, *other, *means;
+    if (!takes(&call, count, 3) || !(one = take_image(&call, arguments[0])) || !(other = take_image(&call, arguments[1])) ||
+        !(means = take(&call, "means", arguments[2], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, (Py_ssize_t)ANY, (Py_ssize_t)ANY)))
+        return finish(&call, NULL);
+    Py_ssize_t blocks = means->shape[0], height = one->shape[0], width = one->shape[1];
+    if (other->shape[0] != height || other->shape[1] != width || means->shape[1] != blocks || blocks < 1 ||
+        blocks > height || blocks > width) {
+        refuse(&call, "means", "or an image has another shape");
+        return finish(&call, NULL);
+    }
+    block_changes(one->buf, one->strides[0], other->buf, other->strides[0], height, width, blocks, means->buf);
+    return ended(&call, 1);
+}
+
 static const float *in_rows_of(Call *call, const char *argument, PyObject *value, Py_ssize_t rows, Py_ssize_t columns)
 {
     Py_buffer *view = take(call, argument, value, 'f', PyBUF_C_CONTIGUOUS, 2, rows, columns);
@@ -519,7 +536,7 @@ static PyObject *py_bytes_apart(PyObject *module, PyObject *const *arguments, Py
 #define FAST(name) {#name, (PyCFunction)(void (*)(void))py_##name, METH_FASTCALL, NULL}
 
 static PyMethodDef METHODS[] = {FAST(median_5), FAST(threshold), FAST(shrink),  FAST(area_means),  FAST(discs),  FAST(pair), FAST(fit),
-                                FAST(settle),   FAST(density),   FAST(bytes_apart), FAST(affine), FAST(mean_shift), FAST(follow), FAST(measure_field), {NULL, NULL, 0, NULL}};
+                                FAST(settle),   FAST(density),   FAST(bytes_apart), FAST(affine), FAST(mean_shift), FAST(follow), FAST(block_changes), FAST(measure_field), {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "touchcell.perception._kernelsc",
                                     "Compiled kernels of touchcell.perception.kernels.", -1, METHODS};

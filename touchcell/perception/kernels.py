@@ -151,6 +151,18 @@ def _shift_in_numpy(image: ImageArray, moved: Array, levels: Array, radius_px: f
             return
 
 
+def block_changes(one: ImageArray, other: ImageArray, blocks: int) -> Array:
+    """Return (blocks, blocks) mean absolute differences of two grey images of one size, at least ``blocks`` px wide."""
+    means = np.empty((blocks, blocks))
+    if _FOUND is not None:
+        _FOUND.block_changes(_in_rows(one), _in_rows(other), means)
+        return means
+    rows, columns = (np.arange(blocks + 1) * side // blocks for side in one.shape)
+    difference = np.abs(one.astype(np.int16) - other)
+    sums = np.add.reduceat(np.add.reduceat(difference, rows[:-1], axis=0, dtype=np.int64), columns[:-1], axis=1)
+    return np.asarray(sums / np.outer(np.diff(rows), np.diff(columns)))
+
+
 class Followed(NamedTuple):
     """Markers next to where they are expected.
 

@@ -31,7 +31,7 @@ Means = Callable[[ImageArray], NDArray[np.float32]]
 
 LEAST_IMAGES = 200
 _MOST_IMAGES = 3000
-_CANDIDATES = 60
+_CANDIDATES, _MOST_RINGS = 60, 16
 _RADIUS = 0.48  # Of the spacing: half way to the next marker.
 _LEVEL = 0.3  # Of the median marker at rest.
 _SHARES = (0.04, 0.055, 0.075, 0.1, 0.135, 0.18, 0.25, 0.33, 0.45, 0.6, 0.8, 1.0, 1.0, 1.0)
@@ -122,7 +122,9 @@ def _rest_markers(images: ImageArray) -> tuple[int, Array] | None:
         centres = _peaks(image)
         rings = round((math.sqrt(max(12 * len(centres) - 3, 1)) - 3.0) / 6.0)
         for count in (rings, rings + 1):
-            points, rms = fit_lattice(Discs(centres, np.ones(len(centres))), count) if count > 1 else (centres, np.inf)
+            if not 1 < count <= _MOST_RINGS:
+                continue
+            points, rms = fit_lattice(Discs(centres, np.ones(len(centres))), count)
             if np.isfinite(rms) and (best is None or rms < best[0]):
                 best = (rms, i, points)
     return None if best is None else best[1:]

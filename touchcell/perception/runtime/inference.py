@@ -71,11 +71,11 @@ class ContactModel:
         self.header: Header = model.header
         self.reference: ImageArray | None = model.reference
         self._preprocessing = model.header.preprocessing
-        texture = None if model.reference is None else MarkerTexture(model.reference)
-        self._texture = texture if texture is not None and texture.usable else None
         architecture = model.header.architecture
         spec = architecture.check if isinstance(architecture, Architecture) else None
         self._check = None if spec is None else ImageCheck(spec, model.tensors, model.header.preprocessing)
+        texture = None if spec is not None or model.reference is None else MarkerTexture(model.reference)
+        self._texture = texture if texture is not None and texture.usable else None
 
     @classmethod
     def load(cls, path: Path) -> ContactModel:
