@@ -28,6 +28,7 @@ BENCHMARKS = {
     "mutation": "benchmarks.mutation",
     "hil-mutation": "benchmarks.hil_mutation",
     "phantom": "benchmarks.phantom",
+    "pushes": "benchmarks.pushes",
     "kinematics": "benchmarks.kinematics",
     "safety": "tests.fault_injection.safety",
     "safety-against": "benchmarks.safety_against",

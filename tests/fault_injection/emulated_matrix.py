@@ -105,6 +105,11 @@ MORE_FAULTS: Final[Mapping[str, Mapping[str, tuple[Any, str]]]] = {
         "adapter_echo": (True, "transient"),
     },
     "v4l2": {
+        "stamp_shift": (-0.02, "unseen"),
+        "wild_stamps": (3, "transient"),
+        "stuck_stamp": (True, "fault"),
+        "stuck_number": (True, "fault"),
+        "duplicates": (3, "transient"),
         "delay": (0.4, "stale"),
         "freeze_frame": (True, "fault"),
         "gain": (1.6, "unseen"),
@@ -145,7 +150,7 @@ _STILL_M: Final = 2e-4
 _STILL_S: Final = 0.12
 # A process that does not run for so long was starved.
 _STALL_S: Final = 0.15
-_TRIES: Final = 3
+_TRIES: Final = 6
 # The last state; on a stop request, a task enters it from the previous one, in which it presses.
 _AFTER_STOP: Final = "retract"
 _RATE_HZ: Final = 50.0

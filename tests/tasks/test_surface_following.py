@@ -47,7 +47,7 @@ def test_follows_a_plane_from_start_to_end():
     plant.run(task, until="run")
     start = plant.T_w_s[:3, 3]
     actions = plant.run(task, until="retract")
-    assert len(actions) == pytest.approx(60.0 / 20.0 * RATE_HZ, abs=3)
+    assert len(actions) == pytest.approx(60.0 / 20.0 * RATE_HZ, abs=8)  # slower while a tilt is corrected
     labels = se3.to_euler_mm_deg(plant.seen)
     np.testing.assert_allclose(labels[2:5], [3.0, 0.0, 0.0], atol=0.001)
     assert np.linalg.norm(plant.T_w_s[:3, 3] - start) == pytest.approx(0.060, abs=0.0005)

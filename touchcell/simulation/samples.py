@@ -49,13 +49,15 @@ class SampledContact:
 
     Attributes:
         T_f_s: (4, 4) label: after slip, or the commanded pose if there is a mount model.
-        pixels: (markers, 2) px of the visible markers, in the 640x480 frame.
+        pixels: (visible, 2) px of the visible markers, in the 640x480 frame.
         disc_radius_px: radius of the markers.
+        markers: (markers, 2) px of all, in the order of the lattice.
     """
 
     T_f_s: Array
     pixels: Array
     disc_radius_px: float
+    markers: Array
 
 
 def contacts(
@@ -101,7 +103,7 @@ def contacts(
         seen = rng.random(pixels.shape[:2]) >= variation.missing
         radius = tip.parameters.disc_radius_px * (1.0 + rng.normal(0.0, variation.disc_radius, count))
         for i in range(count):
-            yield SampledContact(T_f_s[i], pixels[i][seen[i]], float(radius[i]))
+            yield SampledContact(T_f_s[i], pixels[i][seen[i]], float(radius[i]), pixels[i])
 
 
 def _slipping(rig: MountModel, variation: Variation, rng: np.random.Generator) -> MountModel:

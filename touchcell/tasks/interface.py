@@ -159,6 +159,7 @@ class TaskContext:
         T_tcp_sensor: pose (4, 4) of each sensor role in the tool frame of the arm that carries it.
         kept: number of labelled frames that earlier runs of this cell have stored.
         resumed: True after a trip of this run: the arms may stand in contact, and its zero frames hold.
+        T_world_base: pose (4, 4) of each arm's base, by role; one that is not named stands at the world's origin.
         carriers: role of the arm that carries each sensor role; a sensor that nothing moves is missing.
         boxes: workspaces of each arm role that has any.
     """
@@ -167,6 +168,7 @@ class TaskContext:
     T_tcp_sensor: Mapping[str, Array]
     kept: int = 0
     resumed: bool = False
+    T_world_base: Mapping[str, Array] = field(default_factory=dict)
     carriers: Mapping[str, str] = field(default_factory=dict)
     boxes: Mapping[str, tuple[Box, ...]] = field(default_factory=dict)
 

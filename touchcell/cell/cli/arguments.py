@@ -40,6 +40,11 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         help="sim: simulated devices in place of real ones; emulated: real drivers on emulators that start by "
         "themselves; bench: nothing simulated (default: as the file is written)",
     )
+    add_set(parser)
+
+
+def add_set(parser: argparse.ArgumentParser) -> None:
+    """``--set``: values in place of the cell file's own."""
     parser.add_argument(
         "--set",
         action="append",

@@ -93,6 +93,7 @@ def compose(
         plan.cell.rate_hz,
         sensor_poses,
         0 if collection is None else collection.kept,
+        T_world_base={role: plan.cell.arms[name].T_world_base for name, role in role_of.items()},
         carriers={role: sensor.arm_role for role, sensor in sensors.items() if sensor.arm_role is not None},
         boxes=_boxes(plan, sensor_poses),
     )

@@ -56,6 +56,7 @@ from touchcell.perception.networks.progress import Display, Observer
 
 _LEAST_SCORE_TAUGHT = 0.9
 _LEAST_BATCHES = 16
+_ENOUGH_TO_MATCH = 4000  # Frames that teach the matching where a simulation knows the markers.
 _MATCHING = 2  # Version of the matching, so that results of older versions are not taken from the cache.
 
 
@@ -109,10 +110,12 @@ class LabelledDiscs:
     Attributes:
         frames: discs of each image.
         xi: (n, 6) log(T_s_f), m and rad.
+        markers: (n, m, 2) px of all markers, where a simulation knows them; None where they have to be matched.
     """
 
     frames: list[Discs]
     xi: Array
+    markers: Array | None = None
 
     def digest(self) -> str:
         """Return the SHA-256 of the content."""
@@ -312,7 +315,7 @@ def _matched(
         return lambda done, total: None if observer is None else observer.images(what, done, total)
 
     learned = learn_markers(
-        training.frames,
+        training.frames if training.markers is None else training.frames[:_ENOUGH_TO_MATCH],
         image_size,
         rings=settings.rings,
         modes=settings.modes,
@@ -320,14 +323,16 @@ def _matched(
         seed=settings.seed,
         progress=report("matched"),
     )
-    displacements, _ = stacked(learned.fields)
+    displacements, taught = stacked(learned.fields)[0], [each.score >= _LEAST_SCORE_TAUGHT for each in learned.fields]
+    if training.markers is not None:
+        displacements, taught = _known_displacements(learned, training.markers), [True] * len(training.markers)
     fields = match_all(learned.matcher, validation.frames, report("matched, val"))
     matched = _Matched(
         tensors=_tensors(learned),
         frame=np.array([*learned.guess.low, learned.guess.cell_px, learned.least_score, learned.most_rms_px]),
         training=displacements.reshape(len(displacements), -1).astype(np.float32),
         validation=stacked(fields)[0].reshape(len(fields), -1).astype(np.float32),
-        taught=np.array([each.score >= _LEAST_SCORE_TAUGHT for each in learned.fields]),
+        taught=np.array(taught),
     )
     if cache is not None:
         _save(
@@ -341,6 +346,17 @@ def _matched(
             },
         )
     return matched
+
+
+def _known_displacements(learned: Learned, markers: Array) -> Array:
+    """Return (n, m, 2) px from the lattice, of ``markers`` (n, m, 2) that may be numbered in another order."""
+    best = max(range(len(learned.fields)), key=lambda i: (learned.fields[i].score, -learned.fields[i].rms_px))
+    found = learned.fields[best].positions
+    order = np.linalg.norm(found[:, None] - markers[best][None], axis=2).argmin(axis=1)
+    if len(set(order.tolist())) < len(order):
+        raise TrainingError("the lattice found in the images is not the simulated one", hint="check `rings`")
+    displacements: Array = markers[:, order] - learned.matcher.model.reference
+    return displacements
 
 
 def _write_examples(
