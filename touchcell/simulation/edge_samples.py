@@ -85,7 +85,7 @@ def edge_contacts(
             pixels = pixels + rng.normal(0.0, variation.marker_px, pixels.shape)
             seen = rng.random(len(pixels)) >= variation.missing
             radius = tip.parameters.disc_radius_px * (1.0 + rng.normal(0.0, variation.disc_radius))
-            yield SampledContact(T_e_s, pixels[seen], float(radius), pixels)
+            yield SampledContact(T_e_s, pixels, seen, float(radius))
 
 
 def _contact(

@@ -21,8 +21,8 @@ _SHARPEST_CURVATURE_PER_M: Final = 20.0
 def random_part(rng: np.random.Generator) -> TriangleMesh:
     """Return a part whose rim is an edge between a face above and a wall below; its face looks towards +z.
 
-    Half of the faces are flat, the others bend both ways with radii down to 50 mm. Walls lean by up to 25 deg. Outlines
-    are circles, waves round a circle and polygons, stars among them; a quarter are the rims of holes.
+    Half of the faces are flat, the others bend both ways with radii down to 50 mm. Half of the walls lean, by up to
+    25 deg. Outlines are circles, waves round a circle and polygons, stars among them; a quarter are the rims of holes.
     """
     hole = bool(rng.random() < 0.25)
     outline = _outline(rng, hole=hole)

@@ -55,7 +55,7 @@ def shape_contacts(
             pixels = pixels + rng.normal(0.0, variation.marker_px, pixels.shape)
             seen = rng.random(len(pixels)) >= variation.missing
             radius = tip.parameters.disc_radius_px * (1.0 + rng.normal(0.0, variation.disc_radius))
-            yield SampledContact(T_f_s, pixels[seen], float(radius), pixels)
+            yield SampledContact(T_f_s, pixels, seen, float(radius))
 
 
 def _random_surface(rng: np.random.Generator) -> Surface:

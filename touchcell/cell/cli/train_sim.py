@@ -99,6 +99,11 @@ class Imagined:
         """Of the sensor in the middle."""
         return TipParameters() if self.sensor is None else self.sensor.tip
 
+    @property
+    def of_shapes(self) -> bool:
+        """True if it touches more than planes."""
+        return self.feature == "edge" or self.feels == "shape"
+
     def preprocessing(self, kind: str) -> Preprocessing:
         """That of an estimator for such images."""
         if kind == "markers":
@@ -175,9 +180,10 @@ def _train_markers(
 ) -> None:
     from touchcell.perception.networks.marker_training import MarkerSettings, train_on_discs
 
-    shaped = imagined.feature == "edge" or imagined.feels == "shape"
-    # One network in a file of 4 MB, which can ship.
-    settings = MarkerSettings(seed=seed, hidden=(384, 384, 256), networks=1) if shaped else MarkerSettings(seed=seed)
+    settings = MarkerSettings(seed=seed)
+    if imagined.of_shapes:
+        # One network in a file of 4 MB, which can ship.
+        settings = replace(settings, hidden=(384, 384, 256), networks=1)
     train_on_discs(
         _discs(imagined, samples, seed),
         _discs(imagined, samples // 5, seed + 1_000_000),
@@ -192,19 +198,26 @@ def _train_markers(
 
 def _discs(imagined: Imagined, samples: int, seed: int) -> LabelledDiscs:
     """Discs of simulated frames, without the frames."""
+    from touchcell.perception.networks.marker_learning import KnownMarkers
     from touchcell.perception.networks.marker_training import LabelledDiscs
 
     height, width = PUBLIC_SIZE
-    frames, labels, markers = [], [], []
+    corner = np.array(PUBLIC_CROP[:2], dtype=np.float64)
+    frames, labels, places, seen = [], [], [], []
     for contact in imagined.contacts(samples, seed):
-        centres = contact.pixels - np.array(PUBLIC_CROP[:2], dtype=np.float64)
+        centres = contact.markers - corner
         reach = contact.disc_radius_px
-        whole = ((centres >= reach) & (centres <= np.array([width, height]) - 1.0 - reach)).all(axis=1)
+        whole = ((centres >= reach) & (centres <= np.array([width, height]) - 1.0 - reach)).all(axis=1) & contact.seen
         frames.append(Discs(centres[whole], np.full(int(whole.sum()), np.pi * reach**2)))
         labels.append(contact.T_f_s)
-        markers.append(contact.markers - np.array(PUBLIC_CROP[:2], dtype=np.float64))
-    known = imagined.feature == "edge" or imagined.feels == "shape"
-    return LabelledDiscs(frames, se3.log(se3.inverse(np.stack(labels))), np.stack(markers) if known else None)
+        places.append(centres)
+        seen.append(whole)
+    known = None
+    if imagined.of_shapes:
+        middle = Tip(imagined.tip)
+        reference = middle.project(middle.rest_positions) - corner
+        known = KnownMarkers(reference, np.stack(places) - reference, np.stack(seen))
+    return LabelledDiscs(frames, se3.log(se3.inverse(np.stack(labels))), known)
 
 
 def draw(samples: int, seed: int, split: str, observer: Observer, imagined: Imagined | None = None) -> LabelledImages:

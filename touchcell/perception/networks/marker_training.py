@@ -47,8 +47,10 @@ from touchcell.perception.networks.export import write_trained
 from touchcell.perception.networks.marker_learning import (
     GRID,
     GUESS_HIDDEN,
+    KnownMarkers,
     Learned,
     learn_markers,
+    learned_of_known,
     match_all,
     stacked,
 )
@@ -56,7 +58,6 @@ from touchcell.perception.networks.progress import Display, Observer
 
 _LEAST_SCORE_TAUGHT = 0.9
 _LEAST_BATCHES = 16
-_ENOUGH_TO_MATCH = 4000  # Frames that teach the matching where a simulation knows the markers.
 _MATCHING = 2  # Version of the matching, so that results of older versions are not taken from the cache.
 
 
@@ -110,12 +111,12 @@ class LabelledDiscs:
     Attributes:
         frames: discs of each image.
         xi: (n, 6) log(T_s_f), m and rad.
-        markers: (n, m, 2) px of all markers, where a simulation knows them; None where they have to be matched.
+        markers: which disc is which marker, where a simulation knows it; None where it has to be learned.
     """
 
     frames: list[Discs]
     xi: Array
-    markers: Array | None = None
+    markers: KnownMarkers | None = None
 
     def digest(self) -> str:
         """Return the SHA-256 of the content."""
@@ -314,8 +315,14 @@ def _matched(
     def report(what: str) -> Callable[[int, int], None]:
         return lambda done, total: None if observer is None else observer.images(what, done, total)
 
+    if training.markers is not None:
+        learned = learned_of_known(
+            training.markers, image_size, modes=settings.modes, guess_steps=settings.guess_steps, seed=settings.seed
+        )
+        displacements, taught = training.markers.displacements, [True] * len(training.frames)
+        return _as_matched(learned, displacements, taught, validation, report)
     learned = learn_markers(
-        training.frames if training.markers is None else training.frames[:_ENOUGH_TO_MATCH],
+        training.frames,
         image_size,
         rings=settings.rings,
         modes=settings.modes,
@@ -323,17 +330,8 @@ def _matched(
         seed=settings.seed,
         progress=report("matched"),
     )
-    displacements, taught = stacked(learned.fields)[0], [each.score >= _LEAST_SCORE_TAUGHT for each in learned.fields]
-    if training.markers is not None:
-        displacements, taught = _known_displacements(learned, training.markers), [True] * len(training.markers)
-    fields = match_all(learned.matcher, validation.frames, report("matched, val"))
-    matched = _Matched(
-        tensors=_tensors(learned),
-        frame=np.array([*learned.guess.low, learned.guess.cell_px, learned.least_score, learned.most_rms_px]),
-        training=displacements.reshape(len(displacements), -1).astype(np.float32),
-        validation=stacked(fields)[0].reshape(len(fields), -1).astype(np.float32),
-        taught=np.array(taught),
-    )
+    taught = [each.score >= _LEAST_SCORE_TAUGHT for each in learned.fields]
+    matched = _as_matched(learned, stacked(learned.fields)[0], taught, validation, report)
     if cache is not None:
         _save(
             cache / name,
@@ -348,15 +346,21 @@ def _matched(
     return matched
 
 
-def _known_displacements(learned: Learned, markers: Array) -> Array:
-    """Return (n, m, 2) px from the lattice, of ``markers`` (n, m, 2) that may be numbered in another order."""
-    best = max(range(len(learned.fields)), key=lambda i: (learned.fields[i].score, -learned.fields[i].rms_px))
-    found = learned.fields[best].positions
-    order = np.linalg.norm(found[:, None] - markers[best][None], axis=2).argmin(axis=1)
-    if len(set(order.tolist())) < len(order):
-        raise TrainingError("the lattice found in the images is not the simulated one", hint="check `rings`")
-    displacements: Array = markers[:, order] - learned.matcher.model.reference
-    return displacements
+def _as_matched(
+    learned: Learned,
+    displacements: Array,
+    taught: list[bool],
+    validation: LabelledDiscs,
+    report: Callable[[str], Callable[[int, int], None]],
+) -> _Matched:
+    fields = match_all(learned.matcher, validation.frames, report("matched, val"))
+    return _Matched(
+        tensors=_tensors(learned),
+        frame=np.array([*learned.guess.low, learned.guess.cell_px, learned.least_score, learned.most_rms_px]),
+        training=displacements.reshape(len(displacements), -1).astype(np.float32),
+        validation=stacked(fields)[0].reshape(len(fields), -1).astype(np.float32),
+        taught=np.array(taught),
+    )
 
 
 def _write_examples(
