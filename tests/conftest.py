@@ -1,8 +1,6 @@
-"""Tests against emulators run beside processes with clocks of their own.
+"""Tests in tests/emulated run beside processes with clocks of their own, one after another (`-m emulated`).
 
-A machine that is starved for a tenth of a second can make a lawful driver fault, as the real device would. Such tests
-are tried again, twice at most, and pytest counts every such case in its summary; all others have to pass at once. They
-run one after another (`-m emulated`), the others on all cores.
+All others run on all cores; drivers are tested beside their emulators on one simulated time there.
 """
 
 from __future__ import annotations
@@ -24,4 +22,3 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.is_relative_to(_EMULATED):
             item.add_marker(pytest.mark.emulated)
-            item.add_marker(pytest.mark.flaky(reruns=2))

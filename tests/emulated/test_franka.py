@@ -85,6 +85,16 @@ def faulted(harness: FrankaHarness) -> DeviceFault:
     return fault
 
 
+def assert_travel(moved: np.ndarray, direction: np.ndarray) -> None:
+    """Check that the tool moved that way, and no farther than the time-to-live allows.
+
+    What a busy machine takes until the command is under way is taken from its time-to-live.
+    """
+    along = float(moved @ direction)
+    np.testing.assert_allclose(moved, along * direction, atol=1e-4)
+    assert 1e-4 < along <= TTL_DISTANCE_M + 2e-4
+
+
 def test_its_spec_needs_no_sdk() -> None:
     code = "from touchcell.drivers.core.spec import DRIVERS; DRIVERS.load('franka')"
     code += "; import sys; assert 'franky' not in sys.modules"
@@ -208,7 +218,7 @@ def test_a_twist_along_tool_axes_moves_along_the_tool(benches: Callable[..., Fra
     harness.moved()
     harness.rested()
     moved = harness.position() - T_before[:3, 3]
-    np.testing.assert_allclose(moved, TTL_DISTANCE_M * T_before[:3, 2], atol=1e-4)
+    assert_travel(moved, T_before[:3, 2])
 
 
 def test_the_time_to_live_ends_the_motion_while_python_hangs(harness: FrankaHarness) -> None:
@@ -220,7 +230,7 @@ def test_the_time_to_live_ends_the_motion_while_python_hangs(harness: FrankaHarn
     truth = harness.truth()
     assert not truth["moving"]
     assert truth["mode"] == "idle"
-    np.testing.assert_allclose(np.array(truth["position_m"]) - before, [TTL_DISTANCE_M, 0, 0], atol=1e-4)
+    assert_travel(np.array(truth["position_m"]) - before, np.array([1.0, 0.0, 0.0]))
 
 
 CLIENT = """
@@ -497,7 +507,7 @@ def test_a_link_that_is_late_still_moves_it(harness: FrankaHarness) -> None:
     harness.moved()
     harness.rested()
     assert harness.truth()["reflexes"] == 0
-    assert (harness.position() - before)[0] == pytest.approx(TTL_DISTANCE_M, abs=2e-4)
+    assert_travel(harness.position() - before, np.array([1.0, 0.0, 0.0]))
 
 
 def test_after_a_restart_it_connects_anew(harness: FrankaHarness) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 
 from tests.fault_injection.sent_commands import SentCommands
+from tests.helpers.jog_script import ScriptedJog, every_state
 from touchcell.cell.config.cell_plan import CellPlan
 from touchcell.cell.config.find import find_cell
 from touchcell.cell.config.schema import plan_cell
@@ -100,6 +101,8 @@ _STANDS = {
     "grab": "it stands while a frame is taken",
     "keep": "the arm stands still",
     "note": "the arm stands still",
+    "idle": "the arm stands still",
+    "release": "the arm stands still",
 }
 _NO_BASELINE = {"prepare": "the first frames are the reference", "wait": "the first frames are the reference"}
 
@@ -205,7 +208,10 @@ def cells() -> dict[str, dict[str, Any]]:
     stepping["scene"]["surfaces"]["plate"]["pose_mm_deg"] = [0, 0, 13, 0, 0, 0]
     stepping["interlocks"] |= {n: e for n, e in following["interlocks"].items() if e["kind"] in watching}
     stepping["task"] = {"name": "steps", "withdraw_mm": 10, "steps": list(_STEPS)}
-    tasks = (following, tracking, edges, observing, single, dual, collecting, stepping)
+    jogging = _shipped("surface_follow_sim.yaml")
+    jogging["task"] = {"name": "jog"}
+    del jogging["interlocks"]["contact_lost"]
+    tasks = (following, tracking, edges, observing, single, dual, collecting, stepping, jogging)
     return {data["task"]["name"]: data for data in tasks}
 
 
@@ -247,7 +253,7 @@ def places(devices: Sequence[str] = ("arm", "camera"), tasks: Sequence[str] | No
         for kind in devices:
             cell = on_true_contact(data) if kind == "arm" else data
             with tempfile.TemporaryDirectory() as folder:
-                probe = compose(plan_anew(_written(cell, Path(folder))))
+                probe = composed(_written(cell, Path(folder)))
             assert isinstance(probe.task, MachineTask)
             targets = probe.plan.arm_roles if kind == "arm" else probe.cameras
             for fault in (fault for fault in FAULTS if fault.device == kind):
@@ -286,9 +292,15 @@ def plan_anew(path: Path) -> CellPlan:
     return plan_cell(path, {"data": collected} if collects else {})
 
 
+def composed(path: Path) -> Cell:
+    """Compose the cell; one that is moved by hand is moved through every state."""
+    plan = plan_anew(path)
+    return compose(plan, jog_input=ScriptedJog(every_state()) if plan.task.name == "jog" else None)
+
+
 def run_case(path: Path, fault: Fault, device: str, state: str) -> Case:
     """Run the cell, inject the fault into ``device`` in ``state``, and judge the reaction."""
-    cell, stop, sent = compose(plan_anew(path)), StopRequest(), SentCommands()
+    cell, stop, sent = composed(path), StopRequest(), SentCommands()
     case = Case(cell.plan.task.name, device, fault.name, state)
     injected_ns: int | None = None
     with cell:

@@ -18,6 +18,7 @@ from touchcell.drivers.core.device import OperatorToken
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.lease import Lease
 from touchcell.drivers.franka.driver import FrankaArm, FrankaConfig
+from touchcell.drivers.franka.rig import PATIENCE_S
 from touchcell.testing.emulation.process import EmulatorProcess
 
 OPERATOR = OperatorToken("tester", 0)
@@ -44,7 +45,9 @@ class FrankaHarness:
     def __init__(self, **config: Any) -> None:
         host = fresh_host()
         self.clock = MonotonicClock()
-        self.emulator = EmulatorProcess("franka", "--host", host, timeout_s=DEADLINE_S).start()
+        self.emulator = EmulatorProcess(
+            "franka", "--host", host, "--patience", str(PATIENCE_S), timeout_s=DEADLINE_S
+        ).start()
         self.config = FrankaConfig.model_validate(
             {"host": host, "enforce_realtime": False, "state_timeout_s": 0.5} | config
         )

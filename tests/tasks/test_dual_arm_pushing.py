@@ -12,6 +12,8 @@ CELL = "dual_push_sim.yaml"
 START = [("prepare", "ready", "approach"), ("approach", "contact", "settle"), ("settle", "settled", "run")]
 END = [("run", "finished", "retract"), ("retract", "retracted", "done")]
 SHORT = {"task__target_mm": [50, 3], "task__retract_mm": 12, "scene__step_ms": 10}
+BEARING = SHORT | {"task__steering": "bearing", "task__push_speed_mm_s": 20, "task__side_width_mm": None}
+ASIDE = [("run", "aside", "sidestep"), ("sidestep", "placed", "approach"), *START[1:]]
 
 
 def test_both_arms_bring_the_object_to_the_target(tmp_path):
@@ -25,9 +27,7 @@ def test_both_arms_bring_the_object_to_the_target(tmp_path):
         if cell.task.state == "settle":
             apart.append([contact.in_contact for contact in contacts.values()])
 
-    pushed = push(
-        cell_file(CELL, **SHORT | {"task__follower__active": True, "task__target_mm": [70, 3]}), tmp_path, look
-    )
+    pushed = push(cell_file(CELL, **BEARING | {"task__target_mm": [70, 3]}), tmp_path, look)
     assert pushed.path == [*START, *END]
     assert all(map(all, apart))
     assert abs(pushed.error_mm) < 3.0
@@ -48,7 +48,7 @@ def test_the_leader_waits_while_the_follower_searches_for_its_lost_contact(tmp_p
         if cell.task.state == "approach" and lost:
             leader_x.append(cell.arms["leader"].T_world_tcp()[0, 3])
 
-    pushed = push(cell_file(CELL, **SHORT), tmp_path, look)
+    pushed = push(cell_file(CELL, **BEARING), tmp_path, look)
     assert pushed.path == [*START, ("run", "lost", "approach"), *START[1:], *END]
     assert "follower_sensor" in pushed.cell.task.transitions[3].reason
     assert 1e3 * (leader_x[-1] - leader_x[0]) < 1.0
@@ -78,3 +78,31 @@ def test_an_operators_stop_withdraws_both(tmp_path):
     pushed = push(cell_file(CELL, **SHORT), tmp_path, look, stop=stop)
     assert pushed.cell.task.state == "stopped"
     assert min(gaps[-1]) > 8.0
+
+
+@pytest.mark.parametrize(("aside_mm", "turn_deg"), [(8, 5), (-20, -20), (20, 0)])
+def test_an_object_far_off_the_line_is_found_by_its_edge_and_arrives(tmp_path, aside_mm, turn_deg):
+    """Both arms let go, the leader feels an edge, and both press opposite each other then."""
+    data = cell_file(CELL, **SHORT | {"task__target_mm": [200, 40]})
+    data["scene"]["objects"]["prism"]["pose_mm_deg"] = [0, aside_mm, 0, 0, 0, turn_deg]
+    data["arms"]["leader"]["start_pose_mm_deg"][0] -= 20
+    data["arms"]["follower"]["start_pose_mm_deg"][0] -= 25
+    pushed = push(data, tmp_path)
+    assert pushed.path[: len(START) + len(ASIDE)] == [*START, *ASIDE]
+    assert pushed.path[-2:] == END
+    assert pushed.object_mm_deg[:2] == pytest.approx((200.0, 40.0), abs=0.5)
+
+
+def test_a_centre_of_mass_beside_the_middle_is_told_from_it(tmp_path):
+    data = cell_file(CELL, **SHORT | {"task__target_mm": [200, 40]})
+    data["scene"]["objects"]["prism"]["center_of_mass_mm"] = [0, 8]
+    pushed = push(data, tmp_path)
+    assert pushed.path[-1] == END[-1]
+    assert pushed.object_mm_deg[:2] == pytest.approx((200.0, 40.0), abs=1.0)
+
+
+def test_two_arms_that_have_not_felt_the_middle_do_not_claim_to_have_arrived(tmp_path):
+    pushed = push(cell_file(CELL, **SHORT | {"task__side_width_mm": None}), tmp_path)
+    assert pushed.path[-1] == ("retract", "retracted", "failed")
+    missed = next(each for each in pushed.cell.task.transitions if each.event == "missed")
+    assert "it may be beyond the tolerance" in missed.reason

@@ -10,6 +10,12 @@ normal and the centre ``s`` to the left of it, all forces drop out:
 ``u`` being the velocity of the contact, n along the inward normal and l to its left. The point ``c^2 / a`` ahead of
 the centre moves along a direction that is fixed in the object, ``atan(s / a)`` left of the normal, whatever the force:
 there the object is a unicycle (a flat output, as the rear axle of a car is). So motion tells ``s`` and ``c``.
+
+Motion does not tell where the object's middle is. It is the centre of friction where the centre of mass is in the
+middle and nothing else presses. A follower with the normal force F and the friction force T, at a lever D and beside
+the pusher's N by q, moves ``s`` by ``(q F + D T) / (N - F)``: 5 mm for 0.1 mm of shear that is misread. So middle and
+``s`` are estimates of their own: touch tells the middle (``touchcell.control.edge_search``, or the normal of a round
+side), motion tells ``s``.
 """
 
 from __future__ import annotations
@@ -30,8 +36,12 @@ _HEADING_NOISE_RAD: Final = math.radians(0.3)
 _OFFSET_PRIOR_M: Final = 0.015
 _LEVER_PRIOR: Final = 0.15
 """Standard deviation of ``c^2`` over its first value."""
-_OFFSET_DRIFT_M_PER_SQRT_M: Final = 0.003
-"""Growth of the uncertainty of ``s`` over travel: contacts creep."""
+_CREEP_M_PER_SQRT_M: Final = 0.003
+"""Growth of the uncertainty of where an object is touched over travel: contacts creep."""
+_FOLLOWED_DRIFT_M_PER_SQRT_M: Final = 0.010
+"""The same of ``s`` where a follower presses, too ..."""
+_FOLLOWED_CREEP_M_PER_SQRT_M: Final = 0.002
+"""... and of the middle: contacts that press opposite each other creep less."""
 _FEWEST_M: Final = 0.002
 _SHORTEST_M: Final = 0.005
 """Travel from which a motion is compared with the model."""
@@ -61,11 +71,18 @@ class PushModel:
         reach_m: ``a``, from the contact to the centre of friction, along the normal.
         offset_m: ``s``, of the centre to the left of the contact.
         lever_m2: ``c^2``.
+        middle_m: of the object's middle to the left of the contact; None where it is the centre of friction.
     """
 
     reach_m: float
     offset_m: float
     lever_m2: float
+    middle_m: float | None = None
+
+    @property
+    def eccentricity_m(self) -> float:
+        """Distance of the centre of friction to the left of the object's middle."""
+        return 0.0 if self.middle_m is None else self.offset_m - self.middle_m
 
     @property
     def lead_m(self) -> float:
@@ -108,47 +125,71 @@ class Motion:
 
 
 class PushEstimator:
-    """Estimates where a pushed object's centre of friction is, and its lever, from how it moves: a Kalman filter.
+    """Estimates where a pushed object's centre of friction and middle are, and its lever: a Kalman filter.
 
     Args:
         reach_m: from the contact to the centre along the normal.
         lever_m2: first value of ``c^2``.
-        flat: True where the normal does not tell where the centre is (a flat side); a round side's points at it.
+        flat: True where the normal does not tell where the middle is (a flat side); a round side's points at it.
+        eccentricity_m: standard deviation of the centre of friction from the middle.
+        followed: True where a follower presses, too.
     """
 
-    def __init__(self, reach_m: float, lever_m2: float, *, flat: bool = True) -> None:
+    def __init__(
+        self, reach_m: float, lever_m2: float, *, flat: bool = True, eccentricity_m: float = 0.0, followed: bool = False
+    ) -> None:
         self._reach_m = reach_m
         self._first_lever_m2 = lever_m2
         self._flat = flat
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin again with another contact."""
-        self._mean = np.array([0.0, self._first_lever_m2])
-        offset_m = _OFFSET_PRIOR_M if self._flat else 1e-6
-        self._covariance = np.diag([offset_m**2, (_LEVER_PRIOR * self._first_lever_m2) ** 2])
+        self._eccentricity_m = max(eccentricity_m, 1e-6)
+        creep = _CREEP_M_PER_SQRT_M**2 if flat else 0.0
+        # Growth of the covariance of offset, lever and middle over travel. Creep moves offset and middle by the same;
+        # from what a follower's force changes the middle must not learn.
+        self._drift = creep * np.array([[1.0, 0.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 1.0]])
+        if followed:
+            creep = _FOLLOWED_CREEP_M_PER_SQRT_M**2 if flat else 0.0
+            self._drift = np.diag([_FOLLOWED_DRIFT_M_PER_SQRT_M**2, 0.0, creep])
+        self._mean = np.array([0.0, lever_m2, 0.0])
+        self._covariance = np.diag([0.0, (_LEVER_PRIOR * lever_m2) ** 2, 0.0])
         # Of each contact so far: travel, way to the left in the object's frame, heading.
         self._past: deque[tuple[float, float, float]] = deque()
-        self._last: Contact | None = None
-        self._used_m = 0.0
+        self.move_contact(0.0, _OFFSET_PRIOR_M if flat else 0.0)
 
-    def move_contact(self, offset_m: float, sigma_m: float) -> None:
-        """Begin again with another contact of the same object, ``offset_m`` to the right of its centre."""
-        self._mean[0] = offset_m
-        self._covariance = np.diag([sigma_m**2, float(self._covariance[1, 1])])
+    def move_contact(self, middle_m: float, sigma_m: float, *, keep_eccentricity: bool = False) -> None:
+        """Begin again with another contact of the same object.
+
+        Args:
+            middle_m: of the object's middle to the left of it.
+            sigma_m: standard deviation of that.
+            keep_eccentricity: the centre of friction is where it was beside the middle, as well as that was known.
+        """
+        P, x = self._covariance, self._mean
+        eccentricity_m, variance = 0.0, self._eccentricity_m**2
+        if keep_eccentricity:
+            eccentricity_m = float(x[0] - x[2])
+            variance = min(max(float(P[0, 0] + P[2, 2] - 2.0 * P[0, 2]), 0.0), variance)
+        self._mean = np.array([middle_m + eccentricity_m, x[1], middle_m])
+        shared = sigma_m**2
+        self._covariance = np.array([[shared + variance, 0.0, shared], [0.0, P[1, 1], 0.0], [shared, 0.0, shared]])
         self._past.clear()
-        self._last = None
+        self._last: Contact | None = None
         self._used_m = 0.0
 
     @property
     def model(self) -> PushModel:
         """The object as it is estimated."""
-        return PushModel(self._reach_m, float(self._mean[0]), float(self._mean[1]))
+        offset_m, lever_m2, middle_m = self._mean.tolist()
+        return PushModel(self._reach_m, offset_m, lever_m2, middle_m)
 
     @property
     def offset_sigma_m(self) -> float:
         """Standard deviation of the offset."""
-        return math.sqrt(float(self._covariance[0, 0]))
+        return math.sqrt(max(float(self._covariance[0, 0]), 0.0))
+
+    @property
+    def middle_sigma_m(self) -> float:
+        """Standard deviation of the middle."""
+        return math.sqrt(max(float(self._covariance[2, 2]), 0.0))
 
     def update(self, contact: Contact) -> None:
         """Take a new contact into account."""
@@ -177,16 +218,14 @@ class PushEstimator:
         travel, left, turn = travel1 - travel0, left1 - left0, heading1 - heading0
         # Along the normal the contact moves by s omega more than the centre.
         s = float(self._mean[0])
-        H = np.array([travel - s * turn, -turn])
+        H = np.array([travel - s * turn, -turn, 0.0])
         # Windows overlap: each frame's noise is counted as often as it is used.
         shared = max(travel / max(since_m, _FEWEST_M), 1.0)
         noise = 2.0 * shared * ((a * _LATERAL_NOISE_M) ** 2 + (a * a * _HEADING_NOISE_RAD) ** 2)
-        P = self._covariance.copy()
-        if self._flat:
-            P[0, 0] += _OFFSET_DRIFT_M_PER_SQRT_M**2 * since_m
+        P = self._covariance + since_m * self._drift
         gain: Array = P @ H / (H @ P @ H + noise)
         self._mean = self._mean + gain * (a * a * turn + a * left - H @ self._mean)
         self._covariance = P - np.outer(gain, H @ P)
         reach_sq = a * a
-        self._mean[0] = min(max(float(self._mean[0]), -1.2 * a), 1.2 * a)
+        self._mean[::2] = np.clip(self._mean[::2], -1.2 * a, 1.2 * a)
         self._mean[1] = min(max(float(self._mean[1]), 0.25 * reach_sq), 1.5 * reach_sq)

@@ -75,7 +75,7 @@ def steer(
     Args:
         center: the centre of friction, with the heading of the contact normal.
         model: the object.
-        target: where the centre is to arrive.
+        target: where the object's middle is to arrive.
         goal_heading: of the contact normal there, rad; None where it is free.
         friction: slope of the friction cone that may be used.
         kept: curvature to keep where the target is too near to steer.
@@ -83,7 +83,10 @@ def steer(
     lowest, highest = model.curvatures(friction)
     # The centre, moving as the unicycle does: parallel to it while the path is straight, and swinging behind it.
     moving = Pose(center.x, center.y, center.heading + model.drift_rad)
-    ahead, left = moving.local(target)
+    # The middle arrives where the centre of friction arrives beside it: nearly so with the present heading, and exactly
+    # so at the end.
+    beside = Pose(*target, center.heading).ahead(model.eccentricity_m, 0.5 * math.pi)
+    ahead, left = moving.local((beside.x, beside.y))
     length, swing = math.hypot(ahead, left), model.lead_m * math.cos(model.drift_rad)
     if ahead < _SHORTEST_M:
         wanted = kept

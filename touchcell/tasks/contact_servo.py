@@ -14,6 +14,7 @@ from touchcell.control.servo import TactileServo
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.perception.runtime.estimate import ContactEstimate
+from touchcell.tasks.free_motion import Goal
 from touchcell.tasks.interface import Observation, TaskConfig, TaskContext
 
 
@@ -60,12 +61,26 @@ class Sidestepping(Protocol):
         ...
 
     @property
-    def sidestep_m(self) -> float | None:
-        """Distance to step to the left of the contact normal, as seen from above; None for no step."""
+    def wants_sidestep(self) -> bool:
+        """True if it asks now."""
         ...
 
-    def begin_sidestep(self) -> None:
-        """Take note that the contact is given up for another."""
+    @property
+    def only_touches(self) -> bool:
+        """True if the contact shall not be pressed, as it is to be given up."""
+        ...
+
+    def begin_sidestep(self, T_base_sensor: Array) -> None:
+        """Take note that the contact is given up for another, with the sensor at a pose (4, 4)."""
+        ...
+
+    def next_goal(self, T_base_sensor: Array, T_s_f: Array | None) -> Goal | None:
+        """Return where the sensor shall go next; None where it shall make contact again.
+
+        Args:
+            T_base_sensor: (4, 4) pose of the sensor at the last goal.
+            T_s_f: (4, 4) contact made on the way there; None if there was none, or none that could be measured.
+        """
         ...
 
     def begin_approach(self, T_base_sensor: Array) -> None:
@@ -133,6 +148,12 @@ _BACK_RAD = math.radians(1.0)
 _BACK_PER_S = 5.0
 
 
+def _rotation(R: Array) -> Array:
+    T = np.eye(4)
+    T[:3, :3] = R
+    return T
+
+
 def _six(linear_mm: float, angular_deg: float) -> Array:
     return np.repeat([1e-3 * linear_mm, np.radians(angular_deg)], 3)
 
@@ -192,7 +213,8 @@ class ContactServo:
         self._V_tcp = np.zeros(6)
         self._touched = False
         self._first_touch: tuple[Array, float] | None = None
-        self._waypoints: list[Array] = []
+        self._goal: Goal | None = None
+        self._felt_s = 0.0
 
     @property
     def has_fresh_data(self) -> bool:
@@ -322,35 +344,58 @@ class ContactServo:
         """Measure the travelled distance from the current pose."""
         self._start = self.T_base_sensor
 
-    def start_sidestep(self, clear_m: float) -> None:
-        """Plan a step aside: back by ``clear_m`` along the sensor's axis, then as far aside as the behavior asks."""
-        self._waypoints = []
-        if self.T_base_sensor is None or not isinstance(self.run, Sidestepping) or self.run.sidestep_m is None:
+    def start_sidestep(self) -> None:
+        """Let go of the object and go where the behavior says; a behavior that never asks keeps its contact."""
+        self._goal, self._felt_s = None, 0.0
+        if self.T_base_sensor is None or not isinstance(self.run, Sidestepping) or not self.run.may_sidestep:
             return
-        R, position = self.T_base_sensor[:3, :3], self.T_base_sensor[:3, 3]
-        left = np.cross([0.0, 0.0, 1.0], R[:, 2])
-        away = position - clear_m * R[:, 2]
-        self._waypoints = [away, away + self.run.sidestep_m * left]
-        self.run.begin_sidestep()
+        self.run.begin_sidestep(self.T_base_sensor)
+        self._goal = self.run.next_goal(self.T_base_sensor, None)
+
+    @property
+    def only_touches(self) -> bool:
+        """True if the contact shall not be pressed, as it is to be given up."""
+        return isinstance(self.run, Sidestepping) and self.run.only_touches
 
     @property
     def sidestepping(self) -> bool:
         """True while a step aside has not ended."""
-        return bool(self._waypoints)
+        return self._goal is not None
 
-    def step_aside(self, speed_m_s: float) -> Array:
-        """Return the twist (6,) of the tool towards the next waypoint; drop waypoints that are reached."""
+    def step_aside(self, speed_m_s: float, feeling_m_s: float) -> Array:
+        """Return the twist (6,) of the tool towards the present goal, and ask for the next one where it is reached.
+
+        Args:
+            speed_m_s: in free air.
+            feeling_m_s: where the goal is to feel for a contact.
+        """
         assert self.T_base_sensor is not None
-        while self._waypoints:
-            to = self._waypoints[0] - self.T_base_sensor[:3, 3]
-            distance_m = float(np.linalg.norm(to))
-            if distance_m > _REACHED_M:
-                # The last stretch is slower, so that it ends there.
-                v = to / distance_m * min(speed_m_s, _APPROACH_PER_S * distance_m)
-                V_s = np.concatenate([self.T_base_sensor[:3, :3].T @ v, np.zeros(3)])
-                return np.asarray(self._Ad_tcp_sensor @ V_s)
-            self._waypoints.pop(0)
-        return np.zeros(6)
+        assert self._goal is not None
+        T_base_goal = self._goal.T_base_sensor
+        way = T_base_goal[:3, 3] - self.T_base_sensor[:3, 3]
+        R = self.T_base_sensor[:3, :3]
+        turn = se3.log(_rotation(R.T @ T_base_goal[:3, :3]))[3:]
+        distance_m, angle_rad = float(np.linalg.norm(way)), float(np.linalg.norm(turn))
+        V_s = np.zeros(6)
+        if self._goal.feels and self.in_contact:
+            # Standing still until several frames have shown it.
+            self._felt_s += self._period_s
+            if self._felt_s >= _FEEL_S:
+                self._next_goal(self.T_s_f)
+        elif distance_m < _REACHED_M and angle_rad < _BACK_RAD:
+            self._next_goal(None)
+        else:
+            # The last stretch is slower, so that it ends there.
+            fastest = feeling_m_s if self._goal.feels else min(speed_m_s, _APPROACH_PER_S * distance_m)
+            V_s[:3] = R.T @ way * (fastest / max(distance_m, 1e-9))
+            rate = math.radians(self._config.max_turn_deg_s)
+            V_s[3:] = turn * (min(rate, _APPROACH_PER_S * angle_rad) / max(angle_rad, 1e-9))
+        return self._accelerated(self._Ad_tcp_sensor @ V_s)
+
+    def _next_goal(self, T_s_f: Array | None) -> None:
+        assert self.T_base_sensor is not None
+        assert isinstance(self.run, Sidestepping)
+        self._goal, self._felt_s = self.run.next_goal(self.T_base_sensor, T_s_f), 0.0
 
     def travelled_m(self) -> float:
         """Return the distance of the sensor from its pose at ``reset_travel``, m; 0 while it is unknown."""
@@ -392,6 +437,10 @@ class ContactServo:
         if self.T_s_f is None:
             self._V_tcp = np.zeros(6)
             return None
+        return self._accelerated(V_tcp)
+
+    def _accelerated(self, V_tcp: Array) -> Array:
+        """Return the twist (6,) of the tool nearest to ``V_tcp`` that the largest acceleration allows."""
         # One factor for all axes: without the motion that goes with it, a turn about the contact would slide the tip.
         step = (V_tcp - self._V_tcp) / self._period_s
         excess = max(
@@ -422,6 +471,7 @@ _LONGEST_UNCHANGED_MM = 2.5
 # The image changes by about 0.1 per millimetre of depth (``contact_gate``).
 _LEAST_CHANGE = 0.01
 _REACHED_M = 0.5e-3
+_FEEL_S = 0.15
 _APPROACH_PER_S = 8.0
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from touchcell.tasks.data_collection import DataCollectionConfig, collect_table
+from touchcell.tasks.jog import JogConfig, jog_table
 from touchcell.tasks.observe import ObserveConfig, observe_table
 from touchcell.tasks.servoing import servo_table
 from touchcell.tasks.state_machine import Table, mermaid
@@ -25,6 +26,7 @@ def tables() -> Mapping[str, Table]:
         "servoing": servo_table("servoing", SurfaceFollowingConfig(), run_timeout_s=1.0, sidesteps=True),
         "data_collection": collect_table(DataCollectionConfig()),
         "observe": observe_table(ObserveConfig()),
+        "jog": jog_table(JogConfig()),
     }
 
 

@@ -5,17 +5,21 @@ The leader pushes and steers; the follower holds the far side and moves along, w
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Final, Literal
+import math
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Final
 
 import numpy as np
 from pydantic import PositiveFloat
 
+from touchcell.control.push_steering import Pose
 from touchcell.drivers.core.protocols import SERVO_ARM
+from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import ContactServo, ContactServoConfig, Six, SixGains
+from touchcell.tasks.free_motion import Goal, heading_of, placed
 from touchcell.tasks.interface import CONTACT_DEPTH, TaskContext, TaskSpec
-from touchcell.tasks.predictive_push import twist_in_sensor
+from touchcell.tasks.predictive_push import PredictivePush, twist_in_sensor
 from touchcell.tasks.servoing import ServoConfig, ServoTask
 from touchcell.tasks.single_arm_pushing import Push, PushConfig
 
@@ -23,6 +27,8 @@ LEADER: Final = "leader"
 FOLLOWER: Final = "follower"
 LEADER_SENSOR: Final = "leader_sensor"
 FOLLOWER_SENSOR: Final = "follower_sensor"
+_CLEAR_M: Final = 0.015
+"""Distance by which the follower lets go of an object: a turned one reaches farther while it steps aside."""
 
 
 class FollowerConfig(ContactServoConfig):
@@ -54,13 +60,10 @@ class DualArmPushingConfig(PushConfig, ServoConfig):
 
     Attributes:
         align_max_mm_s: largest lateral speed: more than for a single arm, since the follower adds drag.
-        steering: as for a single arm. The model of ``predictive`` has one contact: where the arms do not press opposite
-            each other the follower's force makes it estimate a wrong centre, and the push end beside its target.
         follower: parameters of the follower's servo.
     """
 
     align_max_mm_s: PositiveFloat = 15.0
-    steering: Literal["predictive", "bearing"] = "bearing"
     follower: FollowerConfig = FollowerConfig()
 
 
@@ -69,31 +72,44 @@ class Follow:
 
     Args:
         config: parameters.
-        push: the leader's behavior; None for a follower that only complies.
+        push: the leader's behavior.
+        T_leader_follower: pose (4, 4) of the follower's base in the leader's.
     """
 
-    def __init__(self, config: DualArmPushingConfig, push: Push | None) -> None:
+    def __init__(self, config: DualArmPushingConfig, push: Push, T_leader_follower: Array) -> None:
         self._push = push
+        self._active = config.follower.active
+        self._T_leader_follower = T_leader_follower
         self._speed_m_s = 1e-3 * config.push_speed_mm_s
         self._middle_m = 1e-3 * config.object_center_offset_mm
         self._turn_per_m = 1e3 * np.radians(config.follower.turn_deg_per_mm)
+        self._T_base_sensor: Array | None = None
         self._y_is_left = 1.0
+        self._steps: Iterator[Goal] = iter(())
 
     @property
     def feedforward(self) -> Array:
-        """Twist (6,) in the desired sensor frame.
+        """Twist (6,) in the desired sensor frame: that of the object where the tip is.
 
-        It is that of a point of the object as far beyond its centre as the leader is before it. The follower's left is
-        the leader's right.
+        With predictive steering it is known; otherwise it is that of a point of the object as far beyond its centre as
+        the leader is before it.
         """
-        if self._push is None:
+        if not self._active:
             return np.zeros(6)
-        if (motion := self._push.object_motion) is not None:
-            left_m_s = motion.left_m_s + motion.turn_rad_s * self._middle_m
-            return twist_in_sensor(-motion.ahead_m_s, -left_m_s, motion.turn_rad_s, self._y_is_left)
+        if self._push.predictive is not None:
+            return self._object_twist(self._push.predictive)
         turn_rad_s = self._turn_per_m * self._push.left_m_s
         aside_m_s = self._y_is_left * self._middle_m * turn_rad_s
         return np.array([0.0, aside_m_s, -self._speed_m_s, self._y_is_left * turn_rad_s, 0.0, 0.0])
+
+    def _object_twist(self, push: PredictivePush) -> Array:
+        if self._T_base_sensor is None:
+            return np.zeros(6)
+        T = self._T_leader_follower @ self._T_base_sensor
+        vx, vy, turn = push.velocity_at((float(T[0, 3]), float(T[1, 3])))
+        heading = heading_of(T[:3, 2])
+        cos, sin = math.cos(heading), math.sin(heading)
+        return twist_in_sensor(cos * vx + sin * vy, cos * vy - sin * vx, turn, self._y_is_left)
 
     @property
     def timeout_s(self) -> float:
@@ -103,7 +119,47 @@ class Follow:
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
         """Return False: it never finishes by itself."""
         self._y_is_left = -float(np.sign(now[2, 0]))
+        self._T_base_sensor = now
         return False
+
+    @property
+    def may_sidestep(self) -> bool:
+        """True if the leader may let go of the object, too."""
+        return self._push.may_sidestep
+
+    @property
+    def wants_sidestep(self) -> bool:
+        """False: the leader decides."""
+        return False
+
+    @property
+    def only_touches(self) -> bool:
+        """True until the arms are opposite each other: what they hold beside each other turns as they press."""
+        return self._push.predictive is not None and self._push.predictive.must_place
+
+    def begin_approach(self, T_base_sensor: Array) -> None:
+        """Do nothing: the leader knows from where the object is approached."""
+
+    def begin_sidestep(self, T_base_sensor: Array) -> None:
+        """Let go of the object."""
+        self._steps = self._step_opposite(T_base_sensor)
+
+    def next_goal(self, T_base_sensor: Array, T_s_f: Array | None) -> Goal | None:
+        """Return where the sensor shall go next: away until the leader knows the middle, then opposite it."""
+        return next(self._steps, None)
+
+    def _step_opposite(self, T_base_sensor: Array) -> Iterator[Goal]:
+        away = T_base_sensor.copy()
+        away[:3, 3] -= _CLEAR_M * T_base_sensor[:3, 2]
+        yield Goal(away)
+        push = self._push.predictive
+        assert push is not None
+        while (middle := push.located) is None:
+            yield Goal(away)
+        at = middle.ahead(self._middle_m + _CLEAR_M)
+        T_follower_leader = se3.inverse(self._T_leader_follower)
+        T = placed(self._T_leader_follower @ away, Pose(at.x, at.y, at.heading + math.pi))
+        yield Goal(T_follower_leader @ T)
 
     def shortfall(self) -> str:
         """Return nothing: the leader decides."""
@@ -116,9 +172,10 @@ class Follow:
 
 def build(config: DualArmPushingConfig, context: TaskContext) -> ServoTask:
     """Build the task for a cell that has ``leader`` and ``follower`` with a sensor each."""
-    push, hold = Push(config), config.follower
+    push, hold = Push(config, followed=True), config.follower
     leader = ContactServo(LEADER, LEADER_SENSOR, config, config.reference_mm_deg, push, context)
-    follow = Follow(config, push if hold.active else None)
+    bases = [context.T_world_base.get(arm, np.eye(4)) for arm in (LEADER, FOLLOWER)]
+    follow = Follow(config, push, se3.compose(se3.inverse(bases[0]), bases[1]))
     follower = ContactServo(FOLLOWER, FOLLOWER_SENSOR, hold, hold.reference_mm_deg, follow, context)
     return ServoTask("dual_arm_pushing", config, context, leader, follower)
 

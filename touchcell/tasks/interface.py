@@ -13,6 +13,7 @@ from typing import Any, Final, Generic, Literal, Protocol, TypeAlias, TypeVar
 from pydantic import BaseModel, ConfigDict
 
 from touchcell.drivers.core.commands import TwistCommand
+from touchcell.drivers.core.jog import JogRequest
 from touchcell.drivers.core.protocols import require_protocols
 from touchcell.drivers.core.samples import Stamped, TcpState
 from touchcell.geometry.types import Array
@@ -60,6 +61,7 @@ class Observation:
         operator_stop: True if the operator requested an orderly end.
         ended: True if no sensor will deliver further frames, because the recordings have ended.
         wrenches: (6,) N and N m on the tool centre point along base axes, of each arm of which the task needs it.
+        jog: newest request of an operator who moves an arm by hand; None without such an input, or before the first.
     """
 
     now_ns: int
@@ -69,6 +71,7 @@ class Observation:
     ended: bool = False
     devices: Mapping[str, Stamped[Mapping[str, float]]] = field(default_factory=dict)
     wrenches: Mapping[str, Stamped[Array]] = field(default_factory=dict)
+    jog: Stamped[JogRequest] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +136,20 @@ class Task(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Box:
+    """Where a point of an arm's tool may be, along the axes of the arm's base.
+
+    Attributes:
+        lever_m: (3,) the point in the tool frame.
+        min_m, max_m: corners (3,) in the base frame.
+    """
+
+    lever_m: Array
+    min_m: Array
+    max_m: Array
+
+
 @dataclass(frozen=True, slots=True)
 class TaskContext:
     """Properties of the cell that a task needs.
@@ -142,12 +159,18 @@ class TaskContext:
         T_tcp_sensor: pose (4, 4) of each sensor role in the tool frame of the arm that carries it.
         kept: number of labelled frames that earlier runs of this cell have stored.
         resumed: True after a trip of this run: the arms may stand in contact, and its zero frames hold.
+        T_world_base: pose (4, 4) of each arm's base, by role; one that is not named stands at the world's origin.
+        carriers: role of the arm that carries each sensor role; a sensor that nothing moves is missing.
+        boxes: workspaces of each arm role that has any.
     """
 
     rate_hz: float
     T_tcp_sensor: Mapping[str, Array]
     kept: int = 0
     resumed: bool = False
+    T_world_base: Mapping[str, Array] = field(default_factory=dict)
+    carriers: Mapping[str, str] = field(default_factory=dict)
+    boxes: Mapping[str, tuple[Box, ...]] = field(default_factory=dict)
 
 
 TaskConfigT = TypeVar("TaskConfigT", bound=TaskConfig)
@@ -168,7 +191,9 @@ class TaskSpec(Generic[TaskConfigT]):
         devices: roles of other devices, and the Protocols that each driver must provide.
         forces: returns roles of arms whose wrench a configuration needs, each with the key that needs it; their drivers
             must provide WrenchSource.
-        feature: what the contacts of its sensors must be of.
+        feature: what the contacts of its sensors must be of; None for a task to which it is the same.
+        of_cell: returns the spec with the roles of a cell, for a task whose arms and sensors are those that the cell
+            has: called with the roles of the arms and of the sensors that ``task:`` names, or else with all of them.
     """
 
     name: str
@@ -180,7 +205,8 @@ class TaskSpec(Generic[TaskConfigT]):
     labels_frames: bool = False
     devices: Mapping[str, frozenset[type]] = field(default_factory=dict)
     forces: Callable[[TaskConfigT], Mapping[str, str]] | None = None
-    feature: Feature = "surface"
+    feature: Feature | None = "surface"
+    of_cell: Callable[[frozenset[str], frozenset[str]], TaskSpec[TaskConfigT]] | None = None
 
     def needs_wrenches(self, config: TaskConfigT) -> Mapping[str, str]:
         """Return roles of arms whose wrench ``config`` needs, each with the key that needs it."""

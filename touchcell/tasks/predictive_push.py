@@ -4,16 +4,18 @@ in each cycle, and the tip's feedforward is the motion that takes the object alo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
+from touchcell.control.edge_search import EdgeSearch
 from touchcell.control.path import Path, Point
 from touchcell.control.push_model import Contact, Motion, PushEstimator
 from touchcell.control.push_steering import Plan, Pose, steer
 from touchcell.geometry.types import Array
+from touchcell.tasks.free_motion import Goal, heading_of, placed
 
 _STANDING: Final = Motion(0.0, 0.0, 0.0, 0.0, 0.0)
 _KNOWN_M: Final = 0.003
@@ -33,6 +35,21 @@ _RESERVED: Final = 0.8
 """Share of the tip's limits that steering may use."""
 _DELAY_S: Final = 0.02
 """From a decision to the arm's standstill beyond its deceleration."""
+_CLEAR_M: Final = 0.008
+"""Distance by which a sensor lets go of an object before it steps aside."""
+_EDGE_SIGMA_M: Final = 0.5e-3
+"""Uncertainty of a side's middle by the touch of an edge."""
+_ECCENTRIC_M: Final = 0.006
+"""Standard deviation of the centre of friction from a middle that is felt ..."""
+_CENTRIC_M: Final = 0.001
+"""... and from one that is not: motion alone cannot tell them apart."""
+_FOLLOWED_M: Final = 0.010
+"""What a follower's force adds to it."""
+_REACH_SIGMA_M: Final = 0.3e-3
+"""Uncertainty of the middle along the contact normal."""
+_SIDE_SIGMA_RAD: Final = math.radians(2.5)
+"""Turn of the normal from one touch of a side to the next beyond which the first was none of that side."""
+_MOST_SEARCHES: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +70,8 @@ class PredictivePushSettings:
         look_ahead_m: along paths with waypoints.
         goal_heading_rad: of the contact normal at the target; None where it is free.
         recontact_m: the object is touched anew nearer to its centre where it is pushed farther beside it; None never.
+        side_width_m: width of a flat side, an edge of which is felt before the push; None where it is not.
+        followed: True where a follower presses against the far side.
     """
 
     lead_m: float
@@ -68,6 +87,8 @@ class PredictivePushSettings:
     look_ahead_m: float
     goal_heading_rad: float | None
     recontact_m: float | None
+    side_width_m: float | None = None
+    followed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +96,10 @@ class Progress:
     """Where the object is, by touch and arm pose.
 
     Attributes:
-        center: its centre, with the heading of the contact normal.
+        center: its middle, with the heading of the contact normal.
         remaining_m: way to the target.
-        target_distance_m: distance of its centre from the target.
+        target_distance_m: distance of its middle from the target.
+        sigma_m: standard deviation of that.
         target_lateral_error_m: distance of the target from the contact normal, positive to its left.
         cross_track_error_m: of the centre from the path on which it was to go, positive to its left.
         miss_m: by how much the target will be missed, as far as friction allows to steer.
@@ -86,6 +108,7 @@ class Progress:
     center: Pose
     remaining_m: float
     target_distance_m: float
+    sigma_m: float
     target_lateral_error_m: float
     cross_track_error_m: float
     miss_m: float
@@ -111,19 +134,35 @@ class PredictivePush:
         self._route = route
         self._has_waypoints = has_waypoints
         reach_m = settings.lead_m - settings.tip_radius_m
-        self._estimator = PushEstimator(reach_m, settings.lever_m2, flat=settings.flat)
+        felt = not settings.flat or settings.side_width_m is not None
+        eccentricity_m = _ECCENTRIC_M if felt else _CENTRIC_M
+        self._estimator = PushEstimator(
+            reach_m,
+            settings.lever_m2,
+            flat=settings.flat,
+            eccentricity_m=math.hypot(eccentricity_m, _FOLLOWED_M if settings.followed else 0.0),
+            followed=settings.followed,
+        )
         self._path: Path | None = None
         self._along_m = 0.0
         self._start = Pose(0.0, 0.0, 0.0)
-        self._start_offset_m = 0.0
-        self._known_offset_m = 0.0
+        self._start_middle_m = 0.0
         self._sidesteps = 0
+        self._searches = 0
+        self._has_edge = settings.flat and settings.side_width_m is not None
+        # Arms that press beside each other turn what they hold.
+        self._must_place = self._has_edge or settings.followed
         self._approach: float | None = None
-        self._latest: Pose | None = None
-        self._resting: Pose | None = None
+        self._contact: Contact | None = None
+        self._middle: Pose | None = None
+        self._resting: tuple[Pose, float] | None = None
+        self._steps: Iterator[Goal] = iter(())
+        self._felt: Contact | None = None
         self._speed_m_s = 0.0
         self._plan = Plan(0.0, 0.0, math.inf)
         self.motion = _STANDING
+        self.located: Pose | None = None
+        """The object's middle while it rests and will be touched anew, with its heading."""
 
     @property
     def estimator(self) -> PushEstimator:
@@ -155,33 +194,115 @@ class PredictivePush:
         reach_m = self._settings.lead_m - self._settings.tip_radius_m
         return min(max(-self._settings.lead_m * math.tan(turned), -reach_m), reach_m)
 
+    def velocity_at(self, point: Point) -> tuple[float, float, float]:
+        """Return the planned velocity of the object at a point, m/s along x and y, and its rate of turn, rad/s."""
+        if self._contact is None:
+            return 0.0, 0.0, 0.0
+        contact, motion = self._contact, self.motion
+        cos, sin = math.cos(contact.heading_rad), math.sin(contact.heading_rad)
+        dx, dy = point[0] - contact.x_m, point[1] - contact.y_m
+        ahead, left, turn = motion.contact_ahead_m_s, motion.contact_left_m_s, motion.turn_rad_s
+        return cos * ahead - sin * left - turn * dy, sin * ahead + cos * left + turn * dx, turn
+
+    @property
+    def must_place(self) -> bool:
+        """True if the present contact will be given up before the object is pushed."""
+        return self._must_place
+
     @property
     def may_sidestep(self) -> bool:
         """True if the contact may be given up for another."""
-        return self._settings.recontact_m is not None
+        return self._settings.recontact_m is not None or self._has_edge or self._settings.followed
 
     @property
-    def sidestep_m(self) -> float | None:
-        """By how much the contact should be moved to the left, to be opposite the object's centre; None if it is."""
+    def wants_sidestep(self) -> bool:
+        """True if the object should be let go and touched elsewhere."""
+        if self._must_place:
+            return True
         limit_m = self._settings.recontact_m
-        if limit_m is None or self._sidesteps >= _MOST_SIDESTEPS:
-            return None
-        offset_m = self._estimator.model.offset_m
+        # A round side's normal points at the middle wherever it is touched.
+        if limit_m is None or not self._settings.flat or self._sidesteps >= _MOST_SIDESTEPS:
+            return False
         # The first touch tells only how the side is turned.
         if not (self._known or (self._sidesteps == 0 and self._speed_m_s < self._settings.slowest_m_s)):
-            return None
-        return offset_m if abs(offset_m) > limit_m else None
+            return False
+        return abs(self._estimator.model.offset_m) > limit_m
 
     @property
     def _known(self) -> bool:
         """Whether the object's centre is known well enough to be acted upon."""
         return self._estimator.offset_sigma_m < _KNOWN_M
 
-    def move_contact(self) -> None:
-        """Keep where the object is: it will be touched elsewhere next."""
-        self._sidesteps += 1
-        self._resting = self._latest
+    def begin_sidestep(self, T_base_sensor: Array) -> None:
+        """Let go: the object rests where it is until it is touched again."""
         self.pause()
+        self.located = None
+        assert self._contact is not None
+        if self._must_place:
+            self._must_place = False
+            model = self._estimator.model
+            self._steps = (
+                self._feel_edge(T_base_sensor, self._contact)
+                if self._has_edge
+                else self._step_to(T_base_sensor, model.middle_m or 0.0)
+            )
+        else:
+            self._sidesteps += 1
+            self._steps = self._step_to(T_base_sensor, self._estimator.model.offset_m)
+
+    def next_goal(self, T_base_sensor: Array, T_s_f: Array | None) -> Goal | None:
+        """Return where the sensor shall go next beside the object; None where it shall touch again.
+
+        Args:
+            T_base_sensor: (4, 4) pose of the sensor at the last goal.
+            T_s_f: (4, 4) contact made on the way there; None if there was none.
+        """
+        self._felt = None if T_s_f is None else self._touched(T_base_sensor, T_s_f)
+        return next(self._steps, None)
+
+    def _step_to(self, T_base_sensor: Array, left_m: float) -> Iterator[Goal]:
+        """Let go and touch again, farther to the left."""
+        assert self._contact is not None
+        assert self._middle is not None
+        contact, heading = self._contact, self._contact.heading_rad
+        self._resting = self._middle, self._estimator.middle_sigma_m
+        self.located = self._middle
+        yield Goal(placed(T_base_sensor, _tip_behind(T_base_sensor, heading, _CLEAR_M)))
+        at = Pose(contact.x_m, contact.y_m, heading).ahead(left_m, 0.5 * math.pi)
+        yield Goal(placed(T_base_sensor, at.ahead(-self._settings.tip_radius_m - _CLEAR_M)))
+
+    def _feel_edge(self, T_base_sensor: Array, side: Contact) -> Iterator[Goal]:
+        """Search for an edge of the side, and then be opposite the middle."""
+        settings = self._settings
+        assert settings.side_width_m is not None
+        self._searches += 1
+        search = EdgeSearch(side, self._estimator.model.middle_m or 0.0, settings.side_width_m, settings.tip_radius_m)
+        yield Goal(placed(T_base_sensor, _tip_behind(T_base_sensor, side.heading_rad, _CLEAR_M)))
+        while search.middle is None and not search.failed:
+            clear = search.tip(_CLEAR_M)
+            yield Goal(placed(T_base_sensor, clear))
+            beyond = clear.ahead(2.0 * _CLEAR_M, search.direction_rad - clear.heading)
+            yield Goal(placed(T_base_sensor, beyond), feels=True)
+            if self._felt is None:
+                search.missed()
+            else:
+                search.touched(self._felt)
+            yield Goal(placed(T_base_sensor, clear))
+        if (found := search.middle) is not None:
+            at, sigma_m = Pose(found.x_m, found.y_m, found.heading_rad), _EDGE_SIGMA_M
+        else:
+            at = Pose(side.x_m, side.y_m, side.heading_rad).ahead(self._estimator.model.middle_m or 0.0, 0.5 * math.pi)
+            sigma_m = self._estimator.middle_sigma_m
+        middle = at.ahead(self._estimator.model.reach_m)
+        self._resting, self.located = (middle, sigma_m), middle
+        yield Goal(placed(T_base_sensor, at.ahead(-settings.tip_radius_m - _CLEAR_M)))
+
+    def _touched(self, T_base_sensor: Array, T_s_f: Array) -> Contact:
+        """Return the point of the object nearest to the tip's centre, whatever shear there is."""
+        depth_m = max(0.0, -float(T_s_f[:3, 2] @ T_s_f[:3, 3]))
+        normal = T_base_sensor[:3, :3] @ T_s_f[:3, 2]
+        at = _tip_behind(T_base_sensor, heading_of(normal), depth_m - self._settings.tip_radius_m)
+        return Contact(at.x, at.y, at.heading)
 
     def pause(self) -> None:
         """Stand still: the contact is not known."""
@@ -199,11 +320,11 @@ class PredictivePush:
         Raises:
             ControlError: the path is degenerate.
         """
-        center = self._center(T_base_sensor, T_s_f)
-        self._lay_path(center)
+        center, middle = self._object(T_base_sensor, T_s_f)
+        self._lay_path(middle)
         assert self._path is not None
         target = self._path.end
-        at = self._path.place((center.x, center.y), self._along_m, self._settings.look_ahead_m)
+        at = self._path.place((middle.x, middle.y), self._along_m, self._settings.look_ahead_m)
         self._along_m = max(self._along_m, at.along_m)
         plan = self._planned(center, at.along_m)
         if not self._known:
@@ -224,28 +345,28 @@ class PredictivePush:
         if (scale := self._within_limits()) < 1.0:
             self._speed_m_s *= scale
             self.motion = self._estimator.model.motion(self._speed_m_s, self._plan.curvature)
-        distance_m = math.hypot(target[0] - center.x, target[1] - center.y)
-        left_m = center.local(target)[1]
+        distance_m = math.hypot(target[0] - middle.x, target[1] - middle.y)
+        sigma_m = math.hypot(self._estimator.middle_sigma_m, _REACH_SIGMA_M)
+        left_m = middle.local(target)[1]
         miss_m = plan.miss_m if self._known and remaining_m > _STEERED_M else 0.0
-        return Progress(center, remaining_m - self._stopping_m(), distance_m, left_m, at.cross_track_error_m, miss_m)
+        remaining_m -= self._stopping_m()
+        return Progress(middle, remaining_m, distance_m, sigma_m, left_m, at.cross_track_error_m, miss_m)
 
-    def _lay_path(self, center: Pose) -> None:
-        """Lay the path; a straight one begins where the object's centre was at first, as it is known by now."""
-        offset_m = self._estimator.model.offset_m
+    def _lay_path(self, middle: Pose) -> None:
+        """Lay the path; a straight one begins where the object's middle was at first, as it is known by now."""
+        middle_m = self._estimator.model.middle_m or 0.0
         if self._path is None:
-            start = center.x, center.y
-            self._start, self._start_offset_m = center, offset_m
-            self._path = Path([start, *self._route(start, center.heading)])
+            start = middle.x, middle.y
+            self._start, self._start_middle_m = middle, middle_m
+            self._path = Path([start, *self._route(start, middle.heading)])
         elif not self._has_waypoints:
-            first = self._start.ahead(offset_m - self._start_offset_m, 0.5 * math.pi)
+            first = self._start.ahead(middle_m - self._start_middle_m, 0.5 * math.pi)
             self._path = Path([(first.x, first.y), self._path.end])
 
-    def _center(self, T_base_sensor: Array, T_s_f: Array) -> Pose:
-        """Return the object's centre by the contact, which the estimator then knows too."""
-        settings = self._settings
-        R = T_base_sensor[:3, :3]
-        normal = R[:2] @ T_s_f[:3, 2]
-        heading = math.atan2(float(normal[1]), float(normal[0]))
+    def _object(self, T_base_sensor: Array, T_s_f: Array) -> tuple[Pose, Pose]:
+        """Return the object's centre of friction and its middle by the contact, which the estimator then knows too."""
+        settings, estimator = self._settings, self._estimator
+        heading = heading_of(T_base_sensor[:3, :3] @ T_s_f[:3, 2])
         if settings.flat:
             # {f} sticks to the object, one tip radius behind its side.
             origin = T_base_sensor[:2, :3] @ T_s_f[:3, 3] + T_base_sensor[:2, 3]
@@ -254,19 +375,29 @@ class PredictivePush:
             depth_m = max(0.0, -float(T_s_f[:3, 2] @ T_s_f[:3, 3]))
             behind = Pose(float(T_base_sensor[0, 3]), float(T_base_sensor[1, 3]), heading).ahead(-depth_m)
         contact = behind.ahead(settings.tip_radius_m)
-        if (resting := self._resting) is not None:
-            offset_m = contact.local((resting.x, resting.y))[1]
-            self._estimator.move_contact(offset_m, self._estimator.offset_sigma_m + _TOUCHED_AGAIN_M)
-            # The path goes on from the same start.
-            self._start_offset_m += offset_m - self._known_offset_m
-            self._resting = None
-        elif self._latest is None and (offset_m := self._expected_offset_m(heading)):
-            self._estimator.move_contact(offset_m, _EXPECTED_M)
-        self._estimator.update(Contact(contact.x, contact.y, heading))
-        model = self._estimator.model
-        self._known_offset_m = model.offset_m
-        self._latest = contact.ahead(model.reach_m).ahead(model.offset_m, 0.5 * math.pi)
-        return self._latest
+        if self._resting is not None:
+            self._touch_again(contact, *self._resting)
+            self._resting = self.located = None
+        elif self._contact is None and (middle_m := self._expected_offset_m(heading)):
+            estimator.move_contact(middle_m, _EXPECTED_M)
+        self._contact = Contact(contact.x, contact.y, heading)
+        estimator.update(self._contact)
+        model = estimator.model
+        ahead = contact.ahead(model.reach_m)
+        self._middle = ahead.ahead(model.middle_m or 0.0, 0.5 * math.pi)
+        return ahead.ahead(model.offset_m, 0.5 * math.pi), self._middle
+
+    def _touch_again(self, contact: Pose, middle: Pose, sigma_m: float) -> None:
+        """Know where the middle is beside a new contact, of an object that has rested meanwhile."""
+        turned = math.remainder(contact.heading - middle.heading, 2.0 * math.pi)
+        if self._has_edge and abs(turned) > _SIDE_SIGMA_RAD and self._searches < _MOST_SEARCHES:
+            # What was touched at first was an edge, or the object has turned.
+            self._must_place = True
+        middle_m, sigma_m = contact.local((middle.x, middle.y))[1], math.hypot(sigma_m, _TOUCHED_AGAIN_M)
+        if not self._settings.flat:
+            middle_m = sigma_m = 0.0
+        self._start_middle_m += middle_m - (self._estimator.model.middle_m or 0.0)
+        self._estimator.move_contact(middle_m, sigma_m, keep_eccentricity=self._sidesteps > 0)
 
     def _planned(self, center: Pose, along_m: float) -> Plan:
         assert self._path is not None
@@ -299,10 +430,17 @@ class PredictivePush:
         return {
             "center_offset_mm": 1e3 * model.offset_m,
             "center_offset_sigma_mm": 1e3 * self._estimator.offset_sigma_m,
+            "middle_mm": 1e3 * (model.middle_m or 0.0),
+            "middle_sigma_mm": 1e3 * self._estimator.middle_sigma_m,
             "friction_radius_mm": 1e3 * math.sqrt(model.lever_m2),
             "curvature_per_m": self._plan.curvature,
             "push_mm_s": 1e3 * self._speed_m_s,
         }
+
+
+def _tip_behind(T_base_sensor: Array, heading: float, distance_m: float) -> Pose:
+    """Return the tip's centre moved back by a distance against a heading."""
+    return Pose(float(T_base_sensor[0, 3]), float(T_base_sensor[1, 3]), heading).ahead(-distance_m)
 
 
 def twist_in_sensor(ahead_m_s: float, left_m_s: float, turn_rad_s: float, y_is_left: float) -> Array:

@@ -23,6 +23,8 @@ ARM: Final = "arm"
 """Role of the arm in tasks with one arm."""
 SENSOR: Final = "sensor"
 """Role of the tactile sensor that it carries."""
+_SIDESTEP_S: Final = 30.0
+"""Longest motion beside an object; six touches of an edge take 15 s."""
 _RETURN_S: Final = 10.0
 """Longest return to where a contact was lost; the way is that of a few frames."""
 
@@ -38,10 +40,6 @@ class _Preparation(Enum):
     BACK_OFF = auto()
     STAND = auto()
     READY = auto()
-
-
-_CLEAR_M: Final = 0.008
-"""Distance by which a sensor lets go of an object before it steps aside."""
 
 
 class ServoConfig(ContactServoConfig):
@@ -61,6 +59,7 @@ class ServoConfig(ContactServoConfig):
         settle_timeout_s: settling fails when it takes longer.
         retract_mm: distance to withdraw at the end.
         retract_speed_mm_s: speed of that.
+        sidestep_speed_mm_s: speed beside an object that is to be touched elsewhere.
         return_lift_mm: before a contact that was lost while the behavior ran is searched for again, the sensor returns
             to where it was last felt, less deep by this much; none searches from where the sensor is.
         max_reapproach: number of times that a lost contact is searched for again.
@@ -79,6 +78,7 @@ class ServoConfig(ContactServoConfig):
     settle_timeout_s: PositiveFloat = 10.0
     retract_mm: PositiveFloat = 20.0
     retract_speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
+    sidestep_speed_mm_s: Annotated[PositiveFloat, SPEED] = 40.0
     return_lift_mm: PositiveFloat | None = None
     max_reapproach: NonNegativeInt = 2
     stale_timeout_s: PositiveFloat = 0.5
@@ -128,7 +128,7 @@ def servo_table(
             StateDef(s.SETTLE, config.settle_timeout_s, "timeout", on_enter="start_settle"),
             StateDef(s.RUN, run_timeout_s, "timeout", on_enter="start_run"),
             StateDef(s.RETURN, _RETURN_S, "timeout", on_enter="start_return"),
-            *((StateDef(s.SIDESTEP, config.settle_timeout_s, "timeout", on_enter="start_sidestep"),) * sidesteps),
+            *((StateDef(s.SIDESTEP, _SIDESTEP_S, "timeout", on_enter="start_sidestep"),) * sidesteps),
             StateDef(s.RETRACT, retract_s, "timeout", on_enter="start_retract"),
             StateDef(s.DONE, terminal=True),
             StateDef(s.STOPPED, terminal=True),
@@ -186,13 +186,17 @@ class ServoTask(MachineTask):
         config: parameters of its state machine.
         context: of the cell.
         servos: the contact servos. With several, telemetry names begin with the sensor's role.
+        shears: see ``SensorCheck``.
 
     Raises:
         TaskDefinitionError: the table is invalid.
     """
 
-    def __init__(self, name: str, config: ServoConfig, context: TaskContext, *servos: ContactServo) -> None:
+    def __init__(
+        self, name: str, config: ServoConfig, context: TaskContext, *servos: ContactServo, shears: bool = True
+    ) -> None:
         self._config = config
+        self._shears = shears
         self._period_s = 1.0 / context.rate_hz
         self._servos = servos
         timeout_s = min(servo.run.timeout_s for servo in servos)
@@ -270,7 +274,13 @@ class ServoTask(MachineTask):
         """On entry: begin the motion of the first sensor."""
         c = self._config
         self._checks = [
-            SensorCheck(c.check_s, press_mm=c.check_press_mm, shift_mm=c.check_shift_mm, tilt_deg=c.check_tilt_deg)
+            SensorCheck(
+                c.check_s,
+                press_mm=c.check_press_mm,
+                shift_mm=c.check_shift_mm,
+                tilt_deg=c.check_tilt_deg,
+                shears=self._shears,
+            )
             for _ in self._servos
         ]
         self._blind_s = 0.0
@@ -290,7 +300,7 @@ class ServoTask(MachineTask):
         """On entry: plan the step aside of the servos that asked for one; the others hold their contact."""
         self._blind_s = 0.0
         for servo in self._servos:
-            servo.start_sidestep(_CLEAR_M)
+            servo.start_sidestep()
 
     def start_retract(self, record: TransitionRecord) -> None:
         """On entry: measure the travelled distance from here, unless a stop only confirms a retraction under way."""
@@ -322,7 +332,7 @@ class ServoTask(MachineTask):
                 self._watch_check()
             case ServoState.SETTLE:
                 self._watch_contact(dt_s)
-                steady = all(servo.steady() for servo in servos)
+                steady = all(servo.only_touches or servo.steady() for servo in servos)
                 self._steady_s = self._steady_s + dt_s if steady else 0.0
                 if steady and self._steady_s >= self._config.settle_time_s:
                     self._post("settled")
@@ -336,14 +346,14 @@ class ServoTask(MachineTask):
                         self._post("missed", missed)
                     else:
                         self._post("finished")
-                elif any(isinstance(s.run, Sidestepping) and s.run.sidestep_m is not None for s in servos):
-                    self._post("aside", "the object is pushed beside its centre")
+                elif any(isinstance(s.run, Sidestepping) and s.run.wants_sidestep for s in servos):
+                    self._post("aside", "the object is to be touched elsewhere")
             case ServoState.RETURN:
                 self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in servos))
                 if all(servo.is_back() for servo in servos):
                     self._post("returned")
             case ServoState.SIDESTEP:
-                self._watch_sight(dt_s, blind=any(servo.T_base_sensor is None for servo in servos))
+                self._watch_sight(dt_s, blind=not all(servo.has_fresh_data for servo in servos))
                 if not any(servo.sidestepping for servo in servos):
                     self._post("placed")
             case ServoState.RETRACT:
@@ -444,15 +454,9 @@ class ServoTask(MachineTask):
             backing = self._prepared is _Preparation.BACK_OFF and all(servo.has_fresh_data for servo in self._servos)
             return [(servo, servo.along_z(speed_m_s)) for servo in self._servos if backing and servo.has_zero]
         if state is ServoState.SIDESTEP:
-            if any(servo.T_base_sensor is None for servo in self._servos):
+            if not all(servo.has_fresh_data for servo in self._servos):
                 return []
-            speed_m_s = 1e-3 * self._config.retract_speed_mm_s
-            return [
-                (servo, V)
-                for servo in self._servos
-                if (V := servo.step_aside(speed_m_s) if servo.sidestepping else servo.servo_step(np.zeros(6)))
-                is not None
-            ]
+            return [(servo, V) for servo in self._servos if (V := self._aside(servo)) is not None]
         if state not in (ServoState.APPROACH, ServoState.SETTLE, ServoState.RUN):
             return []
         searching = state is ServoState.APPROACH
@@ -465,7 +469,7 @@ class ServoTask(MachineTask):
             V_tcp: Array | None
             if searching and not servo.touches:
                 V_tcp = servo.along_z(1e-3 * self._config.approach_speed_mm_s)
-            elif searching and self._unchecked and servo.is_estimated:
+            elif (searching and self._unchecked and servo.is_estimated) or servo.only_touches:
                 V_tcp = None
             else:
                 running = state is ServoState.RUN
@@ -473,6 +477,13 @@ class ServoTask(MachineTask):
             if V_tcp is not None:
                 twists.append((servo, V_tcp))
         return twists
+
+    def _aside(self, servo: ContactServo) -> Array | None:
+        """Return the twist (6,) of a tool whose servo steps aside, or holds its contact while another one does."""
+        if not servo.sidestepping:
+            return servo.servo_step(np.zeros(6))
+        c = self._config
+        return servo.step_aside(1e-3 * c.sidestep_speed_mm_s, 1e-3 * c.approach_speed_mm_s)
 
     def _check_twists(self) -> list[tuple[ContactServo, Array]]:
         if not all(servo.has_fresh_data and servo.T_s_f is not None for servo in self._servos):

@@ -11,15 +11,17 @@ from pydantic import NonNegativeFloat, PositiveFloat, model_validator
 
 from touchcell.control.alignment import Aim, AlignmentGains, TargetAlignment
 from touchcell.control.path import Point
-from touchcell.control.push_model import Motion
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import ContactServoConfig, Six, SixGains
+from touchcell.tasks.free_motion import Goal
 from touchcell.tasks.interface import SPEED
 from touchcell.tasks.predictive_push import PredictivePush, PredictivePushSettings, Progress, twist_in_sensor
 from touchcell.tasks.push_path import Obstacle, plan
 from touchcell.tasks.servoing import ServoConfig, one_arm_task
 
 Mm = tuple[float, float]
+_SIGMAS = 2.0
+"""Standard deviations of the object's place that have to lie within the tolerance."""
 
 
 class PushConfig(ContactServoConfig):
@@ -57,10 +59,13 @@ class PushConfig(ContactServoConfig):
         contact_friction: slope of the friction cone between skin and object that steering may use.
         recontact_mm: where the object is found to be pushed farther than this beside its centre, the arm lets go of it,
             steps aside and touches it again opposite its centre; none: never.
+        side_width_mm: width of the pushed side. With it, an edge of the side is felt before the push, which tells where
+            the object's middle is. Without it nothing tells that of a flat side: the centre of friction, which motion
+            tells, is taken for the middle.
         push_accel_mm_s2: acceleration at the start of a predictive push, and deceleration at its end.
         arrival_speed_mm_s: its speed where it arrives.
-        arrival_tolerance_mm: the task is done only if the object's centre, where touch and arm pose put it, ends this
-            close to the target.
+        arrival_tolerance_mm: the task is done only if the object's middle, where touch and arm pose put it, ends this
+            close to the target, with twice the standard deviation of that.
         arrival_tolerance_deg: likewise for ``goal_heading_deg``.
         max_cross_track_mm: the push is given up where the object's centre is farther than this from its path, or with
             predictive steering would pass the target at more than this, as far as friction allows to steer.
@@ -91,6 +96,7 @@ class PushConfig(ContactServoConfig):
     friction_radius_mm: PositiveFloat | None = None
     contact_friction: PositiveFloat = 0.8
     recontact_mm: PositiveFloat | None = None
+    side_width_mm: PositiveFloat | None = None
     push_accel_mm_s2: PositiveFloat = 200.0
     max_speed_mm_s: PositiveFloat = 140.0
     max_turn_deg_s: PositiveFloat = 25.0
@@ -112,8 +118,8 @@ class PushConfig(ContactServoConfig):
         )
         return TargetAlignment(self.route, gains)
 
-    def predictive(self) -> PredictivePush:
-        """Return the predictive steering, in SI units."""
+    def predictive(self, *, followed: bool = False) -> PredictivePush:
+        """Return the predictive steering, in SI units; ``followed`` where a follower presses, too."""
         lead_mm = self.object_center_offset_mm
         radius_mm = self.friction_radius_mm or 0.75 * (lead_mm - self.tip_radius_mm)
         settings = PredictivePushSettings(
@@ -130,6 +136,8 @@ class PushConfig(ContactServoConfig):
             look_ahead_m=1e-3 * self.look_ahead_mm,
             goal_heading_rad=None if self.goal_heading_deg is None else math.radians(self.goal_heading_deg),
             recontact_m=None if self.recontact_mm is None else 1e-3 * self.recontact_mm,
+            side_width_m=None if self.side_width_mm is None else 1e-3 * self.side_width_mm,
+            followed=followed,
         )
         return PredictivePush(settings, self.route, has_waypoints=bool(self.path_mm or self.obstacles_mm))
 
@@ -166,17 +174,17 @@ class SingleArmPushingConfig(PushConfig, ServoConfig):
 class Push:
     """Behavior of pushing: along the contact normal, steered to the target, until it is reached."""
 
-    def __init__(self, config: PushConfig) -> None:
+    def __init__(self, config: PushConfig, *, followed: bool = False) -> None:
         self._speed_m_s = 1e-3 * config.push_speed_mm_s
         self._timeout_s = config.push_timeout_s
         self._alignment = config.alignment()
-        self._predictive = config.predictive() if config.steering == "predictive" else None
+        self._predictive = config.predictive(followed=followed) if config.steering == "predictive" else None
         self._goal_heading_deg = config.goal_heading_deg
         self._tolerance_m, self._tolerance_deg = 1e-3 * config.arrival_tolerance_mm, config.arrival_tolerance_deg
         self._max_cross_track_m = 1e-3 * config.max_cross_track_mm
         self._lead_m = 1e-3 * config.object_center_offset_mm
         self._aim: Aim | None = None
-        self._miss_m = 0.0
+        self._miss_m = self._sigma_m = 0.0
         self._left_m_s = 0.0
         self._y_is_left = 1.0
 
@@ -186,9 +194,9 @@ class Push:
         return self._left_m_s
 
     @property
-    def object_motion(self) -> Motion | None:
-        """Motion of the object that predictive steering feeds forward; None with another steering."""
-        return None if self._predictive is None else self._predictive.motion
+    def predictive(self) -> PredictivePush | None:
+        """Predictive steering; None with another one."""
+        return self._predictive
 
     @property
     def may_sidestep(self) -> bool:
@@ -196,19 +204,28 @@ class Push:
         return self._predictive is not None and self._predictive.may_sidestep
 
     @property
-    def sidestep_m(self) -> float | None:
-        """Distance to step to the left of the contact normal before the push continues; None for no step."""
-        return None if self._predictive is None else self._predictive.sidestep_m
+    def wants_sidestep(self) -> bool:
+        """True if the object should be let go and touched elsewhere."""
+        return self._predictive is not None and self._predictive.wants_sidestep
+
+    @property
+    def only_touches(self) -> bool:
+        """False: the pusher turns with the side that it touches."""
+        return False
 
     def begin_approach(self, T_base_sensor: Array) -> None:
         """Take note of the direction of the approach, in which the object is expected."""
         if self._predictive is not None:
             self._predictive.begin_approach(T_base_sensor)
 
-    def begin_sidestep(self) -> None:
+    def begin_sidestep(self, T_base_sensor: Array) -> None:
         """Let go: the object rests where it is until it is touched again."""
-        assert self._predictive is not None
-        self._predictive.move_contact()
+        if self._predictive is not None:
+            self._predictive.begin_sidestep(T_base_sensor)
+
+    def next_goal(self, T_base_sensor: Array, T_s_f: Array | None) -> Goal | None:
+        """Return where the sensor shall go next beside the object; None where it shall touch again."""
+        return None if self._predictive is None else self._predictive.next_goal(T_base_sensor, T_s_f)
 
     @property
     def feedforward(self) -> Array:
@@ -233,7 +250,7 @@ class Push:
         self._y_is_left = -float(np.sign(now[2, 0]))
         if self._predictive is not None:
             progress = self._predictive.update(dt_s, now, T_s_f)
-            self._aim, self._miss_m = _aim_of(progress), progress.miss_m
+            self._aim, self._miss_m, self._sigma_m = _aim_of(progress), progress.miss_m, progress.sigma_m
         else:
             self._aim = self._alignment.aim(now, T_s_f)
             self._left_m_s = self._alignment.step(self._aim, dt_s)
@@ -257,6 +274,11 @@ class Push:
         if aim.target_distance_m > self._tolerance_m:
             distance_mm = 1e3 * aim.target_distance_m
             return f"object {distance_mm:.1f} mm from the target, tolerance {1e3 * self._tolerance_m:g} mm"
+        if aim.target_distance_m + _SIGMAS * self._sigma_m > self._tolerance_m:
+            return (
+                f"object {1e3 * aim.target_distance_m:.1f} mm from the target by an estimate whose standard deviation "
+                f"is {1e3 * self._sigma_m:.1f} mm: it may be beyond the tolerance, {1e3 * self._tolerance_m:g} mm"
+            )
         error_deg = self._heading_error_deg(aim)
         if error_deg is not None and abs(error_deg) > self._tolerance_deg:
             return f"heading {error_deg:+.1f} deg off at the target, tolerance {self._tolerance_deg:g} deg"
@@ -264,7 +286,7 @@ class Push:
 
     def _strayed(self, aim: Aim) -> bool:
         if self._predictive is not None:
-            return self._miss_m > self._max_cross_track_m and self._predictive.sidestep_m is None
+            return self._miss_m > self._max_cross_track_m and not self._predictive.wants_sidestep
         return abs(aim.cross_track_error_m) > self._max_cross_track_m
 
     def _heading_error_deg(self, aim: Aim) -> float | None:

@@ -5,6 +5,7 @@ Either in one direction of the sensor, as in the paper, or along a planned path 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated
 
@@ -13,6 +14,7 @@ from pydantic import PositiveFloat
 
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import SixGains
+from touchcell.tasks.felt_curvature import CurvedWay
 from touchcell.tasks.interface import DEPTH, DISTANCE, SPEED
 from touchcell.tasks.servoing import ServoConfig, one_arm_task
 from touchcell.tasks.surface_path import Guide, PathConfig
@@ -28,6 +30,7 @@ class SurfaceFollowingConfig(ServoConfig):
         distance_mm: distance that the sensor travels.
         path: path to follow in place of a direction and a distance; see ``surface_path``.
         lookahead_mm: how far ahead on the path the sensor heads.
+        bend_window_mm: the curvature felt over about this last stretch turns the sensor ahead; see ``felt_curvature``.
     """
 
     depth_mm: Annotated[PositiveFloat, DEPTH] = 3.0
@@ -38,6 +41,7 @@ class SurfaceFollowingConfig(ServoConfig):
     distance_mm: Annotated[PositiveFloat, DISTANCE] = 100.0
     path: PathConfig | None = None
     lookahead_mm: PositiveFloat = 2.0
+    bend_window_mm: PositiveFloat = 8.0
     return_lift_mm: PositiveFloat | None = 3.0
 
 
@@ -47,18 +51,18 @@ class Follow:
     def __init__(self, config: SurfaceFollowingConfig) -> None:
         angle = np.radians(config.direction_deg)
         self._direction = np.array([np.cos(angle), np.sin(angle), 0.0])
-        self._feedforward = np.concatenate([1e-3 * config.speed_mm_s * self._direction, np.zeros(3)])
+        self._way = _curved_way(config)
         self._left_m = 1e-3 * config.distance_mm
-        self._timeout_s = 2.0 * config.distance_mm / config.speed_mm_s + 1.0
+        self._timeout_s = 3.0 * config.distance_mm / config.speed_mm_s + 1.0
 
     @property
     def feedforward(self) -> Array:
         """Twist (6,) in the desired sensor frame."""
-        return self._feedforward
+        return self._way.twist
 
     @property
     def timeout_s(self) -> float:
-        """Twice the nominal duration, plus one second."""
+        """Three times the nominal duration, for bends, plus one second."""
         return self._timeout_s
 
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
@@ -66,6 +70,7 @@ class Follow:
 
         Noise and corrections in other directions do not count.
         """
+        self._way.update(self._direction, now, T_s_f)
         self._left_m -= float(self._direction @ now[:3, :3].T @ (now[:3, 3] - before[:3, 3]))
         return self._left_m <= 0.0
 
@@ -74,8 +79,8 @@ class Follow:
         return ""
 
     def telemetry(self) -> Mapping[str, float]:
-        """Return no further telemetry."""
-        return {}
+        """Return the speed, which falls in bends."""
+        return {"speed_mm_s": 1e3 * self._way.speed_m_s}
 
 
 class FollowPath:
@@ -83,24 +88,23 @@ class FollowPath:
 
     def __init__(self, config: SurfaceFollowingConfig, path: PathConfig) -> None:
         self._guide = Guide(path.points(), 1e-3 * config.lookahead_mm)
-        self._speed_m_s = 1e-3 * config.speed_mm_s
-        self._feedforward = np.zeros(6)
-        # A path over a surface is longer than in its plane: up to three times where it is steep.
-        self._timeout_s = 3.0 * self._guide.length_m / self._speed_m_s + 5.0
+        self._way = _curved_way(config)
+        # A path over a surface is longer than in its plane, and slower where it bends.
+        self._timeout_s = 6e3 * self._guide.length_m / config.speed_mm_s + 5.0
 
     @property
     def feedforward(self) -> Array:
         """Twist (6,) in the desired sensor frame."""
-        return self._feedforward
+        return self._way.twist
 
     @property
     def timeout_s(self) -> float:
-        """Three times the duration on a plane, plus five seconds."""
+        """Six times the duration on a plane, plus five seconds."""
         return self._timeout_s
 
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:
         """Head for the next point of the path; return True at its end."""
-        self._feedforward = np.concatenate([self._speed_m_s * self._guide.direction(now), np.zeros(3)])
+        self._way.update(self._guide.direction(now), now, T_s_f)
         return self._guide.along_m >= self._guide.length_m
 
     def shortfall(self) -> str:
@@ -108,11 +112,17 @@ class FollowPath:
         return ""
 
     def telemetry(self) -> Mapping[str, float]:
-        """Return how much of the path is left, and how far beside it the sensor is."""
+        """Return how much of the path is left, how far beside it the sensor is, and its speed, which falls in bends."""
         return {
+            "speed_mm_s": 1e3 * self._way.speed_m_s,
             "path_left_mm": 1e3 * max(self._guide.length_m - self._guide.along_m, 0.0),
             "cross_track_error_mm": 1e3 * self._guide.cross_track_error_m,
         }
+
+
+def _curved_way(config: SurfaceFollowingConfig) -> CurvedWay:
+    fastest_rad_s = math.radians(config.max_turn_deg_s)
+    return CurvedWay(1e-3 * config.speed_mm_s, fastest_rad_s, 1e-3 * config.bend_window_mm)
 
 
 def _behavior(config: SurfaceFollowingConfig) -> Follow | FollowPath:

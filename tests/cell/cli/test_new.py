@@ -197,3 +197,29 @@ def test_a_name_that_cannot_be_is_refused(
     (tmp_path / "there" / "tests").mkdir(parents=True)
     assert main(["new", *words]) == EXIT_BAD_INPUT
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("shipped", ["surface_mesh_sim.yaml", "steps_bench.yaml"])
+def test_a_copied_cell_is_as_valid_as_the_one_that_ships(
+    shipped: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["new", "cell", "mine", "--from", shipped, "--out", str(tmp_path)]) == EXIT_OK
+    assert (tmp_path / "mine.yaml").read_bytes() == (REPOSITORY / "configs" / shipped).read_bytes()
+    assert f"touchcell check {tmp_path / 'mine.yaml'}" in capsys.readouterr().out
+    assert main(["check", str(tmp_path / "mine.yaml"), "--on", "sim"]) == EXIT_OK
+
+
+def test_no_file_is_overwritten_by_a_new_cell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine.yaml").write_text("mine")
+    assert main(["new", "cell", "mine.yaml", "--out", str(tmp_path)]) == EXIT_BAD_INPUT
+    assert (tmp_path / "mine.yaml").read_text() == "mine"
+    assert "is there already" in capsys.readouterr().err
+
+
+def test_a_cell_that_does_not_ship_is_named_with_the_likely_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["new", "cell", "mine", "--from", "colect_sim", "--out", str(tmp_path)]) == EXIT_BAD_INPUT
+    assert "did you mean 'collect_sim.yaml'?" in capsys.readouterr().err
+    assert main(["new", "task", "mine", "--from", "collect_sim.yaml", "--out", str(tmp_path)]) == EXIT_BAD_INPUT
+    assert list(tmp_path.iterdir()) == []

@@ -40,6 +40,11 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         help="sim: simulated devices in place of real ones; emulated: real drivers on emulators that start by "
         "themselves; bench: nothing simulated (default: as the file is written)",
     )
+    add_set(parser)
+
+
+def add_set(parser: argparse.ArgumentParser) -> None:
+    """``--set``: values in place of the cell file's own."""
     parser.add_argument(
         "--set",
         action="append",
@@ -69,6 +74,17 @@ def positive(text: str) -> int:
 def whole(text: str) -> int:
     """A whole number of 0 or more."""
     return 0 if text == "0" else positive_or(text, "must be a whole number of 0 or more")
+
+
+def speed(text: str) -> float:
+    """A speed above 0, at most 250: what ISO 10218-1 allows beside a person."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = 0.0
+    if not 0.0 < number <= 250.0:
+        raise argparse.ArgumentTypeError(f"must be above 0 and at most 250, not {text!r}")
+    return number
 
 
 def positive_or(text: str, message: str) -> int:

@@ -10,23 +10,24 @@ import itertools
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from touchcell.drivers.replay.dataset import Split, read_image, read_split
 from touchcell.geometry.types import Array
 from touchcell.perception.calibration.marked_data import MarkedContacts, SensorMarkers, evenly, learn_sensor
+from touchcell.progress import shown_progress
 from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.tip_file import TipFile, save_tip
 from touchcell.simulation.tip_fit import Sensor, fit_tip
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    pass
 
 DEPTHS_MM = (0.0, 1.5, 2.5, 3.5, 4.5, 10.0)
 _HELD_OUT = 200
@@ -80,21 +81,20 @@ def calibrate_sim(
     """
     console = Console(width=None if sys.stdout.isatty() else 120)
     training = read_split(data, "train")
-    with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
-        told = _teller(bar)
-        markers = learn_sensor(data, images=images, rings=rings, guess_steps=guess_steps, seed=seed, progress=told)
+    with shown_progress() as show:
+        markers = learn_sensor(data, images=images, rings=rings, guess_steps=guess_steps, seed=seed, progress=show)
         chosen = evenly(len(training.images), frames)
         rest = np.setdiff1d(np.arange(len(training.images)), chosen)
         others = rest[evenly(len(rest), _HELD_OUT)]
-        contacts, fitted_to = markers.contacts(training, np.array(chosen), told)
-        sensor = fit_tip(contacts, markers.reference, rings, progress=lambda done, total: told("fitted", done, total))
+        contacts, fitted_to = markers.contacts(training, np.array(chosen), show)
+        sensor = fit_tip(contacts, markers.reference, rings, progress=partial(show, "fitted"))
         sensor = replace(sensor, tip=replace(sensor.tip, disc_radius_px=markers.disc_radius_px))
-        held_out, shown = markers.contacts(training, others, told)
+        held_out, shown = markers.contacts(training, others, show)
         sets = {"fitted to": contacts, "train, held out": held_out}
         if (data / "val").is_dir():
             validation = read_split(data, "val")
             some = np.array(evenly(len(validation.images), _HELD_OUT))
-            sets["val, held out"] = markers.contacts(validation, some, told)[0]
+            sets["val, held out"] = markers.contacts(validation, some, show)[0]
     found = {name: marker_errors(sensor, each, markers.reference) for name, each in sets.items()}
     measured: dict[str, str | int | float | dict[str, float]] = {
         "command": f"touchcell calibrate-sim --frames {frames} --images {images} --seed {seed}",
@@ -168,14 +168,3 @@ def _write_picture(
         x, y, z, alpha, beta, gamma = split.contact_mm_deg[numbers[column]]
         titles.append(f"z {z:.1f}, shear {x:.1f} {y:.1f} mm\ntilt {alpha:.0f} {beta:.0f}, twist {gamma:.0f} deg")
     write_comparison(path, real, simulated, measured, predicted, titles)
-
-
-def _teller(bar: Progress) -> Callable[[str, int, int], None]:
-    tasks = {}
-
-    def told(what: str, done: int, total: int) -> None:
-        if what not in tasks:
-            tasks[what] = bar.add_task(what, total=total)
-        bar.update(tasks[what], completed=done, total=total)
-
-    return told

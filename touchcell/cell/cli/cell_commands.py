@@ -1,4 +1,4 @@
-"""``run`` and ``check``: cell files."""
+"""``run``, ``jog`` and ``check``: cell files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from touchcell.cell.cli.arguments import Subparsers, add_cell, add_command, add_settings, port
+from touchcell.cell.cli.arguments import Subparsers, add_cell, add_command, add_settings, port, speed
 from touchcell.cell.cli.exit_codes import EXIT_OK
 from touchcell.cell.config.find import find_cell
 
@@ -23,19 +23,25 @@ def add_parser(commands: Subparsers) -> None:
     run.add_argument("--model", metavar="FILE", help="model file in place of the one that the cell names")
     run.add_argument("--out", type=Path, metavar="FOLDER", help="run folder (default: runs/NAME-TIME)")
     run.add_argument("--animate", action="store_true", help="also write animation.gif, of a simulated run")
-    run.add_argument(
-        "--live",
-        action="store_true",
-        help="serve what is recorded to Foxglove on this machine while it runs: ws://127.0.0.1:PORT",
-    )
-    run.add_argument(
-        "--live-port",
-        type=port,
-        default=8765,
-        metavar="PORT",
-        help="of --live, 0 for any free one (default: %(default)s)",
-    )
+    _add_live(run)
+    run.add_argument("--ui", action="store_true", help="serve the operator's page while it runs, as `ui` does")
     run.add_argument("--quiet", action="store_true", help="show no live progress line")
+
+    jog = add_command(commands, "jog", _jog, "move a cell's arms by hand, and save poses into its file")
+    add_cell(jog)
+    add_settings(jog)
+    jog.add_argument(
+        "--speed", type=speed, default=50.0, metavar="MM_S", help="largest speed, in mm/s (default: %(default)g)"
+    )
+    jog.add_argument(
+        "--turn",
+        type=speed,
+        default=17.0,
+        metavar="DEG_S",
+        help="largest rate, in deg/s (default: %(default)g)",
+    )
+    jog.add_argument("--out", type=Path, metavar="FOLDER", help="run folder (default: runs/NAME-TIME)")
+    _add_live(jog)
 
     check = add_command(commands, "check", _check, "validate a cell file without connecting anything")
     add_cell(check)
@@ -43,6 +49,36 @@ def add_parser(commands: Subparsers) -> None:
     check.add_argument("--data", type=Path, metavar="DIR", help="data set folder that the run will be given")
     check.add_argument(
         "--explain", action="store_true", help="print the merged file, with the file and line each value comes from"
+    )
+
+
+def _add_live(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--live",
+        action="store_true",
+        help="serve what is recorded to Foxglove on this machine while it runs: ws://127.0.0.1:PORT",
+    )
+    parser.add_argument(
+        "--live-port",
+        type=port,
+        default=8765,
+        metavar="PORT",
+        help="of --live, 0 for any free one (default: %(default)s)",
+    )
+
+
+def _jog(options: argparse.Namespace) -> int:
+    from touchcell.cell.cli.jog import jog_cell
+    from touchcell.cell.config.settings import parse_settings
+
+    return jog_cell(
+        find_cell(options.cell),
+        world=options.world,
+        settings=parse_settings(options.settings),
+        speed_mm_s=options.speed,
+        turn_deg_s=options.turn,
+        out=options.out,
+        live_port=options.live_port if options.live else None,
     )
 
 
@@ -60,6 +96,7 @@ def _run(options: argparse.Namespace) -> int:
         live=not options.quiet and sys.stdout.isatty(),
         moving=options.animate,
         live_port=options.live_port if options.live else None,
+        page_port=0 if options.ui else None,
     )
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
+from functools import partial
 from pathlib import Path
 
 from touchcell.cell.cli.arguments import Subparsers, add_command, positive, whole
 from touchcell.cell.cli.exit_codes import EXIT_OK, EXIT_TASK_FAILED
 from touchcell.cell.cli.workers import add_workers, workers_of
 from touchcell.cell.config.find import find_cell
+from touchcell.progress import shown_progress
 
 _SIMULATED_KINDS = ("gdn", "cnn", "markers")
 _TRAINING_LIMIT_S = 86_400
@@ -81,6 +82,12 @@ def _add_training(commands: Subparsers) -> None:
     train_sim.add_argument("--processed", action="store_true", help="for images as the public data have them")
     train_sim.add_argument(
         "--feature", choices=("surface", "edge"), default="surface", help="what is touched (default: %(default)s)"
+    )
+    train_sim.add_argument(
+        "--feels",
+        choices=("plane", "shape"),
+        default="plane",
+        help="surfaces to press on: planes, or such as bend (default: %(default)s)",
     )
     train_sim.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
     _add_seed(train_sim)
@@ -179,9 +186,7 @@ def _train_many(options: argparse.Namespace, settings: dict[str, object]) -> int
 
     seeds = [options.seed] if options.seeds is None else grid_values("--seeds", options.seeds)
     wanted = trainings(options.kind, [path.absolute() for path in options.data], seeds, settings)
-    done = train_all(
-        wanted, options.out, workers=workers_of(options), executor=options.executor, live=sys.stdout.isatty()
-    )
+    done = train_all(wanted, options.out, workers=workers_of(options), executor=options.executor, live=True)
     text = trainings_table(done)
     print(text)
     (options.out / "summary.txt").write_text(text + "\n")
@@ -200,6 +205,7 @@ def _train_sim(options: argparse.Namespace) -> int:
         epochs=options.epochs,
         seed=options.seed,
         feature=options.feature,
+        feels=options.feels,
     )
     return EXIT_OK
 
@@ -273,19 +279,16 @@ def _adapt(options: argparse.Namespace) -> int:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    from rich.progress import Progress
-
     from touchcell.perception.networks.evaluate import evaluate, print_table
 
-    with Progress(transient=True, disable=not sys.stdout.isatty()) as bar:
-        images = bar.add_task("images", total=None)
+    with shown_progress() as show:
         result = evaluate(
             options.data,
             options.split,
             options.model,
             calibration=options.calibration,
             deeper_than_mm=options.deeper_than,
-            progress=lambda done, total: bar.update(images, completed=done, total=total),
+            progress=partial(show, "images"),
         )
     print_table(result)
     if options.json is not None:

@@ -15,6 +15,7 @@ from touchcell.cell.cli import (
     learning_commands,
     measuring_commands,
     plugin_commands,
+    replay_command,
     run_commands,
 )
 from touchcell.cell.cli.arguments import Subparsers
@@ -27,6 +28,7 @@ from touchcell.logs import log_to_terminal
 _GROUPS: Final = (
     cell_commands,
     run_commands,
+    replay_command,
     device_commands,
     plugin_commands,
     learning_commands,

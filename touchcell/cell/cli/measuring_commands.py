@@ -94,7 +94,6 @@ def _experiment(options: argparse.Namespace) -> int:
     for experiment in experiments:
         folder = options.out / experiment.name
         try:
-            live = sys.stdout.isatty()
             result = run_experiment(
                 experiment,
                 folder,
@@ -102,7 +101,7 @@ def _experiment(options: argparse.Namespace) -> int:
                 workers=workers_of(options),
                 executor=options.executor,
                 keep_stale=options.keep_stale,
-                live=live,
+                live=True,
             )
         except KeyboardInterrupt:
             print(f"touchcell: what has finished is kept in {folder}; the same command goes on", file=sys.stderr)
@@ -137,12 +136,11 @@ def _sweep(options: argparse.Namespace) -> int:
     factors = make_factors({} if searching else grid, sample, options.samples or section.samples, section.seed)
     measures = tuple(options.measure) or section.measures
     sweep = Sweep(cell, factors, measures, settings=parse_settings(options.set))
-    live = sys.stdout.isatty()
     try:
         if searching:
-            return _search(options, sweep, folder, live)
+            return _search(options, sweep, folder)
         result = run_sweep(
-            sweep, folder, workers=workers, executor=options.executor, keep_stale=options.keep_stale, live=live
+            sweep, folder, workers=workers, executor=options.executor, keep_stale=options.keep_stale, live=True
         )
     except KeyboardInterrupt:
         print(f"touchcell: what has finished is kept in {folder}; the same command goes on", file=sys.stderr)
@@ -151,7 +149,7 @@ def _sweep(options: argparse.Namespace) -> int:
     return EXIT_OK if result.complete else EXIT_TASK_FAILED
 
 
-def _search(options: argparse.Namespace, sweep: Sweep, folder: Path, live: bool) -> int:
+def _search(options: argparse.Namespace, sweep: Sweep, folder: Path) -> int:
     from touchcell.cell.sweeps.factors import Distribution
     from touchcell.cell.sweeps.search import search
 
@@ -166,7 +164,7 @@ def _search(options: argparse.Namespace, sweep: Sweep, folder: Path, live: bool)
         folder,
         workers=workers_of(options),
         executor=options.executor,
-        live=live,
+        live=True,
     )
     if found.best is None:
         print(f"none of {len(found.finished)} trials ended as done: {found.finished[-1].reason}")

@@ -1,4 +1,4 @@
-"""``list``, ``describe``, ``schema``: what is installed; ``new``: a package of one's own."""
+"""``list``, ``describe``, ``schema``: what is installed; ``new``: a cell file or package of one's own."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from pathlib import Path
 
 from touchcell.cell.cli.arguments import Subparsers, add_command
 from touchcell.cell.cli.exit_codes import EXIT_OK
+from touchcell.errors import ConfigError
 
 _INDENT = " " * 6
-_KINDS = ("driver", "camera", "task", "interlock", "estimator", "hil")
+_KINDS = ("cell", "driver", "camera", "task", "interlock", "estimator", "hil")
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -24,14 +25,23 @@ def add_parser(commands: Subparsers) -> None:
 
     add_command(commands, "schema", _schema, "print a JSON Schema of cell files, for editors")
 
-    new = add_command(commands, "new", _new, "write a package for a plug-in, or the tests of a cell")
+    new = add_command(commands, "new", _new, "write a cell file, a package for a plug-in, or the tests of a cell")
     new.add_argument(
         "kind", choices=_KINDS, help="what to make; a driver is that of an arm, hil the tests of a cell file"
     )
     new.add_argument(
-        "name", metavar="NAME", help="of the package and of the plug-in, such as my_arm; for hil the cell file"
+        "name",
+        metavar="NAME",
+        help="of the package and of the plug-in, such as my_arm; for hil the cell file, for cell the new one",
     )
     new.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder to put it in (default: this one)")
+    new.add_argument(
+        "--from",
+        dest="source",
+        metavar="CELL",
+        help="for cell: the cell file to copy, or the name of one that ships, as `touchcell list` has them "
+        "(default: surface_follow_sim.yaml)",
+    )
 
 
 def _list(options: argparse.Namespace) -> int:
@@ -66,6 +76,10 @@ def _describe(options: argparse.Namespace) -> int:
 
 
 def _new(options: argparse.Namespace) -> int:
+    if options.source is not None and options.kind != "cell":
+        raise ConfigError("is for `new cell` only", key="--from", value=options.source)
+    if options.kind == "cell":
+        return _new_cell(options)
     if options.kind == "hil":
         return _new_hil(options)
     from touchcell.cell.cli.scaffold import new
@@ -75,6 +89,16 @@ def _new(options: argparse.Namespace) -> int:
         print(file)
     package = files[0].parent
     print(f"next: pip install -e {package}, then pytest {package}, and fill in {options.name}.py until it is green")
+    return EXIT_OK
+
+
+def _new_cell(options: argparse.Namespace) -> int:
+    from touchcell.cell.cli.new_cell import new_cell
+
+    files = new_cell(options.name, options.source, options.out)
+    for file in files:
+        print(file)
+    print(f"next: edit it, then touchcell check {files[0]}")
     return EXIT_OK
 
 

@@ -9,9 +9,10 @@ import logging
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from touchcell.cell.analysis.report import write_report
 from touchcell.cell.cli.exit_codes import EXIT_DEVICE_LOST, EXIT_OK, EXIT_TASK_FAILED, EXIT_TRIPPED
@@ -35,6 +36,7 @@ from touchcell.cell.runtime.stop_request import StopRequest
 from touchcell.cell.runtime.worlds import cell_in_world
 from touchcell.drivers.core.clock import VirtualClock
 from touchcell.drivers.core.errors import DeviceError
+from touchcell.drivers.core.jog import JogInput
 from touchcell.errors import TouchcellError
 from touchcell.logs import log_to_file
 
@@ -88,6 +90,7 @@ def run_cell(
     live: bool = True,
     moving: bool = False,
     live_port: int | None = None,
+    page_port: int | None = None,
 ) -> int:
     """Run a cell file to its end and report; returns the exit code.
 
@@ -101,6 +104,7 @@ def run_cell(
         live: show a progress line.
         moving: also make the animation of a simulated run.
         live_port: of a server for Foxglove on this machine; None serves nothing.
+        page_port: of the operator's page on this machine; None serves none.
 
     Raises:
         ConfigError, ModelError, RunFolderError, ConnectError: before anything moves.
@@ -109,7 +113,13 @@ def run_cell(
     with cell_in_world(path, world, overrides, model=model, settings=settings) as plan:
         for note in plan.notes:
             say(f"on {world}: {note}")
-        run = run_plan(plan, out=out, live=live, live_port=live_port)
+        run = run_plan(plan, out=out, live=live, live_port=live_port, page_port=page_port)
+    end_of_run(run, moving=moving)
+    return run.exit_code
+
+
+def end_of_run(run: FinishedRun, *, moving: bool = False) -> None:
+    """Show the report of a run that has ended, and how it ended."""
     if run.summary:
         say(run.summary)
     if moving:
@@ -120,11 +130,31 @@ def run_cell(
         say(f"{run.result.outcome.value}: {run.result.reason or 'no reason was given'}")
     if run.result.outcome not in (Outcome.DONE, Outcome.STOPPED):
         say(f"`touchcell why {run.folder}` explains")
-    return run.exit_code
+
+
+class RunOperator(Protocol):
+    """The operator's end of a run, in place of the keys and the line of ``touchcell run``."""
+
+    @property
+    def jog_input(self) -> JogInput | None:
+        """What an operator who moves the arms by hand asks for."""
+        ...
+
+    def attend(
+        self, cell: Cell, stop: StopRequest, channel: OperatorChannel, live: bool
+    ) -> AbstractContextManager[Callable[[Progress], None]]:
+        """Read the operator's input within the context; gives what is called after each cycle."""
+        ...
 
 
 def run_plan(
-    plan: CellPlan, *, out: Path | None = None, live: bool = False, live_port: int | None = None
+    plan: CellPlan,
+    *,
+    out: Path | None = None,
+    live: bool = False,
+    live_port: int | None = None,
+    page_port: int | None = None,
+    operator: RunOperator | None = None,
 ) -> FinishedRun:
     """Compose and run a planned cell to its end, and write its run folder.
 
@@ -133,22 +163,35 @@ def run_plan(
         out: run folder, made for this run or empty; None for ``runs/NAME-TIME``.
         live: show a progress line.
         live_port: of a server for Foxglove on this machine; None serves nothing.
+        page_port: of the operator's page on this machine; None serves none.
+        operator: see ``RunOperator``; None for the keys of ``touchcell run``.
 
     Raises:
         ConfigError, ModelError, RunFolderError, ConnectError: before anything moves.
     """
-    cell = compose(plan)
+    operator = operator or KeysAndLine()
+    cell = compose(plan, jog_input=operator.jog_input)
     trim_heap()
     with run_directory(plan.cell.name, out) as folder, _log_and_result(folder, plan) as result_file:
         logger.info("%s: task %s of %s, in %s", plan.cell.name, plan.task.name, plan.file, folder)
         try:
-            result, leaving = _run(cell, folder, live, result_file, live_port)
+            with _page(folder, page_port):
+                result, leaving = _run(cell, folder, live, result_file, live_port, operator)
         except Exception as error:
             _write_result(result_file, _not_started_json(plan, error))
             raise
         ended = f"{result.outcome.value} after {result.duration_s:.2f} s"
         logger.info("%s: %s%s", plan.cell.name, ended, f" ({result.reason})" if result.reason else "")
     return FinishedRun(result, folder, _report(folder), leaving)
+
+
+def _page(folder: Path, port: int | None) -> AbstractContextManager[None]:
+    """The operator's page, from a process of its own."""
+    if port is None:
+        return contextlib.nullcontext()
+    from touchcell.cell.ui.beside import page_beside
+
+    return page_beside(folder.absolute(), port)
 
 
 @contextlib.contextmanager
@@ -176,12 +219,17 @@ def _report(folder: Path) -> str:
 
 
 def _run(
-    cell: Cell, folder: Path, live: bool, result_file: ReservedFile, live_port: int | None
+    cell: Cell,
+    folder: Path,
+    live: bool,
+    result_file: ReservedFile,
+    live_port: int | None,
+    operator: RunOperator,
 ) -> tuple[RunResult, Exception | None]:
     """Run to the end; returns how it ended, and what was raised when the devices were given back."""
     result = None
     try:
-        with _running(cell, folder, live, result_file, live_port) as run:
+        with _running(cell, folder, live, result_file, live_port, operator) as run:
             result = run()
     except Exception as error:
         if result is None:
@@ -195,7 +243,12 @@ def _run(
 
 @contextlib.contextmanager
 def _running(
-    cell: Cell, folder: Path, live: bool, result_file: ReservedFile, live_port: int | None
+    cell: Cell,
+    folder: Path,
+    live: bool,
+    result_file: ReservedFile,
+    live_port: int | None,
+    operator: RunOperator,
 ) -> Iterator[Callable[[], RunResult]]:
     """Within reach of the operator, with everything open and all devices active; yields what runs the task."""
     stop, channel = StopRequest(), OperatorChannel(folder)
@@ -207,17 +260,14 @@ def _running(
         _served(recorder, cell, live_port),
         cell,
         stop_on_signals(stop),
-        stop_on_keys(stop, channel=channel) as look_at_keys,
-        _live_line(cell.plan, live) as show,
+        operator.attend(cell, stop, channel, live) as attend,
     ):
         cell.watchdog.note_to(folder)
         if live:
             say("\n".join(cell.watchdog.describe()))
 
         def after_cycle(progress: Progress) -> None:
-            look_at_keys()
-            if show is not None:
-                show(progress)
+            attend(progress)
             if progress.waiting and isinstance(cell.clock, VirtualClock):
                 # A person takes real time, whatever the cell's clock says.
                 time.sleep(1.0 / cell.rate_hz)
@@ -244,6 +294,26 @@ def _running(
         yield run
     if explained:
         box.discard()
+
+
+class KeysAndLine:
+    """The keys that stop, reset and resume, and the progress line."""
+
+    jog_input: JogInput | None = None
+
+    @contextlib.contextmanager
+    def attend(
+        self, cell: Cell, stop: StopRequest, channel: OperatorChannel, live: bool
+    ) -> Iterator[Callable[[Progress], None]]:
+        """Read the keys within the context; yields what is called after each cycle."""
+        with stop_on_keys(stop, channel=channel) as look_at_keys, _live_line(cell.plan, live) as show:
+
+            def after_cycle(progress: Progress) -> None:
+                look_at_keys()
+                if show is not None:
+                    show(progress)
+
+            yield after_cycle
 
 
 @contextlib.contextmanager

@@ -87,7 +87,7 @@ def _scene(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
 def _features(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
     for name in plan.sensor_roles.values():
         estimator, wanted = plan.cell.sensors[name].estimator, plan.task.feature
-        if estimator.feature != wanted:
+        if wanted is not None and estimator.feature != wanted:
             reason = f"{estimator.kind} estimates the pose of {_a(estimator.feature)}, and {plan.task.name} needs it of"
             yield file.problem(
                 ("sensors", name, "estimator", "kind"),

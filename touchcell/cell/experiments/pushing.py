@@ -29,8 +29,7 @@ _ROOM_MM = 15.0
 _TIP_MM = 20.0
 # Placement of an object: by hand where truth and belief match, and anywhere in front of the arm where truth is sampled.
 _OFFSET_MM, _TURN_DEG = 3.0, 2.0
-_SAMPLED_STARTS = {1: (20.0, 20.0), 2: (8.0, 5.0)}
-"""Largest offset (mm) and turn (deg) of an object by the number of arms: with two, it is not touched a second time."""
+_SAMPLED_OFFSET_MM, _SAMPLED_TURN_DEG = 20.0, 20.0
 
 ESTIMATORS: Mapping[str, Mapping[str, Any] | None] = {"learned": None, "true contact": {"kind": "true_contact"}}
 """Estimator sections by their name in rows; None for the cell file's own."""
@@ -70,7 +69,7 @@ def sampled_truth(mass_g: float, friction: float, sensors: Sequence[str], arms: 
         "noise": {"uniform": [1, 4]},
         "exposure": {"uniform": [0.9, 1.1]},
     }
-    offset_mm, turn_deg = _SAMPLED_STARTS[len(arms)]
+    offset_mm, turn_deg = _SAMPLED_OFFSET_MM, _SAMPLED_TURN_DEG
     arm = {"latency_ms": {"uniform": [0, 15]}, "lag_ms": {"uniform": [2, 15]}, "velocity_step_mm_s": 0.1}
     return {
         "arms": dict.fromkeys(arms, arm),
@@ -109,6 +108,7 @@ class Pushed:
         mass_g: its mass.
         reach_mm: distance from its centre to the contact.
         sides: as in the task: ``flat`` or ``round``.
+        side_mm: width of the pushed side, where it is flat.
     """
 
     name: str
@@ -116,6 +116,7 @@ class Pushed:
     mass_g: float
     reach_mm: float
     sides: str = "flat"
+    side_mm: float | None = None
 
     def taller(self, height_mm: float, mass_g: float) -> Pushed:
         """Return an object of the same outline with that height."""
@@ -124,14 +125,14 @@ class Pushed:
             tall["size_mm"] = [*tall["size_mm"][:2], height_mm]
         else:
             tall["height_mm"] = height_mm
-        return Pushed(f"tall {self.name}", tall, mass_g, self.reach_mm, self.sides)
+        return Pushed(f"tall {self.name}", tall, mass_g, self.reach_mm, self.sides, self.side_mm)
 
 
 PRISMS = (
-    Pushed("large square", {"kind": "box", "size_mm": [80, 80, _HEIGHT_MM]}, 479, 40),
+    Pushed("large square", {"kind": "box", "size_mm": [80, 80, _HEIGHT_MM]}, 479, 40, side_mm=80),
     Pushed("circular", {"kind": "cylinder", "diameter_mm": 80, "height_mm": _HEIGHT_MM}, 363, 40, "round"),
-    Pushed("small square", {"kind": "box", "size_mm": [60, 60, _HEIGHT_MM]}, 264, 30),
-    Pushed("hexagonal", {"kind": "hexagon", "width_mm": 70, "height_mm": _HEIGHT_MM}, 310, 35),
+    Pushed("small square", {"kind": "box", "size_mm": [60, 60, _HEIGHT_MM]}, 264, 30, side_mm=60),
+    Pushed("hexagonal", {"kind": "hexagon", "width_mm": 70, "height_mm": _HEIGHT_MM}, 310, 35, side_mm=40.4),
 )
 
 
@@ -160,6 +161,7 @@ class Arms:
             f"arms.{self.leader}.start_pose_mm_deg": [x_mm, 0, height_mm, 180, 0, 0],
             "task.object_center_offset_mm": pushed.reach_mm + _TIP_MM,
             "task.sides": pushed.sides,
+            "task.side_width_mm": pushed.side_mm,
         }
         if len(self.sensors) > 1:
             # The follower's base is a metre away and rotated by 180 degrees.

@@ -12,6 +12,7 @@ from touchcell.cell.experiments.executors import EXECUTORS, Lost, Workers
 from touchcell.cell.experiments.remote_work import send_by_value
 from touchcell.cell.experiments.trials import INVALID, LOST, Finished, Perform, Trial
 from touchcell.errors import ConfigError
+from touchcell.progress import shown_progress
 
 _logger: Final = logging.getLogger(__name__)
 
@@ -50,7 +51,7 @@ def perform_all(
         trials: all trials.
         workers: how many at a time, and their limits; one without limits runs in this process.
         executor: name of what runs them, with ``:ADDRESS`` where it takes one.
-        live: show a progress bar.
+        live: show progress.
         title: on it.
 
     Raises:
@@ -58,8 +59,6 @@ def perform_all(
         WorkerDiffers: a worker elsewhere has other code.
         KeyboardInterrupt: running trials are ended; finished ones are kept.
     """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
     name, _, address = executor.partition(":")
     spec = EXECUTORS.load(name)
     workers = replace(workers or Workers(), address=address)
@@ -77,9 +76,7 @@ def perform_all(
             missing.append(trial)
         else:
             found[trial.name] = kept
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, transient=True, disable=not live) as progress:
-        bar = progress.add_task(title, total=len(trials), completed=len(found))
+    with shown_progress(live=live) as show:
         if spec.shares_files:
             results = spec.run(perform, missing, workers)
         else:
@@ -96,5 +93,5 @@ def perform_all(
             found[trial.name] = finished
             if finished.broken:
                 _logger.warning("%s: %s: %s", trial.name, finished.outcome, finished.reason)
-            progress.update(bar, advance=1, description=f"{title}: {trial.name} {finished.outcome}")
+            show(title, len(found), len(trials), f"{trial.name} {finished.outcome}")
     return [found[trial.name] for trial in trials]

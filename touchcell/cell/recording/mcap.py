@@ -1,7 +1,7 @@
 """Reader of MCAP recordings, also of those that were cut off or damaged: it takes what is whole and names the rest.
 
-Messages of this package's own types, images and video come back as mappings; those that only repeat them for viewers
-are left out. Recordings of 0.1.0 and 0.2.0, whose messages are JSON, are read as well.
+Messages of this package's own types, images, video and joint states come back as mappings; those that only repeat them
+for viewers are left out. Recordings of 0.1.0 and 0.2.0, whose messages are JSON, are read as well.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ RECORDING: Final = "run.mcap"
 """Name of the recording in a run folder."""
 CELL_CLOCK: Final = "cell_clock_offset_ns"
 """Key in the metadata of a channel: wall clock minus the cell's clock, which its stamps contain."""
-IMAGES: Final = frozenset({"foxglove.CompressedImage", "foxglove.CompressedVideo"})
-"""Types of viewers that are read as well."""
+READ_AS_WELL: Final = frozenset({"foxglove.CompressedImage", "foxglove.CompressedVideo", "foxglove.JointStates"})
+"""Types of viewers that are read as well: what they hold is in no other message."""
 
 _log = logging.getLogger(__name__)
 
@@ -250,7 +250,7 @@ class _Reader:
         schema = self._schemas.get(channel.schema_id)
         if schema is None:
             raise UnreadableType(f"schema {channel.schema_id} is missing")
-        if schema.name.startswith(f"{PACKAGE}.") or schema.name in IMAGES:
+        if schema.name.startswith(f"{PACKAGE}.") or schema.name in READ_AS_WELL:
             return decoder(message_class(schema.name, schema.data))
         return None
 

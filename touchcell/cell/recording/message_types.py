@@ -22,6 +22,8 @@ from google.protobuf.message import DecodeError, Message
 PACKAGE: Final = "touchcell"
 """Package of all types that are declared here; others in a recording are those of viewers."""
 
+_VIEWERS: Final = "foxglove."
+_STAMP: Final = "timestamp"
 _VALUE: Final = ".google.protobuf.Value"
 _INT64: Final = 1 << 63
 _Field = descriptor_pb2.FieldDescriptorProto
@@ -202,7 +204,8 @@ def plain(data: Mapping[str, Any]) -> dict[str, Any]:
 def decoder(kind: type[Message]) -> Callable[[bytes], dict[str, Any]]:
     """Return a function that reads messages of a class as JSON would hold them: None for what is not finite.
 
-    Lists are there even if they are empty; other fields only where the message has them.
+    Lists are there even if they are empty; other fields only where the message has them. The stamp that viewers' types
+    carry is left out, since the record has it as well.
     """
     lists = [field.json_name for field in kind.DESCRIPTOR.fields if field.is_repeated]
 
@@ -210,6 +213,8 @@ def decoder(kind: type[Message]) -> Callable[[bytes], dict[str, Any]]:
         message = kind.FromString(data)
         found: dict[str, Any] = {name: [] for name in lists}
         for field, value in message.ListFields():
+            if field.full_name.startswith(_VIEWERS) and field.name == _STAMP:
+                continue
             found[field.json_name] = _read(field, value)
         return found
 
@@ -239,6 +244,8 @@ def _read(field: FieldDescriptor, value: Any) -> Any:
     if field.is_repeated:
         if field.type == FieldDescriptor.TYPE_DOUBLE:
             return [item if math.isfinite(item) else None for item in value]
+        if field.type == FieldDescriptor.TYPE_MESSAGE:
+            return [json_format.MessageToDict(item) for item in value]
         return list(value)
     if field.type == FieldDescriptor.TYPE_DOUBLE:
         return value if math.isfinite(value) else None

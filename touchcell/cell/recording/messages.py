@@ -23,7 +23,9 @@ _POSE: Final = dict.fromkeys(COMPONENTS, Kind.REAL)
 _SIGMA: Final = {f"sigma_{name}": Kind.REAL for name in COMPONENTS}
 _SIGMA_UNITS: Final = np.array([1e3] * 3 + [180 / np.pi] * 3)
 _DECLARED: Final = {
-    ("arms", "tcp"): MessageType("Tcp", {"seq": Kind.INTEGER, **_POSE, "speed_mm_s": Kind.REAL}),
+    ("arms", "tcp"): MessageType("Tcp", {"seq": Kind.INTEGER, **_POSE, "speed_mm_s": Kind.REAL, "twist": Kind.REALS}),
+    ("arms", "wrench"): MessageType("Wrench", {"seq": Kind.INTEGER, "values": Kind.REALS}),
+    ("arms", "external_torque"): MessageType("ExternalTorque", {"seq": Kind.INTEGER, "values": Kind.REALS}),
     ("arms", "command"): MessageType(
         "Command",
         {
@@ -47,6 +49,9 @@ _DECLARED: Final = {
             "nis": Kind.REAL,
             **_POSE,
             **_SIGMA,
+            "change": Kind.REAL,
+            "markers": Kind.REAL,
+            "refusal": Kind.TEXT,
         },
     ),
     ("sensors", "measurement"): MessageType("Measurement", {"seq": Kind.INTEGER, **_POSE, **_SIGMA}),
@@ -74,12 +79,19 @@ def pose_message(T: Array) -> dict[str, float]:
 
 
 def tcp_message(state: Stamped[TcpState]) -> dict[str, Any]:
-    """Return pose and speed of a tool centre point."""
+    """Return pose, speed and twist (m/s and rad/s along base axes) of a tool centre point."""
+    twist = state.value.twist.tolist()
     return {
         "seq": state.seq,
         **pose_message(state.value.T_base_tcp),
-        "speed_mm_s": 1e3 * math.hypot(*state.value.twist[:3].tolist()),
+        "speed_mm_s": 1e3 * math.hypot(*twist[:3]),
+        "twist": twist,
     }
+
+
+def values_message(sample: Stamped[Array]) -> dict[str, Any]:
+    """Return a wrench (6,) N and N m, or external torques (n,) N m."""
+    return {"seq": sample.seq, "values": sample.value.tolist()}
 
 
 def command_message(sent: Sent[TwistCommand]) -> dict[str, Any]:
@@ -117,7 +129,11 @@ def contact_message(estimate: ContactEstimate) -> dict[str, Any]:
         "in_contact": estimate.in_contact,
         "in_range": estimate.in_range,
         "nis": estimate.nis,
+        "change": estimate.change,
+        "markers": estimate.markers,
     }
+    if estimate.refusal:
+        message["refusal"] = estimate.refusal
     if estimate.belief is not None:
         message |= belief_message(estimate.belief)
     return message

@@ -18,6 +18,7 @@ from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device, Lifecycle
 from touchcell.drivers.core.enabling import EnablingDevice
 from touchcell.drivers.core.errors import DeviceError
+from touchcell.drivers.core.jog import JogInput
 from touchcell.drivers.core.protocols import StopCategory
 from touchcell.errors import ConfigError
 from touchcell.tasks.interface import Task
@@ -47,6 +48,7 @@ class Cell:
         watched_wrenches, watched_torques: roles of arms whose wrench, or external torque, is needed.
         watched_readings: names of devices and of the readings in their health that interlocks limit.
         enabling_device: operator input of a cell whose file names one.
+        jog_input: what an operator who moves the arms by hand asks for; None for other tasks.
         scene: what is simulated around the arms, as far as it can be looked into; None in a cell of real devices.
         collection: where labelled frames go, None where the task labels none.
         watchdog: stops the arms when the loop falls silent.
@@ -71,6 +73,7 @@ class Cell:
     watched_torques: frozenset[str] = frozenset()
     watched_readings: frozenset[tuple[str, str]] = frozenset()
     enabling_device: EnablingDevice | None = None
+    jog_input: JogInput | None = None
     scene: SceneTruth | None = None
     collection: Collection | None = None
     watchdog: Watchdog = field(default_factory=NullWatchdog)

@@ -8,6 +8,8 @@ from dataclasses import replace
 from functools import partial
 from typing import TypeAlias, cast
 
+import numpy as np
+
 from touchcell.cell.config.armed import require_armed
 from touchcell.cell.config.cell_plan import REDUCED_SPEED_M_S, CellPlan
 from touchcell.cell.config.planning_scene import build_planning_scene
@@ -19,6 +21,7 @@ from touchcell.cell.runtime.enabling import SimulatedEnablingDevice
 from touchcell.cell.runtime.sensor import build_sensor
 from touchcell.control.interlocks.always_on import always_on
 from touchcell.control.interlocks.basic import TcpSpeed
+from touchcell.control.interlocks.boundary import WorkspaceConfig
 from touchcell.control.interlocks.config import build_interlocks
 from touchcell.control.interlocks.interlock import Interlock
 from touchcell.control.interlocks.timers import TimedInterlock
@@ -28,9 +31,11 @@ from touchcell.control.supervisor import Supervisor
 from touchcell.drivers.core.arm import Arm
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.enabling import EnablingDevice
+from touchcell.drivers.core.jog import JogInput
 from touchcell.drivers.core.protocols import ExternalTorqueSource, StopCategory, TwistSink, WrenchSource
 from touchcell.errors import ConfigError
-from touchcell.tasks.interface import Task, TaskContext
+from touchcell.geometry.types import Array
+from touchcell.tasks.interface import Box, Task, TaskContext
 
 AnyInterlock: TypeAlias = Interlock | TimedInterlock
 
@@ -40,6 +45,7 @@ def compose(
     *,
     clock: Clock | None = None,
     enabling_device: EnablingDevice | None = None,
+    jog_input: JogInput | None = None,
     arrange: Callable[[Sequence[AnyInterlock]], Sequence[AnyInterlock]] | None = None,
 ) -> Cell:
     """Build everything that ``plan`` needs; nothing is connected yet.
@@ -48,6 +54,7 @@ def compose(
         plan: a checked cell file.
         clock: in place of the one that the file asks for.
         enabling_device: for a cell with ``enabling_device: external``.
+        jog_input: operator input of the task ``jog``.
         arrange: returns the interlocks to use in place of the cell's own, which are proven to be armed all the same:
             for tests that show an interlock what its cell does not.
 
@@ -82,7 +89,14 @@ def compose(
         *_by_switch(plan),
     ]
     collection = _collection(plan)
-    context = TaskContext(plan.cell.rate_hz, sensor_poses, 0 if collection is None else collection.kept)
+    context = TaskContext(
+        plan.cell.rate_hz,
+        sensor_poses,
+        0 if collection is None else collection.kept,
+        T_world_base={role: plan.cell.arms[name].T_world_base for name, role in role_of.items()},
+        carriers={role: sensor.arm_role for role, sensor in sensors.items() if sensor.arm_role is not None},
+        boxes=_boxes(plan, sensor_poses),
+    )
 
     def resumed_task() -> Task:
         return plan.task.build(plan.task_config, replace(context, resumed=True))
@@ -106,12 +120,24 @@ def compose(
         watched_torques=_watched(plan, role_of, "external_torque", ExternalTorqueSource),
         watched_readings=frozenset(key for entry in plan.cell.interlocks.values() for key in entry.reads),
         enabling_device=_enabling_device(plan, world.clock, enabling_device),
+        jog_input=jog_input,
         scene=world.truth,
         scene_start_ns=scene_start_ns,
         collection=collection,
         watchdog=world.watchdog,
         require_armed=partial(require_armed, plan, configured, planning_scene),
     )
+
+
+def _boxes(plan: CellPlan, T_tcp_sensor: Mapping[str, Array]) -> Mapping[str, tuple[Box, ...]]:
+    """The workspaces of each arm role."""
+    found: dict[str, tuple[Box, ...]] = {}
+    for entry in plan.cell.interlocks.values():
+        if isinstance(entry, WorkspaceConfig):
+            lever = np.zeros(3) if entry.sensor is None else T_tcp_sensor[entry.sensor][:3, 3]
+            box = Box(lever, 1e-3 * np.array(entry.min_mm), 1e-3 * np.array(entry.max_mm))
+            found[entry.arm] = (*found.get(entry.arm, ()), box)
+    return found
 
 
 def _by_switch(plan: CellPlan) -> tuple[TcpSpeed, ...]:

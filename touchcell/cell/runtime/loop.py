@@ -229,6 +229,7 @@ class RunLoop:
             ended=self._observer.exhausted,
             devices=reading.devices,
             wrenches=reading.wrenches,
+            jog=None if cell.jog_input is None else cell.jog_input.request(reading.now_ns),
         )
         action = cell.task.tick(observation)
         for role in sorted(action.zero):

@@ -39,6 +39,7 @@ class Reading:
         devices: of the other devices that are read, by role.
         health: what devices have just reported about themselves, by name; most cycles have none.
         wrenches: (6,) N and N m of the arms of which they are needed, by role.
+        external_torques: (n,) N m of each joint of the arms of which they are needed, by role.
     """
 
     now_ns: int
@@ -47,6 +48,7 @@ class Reading:
     devices: Mapping[str, Stamped[Mapping[str, float]]] = field(default_factory=dict)
     health: Mapping[str, Stamped[Health]] = field(default_factory=dict)
     wrenches: Mapping[str, Stamped[Array]] = field(default_factory=dict)
+    external_torques: Mapping[str, Stamped[Array]] = field(default_factory=dict)
 
 
 class Observer:
@@ -82,7 +84,10 @@ class Observer:
         self._times.begin()
         started = time.perf_counter_ns()
         states = {role: call_driver(arm.name, arm.tcp) for role, arm in cell.arms.items()}
-        wrenches = {role: self._wrench(role) for role in cell.watched_wrenches}
+        wrenches = {role: call_driver(cell.arms[role].name, cell.arms[role].wrench) for role in cell.watched_wrenches}
+        torques = {
+            role: call_driver(cell.arms[role].name, cell.arms[role].external_torques) for role in cell.watched_torques
+        }
         self._times.add("read arms", time.perf_counter_ns() - started)
         contacts = {}
         for role, sensor in cell.sensors.items():
@@ -100,7 +105,7 @@ class Observer:
         if health:
             self._times.add("read health", time.perf_counter_ns() - started)
         # Only now: what a device's own thread brought in the meantime would seem to come from the future.
-        return Reading(cell.clock.now_ns(), states, contacts, devices, health, wrenches)
+        return Reading(cell.clock.now_ns(), states, contacts, devices, health, wrenches, torques)
 
     def view(
         self,
@@ -125,7 +130,7 @@ class Observer:
                     sent.get(role),
                     self._joints(role),
                     reading.wrenches.get(role),
-                    self._external_torque(role),
+                    reading.external_torques.get(role),
                 )
                 for role, state in reading.states.items()
             },
@@ -153,14 +158,6 @@ class Observer:
     def _joints(self, role: str) -> Stamped[JointState] | None:
         arm = self._cell.arms[role]
         return call_driver(arm.name, arm.joints) if role in self._cell.watched_joints else None
-
-    def _wrench(self, role: str) -> Stamped[Array]:
-        arm = self._cell.arms[role]
-        return call_driver(arm.name, arm.wrench)
-
-    def _external_torque(self, role: str) -> Stamped[Array] | None:
-        arm = self._cell.arms[role]
-        return call_driver(arm.name, arm.external_torques) if role in self._cell.watched_torques else None
 
 
 def call_driver(device: str, call: Callable[[], _T]) -> _T:

@@ -80,9 +80,20 @@ def stop_on_keys(
     that is gone stops at once too. Where ``stream`` (standard input) is no terminal, or belongs to another job of the
     shell, no key is read. The terminal is left as it was found.
     """
-    fd = _terminal(sys.stdin if stream is None else stream)
+    with terminal_keys(sys.stdin if stream is None else stream) as read:
+        yield (lambda: None) if read is None else (lambda: _look(read, stop, channel))
+
+
+@contextlib.contextmanager
+def terminal_keys(stream: IO[str]) -> Iterator[Callable[[], bytes | None] | None]:
+    """Yield what reads the keys that have been pressed in a terminal: none yet as b"", a terminal that is gone as None.
+
+    Yields None itself where ``stream`` is no terminal, or belongs to another job of the shell. The terminal is left as
+    it was found.
+    """
+    fd = _terminal(stream)
     if fd is None:
-        yield lambda: None
+        yield None
         return
     import termios
     import tty
@@ -92,10 +103,10 @@ def stop_on_keys(
         tty.setcbreak(fd)
     except (termios.error, OSError):
         # It has gone in the meantime, which its hang-up signal reports.
-        yield lambda: None
+        yield None
         return
     try:
-        yield lambda: _look(fd, stop, channel)
+        yield lambda: _pressed(fd)
     finally:
         # A terminal that is gone needs no repair.
         with contextlib.suppress(termios.error):
@@ -110,14 +121,20 @@ def _terminal(stream: IO[str]) -> int | None:
         return None
 
 
-def _look(fd: int, stop: StopRequest, channel: OperatorChannel | None) -> None:
+def _pressed(fd: int) -> bytes | None:
     try:
         if not select.select([fd], [], [], 0.0)[0]:
-            return
-        keys = os.read(fd, 64)
+            return b""
+        return os.read(fd, 256) or None
     except (OSError, ValueError):
-        keys = b""
-    if not keys or any(key in AT_ONCE_KEYS for key in keys):
+        return None
+
+
+def _look(read: Callable[[], bytes | None], stop: StopRequest, channel: OperatorChannel | None) -> None:
+    keys = read()
+    if keys == b"":
+        return
+    if keys is None or any(key in AT_ONCE_KEYS for key in keys):
         stop.ask_at_once()
     elif any(key in ORDERLY_KEYS for key in keys):
         stop.ask()

@@ -16,6 +16,7 @@ from touchcell.cell.recording.messages import (
     declared_type,
     pose_message,
     tcp_message,
+    values_message,
     verdict_message,
 )
 from touchcell.cell.recording.recorder import Recorder
@@ -118,6 +119,10 @@ class RunRecord:
             self._write_frames(self._frames)
         for role, state in reading.states.items():
             self.write(f"/arms/{role}/tcp", state.t_ns, tcp_message(state))
+        for role, wrench in reading.wrenches.items():
+            self.write(f"/arms/{role}/wrench", wrench.t_ns, values_message(wrench))
+        for role, torque in reading.external_torques.items():
+            self.write(f"/arms/{role}/external_torque", torque.t_ns, values_message(torque))
         for role, estimate in reading.contacts.items():
             self.write(f"/sensors/{role}/contact", now_ns, contact_message(estimate))
         for role, sensor in cell.sensors.items():

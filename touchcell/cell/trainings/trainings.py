@@ -18,6 +18,7 @@ from touchcell.cell.experiments.executors import EXECUTORS, Lost, Workers
 from touchcell.cell.experiments.table import Column, Row, table
 from touchcell.cell.experiments.trials import write_whole
 from touchcell.errors import ConfigError, TouchcellError
+from touchcell.progress import shown_progress
 
 if TYPE_CHECKING:
     from touchcell.perception.networks.checkpoint import EpochRecord
@@ -150,15 +151,13 @@ def train_all(
         folder: for ``NAME.safetensors`` and ``NAME.json`` of each.
         workers: how many at a time, and their limits; one without limits trains in this process.
         executor: name of what runs them, with ``:ADDRESS`` where it takes one.
-        live: show a progress bar.
+        live: show progress.
 
     Raises:
         ConfigError: there is no such executor, or two data sets have one name.
         WorkerDiffers: a worker elsewhere has other code.
         KeyboardInterrupt: finished trainings are kept; begun ones continue from their last epoch on this machine.
     """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
     name, _, address = executor.partition(":")
     spec = EXECUTORS.load(name)
     workers = replace(workers or Workers(), address=address)
@@ -182,9 +181,7 @@ def train_all(
             if each.data not in archives:
                 archives[each.data] = archive_of(each.data)
             parcels.append(Parcel(each, None, archives[each.data]))
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, transient=True, disable=not live) as progress:
-        bar = progress.add_task("trainings", total=len(wanted), completed=len(found))
+    with shown_progress(live=live) as show:
         for index, result in spec.run(RunTraining(code), parcels, workers):
             each = parcels[index].training
             if isinstance(result, Lost):
@@ -197,7 +194,7 @@ def train_all(
                 if not result.reason:
                     records[each.name].write(result.scores)
                 found[each.name] = Trained(each, result.scores, result.reason)
-            progress.update(bar, advance=1, description=f"trainings: {each.name}")
+            show("trainings", len(found), len(wanted), each.name)
     return [found[each.name] for each in wanted]
 
 

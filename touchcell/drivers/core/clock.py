@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import select
 import time
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 
 class Clock(Protocol):
@@ -16,6 +17,30 @@ class Clock(Protocol):
     def sleep_until_ns(self, t_ns: int) -> None:
         """Sleep until ``t_ns``; return at once if that has passed."""
         ...
+
+
+@runtime_checkable
+class FileClock(Protocol):
+    """Clock on whose time files are waited for, where that is not the machine's."""
+
+    def wait_readable(self, fd: int, until_ns: int) -> bool:
+        """Wait until ``fd`` can be read or ``until_ns``; return whether it can."""
+        ...
+
+
+def poll_readable(fd: int, timeout_s: float) -> bool:
+    """Wait until ``fd`` can be read or has failed, for ``timeout_s`` of the machine's time; return whether it has."""
+    # Not select(), which fails for file descriptors beyond 1023.
+    poller = select.poll()
+    poller.register(fd, select.POLLIN)
+    return bool(poller.poll(1e3 * max(timeout_s, 0.0)))
+
+
+def wait_readable(clock: Clock, fd: int, until_ns: int) -> bool:
+    """Wait until ``fd`` can be read or it is ``until_ns`` on ``clock``; return whether it can."""
+    if isinstance(clock, FileClock):
+        return clock.wait_readable(fd, until_ns)
+    return poll_readable(fd, (until_ns - clock.now_ns()) * 1e-9)
 
 
 class MonotonicClock:

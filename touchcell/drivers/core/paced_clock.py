@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Final
 
-from touchcell.drivers.core.clock import Clock, MonotonicClock
+from touchcell.drivers.core.clock import Clock, MonotonicClock, poll_readable
 
 PACE: Final = "TOUCHCELL_EMULATED_PACE"
 """Variable with pace and origin in ns of an emulated world's time, which all of its processes read."""
@@ -37,9 +40,27 @@ class PacedClock:
             # A clock that has not reached a whole nanosecond yet is waited for once more.
             time.sleep(max(remaining_ns, 1) * 1e-9 / self.pace)
 
+    def wait_readable(self, fd: int, until_ns: int) -> bool:
+        return poll_readable(fd, (until_ns - self.now_ns()) * 1e-9 / self.pace)
+
+
+_SHARED: Final[ContextVar[Clock]] = ContextVar("clock of an emulated world within this process")
+
+
+@contextmanager
+def share_clock(clock: Clock) -> Iterator[None]:
+    """Make ``clock`` the one of the emulated world, for this context and the threads that copy it."""
+    token = _SHARED.set(clock)
+    try:
+        yield
+    finally:
+        _SHARED.reset(token)
+
 
 def emulated_clock() -> Clock:
     """Return the clock of the emulated world that this process belongs to: the machine's where none is slower."""
+    if (shared := _SHARED.get(None)) is not None:
+        return shared
     pace, _, origin_ns = os.environ.get(PACE, "").partition(" ")
     return PacedClock(float(pace), int(origin_ns)) if pace else MonotonicClock()
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from touchcell.drivers.core import bus_arm
 from touchcell.drivers.damiao import driver as damiao_can
+from touchcell.drivers.damiao import emulator
 from touchcell.testing.emulation.in_cell import EmulatedDriver, start_arguments, tcp_of_joints
+from touchcell.testing.emulation.lockstep import Lockstep, emulator_in_step
 from touchcell.testing.emulation.process import EmulatorProcess
-from touchcell.testing.emulation.rig import DeviceFixture
+from touchcell.testing.emulation.rig import DeviceFixture, Emulated
 
 PARK_DEG = (0.0, -60.0, 130.0, 0.0, 20.0, 0.0)
 TOOL = {"origin_mm": [0, 0, 80], "mass_kg": 0.15, "com_mm": [0, 0, 40]}
@@ -40,10 +44,22 @@ def rig(folder: Path, address: int) -> DeviceFixture:
     """Build one arm on a hub of its own in ``folder``; ``address`` keeps several apart."""
     channel = folder / f"can-{address}"
 
-    def start() -> EmulatorProcess:
-        tool = config(channel).tool.model_dump_json()
-        return EmulatorProcess("damiao", str(channel), "--tool", tool).start()
+    return _fixture(channel, lambda: EmulatorProcess("damiao", *_arguments(channel)).start())
 
+
+def rig_in_step(folder: Path, address: int) -> DeviceFixture:
+    """Build the same arm on a simulated time, which the emulator shares with the driver."""
+    channel = folder / f"can-{address}"
+    world = Lockstep([bus_arm])
+    fixture = _fixture(channel, lambda: emulator_in_step(world, emulator, *_arguments(channel)).start())
+    return replace(fixture, world=world, clock=lambda: world, reachable=False)
+
+
+def _arguments(channel: Path) -> tuple[str, ...]:
+    return str(channel), "--tool", config(channel).tool.model_dump_json()
+
+
+def _fixture(channel: Path, start: Callable[[], Emulated]) -> DeviceFixture:
     return DeviceFixture(
         spec=damiao_can.SPEC,
         start=start,

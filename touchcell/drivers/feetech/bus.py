@@ -9,14 +9,13 @@ and is counted as late instead of being mistaken for a fresh one.
 
 from __future__ import annotations
 
-import select
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from touchcell.drivers.core.bus_reply import BusCounters, Reply
-from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.clock import Clock, wait_readable
 from touchcell.drivers.core.errors import CodecError, ConnectError, CorruptMessage, DeviceGone, TransportTimeout
 from touchcell.drivers.feetech import codec
 from touchcell.drivers.feetech.codec import Identity, Packet, Register, ServoState
@@ -246,8 +245,9 @@ class ServoBus:
         import serial
 
         try:
-            ready, _, _ = select.select([self._port], [], [], max(timeout_s, 0.0))
-            return bytes(self._port.read(_READ_SIZE)) if ready else b""
+            until_ns = self._clock.now_ns() + round(1e9 * max(timeout_s, 0.0))
+            is_ready = wait_readable(self._clock, self._port.fileno(), until_ns)
+            return bytes(self._port.read(_READ_SIZE)) if is_ready else b""
         except (serial.SerialException, OSError, ValueError) as error:
             raise self._gone(error) from None
 

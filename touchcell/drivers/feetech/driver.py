@@ -15,7 +15,7 @@ adjustments of ``Sent`` and in ``health``.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -201,10 +201,12 @@ class FeetechSerialArm(BusArm):
 
     _config: FeetechSerialConfig
 
-    def __init__(self, name: str, config: FeetechSerialConfig, clock: Clock) -> None:
+    def __init__(
+        self, name: str, config: FeetechSerialConfig, clock: Clock, open_port: Callable[[], Any] | None = None
+    ) -> None:
         super().__init__(name, config, clock, SerialChain(config.describe(), config.tool))
         self._ids = [servo.id for servo in config.servos]
-        self._bus = ServoBus(name, self._ids, partial(_open_port, name, config), clock, echo=config.echo)
+        self._bus = ServoBus(name, self._ids, open_port or partial(_open_port, name, config), clock, echo=config.echo)
 
     def _reset_state(self) -> None:
         super()._reset_state()

@@ -9,11 +9,6 @@ real brown-out lets an arm sink.
 from __future__ import annotations
 
 import asyncio
-import fcntl
-import os
-import pty
-import struct
-import tty
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,6 +20,7 @@ from touchcell.drivers.feetech import codec
 from touchcell.drivers.feetech.codec import Instruction, Packet, Register
 from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain, Tool
 from touchcell.testing.emulation.base import CommandOnset, Emulator
+from touchcell.testing.emulation.serial_line import PtyLine, SerialLine
 
 _TICK_S = 5e-3
 _RESPONSE_S = 0.03
@@ -39,8 +35,6 @@ _ALL = -1
 _STRAY = b"\x00"
 # Register 6, by its value (Feetech, "SMS/STS series memory table").
 _BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
-_TCGETS2 = 0x802C542A
-_TERMIOS2 = struct.Struct("=4IB19s2I")
 _EEPROM_LENGTH = 40
 _TABLE_LENGTH = 128
 _GOAL_SPEED = 46
@@ -171,7 +165,7 @@ class Servo:
         lowest, highest = (int.from_bytes(self.get(r, 2), "little") for r in (Register.MIN_TICKS, Register.MAX_TICKS))
         left = min(max(self.goal, lowest), highest) - self.position
         speed = codec.from_signed_word(self.get(_GOAL_SPEED, 2)) or _FASTEST_TICKS_S
-        pushes = self.torque and not self.status & _OVERLOAD
+        pushes = self.torque and not self.status & _OVERLOAD and any(self.get(Register.TORQUE_LIMIT, 2))
         wanted = float(np.clip(left / _RESPONSE_S, -speed, speed)) if pushes else 0.0
         self.velocity = 0.0 if self.blocked else wanted
         self.encoder += self.velocity * dt_s
@@ -200,7 +194,7 @@ class FeetechArm(Emulator):
     """Emulator of an arm; joint i is at zero at 2048 ticks of servo i, unless ``zero_ticks`` says otherwise.
 
     Args:
-        link: symbolic link to create to the pseudo-terminal.
+        line: the adapter and its line.
         chain: kinematic chain, for the tool's true position.
         start_deg: initial angles.
         zero_ticks: ticks of each servo at joint angle zero.
@@ -239,7 +233,7 @@ class FeetechArm(Emulator):
 
     def __init__(
         self,
-        link: Path,
+        line: SerialLine,
         chain: SerialChain,
         start_deg: Sequence[float],
         zero_ticks: Sequence[int],
@@ -249,7 +243,7 @@ class FeetechArm(Emulator):
         protection_time_s: float = 2.0,
     ) -> None:
         super().__init__()
-        self._link = link
+        self._line = line
         self._chain = chain
         self._zero = np.array(zero_ticks, dtype=np.float64)
         self._direction = np.array(direction, dtype=np.float64)
@@ -257,9 +251,6 @@ class FeetechArm(Emulator):
         self._start_ticks = self._zero + self._direction * start / codec.RAD_PER_TICK
         self._echo = echo
         self._protection_time_s = protection_time_s
-        self._master: int | None = None
-        self._slave: int | None = None
-        self._rival: int | None = None
         self._ticker: asyncio.Task[None] | None = None
         self._reset()
 
@@ -280,7 +271,7 @@ class FeetechArm(Emulator):
 
     async def start(self) -> None:
         """Open the pseudo-terminal and start the simulated time."""
-        self._plug_in()
+        self._line.plug_in(self._on_bytes)
         self.publish_joints(self._q())
         self._ticker = asyncio.create_task(self._tick())
 
@@ -288,7 +279,7 @@ class FeetechArm(Emulator):
         """Close the pseudo-terminal."""
         if self._ticker is not None:
             self._ticker.cancel()
-        self._unplug()
+        self._line.unplug()
 
     def state(self) -> dict[str, Any]:
         """Return the ground truth: angles, tool position, enabled servos, received packets."""
@@ -319,9 +310,9 @@ class FeetechArm(Emulator):
     def on_fault(self, fault: str, value: Any) -> None:
         """Apply faults that act at once."""
         if fault == "unplug":
-            self._unplug()
-        elif fault == "busy":
-            self._hold_port()
+            self._line.unplug()
+        elif fault == "busy" and isinstance(self._line, PtyLine):
+            self._line.hold()
         elif fault == "voltage":
             index, volts = value
             self.servos[index].put(Register.VOLTAGE, bytes([round(10.0 * volts)]))
@@ -348,16 +339,16 @@ class FeetechArm(Emulator):
                 servo.power_up()
             del self.active[fault]
         elif fault == "reset":
-            self._unplug()
+            self._line.unplug()
             self._reset()
-            self._plug_in()
+            self._line.plug_in(self._on_bytes)
 
     def on_clear(self, fault: str) -> None:
         """Reconnect the adapter, unblock the servos, and end the faults that are not latched."""
-        if fault == "unplug" and self._master is None:
-            self._plug_in()
-        elif fault == "busy":
-            self._release_port()
+        if fault == "unplug" and not self._line.plugged:
+            self._line.plug_in(self._on_bytes)
+        elif fault == "busy" and isinstance(self._line, PtyLine):
+            self._line.release()
         elif fault == "block":
             for servo in self.servos:
                 servo.blocked = False
@@ -368,47 +359,13 @@ class FeetechArm(Emulator):
             for servo in self.servos:
                 servo.status &= _LATCHED
 
-    def _plug_in(self) -> None:
-        self._master, self._slave = pty.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self._link.unlink(missing_ok=True)
-        self._link.symlink_to(os.ttyname(self._slave))
-        asyncio.get_running_loop().add_reader(self._master, self._on_bytes)
-
-    def _hold_port(self) -> None:
-        if self._slave is not None and self._rival is None:
-            self._rival = os.open(os.ttyname(self._slave), os.O_RDWR | os.O_NOCTTY)
-            fcntl.flock(self._rival, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-    def _release_port(self) -> None:
-        if self._rival is not None:
-            os.close(self._rival)
-            self._rival = None
-
-    def _host_baud(self) -> int:
-        """Return the baud rate that the client has set."""
-        assert self._master is not None
-        # struct termios2 (asm-generic/termbits.h) also has the rates without a constant, such as 76800.
-        settings = fcntl.ioctl(self._master, _TCGETS2, bytes(_TERMIOS2.size))
-        return int(_TERMIOS2.unpack(settings)[-1])
-
     def _hears(self, index: int) -> bool:
         servo, rate = self.active.get("baud", (None, 0))
         if self.active.get("silent") == index:
             return False
         if servo not in (index, _ALL):
             rate = self.servos[index].get(Register.BAUD_RATE, 1)[0]
-        return rate < len(_BAUD_RATES) and _BAUD_RATES[rate] == self._host_baud()
-
-    def _unplug(self) -> None:
-        self._release_port()
-        if self._master is not None and self._slave is not None:
-            asyncio.get_running_loop().remove_reader(self._master)
-            os.close(self._master)
-            os.close(self._slave)
-            self._master = self._slave = None
-            self._link.unlink(missing_ok=True)
+        return rate < len(_BAUD_RATES) and _BAUD_RATES[rate] == self._line.baud_rate()
 
     def _now_s(self) -> float:
         return asyncio.get_running_loop().time()
@@ -434,15 +391,9 @@ class FeetechArm(Emulator):
             before_s += dt_s
         self._stepped_s = now_s
 
-    def _on_bytes(self) -> None:
-        if self._master is None:
-            return
-        try:
-            heard = os.read(self._master, 4096)
-        except OSError:
-            return
+    def _on_bytes(self, heard: bytes) -> None:
         if self._echo or "adapter_echo" in self.active:
-            self._put(heard)
+            self._line.write(heard)
         found = codec.split(self._buffer + heard)
         self._buffer = found.rest
         for packet in found.packets:
@@ -523,9 +474,9 @@ class FeetechArm(Emulator):
                 continue
             packet += self._held_back.pop(servo.number, b"")
             if later_s > 0.0:
-                asyncio.get_running_loop().call_later(later_s, self._put, packet)
+                asyncio.get_running_loop().call_later(later_s, self._line.write, packet)
             else:
-                self._put(packet)
+                self._line.write(packet)
 
     def _collided(self, servo: Servo, packet: bytes, data: bytes) -> bytes:
         """Return what the host hears when the other servo of the same id replies at once: its zeros pull the line."""
@@ -551,15 +502,6 @@ class FeetechArm(Emulator):
             return packet
         return Packet(packet.servo, packet.code, packet.data[:at] + codec.signed_word(ticks) + packet.data[at + 2 :])
 
-    def _put(self, data: bytes) -> None:
-        if self._master is None:
-            return
-        try:
-            os.write(self._master, data)
-        except OSError:
-            # The terminal is full because nothing reads it: on a wire these bytes would be lost too.
-            return
-
 
 def add_arguments(parser: Any) -> None:
     """Add the command-line arguments of ``touchcell emulate feetech``."""
@@ -575,13 +517,18 @@ def add_arguments(parser: Any) -> None:
 
 def build(arguments: Any) -> FeetechArm:
     """Build the emulator from its command-line arguments."""
+    return build_on(PtyLine(arguments.link), arguments)
+
+
+def build_on(line: SerialLine, arguments: Any) -> FeetechArm:
+    """Build the emulator on ``line`` from its other command-line arguments."""
     is_file = Path(arguments.chain).suffix == ".yaml"
     read = ChainDescription.read(Path(arguments.chain)) if is_file else ChainDescription.shipped(arguments.chain)
     tool = Tool.model_validate_json(arguments.tool) if arguments.tool else None
     chain = SerialChain(read, tool)
     n = chain.joint_count
     return FeetechArm(
-        arguments.link,
+        line,
         chain,
         arguments.start_deg,
         arguments.zero_ticks or [_MIDDLE] * n,

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from touchcell.drivers.core import bus_arm
+from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.errors import ConnectError
+from touchcell.drivers.feetech import bus
 from touchcell.drivers.feetech import driver as feetech_serial
+from touchcell.drivers.feetech import emulator as feetech_emulator
 from touchcell.testing.emulation.in_cell import EmulatedDriver, start_arguments, tcp_of_joints
+from touchcell.testing.emulation.lockstep import Lockstep, emulator_in_step
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
+from touchcell.testing.emulation.serial_line import SocketLine, SocketPort
 
 PARK_DEG = (0.0, -60.0, 140.0, 60.0, 0.0)
 TOOL = {"origin_mm": [0, 0, 40]}
@@ -36,12 +45,48 @@ def config(port: Path, **changes: object) -> feetech_serial.FeetechSerialConfig:
 
 def emulator(port: Path, *arguments: str) -> EmulatorProcess:
     """Build an emulator of the servos that ``config`` describes; it is not started yet."""
-    return EmulatorProcess(
-        "feetech",
+    return EmulatorProcess("feetech", *_arguments(port), *arguments)
+
+
+def arm_in_step(
+    port: Path, clock: Clock, settings: feetech_serial.FeetechSerialConfig | None = None
+) -> feetech_serial.FeetechSerialArm:
+    """Build the driver on the socket that an emulator of ``rig_in_step`` has at ``port``."""
+    settings = settings or config(port)
+    return feetech_serial.FeetechSerialArm("arm", settings, clock, partial(_open_socket, settings))
+
+
+def rig_in_step(folder: Path, address: int) -> DeviceFixture:
+    """Build the same arm as ``rig`` on a simulated time, which the emulator shares with the driver."""
+    port = folder / f"servos-{address}"
+    world = Lockstep([bus_arm, bus])
+    return replace(
+        rig(folder, address),
+        start=lambda: emulator_in_step(world, feetech_emulator, *_arguments(port), build=_build_on_socket).start(),
+        build=lambda clock: arm_in_step(port, clock),
+        configured=lambda other, clock: arm_in_step(port, clock, other),
+        world=world,
+        clock=lambda: world,
+        reachable=False,
+    )
+
+
+def _arguments(port: Path) -> tuple[str, ...]:
+    return (
         *("--link", str(port), "--tool", config(port).tool.model_dump_json()),
         *("--zero-ticks", *map(str, ZERO_TICKS), "--direction", *map(str, DIRECTION)),
-        *arguments,
     )
+
+
+def _build_on_socket(arguments: Any) -> feetech_emulator.FeetechArm:
+    return feetech_emulator.build_on(SocketLine(arguments.link, config(arguments.link).baudrate), arguments)
+
+
+def _open_socket(settings: feetech_serial.FeetechSerialConfig) -> SocketPort:
+    try:
+        return SocketPort(settings.port)
+    except OSError as error:
+        raise ConnectError("arm", f"cannot open {settings.port}: {error}") from None
 
 
 def rig(folder: Path, address: int) -> DeviceFixture:

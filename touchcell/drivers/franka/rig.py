@@ -23,6 +23,9 @@ from touchcell.testing.emulation.in_cell import (
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
+PATIENCE_S: Final = 0.3
+"""A machine that is busy for so long slows the emulated arm down; on a real one it would be a reflex."""
+
 
 def host_of(address: int) -> str:
     """Return the loopback address of emulator ``address``: libfranka's port is fixed, so each needs its own."""
@@ -36,7 +39,7 @@ def rig(folder: Path, address: int) -> DeviceFixture:
     config = FrankaConfig(host=host, enforce_realtime=False, state_timeout_s=0.5)
 
     def start() -> EmulatorProcess:
-        return EmulatorProcess("franka", "--host", host).start()
+        return EmulatorProcess("franka", "--host", host, "--patience", str(PATIENCE_S)).start()
 
     def build(clock: Clock) -> FrankaArm:
         return FrankaArm("arm", config, clock)

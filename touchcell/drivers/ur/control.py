@@ -35,7 +35,7 @@ from touchcell.drivers.ur.codec import Value
 from touchcell.drivers.ur.dashboard import dashboard
 from touchcell.drivers.ur.modes import RuntimeState
 from touchcell.drivers.ur.registers import Registers
-from touchcell.drivers.ur.sdk import upload_control_program
+from touchcell.drivers.ur.sdk import Upload, upload_control_program
 from touchcell.geometry.types import Array
 
 PERIOD_S = 0.002
@@ -60,17 +60,26 @@ class ControlLink:
         host: address of the controller.
         clock: the host's clock.
         watchdog_hz: lowest rate of register writes that the controller tolerates.
+        upload: uploads the control program.
 
     Attributes:
         ttl_stops: motions that ended because their time-to-live had expired.
         trip_s: time the watchdog took to stop the silent program in its test.
     """
 
-    def __init__(self, device: str, host: str, clock: Clock, watchdog_hz: float) -> None:
+    def __init__(
+        self,
+        device: str,
+        host: str,
+        clock: Clock,
+        watchdog_hz: float,
+        upload: Upload = upload_control_program,
+    ) -> None:
         self._device = device
         self._host = host
         self._clock = clock
         self._watchdog_hz = watchdog_hz
+        self._upload = upload
         self._kick_ns = round(1e9 / (watchdog_hz * _KICKS_PER_WATCHDOG_PERIOD))
         self._lock = threading.RLock()
         self._registers: Registers | None = None
@@ -190,15 +199,15 @@ class ControlLink:
             if registers is None:
                 return
             registers.close()
-            with suppress(DeviceError), dashboard(self._device, self._host) as client:
+            with suppress(DeviceError), dashboard(self._device, self._host, self._clock) as client:
                 client.ask("stop")
 
     def _start_program(self) -> Registers:
-        upload_control_program(self._device, self._host)
+        self._upload(self._device, self._host)
         deadline_ns = self._clock.now_ns() + round(_ANSWER_S * 1e9)
         while True:
             try:
-                registers = self._registers = Registers(self._device, self._host, _ANSWER_S)
+                registers = self._registers = Registers(self._device, self._host, _ANSWER_S, self._clock)
                 break
             except CorruptMessage:
                 # The uploader's connection may hold the registers for a moment after it has been closed.

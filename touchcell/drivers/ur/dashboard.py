@@ -9,6 +9,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from touchcell.drivers.core.clock import Clock, wait_readable
 from touchcell.drivers.core.errors import DeviceGone
 
 PORT = 29999
@@ -22,19 +23,22 @@ class Dashboard:
     Args:
         device: name for errors.
         host: address of the controller.
+        clock: the host's clock.
 
     Raises on construction:
         DeviceGone: nothing answers there.
     """
 
-    def __init__(self, device: str, host: str) -> None:
+    def __init__(self, device: str, host: str, clock: Clock) -> None:
         self._device = device
         self._host = host
+        self._clock = clock
         self._text = b""
         try:
             self._socket = socket.create_connection((host, PORT), _TIMEOUT_S)
         except OSError as error:
             raise self._gone(error) from error
+        self._socket.setblocking(False)
         try:
             self._line()
         except BaseException:
@@ -54,8 +58,11 @@ class Dashboard:
         self._socket.close()
 
     def _line(self) -> str:
+        deadline_ns = self._clock.now_ns() + round(1e9 * _TIMEOUT_S)
         try:
             while b"\n" not in self._text:
+                if not wait_readable(self._clock, self._socket.fileno(), deadline_ns):
+                    raise TimeoutError("timed out")
                 piece = self._socket.recv(_LONGEST_LINE)
                 if not piece or len(self._text) > _LONGEST_LINE:
                     raise OSError("closed by the controller" if not piece else "no end of line")
@@ -74,9 +81,9 @@ class Dashboard:
 
 
 @contextmanager
-def dashboard(device: str, host: str) -> Iterator[Dashboard]:
+def dashboard(device: str, host: str, clock: Clock) -> Iterator[Dashboard]:
     """Connect for the duration of a ``with`` block. Raises DeviceGone."""
-    client = Dashboard(device, host)
+    client = Dashboard(device, host, clock)
     try:
         yield client
     finally:

@@ -58,6 +58,7 @@ from touchcell.drivers.ur.control import ControlLink
 from touchcell.drivers.ur.dashboard import dashboard
 from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyMode, power_fault, program_fault, safety_fault
 from touchcell.drivers.ur.registers import Registers, RtdeWire
+from touchcell.drivers.ur.sdk import Upload, upload_control_program
 from touchcell.drivers.ur.state import RATE_HZ, Snapshot, StateReader, StateStream
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
@@ -150,13 +151,15 @@ class UrArm(Arm):
         name: the device's name in the cell.
         config: configuration of the arm.
         clock: injected clock.
+        upload: uploads the control program.
     """
 
-    def __init__(self, name: str, config: UrConfig, clock: Clock) -> None:
+    def __init__(self, name: str, config: UrConfig, clock: Clock, upload: Upload = upload_control_program) -> None:
         super().__init__(
             name, clock, config.limits.build(), stop_categories=_STOPS, max_state_age_s=config.state_timeout_s
         )
         self._config = config
+        self._upload = upload
         self._flange_to_tcp = _pose_vector(se3.from_euler_mm_deg(np.array(config.flange_to_tcp_mm_deg)))
         self._chain = config.described_chain()
         self._ik = DifferentialIk(self._chain, config.joint_limits.settings(own_controller=True))
@@ -298,7 +301,7 @@ class UrArm(Arm):
             yield Finding(what, "activate powers it on and releases its brakes", (), is_fault=False)
 
     def _require_registers(self) -> None:
-        Registers(self.name, self._config.host, self._config.connect_timeout_s).close()
+        Registers(self.name, self._config.host, self._config.connect_timeout_s, self._clock).close()
 
     def _require_chain(self) -> None:
         snapshot = self._fresh()
@@ -333,7 +336,7 @@ class UrArm(Arm):
     def _open(self) -> None:
         if not _is_installed("rtde_control"):
             raise ConnectError(self.name, "ur-rtde is not installed", hint="pip install touchcell[ur]")
-        version = _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
+        version = _ask_version(self.name, self._config.host, self._config.connect_timeout_s, self._clock)
         if not _OLDEST_POLYSCOPE <= version[:2] < (6, 0):
             raise ConnectError(
                 self.name,
@@ -341,7 +344,7 @@ class UrArm(Arm):
                 hint="this driver needs PolyScope 5.6 or later of version 5",
             )
         self._start_receiving()
-        with dashboard(self.name, self._config.host) as client:
+        with dashboard(self.name, self._config.host, self._clock) as client:
             self._tool_warning = self._compare_tools(self._newest(None))
             self._model = f"{client.ask('get robot model')}, {client.ask('PolyscopeVersion')}"
         self._ending.clear()
@@ -357,7 +360,7 @@ class UrArm(Arm):
         self._forget_state()
         self._drop_program()
         if self._power_off_by is not None:
-            with suppress(DeviceError), dashboard(self.name, self._config.host) as client:
+            with suppress(DeviceError), dashboard(self.name, self._config.host, self._clock) as client:
                 client.ask("power off")
         self._power_off_by = None
         self._stop_receiving()
@@ -378,8 +381,8 @@ class UrArm(Arm):
         self._require_remote_control()
         self._require_no_program()
         self._power_on()
-        _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
-        link = ControlLink(self.name, self._config.host, self._clock, self._config.watchdog_hz)
+        _ask_version(self.name, self._config.host, self._config.connect_timeout_s, self._clock)
+        link = ControlLink(self.name, self._config.host, self._clock, self._config.watchdog_hz, self._upload)
         self._link = link
         self._program_is_ours = True
         try:
@@ -410,7 +413,7 @@ class UrArm(Arm):
     def _recover(self, token: OperatorToken) -> None:
         self._drop_program()
         if not self._opened().connected:
-            _ask_version(self.name, self._config.host, self._config.connect_timeout_s)
+            _ask_version(self.name, self._config.host, self._config.connect_timeout_s, self._clock)
             # The old reader serves the supervision thread until the new one has received a state.
             self._start_receiving()
         self._opened().reset_statistics()
@@ -535,7 +538,7 @@ class UrArm(Arm):
         with suppress(DeviceError):
             if self._power_off_by is StopCategory.STOP_THEN_REMOVE_POWER and not self.at_rest():
                 return
-            with dashboard(self.name, self._config.host) as client:
+            with dashboard(self.name, self._config.host, self._clock) as client:
                 client.ask("power off")
         self._drop_program()
         self._power_off_by = None
@@ -552,7 +555,7 @@ class UrArm(Arm):
     def _start_receiving(self) -> None:
         self._stop_receiving()
         try:
-            stream = StateStream(self.name, self._config.host, self._config.connect_timeout_s)
+            stream = StateStream(self.name, self._config.host, self._config.connect_timeout_s, self._clock)
         except (OSError, TransportError) as error:
             raise DeviceGone(self.name, f"RTDE state of {self._config.host}: {error}") from error
         self._stream = stream
@@ -615,7 +618,7 @@ class UrArm(Arm):
         )
 
     def _require_remote_control(self) -> None:
-        with dashboard(self.name, self._config.host) as client:
+        with dashboard(self.name, self._config.host, self._clock) as client:
             if client.ask("is in remote control") != "true":
                 raise DeviceFault(
                     self.name,
@@ -640,27 +643,27 @@ class UrArm(Arm):
     def _power_on(self) -> None:
         if self._fresh().robot_mode is RobotMode.RUNNING:
             return
-        with dashboard(self.name, self._config.host) as client:
+        with dashboard(self.name, self._config.host, self._clock) as client:
             client.ask("power on")
             self._await(lambda state: state.robot_mode in (RobotMode.IDLE, RobotMode.RUNNING), _MODE_CHANGE_S, "power")
             client.ask("brake release")
             self._await(lambda state: state.robot_mode is RobotMode.RUNNING, _MODE_CHANGE_S, "release of the brakes")
 
     def _power_off(self) -> None:
-        with dashboard(self.name, self._config.host) as client:
+        with dashboard(self.name, self._config.host, self._clock) as client:
             client.ask("power off")
         self._await(lambda state: state.robot_mode is RobotMode.POWER_OFF, _MODE_CHANGE_S, "power-off")
 
     def _end_program(self) -> None:
         # It may have survived the fault if the controller was unreachable then.
         if self._fresh().runtime_state is not RuntimeState.STOPPED:
-            with dashboard(self.name, self._config.host) as client:
+            with dashboard(self.name, self._config.host, self._clock) as client:
                 client.ask("stop")
         self._await(lambda state: state.runtime_state is RuntimeState.STOPPED, _RECOVER_S, "end of the program")
         self._program_is_ours = False
 
     def _unlock(self) -> None:
-        with dashboard(self.name, self._config.host) as client:
+        with dashboard(self.name, self._config.host, self._clock) as client:
             reply = client.ask("unlock protective stop")
         if not reply.startswith("Protective stop releasing"):
             raise DeviceFault(
@@ -685,10 +688,10 @@ class UrArm(Arm):
         return snapshot
 
 
-def _ask_version(device: str, host: str, timeout_s: float) -> tuple[int, int, int, int]:
+def _ask_version(device: str, host: str, timeout_s: float, clock: Clock) -> tuple[int, int, int, int]:
     """Read the controller's version by a separate connection: ur-rtde's constructors block on a frozen controller."""
     try:
-        wire = RtdeWire(device, host, timeout_s)
+        wire = RtdeWire(device, host, timeout_s, clock)
         try:
             if not ur_codec.parse_accepted(wire.ask(ur_codec.version_request()).payload):
                 raise ConnectError(device, f"RTDE of {host} does not support version {ur_codec.PROTOCOL_VERSION}")

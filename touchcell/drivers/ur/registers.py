@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import selectors
 import socket
-import time
 
+from touchcell.drivers.core.clock import Clock, wait_readable
 from touchcell.drivers.core.errors import CorruptMessage, DeviceGone, TransportTimeout
 from touchcell.drivers.ur import codec as ur_codec
 from touchcell.drivers.ur.codec import Packet, PacketType, Recipe, Value
@@ -29,13 +28,15 @@ class RtdeWire:
         device: name for errors.
         host: address of the controller.
         timeout_s: timeout of the connection and of each reply.
+        clock: the host's clock.
 
     Raises:
         OSError: the controller cannot be reached.
     """
 
-    def __init__(self, device: str, host: str, timeout_s: float) -> None:
+    def __init__(self, device: str, host: str, timeout_s: float, clock: Clock) -> None:
         self._device = device
+        self._clock = clock
         self._timeout_s = timeout_s
         self._stream = b""
         self._socket = socket.create_connection((host, ur_codec.PORT), timeout_s)
@@ -49,9 +50,9 @@ class RtdeWire:
     def ask(self, request: Packet) -> Packet:
         """Send ``request`` and return the reply. Raises TransportTimeout, DeviceGone, CorruptMessage."""
         self.send(request)
-        deadline_s = time.monotonic() + self._timeout_s
-        while (left_s := deadline_s - time.monotonic()) > 0.0:
-            for packet in self.receive(left_s):
+        deadline_ns = self._clock.now_ns() + round(1e9 * self._timeout_s)
+        while (left_ns := deadline_ns - self._clock.now_ns()) > 0:
+            for packet in self.receive(left_ns * 1e-9):
                 if packet.kind is request.kind:
                     return packet
         raise TransportTimeout(self._device, f"reply to {request.kind.name}", self._timeout_s)
@@ -69,9 +70,7 @@ class RtdeWire:
     def receive(self, timeout_s: float) -> list[Packet]:
         """Return received packets, waiting for the first up to ``timeout_s``. Raises DeviceGone, CorruptMessage."""
         if timeout_s > 0.0:
-            with selectors.DefaultSelector() as selector:
-                selector.register(self._socket, selectors.EVENT_READ)
-                selector.select(timeout_s)
+            wait_readable(self._clock, self._socket.fileno(), self._clock.now_ns() + round(1e9 * timeout_s))
         try:
             piece = self._socket.recv(_LARGEST_READ)
         except BlockingIOError:
@@ -93,10 +92,10 @@ class Registers:
         CorruptMessage: the registers do not exist, or another client owns them.
     """
 
-    def __init__(self, device: str, host: str, timeout_s: float) -> None:
+    def __init__(self, device: str, host: str, timeout_s: float, clock: Clock) -> None:
         self._device = device
         try:
-            self._wire = RtdeWire(device, host, timeout_s)
+            self._wire = RtdeWire(device, host, timeout_s, clock)
         except OSError as error:
             raise DeviceGone(device, f"RTDE of {host}: {error}") from error
         try:

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
+from touchcell.drivers.core.errors import CorruptMessage, DeviceGone, TransportError
 from touchcell.drivers.core.spec import DriverContext
-from touchcell.drivers.ur.driver import SPEC, UrConfig
+from touchcell.drivers.ur import control, driver, state
+from touchcell.drivers.ur.driver import SPEC, UrArm, UrConfig
+from touchcell.drivers.ur.emulator import server
+from touchcell.drivers.ur.registers import Registers
 from touchcell.testing.emulation.in_cell import (
     FOR_EVER_PACKETS,
     FOR_EVER_S,
@@ -18,8 +25,15 @@ from touchcell.testing.emulation.in_cell import (
     start_arguments,
     tcp_of_joints,
 )
+from touchcell.testing.emulation.lockstep import Lockstep, emulator_in_step
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
+
+SCRIPT_PORT: Final = 30002
+_UPLOAD_S = 1.0
+_UPLOADING_NS = 100_000_000
+# What the emulated controller recognises ur-rtde's program by.
+_PROGRAM: Final = b"def rtde_control():\n  rtde_set_watchdog\nend\n"
 
 UNLOCK_AFTER_S = 0.1
 """A real controller keeps a protective stop locked for 5 s; too long for a test."""
@@ -82,6 +96,38 @@ def rig(folder: Path, address: int) -> DeviceFixture:
             "that registers keep their values when a program or a client ends",
         ),
     )
+
+
+def rig_in_step(folder: Path, address: int) -> DeviceFixture:
+    """Build the same fixture on a simulated time, which the emulator shares with the driver."""
+    world = Lockstep([driver, control, state])
+    arguments = ("--host", host_of(address), "--unlock-after", str(UNLOCK_AFTER_S))
+    return replace(
+        rig(folder, address),
+        start=lambda: emulator_in_step(world, server, *arguments).start(),
+        build=lambda clock: arm_in_step(config_of(address), clock),
+        configured=arm_in_step,
+        world=world,
+        clock=lambda: world,
+        reachable=False,
+    )
+
+
+def arm_in_step(config: UrConfig, clock: Clock) -> UrArm:
+    """Build the driver with an upload that takes no other process, for an emulator in the same world."""
+
+    def upload(device: str, host: str) -> None:
+        try:
+            # Claimed and cleared first, as ur-rtde does.
+            registers = Registers(device, host, _UPLOAD_S, clock)
+            with closing(registers), socket.create_connection((host, SCRIPT_PORT), _UPLOAD_S) as script:
+                registers.feed_watchdog()
+                script.sendall(_PROGRAM)
+                clock.sleep_until_ns(clock.now_ns() + _UPLOADING_NS)
+        except (OSError, TransportError, CorruptMessage) as error:
+            raise DeviceGone(device, f"upload to {host}: {error}") from None
+
+    return UrArm("ur", config, clock, upload)
 
 
 def _settings(config: UrConfig, folder: Path, number: int) -> Mapping[str, Any]:

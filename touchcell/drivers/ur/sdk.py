@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 
 from touchcell.drivers.core.errors import DeviceGone
 
 _UPLOAD_S = 10.0
+
+Upload = Callable[[str, str], None]
+"""Function of device and host that uploads the control program, as ``upload_control_program`` does."""
 
 
 def upload_control_program(device: str, host: str) -> None:

@@ -136,14 +136,15 @@ class StateStream:
         device: name for errors.
         host: address of the controller.
         timeout_s: timeout of the connection and of each reply of its setup.
+        clock: the host's clock.
 
     Raises on construction:
         ConnectError: the controller does not have one of ``VARIABLES``.
         OSError, TransportError: it cannot be reached or does not reply.
     """
 
-    def __init__(self, device: str, host: str, timeout_s: float) -> None:
-        self._wire = RtdeWire(device, host, timeout_s)
+    def __init__(self, device: str, host: str, timeout_s: float, clock: Clock) -> None:
+        self._wire = RtdeWire(device, host, timeout_s, clock)
         self._connected = True
         try:
             self._wire.ask(ur_codec.version_request())

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from touchcell.drivers.core.camera import CameraConfig
 from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
+from touchcell.drivers.core.paced_clock import emulated_clock
 from touchcell.drivers.v4l2.driver import SPEC, V4l2Camera, V4l2Config
+from touchcell.drivers.v4l2.emulator import server
 from touchcell.drivers.v4l2.shim import ShimCalls
 from touchcell.testing.emulation.in_cell import EmulatedDriver
+from touchcell.testing.emulation.lockstep import Lockstep, emulator_in_step
 from touchcell.testing.emulation.process import EmulatorProcess
 from touchcell.testing.emulation.rig import DeviceFixture
 
@@ -53,6 +58,46 @@ def rig(folder: Path, address: int) -> DeviceFixture:
             "frame pacing, exposure latency and error frames of real uvcvideo cameras are known from documents only",
             "stamps of the emulated camera have no transport delay; a USB camera delivers about one frame time later",
         ),
+    )
+
+
+class CallsInStep(ShimCalls):
+    """System calls on cameras that share the simulated time of a ``Lockstep`` world with the caller."""
+
+    @property
+    def _world(self) -> Lockstep:
+        world = emulated_clock()
+        assert isinstance(world, Lockstep)
+        return world
+
+    def open(self, path: str) -> int:
+        return self._world.outside(lambda: ShimCalls.open(self, path))
+
+    def ioctl(self, fd: int, request: int, argument: ctypes.Structure | ctypes.c_int32) -> None:
+        self._world.outside(lambda: ShimCalls.ioctl(self, fd, request, argument))
+
+    def poll(self, fd: int, timeout_s: float) -> int:
+        self._world.wait_readable(fd, self._world.now_ns() + round(1e9 * max(timeout_s, 0.0)))
+        return super().poll(fd, 0.0)
+
+
+def rig_in_step(folder: Path, address: int) -> DeviceFixture:
+    """Build the same camera as ``rig`` on a simulated time, which the emulator shares with the driver."""
+    fixture = rig(folder, address)
+    world = Lockstep()
+    arguments = ("--folder", str(folder), "--minor", str(address))
+
+    def build(config: V4l2Config, clock: Clock) -> Device:
+        return V4l2Camera("tip", clock, config, CallsInStep(folder))
+
+    return replace(
+        fixture,
+        start=lambda: emulator_in_step(world, server, *arguments).start(),
+        build=lambda clock: build(cast(V4l2Config, fixture.config), clock),
+        configured=build,
+        world=world,
+        clock=lambda: world,
+        reachable=False,
     )
 
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Protocol, Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from touchcell.progress import ProgressLines
+
 if TYPE_CHECKING:
     from touchcell.perception.networks.checkpoint import EpochRecord
 
@@ -29,7 +31,8 @@ class Observer(Protocol):
 
 
 class Display:
-    """Show a bar with the remaining time, and one line per epoch; into a file, the lines alone."""
+    """Show a bar with the remaining time, and one line per epoch; into a file the lines alone, and now and then one to
+    standard error."""
 
     def __init__(self, console: Console | None = None) -> None:
         self._console = console or Console()
@@ -43,6 +46,7 @@ class Display:
             console=self._console,
             disable=not self._console.is_terminal,
         )
+        self._lines = None if self._console.is_terminal else ProgressLines()
         self._task: TaskID | None = None
         self._task_name = ""
 
@@ -78,6 +82,9 @@ class Display:
         )
 
     def _show(self, name: str, description: str, done: int, total: int, loss: str = "") -> None:
+        if self._lines is not None:
+            self._lines(description, done, total, loss)
+            return
         if self._task is None or self._task_name != name:
             if self._task is not None:
                 self._bar.remove_task(self._task)

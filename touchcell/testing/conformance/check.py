@@ -9,7 +9,7 @@ from typing import Any, Literal
 from touchcell.drivers.core.commands import C
 from touchcell.testing.emulation.rig import DeviceFixture
 
-Circumstance = Literal["arm", "camera", "truth", "process", "limited axes"]
+Circumstance = Literal["arm", "camera", "truth", "process", "reachable", "limited axes"]
 """A kind of device, or what has to hold for it beside its protocols."""
 
 
@@ -19,7 +19,7 @@ class Needs:
 
     Attributes:
         needs: Protocols that the device provides, and "arm", "camera", "truth" (an emulator), "process" (an emulator of
-            its own), "limited axes".
+            its own), "reachable" (by other processes), "limited axes".
         on_hardware: whether it may run on a real device.
         of_faults: chooses among the rig's faults, by name, value and expected reaction, those for which it runs;
             None for a check without faults.
@@ -47,6 +47,9 @@ class Needs:
             elif need == "process":
                 if not rig.process:
                     return "simulated in the client's own process: it cannot vanish or hang while the client runs"
+            elif need == "reachable":
+                if not rig.reachable:
+                    return "emulated in the client's own process: no other client can use it"
             elif all(capabilities.twist_axes):
                 return "follows all six axes"
         return None

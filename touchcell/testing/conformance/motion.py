@@ -113,7 +113,7 @@ def release_stops_at_once(context: ConformanceContext) -> None:
     assert np.linalg.norm(rest.poses[-1][:3, 3] - start) <= _braking_m(context, rest.late_s)
 
 
-@check(TwistSink, "truth", "process")
+@check(TwistSink, "truth", "process", "reachable")
 def killed_client_leaves_the_arm_at_rest(context: ConformanceContext) -> None:
     """kill -9 of the client process: the device itself stops within its watchdog.
 

@@ -32,8 +32,9 @@ def conformance_device(request: pytest.FixtureRequest, tmp_path_factory: pytest.
     suite: Any = request.cls
     folder = tmp_path_factory.mktemp(suite.driver)
     under_test = DeviceUnderTest(suite.rig_function, folder, _address(request.config))
-    yield under_test
-    under_test.clear()
+    with under_test.rig.world:
+        yield under_test
+        under_test.clear()
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +12,19 @@ from touchcell.testing.conformance.check import Needs
 from touchcell.testing.emulation.rig import FixtureFactory
 
 
-def suite(rig: FixtureFactory, *, prefix: str = "Test") -> type:
+def suite(rig: FixtureFactory, *, prefix: str = "Test", only: Collection[str] | None = None) -> type:
     """Return the test class of ``rig``; assign it to a name that begins with ``prefix``.
 
     Args:
         rig: a module-level function, so that the client process that the suite kills can import it.
         prefix: prefix of test classes in pytest.
+        only: names of the checks to run; None for all.
     """
     plan = rig(Path(), 0)
     body: dict[str, Any] = {"rig_function": staticmethod(rig), "driver": plan.spec.name}
     for function in _checks():
+        if only is not None and function.__name__ not in only:
+            continue
         needs: Needs = function.conformance
         choose = needs.of_faults
         if choose is None:

@@ -10,9 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import math
 import os
-import select
 import socket
 import struct
 import time
@@ -24,11 +22,14 @@ import can
 
 from touchcell.drivers.core import can_errors
 from touchcell.drivers.core.can_packets import pack, unpack
+from touchcell.drivers.core.clock import wait_readable
+from touchcell.drivers.core.paced_clock import emulated_clock
 
 # What the hub makes the adapter of a client do: refuse sends (count, error number or 0 for none), be down (seconds).
 _REFUSE = struct.Struct("=Ii")
 _DOWN = struct.Struct("=4xd")
 _MOST_FRAMES = 256
+_LONGEST_WAIT_NS = 1_000_000_000
 
 
 class HubBus(can.BusABC):  # type: ignore[misc]
@@ -51,8 +52,9 @@ class HubBus(can.BusABC):  # type: ignore[misc]
         self.channel_info = f"touchcell_hub {channel}"
         self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         self._bus_state = can.BusState.ACTIVE
+        self._clock = emulated_clock()
         self._refused_sends, self._refusal = 0, 0
-        self._down_until_s, self._down_reported = 0.0, True
+        self._down_until_ns, self._down_reported = 0, True
         super().__init__(channel=channel, can_filters=can_filters)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
@@ -63,7 +65,7 @@ class HubBus(can.BusABC):  # type: ignore[misc]
                 # As python-can's socketcan interface reports a queue that select() finds full: without an error number.
                 raise can.CanOperationError("Transmit buffer full")
             raise can.CanOperationError(f"Failed to transmit: {os.strerror(self._refusal)}", self._refusal)
-        if time.monotonic() < self._down_until_s:
+        if self._clock.now_ns() < self._down_until_ns:
             raise can.CanOperationError(f"Failed to transmit: {os.strerror(errno.ENETDOWN)}", errno.ENETDOWN)
         try:
             self._socket.settimeout(timeout or 0.0)
@@ -73,15 +75,25 @@ class HubBus(can.BusABC):  # type: ignore[misc]
         except OSError as error:
             raise can.CanOperationError(f"adapter is disconnected: {error}", error.errno) from error
 
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """Return the next frame that passes the filters; None after ``timeout`` seconds of the emulated world."""
+        now_ns = self._clock.now_ns()
+        until_ns = None if timeout is None else now_ns + round(1e9 * timeout)
+        while True:
+            message, _ = self._recv_internal(None if until_ns is None else (until_ns - now_ns) * 1e-9)
+            if message is not None and self._matches_filters(message):
+                return message
+            now_ns = self._clock.now_ns()
+            if until_ns is not None and now_ns >= until_ns:
+                return None
+
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         if not self._down_reported:
             # A raw socket reports once that its interface went down, and then waits.
             self._down_reported = True
             raise can.CanOperationError(f"Failed to receive: {os.strerror(errno.ENETDOWN)}", errno.ENETDOWN)
-        # Not select(), which fails for file descriptors beyond 1023.
-        poller = select.poll()
-        poller.register(self._socket, select.POLLIN)
-        if not poller.poll(None if timeout is None else math.ceil(1e3 * timeout)):
+        until_ns = self._clock.now_ns() + (_LONGEST_WAIT_NS if timeout is None else round(1e9 * timeout))
+        if not wait_readable(self._clock, self._socket.fileno(), until_ns):
             return None, False
         try:
             packet = self._socket.recv(128)
@@ -93,10 +105,10 @@ class HubBus(can.BusABC):  # type: ignore[misc]
             self._refused_sends, self._refusal = _REFUSE.unpack(packet)
             return None, False
         if len(packet) == _DOWN.size:
-            self._down_until_s = time.monotonic() + _DOWN.unpack(packet)[0]
+            self._down_until_ns = self._clock.now_ns() + round(1e9 * _DOWN.unpack(packet)[0])
             self._down_reported = False
             return None, False
-        if time.monotonic() < self._down_until_s:
+        if self._clock.now_ns() < self._down_until_ns:
             return None, False
         message = unpack(packet, time.time())
         if message.is_error_frame:

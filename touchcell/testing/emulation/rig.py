@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
@@ -68,6 +69,8 @@ class DeviceFixture:
         state_rate_hz: rate that ``build`` configures, if not the declared one.
         clock: creates the common clock of a check.
         process: whether the emulator is a process of its own, which can hang and vanish while the client runs.
+        reachable: whether another process can use the emulator.
+        world: entered while the fixture is used, where driver and emulator share a simulated time.
         notes: behaviours known only from public documents.
     """
 
@@ -86,6 +89,8 @@ class DeviceFixture:
     state_rate_hz: float | None = None
     clock: Callable[[], Clock] = MonotonicClock
     process: bool = True
+    reachable: bool = True
+    world: AbstractContextManager[object] = field(default_factory=nullcontext)
     notes: tuple[str, ...] = ()
 
 
@@ -102,3 +107,6 @@ class FixtureFactory(Protocol):
 
 RIGS: Final = Registry("touchcell.rigs", "rig", FixtureFactory)
 """Fixtures of all drivers that have an emulator, by the driver's name."""
+
+RIGS_IN_STEP: Final = Registry("touchcell.rigs_in_step", "rig", FixtureFactory)
+"""Fixtures of the drivers that share a simulated time with their emulators, by the driver's name."""

@@ -31,16 +31,18 @@ class Tick:
     coasted: int = 0
 
 
-def following_tick(due_ns: int, now_ns: int, period_ns: int) -> tuple[int, int, Tick]:
+def following_tick(due_ns: int, now_ns: int, period_ns: int, *, waits: bool = False) -> tuple[int, int, Tick]:
     """Plan the tick after the one that was due at ``due_ns`` and comes now.
+
+    With ``waits`` none is coasted through: the device's clock waits for a busy machine.
 
     Returns:
         when the next is due, in how many nanoseconds to wake up for it, and what this one is.
     """
     late_ns = now_ns - due_ns
     behind = late_ns // period_ns
-    coasted = behind if _MADE_UP_FOR < behind <= _COASTED_THROUGH else 0
-    due_ns = now_ns if behind > _COASTED_THROUGH else due_ns + coasted * period_ns
+    coasted = behind if _MADE_UP_FOR < behind <= _COASTED_THROUGH and not waits else 0
+    due_ns = now_ns if behind > (_MADE_UP_FOR if waits else _COASTED_THROUGH) else due_ns + coasted * period_ns
     next_due_ns = due_ns + period_ns
     return next_due_ns, max(next_due_ns - now_ns, 3 * period_ns // 4), Tick(late_ns > period_ns // 4, coasted)
 
@@ -63,9 +65,11 @@ class Ticker:
     Args:
         period_ns: below one second.
         on_tick: called in the loop's thread.
+        waits: late ticks are never coasted through, so that a busy machine slows the device's clock.
     """
 
-    def __init__(self, period_ns: int, on_tick: Callable[[Tick], None]) -> None:
+    def __init__(self, period_ns: int, on_tick: Callable[[Tick], None], *, waits: bool = False) -> None:
+        self._waits = waits
         self._period_ns = period_ns
         self._on_tick = on_tick
         self._libc = ctypes.CDLL(None, use_errno=True)
@@ -93,6 +97,8 @@ class Ticker:
             os.read(self._fd, 8)
         except BlockingIOError:
             return
-        self._due_ns, in_ns, tick = following_tick(self._due_ns, self._clock.now_ns(), self._period_ns)
+        self._due_ns, in_ns, tick = following_tick(
+            self._due_ns, self._clock.now_ns(), self._period_ns, waits=self._waits
+        )
         self._arm(in_ns)
         self._on_tick(tick)

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import select
 import socket
+import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -50,6 +52,7 @@ from touchcell.testing.emulation.ticker import Tick, Ticker
 _PERIOD_NS = 1_000_000
 _LOST_LIMIT = 20
 _RESTART_S = 0.2
+_LINK_FAULTS = frozenset({"unplug", "drop", "drop_states", "delay", "corrupt"})
 _INDEX = {error.name: index for index, error in enumerate(ERRORS)}
 _POWER_OR_MODE = frozenset({Request.MOVE, Request.SET_GUIDING_MODE, Request.AUTOMATIC_ERROR_RECOVERY})
 
@@ -59,6 +62,8 @@ class FrankaEmulator(Emulator):
 
     Args:
         host: address to bind; the port is fixed by libfranka.
+        start_deg: joint angles at which it begins.
+        patience_s: how long the time stands still for a moving client that has not answered the last state.
     """
 
     faults: ClassVar[Mapping[str, str]] = {
@@ -82,7 +87,7 @@ class FrankaEmulator(Emulator):
         "restart": "drop the client and return after a fifth of a second with the clock at zero",
     }
 
-    def __init__(self, host: str, start_deg: Sequence[float] | None = None) -> None:
+    def __init__(self, host: str, start_deg: Sequence[float] | None = None, *, patience_s: float = 0.0) -> None:
         super().__init__()
         self._host = host
         self._arm = EmulatedArm() if start_deg is None else EmulatedArm(q=np.radians(start_deg))
@@ -105,6 +110,8 @@ class FrankaEmulator(Emulator):
         self._onset = CommandOnset()
         self._at_last_command: list[float] | None = None
         self._reflex_detail = ""
+        self._patience_s = patience_s
+        self._answers = True
         self._ticker: Ticker | None = None
 
     async def start(self) -> None:
@@ -114,7 +121,7 @@ class FrankaEmulator(Emulator):
         self._udp.setblocking(False)
         self._describe_tool()
         self.publish_joints(self._arm.q)
-        self._ticker = Ticker(_PERIOD_NS, self._tick)
+        self._ticker = Ticker(_PERIOD_NS, self._tick, waits=self._patience_s > 0.0)
 
     async def stop(self) -> None:
         if self._ticker is not None:
@@ -239,6 +246,7 @@ class FrankaEmulator(Emulator):
         self._state.message_id += 1
         if "unplug" not in self.active:
             self._read_requests()
+        self._await_answer()
         command = self._read_command()
         if self._move_id is not None:
             self._advance(command)
@@ -264,6 +272,23 @@ class FrankaEmulator(Emulator):
         except CorruptMessage:
             self._counts["bad_messages"] += 1
             self._drop_client()
+
+    def _await_answer(self) -> None:
+        """Let the time stand still until a moving client has answered the last state, where that is wished."""
+        if self._patience_s <= 0.0 or self._move_id is None or _LINK_FAULTS & self.active.keys():
+            return
+        assert self._udp is not None
+        # A client that has missed one answer is waited for no more until it answers again.
+        deadline_s = time.monotonic() + (self._patience_s if self._answers else 0.0)
+        self._answers = False
+        while self._move_id is not None and not self._answers:
+            sources = [self._udp] if self._client is None else [self._udp, self._client]
+            ready, _, _ = select.select(sources, [], [], max(deadline_s - time.monotonic(), 0.0))
+            self._answers = self._udp in ready
+            if not ready:
+                return
+            if not self._answers:
+                self._read_requests()
 
     def _read_command(self) -> MotionCommand | None:
         assert self._udp is not None
@@ -481,8 +506,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command-line arguments."""
     parser.add_argument("--host", default="127.0.0.1", help="address to bind; the port is 1337")
     parser.add_argument("--start-deg", type=float, nargs=7, metavar="DEG", help="joint angles at which it begins")
+    parser.add_argument(
+        "--patience", type=float, default=0.0, metavar="S", help="let time stand still for a client that answers late"
+    )
 
 
 def build(arguments: argparse.Namespace) -> FrankaEmulator:
     """Build the emulator; it is not started yet."""
-    return FrankaEmulator(arguments.host, arguments.start_deg)
+    return FrankaEmulator(arguments.host, arguments.start_deg, patience_s=arguments.patience)

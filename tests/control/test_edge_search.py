@@ -1,0 +1,68 @@
+"""Touching one edge of a side tells where its middle is."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from touchcell.control.edge_search import EdgeSearch
+from touchcell.control.push_model import Contact
+from touchcell.control.push_steering import Pose
+
+RADIUS_M, CLEAR_M = 0.02, 0.008
+
+
+def touch(tip: Pose, direction_rad: float, middle: Pose, width_m: float) -> Contact | None:
+    """Return where a round tip that moves on by twice the clearance touches a straight side; None where it does not."""
+    x, y = middle.local((tip.x, tip.y))
+    beyond_m = max(abs(y) - 0.5 * width_m, 0.0)
+    # The tip is turned to the edge, and models read no contact that is more than 25 degrees beside its axis.
+    if beyond_m >= RADIUS_M:
+        return None
+    angle = math.copysign(math.asin(beyond_m / RADIUS_M), -y)
+    contact_x = -x - RADIUS_M * math.cos(angle)
+    if contact_x > 2.0 * CLEAR_M or abs(math.remainder(middle.heading + angle - tip.heading, math.tau)) > 0.435:
+        return None
+    edge_y = math.copysign(min(abs(y), 0.5 * width_m), y)
+    at = middle.ahead(edge_y, 0.5 * math.pi)
+    return Contact(at.x, at.y, middle.heading + angle)
+
+
+@given(st.floats(-0.02, 0.02), st.floats(-0.018, 0.018), st.floats(0.04, 0.12), st.floats(-0.02, 0.02))
+def test_the_middle_is_found_from_20_mm_off_what_is_expected(
+    off_m: float, expected_m: float, width_m: float, turned: float
+) -> None:
+    side = Contact(0.1, -0.05, 0.3)
+    middle_m = expected_m + off_m
+    middle = Pose(side.x_m, side.y_m, side.heading_rad).ahead(middle_m, 0.5 * math.pi)
+    search = EdgeSearch(Contact(side.x_m, side.y_m, side.heading_rad + turned), expected_m, width_m, RADIUS_M)
+    while search.middle is None and not search.failed:
+        tip = search.tip(CLEAR_M)
+        contact = touch(tip, search.direction_rad, middle, width_m)
+        search.missed() if contact is None else search.touched(contact)
+    assert search.middle is not None
+    assert math.dist((search.middle.x_m, search.middle.y_m), (middle.x, middle.y)) < 1.5e-3
+
+
+@given(st.sampled_from([-1.0, 1.0]), st.floats(0.1, 0.5), st.floats(0.04, 0.1), st.floats(-0.01, 0.01))
+def test_a_first_contact_with_the_edge_itself_is_no_contact_with_the_side(
+    left: float, turned: float, width_m: float, expected_m: float
+) -> None:
+    middle = Pose(0.2, 0.1, -0.2)
+    edge = middle.ahead(left * 0.5 * width_m, 0.5 * math.pi)
+    first = Contact(edge.x, edge.y, middle.heading - left * turned)
+    search = EdgeSearch(first, expected_m - left * 0.02, width_m, RADIUS_M)
+    side = Pose(first.x_m, first.y_m, middle.heading).ahead(-left * 0.6 * width_m, 0.5 * math.pi)
+    search.touched(Contact(side.x, side.y, side.heading))
+    assert search.middle is not None
+    assert math.dist((search.middle.x_m, search.middle.y_m), (middle.x, middle.y)) < 1e-6
+    assert search.middle.heading_rad == pytest.approx(middle.heading)
+
+
+def test_a_side_that_never_ends_is_given_up() -> None:
+    search = EdgeSearch(Contact(0.0, 0.0, 0.0), 0.0, 0.08, RADIUS_M)
+    while not search.failed:
+        at = search.tip(0.0)
+        search.touched(Contact(0.0, at.y, 0.0))
+    assert search.middle is None

@@ -1,0 +1,107 @@
+"""Find the middle of an object's flat side by touching one of its edges.
+
+A round tip of radius R whose centre is beyond an edge, by less than R, touches the edge itself: the normal turns
+inwards, and the edge is where the tip's surface is, along that normal. With the width of the side it tells where the
+side's middle is, which no touch of the side itself tells.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from touchcell.control.push_model import Contact
+from touchcell.control.push_steering import Pose
+
+_BEYOND_M: Final = 0.006
+"""Distance beyond the expected edge at which it is searched for."""
+_STEP_M: Final = 0.011
+"""Distance to the next attempt: an edge is felt from 1.4 to 13 mm beside the tip's centre."""
+_EDGE_RAD: Final = math.radians(4.0)
+"""Turn of the normal from which an edge is touched, and not the side."""
+_INWARDS_RAD: Final = math.radians(20.0)
+"""Turn of the tip towards the edge's normals: models know tilts to 25 degrees."""
+_APART_M: Final = 0.005
+"""Distance of two contacts from which the line through them tells how their side is turned."""
+_MOST_TOUCHES: Final = 6
+
+
+class EdgeSearch:
+    """Search for one edge of a side; touches are made by the caller.
+
+    Args:
+        side: a contact with the side, or, unknown to the caller, with one of its edges.
+        expected_m: of the side's middle to the left of that contact.
+        width_m: of the side.
+        tip_radius_m: radius of the tip.
+    """
+
+    def __init__(self, side: Contact, expected_m: float, width_m: float, tip_radius_m: float) -> None:
+        self._side = Pose(side.x_m, side.y_m, side.heading_rad)
+        self._left = -1.0 if expected_m > 0.0 else 1.0
+        self._half_m = 0.5 * width_m
+        self._tip_radius_m = tip_radius_m
+        self._at_m = self._left * expected_m + self._half_m + _BEYOND_M
+        # Outwards: the farthest touch of the side, and the nearest attempt that touched nothing.
+        self._flat_m: float | None = None
+        self._missed_m: float | None = None
+        self._touches = 0
+        self.middle: Contact | None = None
+        """The side's middle; None until the edge has been found."""
+
+    @property
+    def failed(self) -> bool:
+        """True if the edge is not where it was searched for."""
+        return self.middle is None and self._touches >= _MOST_TOUCHES
+
+    def tip(self, clear_m: float) -> Pose:
+        """Return where the tip's centre shall be for the next touch, before it moves on by ``clear_m`` and more."""
+        at = self._side.ahead(-self._tip_radius_m - clear_m).ahead(self._left * self._at_m, 0.5 * math.pi)
+        return Pose(at.x, at.y, at.heading - self._left * _INWARDS_RAD)
+
+    @property
+    def direction_rad(self) -> float:
+        """Direction in which the tip moves on to touch."""
+        return self._side.heading
+
+    def touched(self, contact: Contact) -> None:
+        """Take the point that was touched and its normal into account."""
+        self._touches += 1
+        turned = math.remainder(contact.heading_rad - self._side.heading, 2.0 * math.pi)
+        if abs(turned) > _EDGE_RAD and self._lies_on_turned_side(contact, turned):
+            # The first contact was with the edge, whose normal is not the side's.
+            edge, towards = self._side, Pose(contact.x_m, contact.y_m, contact.heading_rad)
+            towards_left = -math.copysign(1.0, towards.local((edge.x, edge.y))[1])
+            self._find(Pose(edge.x, edge.y, towards.heading).ahead(towards_left * self._half_m, 0.5 * math.pi))
+        elif -self._left * turned > _EDGE_RAD:
+            edge = Pose(contact.x_m, contact.y_m, self._side.heading)
+            self._find(edge.ahead(-self._left * self._half_m, 0.5 * math.pi))
+        else:
+            self._flat_m = self._at_m
+            self._step()
+
+    def _lies_on_turned_side(self, contact: Contact, turned: float) -> bool:
+        """Return True if both contacts lie on one straight side with the normal of the second."""
+        ahead, left = self._side.local((contact.x_m, contact.y_m))
+        if abs(left) < _APART_M:
+            return False
+        direction = math.atan2(-ahead * math.copysign(1.0, left), abs(left))
+        return abs(direction - turned) < abs(direction)
+
+    def _find(self, middle: Pose) -> None:
+        self.middle = Contact(middle.x, middle.y, middle.heading)
+
+    def missed(self) -> None:
+        """Take into account that nothing was touched, or nothing that could be measured."""
+        self._touches += 1
+        self._missed_m = self._at_m
+        self._step()
+
+    def _step(self) -> None:
+        match self._flat_m, self._missed_m:
+            case float(), float():
+                self._at_m = 0.5 * (self._flat_m + self._missed_m)
+            case float(), None:
+                self._at_m = self._flat_m + _STEP_M
+            case None, float():
+                self._at_m = self._missed_m - _STEP_M
