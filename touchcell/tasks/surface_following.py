@@ -62,7 +62,7 @@ class TurnFeedforward:
     def speed_m_s(self, wanted_m_s: float) -> float:
         """Return the speed at which the turn stays within the limits, with a reserve for what touch corrects."""
         bend = float(np.linalg.norm(self._curvature.rad_per_m()[:2]))
-        return min(wanted_m_s, self._fastest_rad_s / max(bend, 1e-9))
+        return min(wanted_m_s, float(self._fastest_rad_s) / max(bend, 1e-9))
 
     def rate_rad_s(self, speed_m_s: float) -> Array:
         """Return the turn (3,) about the axes of the sensor at a speed."""
