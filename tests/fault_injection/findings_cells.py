@@ -155,8 +155,8 @@ def broken_commands(folder: Path, good: Path) -> dict[str, list[object]]:
     return commands | {
         "--out a file": ["run", good, "--out", folder / "file", "--quiet"],
         "--out no parent": ["run", good, "--out", folder / "file" / "x", "--quiet"],
-        "--port 80000": ["view", folder, "--port", 80000],
-        "--port -5": ["view", folder, "--port", -5],
+        "--port 80000": ["ui", folder, "--port", 80000],
+        "--port -5": ["ui", folder, "--port", -5],
         "--jobs -3": ["experiment", "surface_following", "--jobs", -3, "--quick"],
         "--trials -1": ["experiment", "surface_following", "--trials", -1],
         "emulate no file": ["emulate", "cell", folder / "none.yaml"],

@@ -11,6 +11,7 @@ import pytest
 from touchcell.cell.cli.main import main
 from touchcell.geometry import se3
 from touchcell.paths import MODELS
+from touchcell.perception.markers.estimator import MarkerEstimator
 from touchcell.perception.models.architecture import Architecture
 from touchcell.perception.runtime.contact_gate import ContactGate
 from touchcell.perception.runtime.inference import ContactModel
@@ -70,3 +71,22 @@ def test_the_demo_follows_the_ramp(tmp_path: Path, capsys: pytest.CaptureFixture
     assert rms["z_mm"] < 0.2
     assert rms["alpha_deg"] < 1.0
     assert rms["beta_deg"] < 1.2
+
+
+@pytest.mark.parametrize("name", ["sim_shape", "sim_edge"])
+def test_the_models_of_shapes_are_small_and_read_the_camera_of_the_simulation(name: str) -> None:
+    training = pytest.importorskip("touchcell.cell.cli.train_sim", exc_type=ImportError)
+    path = MODELS / f"{name}.safetensors"
+    assert path.stat().st_size < 6_000_000
+    estimator = MarkerEstimator.load(path)
+    imagined = training.Imagined(feature="edge") if name == "sim_edge" else training.Imagined(feels="shape")
+    assert estimator.header.preprocessing == imagined.preprocessing("markers")
+    renderer, errors = FrameRenderer(seed=99), []
+    for i, contact in enumerate(imagined.contacts(64, 4321)):
+        prediction = estimator.predict(renderer.raw(contact.pixels, i))
+        predicted = se3.to_euler_mm_deg(se3.inverse(se3.exp(prediction.xi)))
+        errors.append(np.abs(predicted - se3.to_euler_mm_deg(contact.T_f_s)))
+    assert (np.median(errors, axis=0) < MEDIAN_ERRORS[name]).all(), np.median(errors, axis=0)
+
+
+MEDIAN_ERRORS = {"sim_shape": [0.2, 0.2, 0.2, 1.5, 1.5, 0.6], "sim_edge": [1.0, 0.2, 0.3, 2.0, 2.0, 8.0]}

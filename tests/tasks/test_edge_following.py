@@ -30,9 +30,15 @@ def over(x_mm: float, y_mm: float, z_mm: float, yaw_deg: float = 0.0) -> np.ndar
     return se3.from_euler_mm_deg(np.array([x_mm, y_mm, z_mm, 180.0, 0.0, yaw_deg]))
 
 
-def run(settings: dict[str, Any], folder: Path) -> tuple[Any, np.ndarray, Any]:
+TRUE_EDGE: dict[str, Any] = {
+    "sensors.sensor.estimator": {"kind": "true_edge", "noise_mm": 0.1, "noise_deg": 0.5},
+    "sensors.sensor.feels": "plane",
+}
+
+
+def run(settings: dict[str, Any], folder: Path, *, learned: bool = False) -> tuple[Any, np.ndarray, Any]:
     """Return the result, true edge poses (n, 6) in mm and degrees while the task ran, and the task."""
-    plan = plan_cell(CELL, settings=settings)
+    plan = plan_cell(CELL, settings=settings if learned else {**TRUE_EDGE, **settings})
     (folder / "cell.yaml").write_text(plan.text())
     cell = compose(plan)
     with Recorder(folder / "run.mcap") as recorder, cell:
@@ -55,6 +61,16 @@ def test_the_rim_of_a_disc_is_followed_once_around(direction: str, tmp_path: Pat
     assert rms(edge[:, 2] - 3.0) < 0.2
     assert rms(edge[:, 5]) < 2.0
     assert len(edge) / 100.0 == pytest.approx(2.0 * math.pi * 50.0 / 30.0, rel=0.06)
+
+
+def test_the_network_that_ships_follows_a_rim(tmp_path: Path) -> None:
+    settings = {"task.close_loop": False, "task.distance_mm": 60}
+    result, edge, task = run(settings, tmp_path, learned=True)
+    assert result.outcome.value == "done", result.reason
+    assert task.transitions[1].target == "check"
+    assert rms(edge[:, 0]) < 0.8
+    assert rms(edge[:, 2] - 3.0) < 0.2
+    assert rms(edge[:, 5]) < 4.0
 
 
 def test_corners_of_a_square_are_turned_without_losing_the_contact(tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ def test_follows_a_plane_from_start_to_end():
     plant.run(task, until="run")
     start = plant.T_w_s[:3, 3]
     actions = plant.run(task, until="retract")
-    assert len(actions) == pytest.approx(60.0 / 20.0 * RATE_HZ, abs=3)
+    assert len(actions) == pytest.approx(60.0 / 20.0 * RATE_HZ, abs=8)  # slower while a tilt is corrected
     labels = se3.to_euler_mm_deg(plant.seen)
     np.testing.assert_allclose(labels[2:5], [3.0, 0.0, 0.0], atol=0.001)
     assert np.linalg.norm(plant.T_w_s[:3, 3] - start) == pytest.approx(0.060, abs=0.0005)
@@ -442,7 +442,7 @@ def test_turns_with_a_surface_that_bends(surface, speed_mm_s):
 def test_meets_the_limits_under_single_frame_noise():
     noise = np.array([0.25e-3, 0.25e-3, 0.06e-3, *np.radians([0.35, 0.35, 0.8])])
     loop = SimulatedLoop(RAMPS[0][0], (-30.0, 0.0, 40.0, 180.0, 0.0, 0.0), noise=noise, latency_s=0.04, seed=1)
-    task = SPEC.build(SurfaceFollowingConfig(curvature_window_mm=20.0), loop.context)
+    task = SPEC.build(SurfaceFollowingConfig(), loop.context)
     log = loop.run(task)
     assert task.succeeded
     assert log.depth_rms_mm(3.0) < 0.1

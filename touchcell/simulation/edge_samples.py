@@ -1,12 +1,13 @@
 """Random contacts of randomised simulated sensors with edges: Algorithm 1 of the paper, generalised.
 
-For each sample the tip is tilted, turned and offset against a straight edge of a block, pressed in and sheared. The
-label is the pose of the sensor in the edge frame {e} (``touchcell.simulation.edges``); its y, along the edge, carries
-nothing.
+For each sample the tip is tilted, turned and offset against the rim of a random part, pressed in and sheared. The
+label is the pose of the sensor in the edge frame {e} (``touchcell.simulation.edges``), whose origin glides along the
+edge with the tip: its y is zero.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
@@ -15,22 +16,26 @@ import numpy as np
 
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.simulation.closed_forms import Box
-from touchcell.simulation.contact import ContactLaw, ContactModel
-from touchcell.simulation.relief import felt_relief
+from touchcell.simulation.contact import ContactLaw
+from touchcell.simulation.edges import nearest_edge
+from touchcell.simulation.meshes.mesh_shape import MeshShape
+from touchcell.simulation.pressed import pressed
+from touchcell.simulation.random_parts import random_part
 from touchcell.simulation.samples import SampledContact, Variation, scattered
 from touchcell.simulation.surfaces import Surface
 from touchcell.simulation.tip import Tip, TipParameters
 
-_IMAGES_PER_TIP: Final = 16
-_BLOCK_M: Final = (0.4, 0.4, 0.1)
-_T_WORLD_E: Final = se3.from_euler_mm_deg(np.array([200.0, 0.0, 120.0, 180.0, 0.0, 0.0]))
-"""Of the edge at x = 200 mm of the block, for a tip of 20 mm."""
+_IMAGES_PER_TIP: Final = 32
+_CREASE_RAD: Final = math.radians(30.0)
+_NEAR_CORNER: Final = 0.3
+_CORNER_RAD: Final = math.radians(15.0)
+_ALONG_MM: Final = 0.1
+"""Along the edge nothing is felt: a label within a tenth of a millimetre keeps its scale from being zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class EdgeRanges:
-    """From where contacts are drawn, evenly.
+    """From where contacts are drawn: half of them evenly, half about the middle, where a controller holds them.
 
     Attributes:
         offset_mm: of the tip across the edge, to either side.
@@ -40,11 +45,30 @@ class EdgeRanges:
         shear_mm: largest, in any direction.
     """
 
-    offset_mm: float = 7.0
-    depth_mm: tuple[float, float] = (0.5, 5.5)
+    offset_mm: float = 8.0
+    depth_mm: tuple[float, float] = (0.2, 7.0)
     tilt_deg: float = 12.0
-    turn_deg: float = 60.0
-    shear_mm: float = 3.0
+    turn_deg: float = 75.0
+    shear_mm: float = 3.5
+
+    def drawn(self, rng: np.random.Generator) -> Array:
+        """Return a random contact (6,) mm and deg."""
+        low, high = self.depth_mm
+        most = np.array([self.offset_mm, 0.5 * (high - low), self.tilt_deg, self.tilt_deg, self.turn_deg])
+        share = rng.uniform(-1.0, 1.0, 5) if rng.random() < 0.5 else np.clip(rng.normal(0.0, 0.25, 5), -1.0, 1.0)
+        offset, depth, alpha, beta, turn = share * most
+        return np.array([offset, 0.0, depth + 0.5 * (low + high), alpha, beta, turn])
+
+    def holds(self, contact_mm_deg: Array) -> bool:
+        """Return True if a contact (6,) is within."""
+        offset, _, depth, alpha, beta, turn = np.abs(contact_mm_deg)
+        low, high = self.depth_mm
+        return bool(
+            offset <= self.offset_mm
+            and low <= depth <= high
+            and max(alpha, beta) <= 1.3 * self.tilt_deg
+            and turn <= 1.2 * self.turn_deg
+        )
 
 
 def edge_contacts(
@@ -53,35 +77,68 @@ def edge_contacts(
     """Yield ``n`` random contacts with edges, the same for the same seed."""
     rng = np.random.default_rng(seed)
     ranges, variation, law = ranges or EdgeRanges(), variation or Variation(), ContactLaw()
-    surface = Surface(Box(_BLOCK_M))
     for start in range(0, n, _IMAGES_PER_TIP):
         tip = Tip(scattered(TipParameters(), variation, rng))
+        shape = MeshShape(random_part(rng), _CREASE_RAD)
         for _ in range(min(_IMAGES_PER_TIP, n - start)):
-            T_e_s = se3.from_euler_mm_deg(_drawn(ranges, rng))
-            pixels = _pixels(tip, T_e_s, _shear(ranges, rng), surface, law)
+            T_e_s, pixels = _contact(shape, tip, ranges, law, rng)
             pixels = pixels + rng.normal(0.0, variation.marker_px, pixels.shape)
             seen = rng.random(len(pixels)) >= variation.missing
             radius = tip.parameters.disc_radius_px * (1.0 + rng.normal(0.0, variation.disc_radius))
-            yield SampledContact(T_e_s, pixels[seen], float(radius))
+            yield SampledContact(T_e_s, pixels, seen, float(radius))
 
 
-def _drawn(ranges: EdgeRanges, rng: np.random.Generator) -> Array:
-    low, high = ranges.depth_mm
-    # Along the edge nothing is felt: a label within a tenth of a millimetre keeps its scale from being zero.
-    offset, along, depth = rng.uniform([-ranges.offset_mm, -0.1, low], [ranges.offset_mm, 0.1, high])
-    alpha, beta = rng.uniform(-ranges.tilt_deg, ranges.tilt_deg, 2)
-    return np.array([offset, along, depth, alpha, beta, rng.uniform(-ranges.turn_deg, ranges.turn_deg)])
+def _contact(
+    shape: MeshShape, tip: Tip, ranges: EdgeRanges, law: ContactLaw, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return T_e_s (4, 4) and pixels (markers, 2) of a contact within the ranges."""
+    surface, radius_m = Surface(shape), law.tip_radius_m
+    while True:
+        T_world_e = _somewhere(shape, surface, radius_m, rng)
+        T_world_s = se3.compose(T_world_e, se3.from_euler_mm_deg(ranges.drawn(rng)))
+        # Beside corners and on bends the edge that the tip feels is not the one that it was placed at.
+        felt = nearest_edge([surface], T_world_s, 0.0, radius_m)
+        assert felt is not None
+        label = se3.to_euler_mm_deg(se3.compose(se3.inverse(felt), T_world_s))
+        if not ranges.holds(label):
+            continue
+        state, pixels = pressed(surface, tip, law, _sheared(T_world_e, T_world_s, ranges, rng), T_world_s)
+        if not state.in_contact:
+            continue
+        label[1] = rng.uniform(-_ALONG_MM, _ALONG_MM)
+        return se3.from_euler_mm_deg(label), pixels
 
 
-def _shear(ranges: EdgeRanges, rng: np.random.Generator) -> Array:
-    angle, length = rng.uniform(0.0, 2.0 * np.pi), 1e-3 * ranges.shear_mm * np.sqrt(rng.random())
-    return np.array([length * np.cos(angle), length * np.sin(angle), 0.0, 0.0, 0.0, 0.0])
+def _somewhere(shape: MeshShape, surface: Surface, radius_m: float, rng: np.random.Generator) -> Array:
+    """Return the frame {e} (4, 4) of a random point of the rim, often near a corner."""
+    edges = shape.edges
+    upper = np.flatnonzero(edges.middle_normals[:, :, 2].max(axis=1) > math.cos(math.radians(50.0)))
+    sides = edges.ends - edges.starts
+    if rng.random() < _NEAR_CORNER:
+        units = sides / np.linalg.norm(sides, axis=1, keepdims=True)
+        bends = np.einsum("kc,kc->k", units[upper], np.roll(units[upper], -1, axis=0))
+        corners = upper[np.abs(bends) < math.cos(_CORNER_RAD)]
+        upper = corners if len(corners) else upper
+    i = int(rng.choice(upper))
+    point = edges.starts[i] + rng.random() * sides[i]
+    normal = edges.middle_normals[i, edges.middle_normals[i, :, 2].argmax()]
+    T_world_s = np.eye(4)
+    T_world_s[:3, :3] = _with_z(-normal)
+    T_world_s[:3, 3] = point + radius_m * normal
+    T_world_e = nearest_edge([surface], T_world_s, 0.0, radius_m)
+    assert T_world_e is not None
+    return T_world_e
 
 
-def _pixels(tip: Tip, T_e_s: Array, shear: Array, surface: Surface, law: ContactLaw) -> Array:
-    model = ContactModel(law)
-    T_world_s = se3.compose(_T_WORLD_E, T_e_s)
-    model.step(se3.compose(se3.compose(_T_WORLD_E, se3.exp(-shear)), T_e_s), surface, 0.0)
-    state = model.step(T_world_s, surface, 0.0)
-    relief = felt_relief(surface, T_world_s, 0.0, tip.relief.directions, law.tip_radius_m)
-    return tip.pixels(state.T_f_s, relief)
+def _with_z(z: Array) -> Array:
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def _sheared(T_world_e: Array, T_world_s: Array, ranges: EdgeRanges, rng: np.random.Generator) -> Array:
+    """Return from where a contact is dragged to ``T_world_s`` along the face."""
+    angle, length = rng.uniform(0.0, 2.0 * math.pi), 1e-3 * ranges.shear_mm * rng.random()
+    T = T_world_s.copy()
+    T[:3, 3] -= T_world_e[:3, :3] @ np.array([length * math.cos(angle), length * math.sin(angle), 0.0])
+    return T

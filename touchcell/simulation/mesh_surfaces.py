@@ -17,7 +17,8 @@ from touchcell.geometry.types import Array
 from touchcell.input_file import InputFile
 from touchcell.plugin_section import PluginSection
 from touchcell.simulation.meshes import primitives
-from touchcell.simulation.meshes.load import INSTALL, SUFFIXES, load_mesh, mesh_library, what_is_open
+from touchcell.simulation.meshes.hollows import hollows
+from touchcell.simulation.meshes.load import INSTALL, SUFFIXES, Unit, load_mesh, mesh_library, what_is_open
 from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.meshes.smoothing import TriangleMesh
 from touchcell.simulation.shape_drawing import Drawable
@@ -52,6 +53,25 @@ class MeshSurfaceConfig(SurfaceConfig):
         except ConfigError as error:
             yield error
 
+    def remarks(self, tip_radius_m: float) -> Iterable[str]:
+        """Yield where a tip of ``tip_radius_m`` rests on two sides at once."""
+        found = hollows(self.mesh(), math.radians(self.crease_deg), tip_radius_m)
+        if not found.any or found.at is None:
+            return
+        T = se3.from_euler_mm_deg(self.pose_mm_deg)
+        at = ", ".join(f"{1e3 * each:.0f}" for each in T[:3, :3] @ found.at + T[:3, 3])
+        what = []
+        if found.share > 0.0:
+            what.append(
+                f"{100.0 * found.share:.1f} % of it is hollow, down to a radius of {1e3 * found.tightest_m:.1f} mm"
+            )
+        if found.crease_m > 0.0:
+            what.append(f"{1e3 * found.crease_m:.0f} mm of its creases are hollow")
+        yield (
+            f"the tip of {1e3 * tip_radius_m:g} mm does not fit everywhere: {' and '.join(what)}, as at ({at}) mm; "
+            "there it rests on two sides, with no one depth and tilt to hold"
+        )
+
 
 class MeshConfig(MeshSurfaceConfig):
     """A mesh file: STL, OBJ or PLY, in its own frame.
@@ -59,12 +79,14 @@ class MeshConfig(MeshSurfaceConfig):
     Attributes:
         file: the mesh, beside the cell file.
         unit: of its coordinates, which no mesh file tells.
+        scale: factor on the mesh, as for one that was normalised to a size of 1.
         repair: close small holes, orient all faces, and use what stays open as a sheet.
     """
 
     kind: Literal["mesh"]
     file: Annotated[str, InputFile("a mesh", hint="STL, OBJ and PLY files can be read")]
     unit: Literal["mm", "m", "inch"]
+    scale: float = Field(default=1.0, gt=0.0)
     repair: bool = False
 
     def mesh(self) -> TriangleMesh:
@@ -74,7 +96,7 @@ class MeshConfig(MeshSurfaceConfig):
             status = path.stat()
         except OSError as error:
             raise ConfigError(f"cannot be read: {error.strerror}", key="file", value=self.file) from None
-        return _loaded(path, self.unit, self.repair, status.st_mtime_ns, status.st_size)
+        return _loaded(path, self.unit, self.scale, self.repair, status.st_mtime_ns, status.st_size)
 
     def modules(self) -> Mapping[str, str]:
         """Return the mesh library."""
@@ -82,9 +104,9 @@ class MeshConfig(MeshSurfaceConfig):
 
 
 @lru_cache(maxsize=16)
-def _loaded(path: Path, unit: Literal["mm", "m", "inch"], repair: bool, modified_ns: int, size: int) -> TriangleMesh:
+def _loaded(path: Path, unit: Unit, scale: float, repair: bool, modified_ns: int, size: int) -> TriangleMesh:
     """Read a mesh once for check and run, unless the file has changed."""
-    return load_mesh(path, unit, repair=repair)
+    return load_mesh(path, unit, scale=scale, repair=repair)
 
 
 class HeightFieldConfig(MeshSurfaceConfig):

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array
 from touchcell.perception.contact_poses import PUBLIC_DEPTH_MM, random_poses
@@ -49,13 +50,20 @@ class SampledContact:
 
     Attributes:
         T_f_s: (4, 4) label: after slip, or the commanded pose if there is a mount model.
-        pixels: (markers, 2) px of the visible markers, in the 640x480 frame.
+        markers: (markers, 2) px of all markers, in the 640x480 frame and in the order of the lattice.
+        seen: (markers,) which of them are visible.
         disc_radius_px: radius of the markers.
     """
 
     T_f_s: Array
-    pixels: Array
+    markers: Array
+    seen: NDArray[np.bool_]
     disc_radius_px: float
+
+    @property
+    def pixels(self) -> Array:
+        """(visible, 2) px of the visible markers."""
+        return self.markers[self.seen]
 
 
 def contacts(
@@ -101,7 +109,7 @@ def contacts(
         seen = rng.random(pixels.shape[:2]) >= variation.missing
         radius = tip.parameters.disc_radius_px * (1.0 + rng.normal(0.0, variation.disc_radius, count))
         for i in range(count):
-            yield SampledContact(T_f_s[i], pixels[i][seen[i]], float(radius[i]))
+            yield SampledContact(T_f_s[i], pixels[i], seen[i], float(radius[i]))
 
 
 def _slipping(rig: MountModel, variation: Variation, rng: np.random.Generator) -> MountModel:

@@ -464,6 +464,12 @@ class SceneConfig(Section, SceneSection):
                 key = f"surfaces.{name}.{problem.key}"
                 yield ConfigError(problem.reason, key=key, value=problem.value, hint=problem.hint)
 
+    def remarks(self) -> Iterable[str]:
+        """Yield where the tip does not fit into a surface."""
+        for name, surface in self.surfaces.items():
+            for remark in surface.remarks(1e-3 * self.tip.radius_mm):
+                yield f"scene.surfaces.{name}: {remark}"
+
     def _world(self, surfaces: Mapping[str, Surface]) -> World:
         if self.physics == "kinematic":
             return KinematicWorld(surfaces, self.tip.build())

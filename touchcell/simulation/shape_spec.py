@@ -99,6 +99,10 @@ class SurfaceConfig(Section):
         """Return what is wrong with the files that it names; ``key`` of each is relative to this section."""
         return ()
 
+    def remarks(self, tip_radius_m: float) -> Iterable[str]:
+        """Return what a tip of ``tip_radius_m`` cannot follow of it, for a reader of ``touchcell check``."""
+        return ()
+
     def modules(self) -> Mapping[str, str]:
         """Return the optional modules that it needs, each with how to install it."""
         return {}

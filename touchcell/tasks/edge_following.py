@@ -155,7 +155,7 @@ def _build(config: EdgeFollowingConfig, context: TaskContext) -> ServoTask:
     reference = (config.offset_mm, 0.0, config.depth_mm, 0.0, 0.0, 0.0)
     axes = _AXES[config.dimensions]
     servo = ContactServo(ARM, SENSOR, config, reference, FollowEdge(config), context, axes, decoupled=True)
-    return ServoTask("edge_following", config, context, servo)
+    return ServoTask("edge_following", config, context, servo, shears=False)
 
 
 SPEC = TaskSpec(

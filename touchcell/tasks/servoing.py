@@ -78,7 +78,7 @@ class ServoConfig(ContactServoConfig):
     settle_timeout_s: PositiveFloat = 10.0
     retract_mm: PositiveFloat = 20.0
     retract_speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
-    sidestep_speed_mm_s: Annotated[PositiveFloat, SPEED] = 80.0
+    sidestep_speed_mm_s: Annotated[PositiveFloat, SPEED] = 40.0
     return_lift_mm: PositiveFloat | None = None
     max_reapproach: NonNegativeInt = 2
     stale_timeout_s: PositiveFloat = 0.5
@@ -186,13 +186,17 @@ class ServoTask(MachineTask):
         config: parameters of its state machine.
         context: of the cell.
         servos: the contact servos. With several, telemetry names begin with the sensor's role.
+        shears: see ``SensorCheck``.
 
     Raises:
         TaskDefinitionError: the table is invalid.
     """
 
-    def __init__(self, name: str, config: ServoConfig, context: TaskContext, *servos: ContactServo) -> None:
+    def __init__(
+        self, name: str, config: ServoConfig, context: TaskContext, *servos: ContactServo, shears: bool = True
+    ) -> None:
         self._config = config
+        self._shears = shears
         self._period_s = 1.0 / context.rate_hz
         self._servos = servos
         timeout_s = min(servo.run.timeout_s for servo in servos)
@@ -270,7 +274,13 @@ class ServoTask(MachineTask):
         """On entry: begin the motion of the first sensor."""
         c = self._config
         self._checks = [
-            SensorCheck(c.check_s, press_mm=c.check_press_mm, shift_mm=c.check_shift_mm, tilt_deg=c.check_tilt_deg)
+            SensorCheck(
+                c.check_s,
+                press_mm=c.check_press_mm,
+                shift_mm=c.check_shift_mm,
+                tilt_deg=c.check_tilt_deg,
+                shears=self._shears,
+            )
             for _ in self._servos
         ]
         self._blind_s = 0.0

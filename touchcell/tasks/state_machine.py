@@ -129,6 +129,9 @@ class TaskMachine:
         table: states and transitions.
         model: has the methods that the table names.
 
+    Attributes:
+        table: states and transitions.
+
     Raises:
         TaskDefinitionError: the table is invalid; lists all problems.
     """
@@ -136,6 +139,7 @@ class TaskMachine:
     def __init__(self, table: Table, model: object) -> None:
         if problems := lint(table, model):
             raise TaskDefinitionError(table.task, problems)
+        self.table = table
         self._name = table.task
         self._model = model
         self._definitions = {definition.state: definition for definition in table.states}

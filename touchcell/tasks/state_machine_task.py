@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 from touchcell.tasks.interface import Action, Observation, TransitionRecord
-from touchcell.tasks.state_machine import TRIP, TaskMachine, state_name
+from touchcell.tasks.state_machine import TRIP, Table, TaskMachine, state_name
 
 DONE = "done"
 """Name of the state in which a task has succeeded."""
@@ -25,6 +25,11 @@ class MachineTask(ABC):
     def states(self) -> tuple[str, ...]:
         """Names of the non-terminal states, the initial one first."""
         return tuple(state_name(state) for state in self._machine.active_states)
+
+    @property
+    def table(self) -> Table:
+        """States and transitions."""
+        return self._machine.table
 
     @property
     def finished(self) -> bool:

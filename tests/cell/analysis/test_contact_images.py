@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import http.client
-import json
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,12 +10,9 @@ import pytest
 import yaml
 
 from touchcell.cell.analysis.contact_images import contact_pictures
-from touchcell.cell.analysis.web_viewer import Page, play
-from touchcell.cell.cli.exit_codes import EXIT_BAD_INPUT
 from touchcell.cell.cli.main import main
 from touchcell.cell.recording.mcap import RECORDING, follow, read
 from touchcell.cell.recording.recorder import Recorder
-from touchcell.drivers.core.clock import VirtualClock
 from touchcell.geometry import se3
 from touchcell.paths import CONFIGS
 from touchcell.perception.errors import ImageError
@@ -108,33 +102,6 @@ def test_pictures_of_a_run_show_the_contact(folder: Path) -> None:
     assert "markers_sensor.png" in (folder / "summary.txt").read_text()
 
 
-def test_a_run_without_images_has_no_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with Recorder(tmp_path / RECORDING) as recorder:
-        recorder.write("/task", 0, {"state": "run"})
-    assert main(["view", str(tmp_path), "--port", "0"]) == EXIT_BAD_INPUT
-    assert "recording: {frames: jpeg}" in capsys.readouterr().err
-
-
-def test_the_web_page_serves_the_newest_image(folder: Path) -> None:
-    clock = VirtualClock()
-    with Page(0) as page:
-        connection = http.client.HTTPConnection(page.url.removeprefix("http://").rstrip("/"), timeout=20)
-        assert fetched(connection, "/picture.jpg")[0] == 404
-        status, content = fetched(connection, "/")
-        assert (status, b"picture.jpg" in content) == (200, True)
-        shown: list[Any] = []
-        pictures = play(folder, lambda picture: (page.show(picture), shown.append(picture))[0], clock)
-        status, content = fetched(connection, "/picture.jpg?1")
-        connection.close()
-    newest = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
-    assert (status, newest.shape) == (200, (440, 890, 3))
-    assert np.abs(newest.astype(int) - shown[-1].astype(int)).mean() < 6.0
-    # At the pace of the recording, and at most ten images per second.
-    duration_s = clock.now_ns() * 1e-9
-    assert duration_s == pytest.approx(json.loads((folder / "result.json").read_text())["duration_s"], abs=0.3)
-    assert len(shown) <= 10 * duration_s + 2 < pictures
-
-
 def test_red_where_markers_crowd() -> None:
     reference = np.stack(np.meshgrid(np.arange(20.0, 181.0, 8.0), np.arange(20.0, 181.0, 8.0)), axis=-1).reshape(-1, 2)
     crowded = np.where(reference[:, :1] < 100, reference * [0.5, 1.0] + [50, 0], reference)
@@ -149,9 +116,3 @@ def test_red_where_markers_crowd() -> None:
     assert blue > red + 30
     assert drawn[:, :200].any()
     assert not draw_contact(np.zeros((200, 200), np.uint8), reference, crowded, 8.0, arrows=False)[:, :200].any()
-
-
-def fetched(connection: http.client.HTTPConnection, path: str) -> tuple[int, bytes]:
-    connection.request("GET", path)
-    response = connection.getresponse()
-    return response.status, response.read()

@@ -482,3 +482,19 @@ def test_an_encoder_one_turn_off_is_counted_into_the_joints_range(arm: DamiaoCan
     commands = state["commands"]
     wait(lambda: emulator.state()["commands"] > commands + 300)
     np.testing.assert_allclose(position(emulator.state()), position(state), atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("index", "register", "value", "says"),
+    [(1, 9, 0, "timeout"), (3, 21, 6.0, "PMAX of motor 4 is 6, was 12.5"), (5, 23, 5.0, "TMAX of motor 6")],
+)
+def test_settings_that_another_host_changes_are_a_fault_though_nothing_is_lost(
+    arm: DamiaoCanArm, emulator: EmulatorInStep, index: int, register: int, value: float, says: str
+) -> None:
+    activate(arm)
+    emulator.fault("registers", [index, register, value])
+    wait(lambda: faulted(arm), 2.0)
+    assert says in str(arm.fault)
+    # What it measures and commands is in the new scale at once.
+    pause(0.5)
+    np.testing.assert_allclose(arm.joints(0.1).value.q, emulator.state()["q_rad"], atol=0.02)

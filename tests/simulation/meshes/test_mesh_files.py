@@ -126,3 +126,44 @@ def test_a_repaired_sheet_stays_a_sheet(tmp_path: Path) -> None:
     mended = load_mesh(export(tmp_path / "saddle.stl", sheet), "mm", repair=True)
     assert len(mended.faces) == len(sheet.faces)
     assert np.all(mended.face_normals()[:, 2] > 0.0)
+
+
+def test_a_mesh_that_was_normalised_is_scaled(tmp_path: Path) -> None:
+    path = export(tmp_path / "ball.obj", BALL, scale=12.5)
+    mesh = load_mesh(path, "m", scale=0.08, repair=False)
+    assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(0.08, abs=1e-6)
+    with pytest.raises(ConfigError) as refused:
+        load_mesh(path, "mm", scale=0.08, repair=False)
+    assert refused.value.key == "unit"
+
+
+def test_a_nearly_closed_vessel_that_is_inside_out_is_turned_round_and_a_hollow_piece_beside_it_kept(
+    tmp_path: Path,
+) -> None:
+    vessel = TriangleMesh(BALL.vertices, BALL.faces[:-20, ::-1])
+    other = TriangleMesh(BALL.vertices + np.array([0.1, 0.0, 0.0]), BALL.faces)
+    both = TriangleMesh(
+        np.concatenate([vessel.vertices, other.vertices]),
+        np.concatenate([vessel.faces, other.faces + len(vessel.vertices)]),
+    )
+    mended = load_mesh(export(tmp_path / "vessels.stl", both), "mm", repair=True)
+    middles = mended.vertices[mended.faces].mean(axis=1)
+    centres = np.where(middles[:, :1] > 0.05, [[0.1, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
+    assert np.all(np.einsum("mc,mc->m", mended.face_normals(), middles - centres) > 0.0)
+
+
+def test_check_names_hollows_into_which_the_tip_does_not_fit(tmp_path: Path) -> None:
+    valley = np.abs(np.linspace(-0.05, 0.05, 41)) * 0.5
+    creased = primitives.height_field(np.repeat(valley[None], 41, axis=0), 2.5e-3)
+    narrow = primitives.height_field(np.repeat((np.linspace(-0.01, 0.01, 41) ** 2 / 0.02)[None], 41, axis=0), 0.5e-3)
+    wide = primitives.height_field(np.repeat((np.linspace(-0.05, 0.05, 41) ** 2 / 0.1)[None], 41, axis=0), 2.5e-3)
+    notes = {}
+    for name, mesh in (("creased", creased), ("narrow", narrow), ("wide", wide)):
+        export(tmp_path / f"{name}.stl", mesh)
+        cell = tmp_path / f"{name}.yaml"
+        cell.write_text(CELL.format(file=f"{name}.stl", unit="mm\n      repair: true"))
+        notes[name] = " ".join(plan_cell(cell).notes)
+    assert "scene.surfaces.ramp" in notes["creased"]
+    assert "of its creases are hollow" in notes["creased"]
+    assert "down to a radius of" in notes["narrow"]
+    assert not notes["wide"]

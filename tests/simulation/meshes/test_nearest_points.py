@@ -185,3 +185,21 @@ def test_the_rim_of_a_cylinder_is_a_smooth_curve() -> None:
         found = edges.nearest(0.032 * out + [0.0, 0.0, 0.052])
         assert np.linalg.norm(found.point - 0.03 * out - [0.0, 0.0, 0.05]) < 0.03 * MM
         assert abs(found.tangent @ out) < math.sin(math.radians(0.5))
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_corner_of_a_rim_is_as_far_away_as_it_is_from_wherever_it_is_seen(
+    compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From far above, the nearest point of a hollow top is its rim, where the wall's own normal leads elsewhere."""
+    if not compiled:
+        monkeypatch.setattr("touchcell.simulation.meshes.mesh_shape.extension", lambda _: None)
+    angle = np.arange(24) * 2.0 * math.pi / 24
+    profile = np.array([[0.0, 0.0], [0.06, 0.0], [0.06, 0.05], [0.03, 0.04], [0.0, 0.038]])
+    cup = MeshShape(primitives.turned(profile, len(angle)), math.radians(30.0))
+    for height in (0.2, 0.35, 0.5):
+        for at in angle[:4]:
+            p = np.array([0.002 * math.cos(at), 0.002 * math.sin(at), height])
+            vertices = cup.drawn().vertices
+            found = cup.nearest(p)
+            assert found.distance_m == pytest.approx(np.linalg.norm(vertices - p, axis=1).min(), abs=2e-3)

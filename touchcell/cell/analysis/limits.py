@@ -10,7 +10,7 @@ import numpy as np
 
 from touchcell.cell.analysis.run_data import Run, Series, tip_points
 from touchcell.cell.config.cell_plan import CellPlan
-from touchcell.control.interlocks.boundary import WorkspaceConfig
+from touchcell.control.interlocks.boundary import TiltConfig, WorkspaceConfig
 from touchcell.geometry.types import Array
 
 _CLOSE: Final = 0.7
@@ -88,6 +88,8 @@ def watched_quantities(run: Run, plan: CellPlan) -> Iterator[WatchedQuantity]:
     for name, entry in plan.cell.interlocks.items():
         if isinstance(entry, WorkspaceConfig):
             yield from _in_workspace(run, plan, name, entry)
+        if isinstance(entry, TiltConfig):
+            yield from _tilted(run, plan, name, entry)
         for rule in _RULES:
             if entry.kind != rule.kind:
                 continue
@@ -109,6 +111,18 @@ def _in_workspace(run: Run, plan: CellPlan, name: str, entry: WorkspaceConfig) -
     points = 1e3 * (tip_points(series) @ mount)[:, :3, 3]
     beyond = np.maximum(np.array(entry.min_mm) - points, points - np.array(entry.max_mm)).max(axis=1)
     yield WatchedQuantity(name, entry.arm, "distance beyond the workspace", "mm", series.t_s, beyond, 0.0, True)
+
+
+def _tilted(run: Run, plan: CellPlan, name: str, entry: TiltConfig) -> Iterator[WatchedQuantity]:
+    series = run.series(f"/arms/{entry.arm}/tcp")
+    if series is None:
+        return
+    axis = np.array([0.0, 0.0, 1.0])
+    if entry.sensor is not None and entry.sensor in plan.sensor_roles:
+        axis = plan.cell.sensors[plan.sensor_roles[entry.sensor]].T_tcp_sensor[:3, 2]
+    direction = np.array(entry.direction) / np.linalg.norm(entry.direction)
+    tilt_deg = np.degrees(np.arccos(np.clip(tip_points(series)[:, :3, :3] @ axis @ direction, -1.0, 1.0)))
+    yield WatchedQuantity(name, entry.sensor or entry.arm, "tilt", "deg", series.t_s, tilt_deg, entry.limit_deg)
 
 
 def close_calls(run: Run, plan: CellPlan) -> list[str]:

@@ -36,11 +36,11 @@ class _Evidence:
     source: str
 
 
-def explain(folder: Path) -> str:
+def explain(folder: Path, *, draw: bool = True) -> str:
     """Why the run in ``folder`` did not end as done, what happened in the second before, and how the arms came to rest.
 
-    Also draws ``why.png`` beside it. Evidence is taken, in this order, from the ring of a run whose process did not end
-    by itself, from its black box, and from its result and recording.
+    With ``draw`` also draws ``why.png`` beside it. Evidence is taken, in this order, from the ring of a run whose
+    process did not end by itself, from its black box, and from its result and recording.
 
     Raises:
         RecordingError: the folder holds nothing of a run.
@@ -86,7 +86,7 @@ def explain(folder: Path) -> str:
         lines += [f"  {role}: {_stop(stop)}" for role, stop in stops.items()]
     lines.append(f"evidence: {evidence.source}")
     lines += [f"  damaged {damage}" for damage in run.damage]
-    if run.topics:
+    if run.topics and draw:
         from touchcell.cell.analysis.trip_plot import plot_trip
 
         moment = "trip" if causes else "end"

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -27,9 +26,10 @@ from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.device import Device, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import DeviceError, TransportTimeout
 from touchcell.drivers.core.lease import Lease
+from touchcell.drivers.core.paced_clock import emulated_clock
 from touchcell.drivers.core.protocols import HealthSource
 from touchcell.errors import ConfigError
-from touchcell.testing.emulation.rig import RIGS, DeviceFixture, Emulated
+from touchcell.testing.emulation.rig import RIGS, RIGS_IN_STEP, DeviceFixture, Emulated
 
 _ROWS = Path(__file__).with_name("zoo.yaml")
 _CALM_S = 0.5
@@ -64,6 +64,7 @@ class ZooRow(BaseModel):
         then: further faults, for ``replug``.
         settings: changed settings of the device, by dotted key.
         shows: readings of ``health`` that must appear: a text, a boolean, or [least, most].
+        real_time: needs a wire of the machine's own, and so its time.
         expect: reaction that is right; see ``zoo.yaml``.
     """
 
@@ -77,6 +78,7 @@ class ZooRow(BaseModel):
     then: dict[str, Any] = {}
     settings: dict[str, Any] = {}
     shows: dict[str, Any] = {}
+    real_time: bool = False
     expect: Expected
 
 
@@ -165,12 +167,17 @@ def _try_and_print(row: ZooRow, number: int, *, peers: bool) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="touchcell-zoo-") as name:
         folder = Path(name)
         rig = RIGS.load(row.driver)
+        # Where driver and emulator share a simulated time, a busy machine changes nothing.
+        shares_time = row.driver in RIGS_IN_STEP.names() and not row.real_time
+        in_step = RIGS_IN_STEP.load(row.driver) if shares_time else rig
         tries, found, message = 0, "", ""
         # A machine that is busy starves emulators and drivers; what is not handled twice is not handled.
         while tries < _TRIES and not is_handled(row, found):
             tries += 1
+            fixture = in_step(folder, _FIRST_ADDRESS + 2 * number)
             try:
-                found, message = try_row(row, rig(folder, _FIRST_ADDRESS + 2 * number))
+                with fixture.world:
+                    found, message = try_row(row, fixture)
             except (TimeoutError, TransportTimeout) as error:
                 found, message = "not tried", f"the emulator did not answer: {error}"
         result = {
@@ -304,21 +311,22 @@ def _recovered(row: ZooRow, device: Device, emulated: Emulated, lease: Lease | N
         emulated.clear(fault)
     first = str(device.fault or "")
     stood = _joints(emulated)
-    deadline_s = time.monotonic() + _RECOVERY_S
+    deadline_s = _now_s() + _RECOVERY_S
     while device.state is Lifecycle.FAULTED:
         try:
-            device.recover(OperatorToken("zoo", time.monotonic_ns()))
+            device.recover(OperatorToken("zoo", emulated_clock().now_ns()))
         except (DeviceError, ConfigError) as error:
-            if row.expect == "refused" or time.monotonic() > deadline_s:
+            if row.expect == "refused" or _now_s() > deadline_s:
                 return "refused", str(error)
-            time.sleep(_STEP_S)
+            _pause()
     while device.state is Lifecycle.READY:
         # An arm that loses its power with a delay refuses the first time.
         try:
             device.activate()
         except DeviceError as error:
-            if time.monotonic() > deadline_s:
+            if _now_s() > deadline_s:
                 return "refused", str(error)
+            _pause()
     if row.expect == "still":
         return _moved(emulated, stood)
     if isinstance(device, Arm) and device.owner is None:
@@ -360,14 +368,23 @@ def _joints(emulated: Emulated) -> Any:
 
 
 def _moved(emulated: Emulated, start: Any) -> tuple[str, str]:
-    deadline_s = time.monotonic() + _CALM_S
+    deadline_s = _now_s() + _CALM_S
     farthest_deg = 0.0
-    while time.monotonic() < deadline_s:
+    while _now_s() < deadline_s:
         moved = np.rad2deg(np.abs(np.subtract(_joints(emulated), start)))
         farthest_deg = max(farthest_deg, float(moved.max(initial=0.0)))
-        time.sleep(_STEP_S)
+        _pause()
     what = f"a joint moved {farthest_deg:.3f} deg"
     return ("still" if farthest_deg <= _STILL_DEG else what), what
+
+
+def _now_s() -> float:
+    return 1e-9 * emulated_clock().now_ns()
+
+
+def _pause() -> None:
+    clock = emulated_clock()
+    clock.sleep_until_ns(clock.now_ns() + round(1e9 * _STEP_S))
 
 
 def _activate(device: Device) -> None:
@@ -388,7 +405,7 @@ def _faulted(device: Device, lease: Lease | None) -> bool:
         elif isinstance(device, Arm) and lease is not None:
             twist = np.array([0.0, 0.0, _SLOW_M_S, 0.0, 0.0, 0.0])
             device.tcp()
-            device.send_twist(TwistCommand(twist, TwistFrame.BASE, time.monotonic_ns(), _TTL_S), lease)
+            device.send_twist(TwistCommand(twist, TwistFrame.BASE, emulated_clock().now_ns(), _TTL_S), lease)
     return device.state is Lifecycle.FAULTED
 
 
@@ -403,9 +420,9 @@ def _is_trouble(name: str) -> bool:
 
 
 def _until(condition: Callable[[], bool], seconds: float) -> bool:
-    deadline_s = time.monotonic() + seconds
-    while time.monotonic() < deadline_s:
+    deadline_s = _now_s() + seconds
+    while _now_s() < deadline_s:
         if condition():
             return True
-        time.sleep(_STEP_S)
+        _pause()
     return False

@@ -24,6 +24,7 @@ def add_parser(commands: Subparsers) -> None:
     run.add_argument("--out", type=Path, metavar="FOLDER", help="run folder (default: runs/NAME-TIME)")
     run.add_argument("--animate", action="store_true", help="also write animation.gif, of a simulated run")
     _add_live(run)
+    run.add_argument("--ui", action="store_true", help="serve the operator's page while it runs, as `ui` does")
     run.add_argument("--quiet", action="store_true", help="show no live progress line")
 
     jog = add_command(commands, "jog", _jog, "move a cell's arms by hand, and save poses into its file")
@@ -95,6 +96,7 @@ def _run(options: argparse.Namespace) -> int:
         live=not options.quiet and sys.stdout.isatty(),
         moving=options.animate,
         live_port=options.live_port if options.live else None,
+        page_port=0 if options.ui else None,
     )
 
 

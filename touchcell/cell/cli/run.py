@@ -90,6 +90,7 @@ def run_cell(
     live: bool = True,
     moving: bool = False,
     live_port: int | None = None,
+    page_port: int | None = None,
 ) -> int:
     """Run a cell file to its end and report; returns the exit code.
 
@@ -103,6 +104,7 @@ def run_cell(
         live: show a progress line.
         moving: also make the animation of a simulated run.
         live_port: of a server for Foxglove on this machine; None serves nothing.
+        page_port: of the operator's page on this machine; None serves none.
 
     Raises:
         ConfigError, ModelError, RunFolderError, ConnectError: before anything moves.
@@ -111,7 +113,7 @@ def run_cell(
     with cell_in_world(path, world, overrides, model=model, settings=settings) as plan:
         for note in plan.notes:
             say(f"on {world}: {note}")
-        run = run_plan(plan, out=out, live=live, live_port=live_port)
+        run = run_plan(plan, out=out, live=live, live_port=live_port, page_port=page_port)
     end_of_run(run, moving=moving)
     return run.exit_code
 
@@ -151,6 +153,7 @@ def run_plan(
     out: Path | None = None,
     live: bool = False,
     live_port: int | None = None,
+    page_port: int | None = None,
     operator: RunOperator | None = None,
 ) -> FinishedRun:
     """Compose and run a planned cell to its end, and write its run folder.
@@ -160,6 +163,7 @@ def run_plan(
         out: run folder, made for this run or empty; None for ``runs/NAME-TIME``.
         live: show a progress line.
         live_port: of a server for Foxglove on this machine; None serves nothing.
+        page_port: of the operator's page on this machine; None serves none.
         operator: see ``RunOperator``; None for the keys of ``touchcell run``.
 
     Raises:
@@ -171,13 +175,23 @@ def run_plan(
     with run_directory(plan.cell.name, out) as folder, _log_and_result(folder, plan) as result_file:
         logger.info("%s: task %s of %s, in %s", plan.cell.name, plan.task.name, plan.file, folder)
         try:
-            result, leaving = _run(cell, folder, live, result_file, live_port, operator)
+            with _page(folder, page_port):
+                result, leaving = _run(cell, folder, live, result_file, live_port, operator)
         except Exception as error:
             _write_result(result_file, _not_started_json(plan, error))
             raise
         ended = f"{result.outcome.value} after {result.duration_s:.2f} s"
         logger.info("%s: %s%s", plan.cell.name, ended, f" ({result.reason})" if result.reason else "")
     return FinishedRun(result, folder, _report(folder), leaving)
+
+
+def _page(folder: Path, port: int | None) -> AbstractContextManager[None]:
+    """The operator's page, from a process of its own."""
+    if port is None:
+        return contextlib.nullcontext()
+    from touchcell.cell.ui.beside import page_beside
+
+    return page_beside(folder.absolute(), port)
 
 
 @contextlib.contextmanager

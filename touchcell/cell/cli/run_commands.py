@@ -1,4 +1,4 @@
-"""``why``, ``report``, ``open``, ``view``, ``compare``: ended runs; ``stop``, ``reset``, ``resume``: others."""
+"""``why``, ``report``, ``open``, ``ui``, ``compare``: ended runs; ``stop``, ``reset``, ``resume``: others."""
 
 from __future__ import annotations
 
@@ -33,9 +33,13 @@ def add_parser(commands: Subparsers) -> None:
     viewer.add_argument("--rerun", action="store_true", help="in Rerun, with a blueprint")
     opened.add_argument("--to", type=Path, metavar="FILE", help="with --rerun: write this .rrd file instead")
 
-    view = add_command(commands, "view", _view, "show in a browser what a run's sensors feel, live or recorded")
-    add_run_folder(view)
-    view.add_argument("--port", type=port, default=8177, help="of the page on this machine (default: %(default)s)")
+    page = add_command(commands, "ui", _ui, "serve the operator's page: runs, live and recorded, stop, reset, resume")
+    page.add_argument(
+        "folder", type=Path, nargs="?", default=RUNS, metavar="FOLDER", help="of one run, or of all (default: runs/)"
+    )
+    page.add_argument(
+        "--port", type=port, default=8177, help="of the page on this machine, 0 for any free one (default: %(default)s)"
+    )
 
     compare = add_command(
         commands, "compare", _compare, "compare two recordings bit for bit, and name where they first differ"
@@ -145,15 +149,19 @@ def _felt(options: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def _view(options: argparse.Namespace) -> int:
-    from touchcell.cell.analysis.web_viewer import view_run
+def _ui(options: argparse.Namespace) -> int:
+    from touchcell.cell.ui.server import serve_page
 
-    try:
-        view_run(_folder(options), options.port)
-    except OSError as error:
-        raise ConfigError(
-            f"cannot serve a page: {error.strerror}", key="--port", value=options.port, hint="--port 0 takes a free one"
-        ) from None
+    folder: Path = options.folder
+    is_run = (folder / "cell.yaml").is_file()
+    if not is_run and folder != RUNS and not folder.is_dir():
+        raise ConfigError("there is no such folder", file=str(folder), hint="name a run, or leave it out")
+
+    def ready(address: str) -> None:
+        print(f"{address}\nis the operator's page, for browsers on this machine; Ctrl-C ends it", flush=True)
+
+    root, name = (folder.absolute().parent, folder.absolute().name) if is_run else (folder, None)
+    serve_page(root, options.port, ready, run=name)
     return EXIT_OK
 
 

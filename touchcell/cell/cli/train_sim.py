@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
@@ -29,11 +29,15 @@ from touchcell.perception.runtime.estimator_spec import Feature
 from touchcell.simulation.edge_samples import edge_contacts
 from touchcell.simulation.render import FrameRenderer
 from touchcell.simulation.samples import SampledContact, Variation, contacts
+from touchcell.simulation.shape_samples import shape_contacts
 from touchcell.simulation.tip import Tip, TipParameters
 from touchcell.simulation.tip_file import TipFile, load_tip
 
 if TYPE_CHECKING:
     from touchcell.perception.networks.marker_training import LabelledDiscs
+
+Feels: TypeAlias = Literal["plane", "shape"]
+"""What surfaces are made of."""
 
 PREPROCESSING = Preprocessing(
     input_size=(FRAME_SIZE[1], FRAME_SIZE[0]),
@@ -82,16 +86,23 @@ class Imagined:
         sensor: a real sensor's file, or None for the default tip.
         processed: images as the public data have them, cropped and black and white, rather than raw frames.
         feature: what the contacts are with.
+        feels: ``plane`` presses on planes, as the paper does; ``shape`` on surfaces that bend. Edges are always shapes.
     """
 
     sensor: TipFile | None = None
     processed: bool = False
     feature: Feature = "surface"
+    feels: Feels = "plane"
 
     @property
     def tip(self) -> TipParameters:
         """Of the sensor in the middle."""
         return TipParameters() if self.sensor is None else self.sensor.tip
+
+    @property
+    def of_shapes(self) -> bool:
+        """True if it touches more than planes."""
+        return self.feature == "edge" or self.feels == "shape"
 
     def preprocessing(self, kind: str) -> Preprocessing:
         """That of an estimator for such images."""
@@ -106,6 +117,8 @@ class Imagined:
         """Random ones."""
         if self.feature == "edge":
             return edge_contacts(samples, seed, variation=VARIATION)
+        if self.feels == "shape":
+            return shape_contacts(samples, seed, depth_mm=DEPTH_MM, variation=VARIATION)
         if self.sensor is None:
             return contacts(samples, seed, depth_mm=DEPTH_MM, variation=VARIATION)
         sensor = self.sensor
@@ -124,6 +137,7 @@ def train_on_simulation(
     epochs: int | None = None,
     seed: int = 0,
     feature: Feature = "surface",
+    feels: Feels = "plane",
 ) -> None:
     """Draw ``samples`` training images and a fifth of that for validation, train, and write the model file.
 
@@ -135,13 +149,14 @@ def train_on_simulation(
         processed: for images as the public data have them rather than raw frames.
         epochs: passes over the samples; None for the kind's default.
         seed: of everything random.
-        feature: ``edge`` for contacts with edges, of the default tip and images that a network sees whole.
+        feature: ``edge`` for contacts with edges, of the default tip.
+        feels: ``shape`` for surfaces that bend, of the default tip.
 
     Raises:
         ConfigError: the tip file cannot be used.
         TrainingError: as ``touchcell.perception.networks.training.train``.
     """
-    imagined = Imagined(None if tip is None else load_tip(tip), processed, feature)
+    imagined = Imagined(None if tip is None else load_tip(tip), processed, feature, feels)
     with Display() as display:
         if kind == "markers":
             _train_markers(imagined, out, samples, epochs, seed, display)
@@ -166,6 +181,9 @@ def _train_markers(
     from touchcell.perception.networks.marker_training import MarkerSettings, train_on_discs
 
     settings = MarkerSettings(seed=seed)
+    if imagined.of_shapes:
+        # One network in a file of 4 MB, which can ship.
+        settings = replace(settings, hidden=(384, 384, 256), networks=1)
     train_on_discs(
         _discs(imagined, samples, seed),
         _discs(imagined, samples // 5, seed + 1_000_000),
@@ -180,17 +198,26 @@ def _train_markers(
 
 def _discs(imagined: Imagined, samples: int, seed: int) -> LabelledDiscs:
     """Discs of simulated frames, without the frames."""
+    from touchcell.perception.networks.marker_learning import KnownMarkers
     from touchcell.perception.networks.marker_training import LabelledDiscs
 
     height, width = PUBLIC_SIZE
-    frames, labels = [], []
+    corner = np.array(PUBLIC_CROP[:2], dtype=np.float64)
+    frames, labels, places, seen = [], [], [], []
     for contact in imagined.contacts(samples, seed):
-        centres = contact.pixels - np.array(PUBLIC_CROP[:2], dtype=np.float64)
+        centres = contact.markers - corner
         reach = contact.disc_radius_px
-        whole = ((centres >= reach) & (centres <= np.array([width, height]) - 1.0 - reach)).all(axis=1)
+        whole = ((centres >= reach) & (centres <= np.array([width, height]) - 1.0 - reach)).all(axis=1) & contact.seen
         frames.append(Discs(centres[whole], np.full(int(whole.sum()), np.pi * reach**2)))
         labels.append(contact.T_f_s)
-    return LabelledDiscs(frames, se3.log(se3.inverse(np.stack(labels))))
+        places.append(centres)
+        seen.append(whole)
+    known = None
+    if imagined.of_shapes:
+        middle = Tip(imagined.tip)
+        reference = middle.project(middle.rest_positions) - corner
+        known = KnownMarkers(reference, np.stack(places) - reference, np.stack(seen))
+    return LabelledDiscs(frames, se3.log(se3.inverse(np.stack(labels))), known)
 
 
 def draw(samples: int, seed: int, split: str, observer: Observer, imagined: Imagined | None = None) -> LabelledImages:

@@ -31,7 +31,7 @@ from touchcell.drivers.core.protocols import (
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.tasks.interface import TaskContext
+from touchcell.tasks.interface import Task, TaskContext
 
 if TYPE_CHECKING:
     from touchcell.cell.config.cell_plan import CellPlan
@@ -87,9 +87,7 @@ def cell_facts(plan: CellPlan, scene: PlanningScene | None = None) -> CellFacts:
     role_of = arm_roles(plan)
     moved = {role for role, protocols in plan.task.arms.items() if TwistSink in protocols}
     sensors = {role: _sensor_facts(plan, name, role_of) for role, name in plan.sensor_roles.items()}
-    poses = {role: sensor.T_tcp_sensor for role, sensor in sensors.items()}
-    carriers = {role: sensor.arm for role, sensor in sensors.items() if sensor.arm is not None}
-    task = plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses, carriers=carriers))
+    task = built_task(plan)
     return CellFacts(
         1.0 / plan.cell.rate_hz,
         tuple(getattr(task, "states", ())),
@@ -104,6 +102,15 @@ def cell_facts(plan: CellPlan, scene: PlanningScene | None = None) -> CellFacts:
         ),
         _health_facts(plan),
     )
+
+
+def built_task(plan: CellPlan) -> Task:
+    """Return the task of a planned cell, for what it can tell of itself: nothing runs."""
+    role_of = arm_roles(plan)
+    sections = {role: plan.cell.sensors[name] for role, name in plan.sensor_roles.items()}
+    carriers = {role: role_of[each.mounted_on] for role, each in sections.items() if each.mounted_on is not None}
+    poses = {role: each.T_tcp_sensor for role, each in sections.items()}
+    return plan.task.build(plan.task_config, TaskContext(plan.cell.rate_hz, poses, carriers=carriers))
 
 
 def _health_facts(plan: CellPlan) -> dict[str, dict[str, float]]:

@@ -317,7 +317,7 @@ class CellPlan:
         auxiliaries: other devices that the task needs or that are read, by name in the cell.
         auxiliary_roles: role in the task -> name in the cell; a device without a role has its own name as role.
         world_settings: values that its world put in place of the file's own, by dotted key, behind ``settings``.
-        notes: what its world does not show, and what it puts in place of something else.
+        notes: what its world does not show, what it puts in place of something else, and what a sensor cannot follow.
         truth: what the seed made of ``truth:``, by dotted key; empty without one.
     """
 

@@ -86,7 +86,7 @@ def plan_cell(
             if isinstance(estimator, dict) and estimator.get("kind") in ("network", "edge_network"):
                 estimator["model"] = model
     plan = _Planner(file, overrides, settings or {}, to_run=to_run).plan()
-    return plan if world is None else replace(plan, world_settings=world.settings, notes=tuple(world.notes))
+    return plan if world is None else replace(plan, world_settings=world.settings, notes=(*plan.notes, *world.notes))
 
 
 def plan_in_world(
@@ -205,7 +205,7 @@ class _Planner:
             return planned
         if problems := unfeasible(file, planned):
             raise InvalidCell(problems)
-        return self._require_armed(planned)
+        return replace(self._require_armed(planned), notes=_remarks(planned))
 
     def _in_truth(self, cell: CellFile) -> CellFile:
         """Return the cell with its scene as it truly is, and keep what is true of its devices."""
@@ -610,6 +610,11 @@ class _Planner:
 
     def _add(self, path: tuple[str, ...], reason: str, *, value: Any = None, hint: str = "") -> None:
         self._problems.append(self._file.problem(path, reason, value=value, hint=hint))
+
+
+def _remarks(plan: CellPlan) -> tuple[str, ...]:
+    scene = plan.cell.scene
+    return () if scene is None else tuple(scene_section().model_validate(scene).remarks())
 
 
 def _a(word: str) -> str:

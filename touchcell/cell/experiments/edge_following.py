@@ -1,6 +1,7 @@
 """Edge following: outlines of flat parts and rims of curved sheets, once around each, at 30 mm/s.
 
-Errors are of the true edge. Lateral error and angle are also told away from corners, where the edge itself jumps.
+Errors are of the true edge; beside them stand those of the estimate. Lateral error and angle are given away from
+corners, where the edge itself jumps.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from touchcell.cell.analysis.run_folder import RunFolder, during, rms
 from touchcell.cell.experiments.runner import ExperimentSpec, Scale
 from touchcell.cell.experiments.sample_meshes import FILES, HEIGHTS_MM
+from touchcell.cell.experiments.shape_truth import SAMPLED, sampled_truth
 from touchcell.cell.experiments.table import Column
 from touchcell.cell.experiments.trials import Finished, Trial
 from touchcell.geometry.types import Array
@@ -22,9 +24,10 @@ from touchcell.paths import CONFIGS
 
 SENSOR: Final = "sensor"
 ESTIMATORS: Final[dict[str, dict[str, Any] | None]] = {
-    "true edge with noise": None,
-    "true edge": {"kind": "true_edge"},
+    "learned": None,
+    "true edge with noise": {"kind": "true_edge", "noise_mm": 0.1, "noise_deg": 0.5},
 }
+_SAMPLED: Final = ("circle", "square", "clover")
 _QUICK: Final = ("circle", "square")
 _HEIGHT_MM: Final = 20.0
 _RIM_MM: Final = 45.0
@@ -78,7 +81,7 @@ RIMS: Final = ("saddle", "wave")
 SHAPES: Final = ("circle", "square", "clover", "foil", "saddle", "bowl", "hexagon", "star", "ell", "leaf", "wave")
 
 
-def section(name: str) -> dict[str, Any]:
+def surface_of(name: str) -> dict[str, Any]:
     """Return the surface of a shape, as a section of a scene."""
     if name == "circle":
         return {"kind": "cylinder", "radius_mm": 50.0, "height_mm": _HEIGHT_MM}
@@ -121,32 +124,32 @@ def start_pose_mm_deg(name: str) -> list[float]:
 
 def trials(scale: Scale) -> list[Trial]:
     """Return trials of all shapes with each estimator, half of them backwards."""
-    found = []
-    for estimator, chosen in ESTIMATORS.items():
-        for number, name in enumerate(_QUICK if scale.quick else SHAPES):
-            changes: dict[str, Any] = {
-                "scene.surfaces": {name: section(name)},
+    shapes = _QUICK if scale.quick else SHAPES
+    rows: list[tuple[str, str, dict[str, Any]]] = []
+    for estimator, section in ESTIMATORS.items():
+        chosen = {} if section is None else {f"sensors.{SENSOR}.estimator": section}
+        rows += [(name, estimator, chosen) for name in shapes]
+    truth = {"truth": sampled_truth(SENSOR, "arm")}
+    rows += [(name, f"learned, {SAMPLED}", truth) for name in shapes if name in _SAMPLED]
+    return [
+        Trial(
+            f"{name}_{row.replace(', ', '_').replace(' ', '_')}_{seed}",
+            f"{name}, {row}",
+            "edge_follow_sim.yaml",
+            {
+                "scene.surfaces": {name: surface_of(name)},
                 "arms.arm.start_pose_mm_deg": start_pose_mm_deg(name),
                 "task.distance_mm": 800.0,
-                "task.direction": ("forward", "backward")[number % 2],
+                "task.direction": ("forward", "backward")[SHAPES.index(name) % 2],
                 "interlocks.tilt.limit_deg": 60,
                 "interlocks.workspace.min_mm": [-120, -120, -40],
-            }
-            if chosen is not None:
-                changes[f"sensors.{SENSOR}.estimator"] = chosen
-            found += [
-                Trial(
-                    f"{name}_{estimator.replace(' ', '_')}_{seed}",
-                    f"{name}, {estimator}",
-                    "edge_follow_sim.yaml",
-                    {
-                        **changes,
-                        "seed": seed,
-                    },
-                )
-                for seed in range(1, scale.repetitions(1) + 1)
-            ]
-    return found
+                **changes,
+                "seed": seed,
+            },
+        )
+        for name, row, changes in rows
+        for seed in range(1, scale.repetitions(1) + 1)
+    ]
 
 
 def measure(trial: RunFolder) -> Mapping[str, float]:
@@ -156,12 +159,18 @@ def measure(trial: RunFolder) -> Mapping[str, float]:
     running = during(trial, series)
     edge, t_s = series.poses()[running], series.t_s[running]
     away = away_from_corners(t_s, edge[:, 5])
+    estimated = trial.recording.series(f"/sensors/{SENSOR}/contact")
+    assert estimated is not None
+    believed = estimated.poses()[: len(series.t_s)][running[: len(estimated.t_s)]]
+    off = (believed - edge[: len(believed)])[away[: len(believed)]]
     return {
         "lateral_rms_mm": rms(edge[away, 0]),
         "angle_rms_deg": rms(edge[away, 5]),
         "depth_rms_mm": rms(edge[:, 2] - 3.0),
         "tilt_rms_deg": rms(np.hypot(edge[:, 3], edge[:, 4])),
         "lateral_max_mm": float(np.nanmax(np.abs(edge[:, 0]), initial=0.0)),
+        "estimated_lateral_rms_mm": rms(off[:, 0]),
+        "estimated_angle_rms_deg": rms(off[:, 5]),
         "corner_percent": 100.0 * float(1.0 - away.mean()) if len(away) else float("nan"),
         "duration_s": float(t_s[-1] - t_s[0]) if len(t_s) else float("nan"),
     }
@@ -180,7 +189,7 @@ def draw(finished: Sequence[Finished], folder: Path) -> list[Path]:
     """Draw each shape with the path along its edge, and the errors over the way."""
     from touchcell.cell.experiments.shape_plots import plot_edges
 
-    first = [each for each in finished if each.trial.name.endswith("noise_1")]
+    first = [each for each in finished if each.trial.name.endswith("learned_1")]
     return [plot_edges([each.folder for each in first], [each.trial.row for each in first], folder / "edges.png")]
 
 
@@ -196,6 +205,8 @@ SPEC = ExperimentSpec(
         Column("depth_rms_mm", "depth RMS mm", digits=3),
         Column("tilt_rms_deg", "tilt RMS deg", digits=2),
         Column("corner_percent", "at corners %", digits=0),
+        Column("estimated_lateral_rms_mm", "estimate: mm", digits=3),
+        Column("estimated_angle_rms_deg", "deg", digits=2),
         Column("duration_s", "s", digits=1),
     ),
     draw=draw,

@@ -122,6 +122,10 @@ class SceneSection(BaseModel):
         """Return what is wrong with the files that it names; ``key`` of each is relative to the section."""
         return ()
 
+    def remarks(self) -> Iterable[str]:
+        """Return what a sensor cannot follow of it, in a line each."""
+        return ()
+
 
 @dataclass(frozen=True, slots=True)
 class SceneSpec:

@@ -6,16 +6,18 @@ no receive thread is needed, no queue overflows unnoticed, and no reply is await
 Replies carry no timestamp. Each is stamped with the time at which its request was sent, so its age is never
 understated: a motor's requests are queued and its replies arrive in order (CAN keeps the order of one sender). After a
 loss the queue would stay one entry too long; then a register is read as well, whose reply identifies itself and so
-marks the position. Such a read is called a fence. Each motor has at most one fence pending, and fences cycle through
-four registers, so a reply that arrives after its fence timed out is not mistaken for the next one's.
+marks the position. Such a read is called a fence; it is also sent now and then to see that no other host has changed
+the motor's timeout or scales. Each motor has at most one fence pending, and fences cycle through four registers, so a
+reply that arrives after its fence timed out is not mistaken for the next one's.
 """
 
 from __future__ import annotations
 
 import errno
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from touchcell.drivers.core import can_errors
@@ -40,6 +42,9 @@ _SETTLE_NS = 20_000_000
 _GONE = frozenset(
     (errno.ENODEV, errno.ENXIO, errno.EBADF, errno.ESHUTDOWN, errno.ENOTCONN, errno.EPIPE, errno.ECONNRESET)
 )
+# What another host may change unnoticed: a timeout that no longer protects, scales by which frames mean something else.
+_WATCHED = (Register.TIMEOUT, Register.PMAX, Register.VMAX, Register.TMAX)
+_CHECK_NS = 250_000_000
 _FENCES = (Register.TIMEOUT, Register.CTRL_MODE, Register.MST_ID, Register.ESC_ID)
 
 
@@ -84,7 +89,8 @@ class MotorBus:
     Attributes:
         counters: message statistics.
         last_error: text of the newest error frame or failure of the adapter, or "".
-        timeout_ticks: the motors' timeout as last read after a loss, or None; it reveals a motor that lost power.
+        timeout_ticks: the motors' timeout as last read, once a second and after a loss, or None; it reveals a motor
+            that lost power.
     """
 
     def __init__(
@@ -122,6 +128,9 @@ class MotorBus:
         self._passive = False
         self._fences: list[_Pending | None] = [None] * n
         self._fence_turns = [0] * n
+        # One motor after the other, so that no cycle has much more to transfer.
+        self._checked_ns = [self._clock.now_ns() + index * _CHECK_NS // n for index in range(n)]
+        self._rescaled = ""
         self.counters = Counters()
         self.last_error = ""
         self.timeout_ticks: list[int | None] = [None] * n
@@ -219,6 +228,16 @@ class MotorBus:
                 needs=Remedy.OPERATOR,
                 hint="check wiring, termination and bit rates, then restart the interface",
             )
+        if self._rescaled:
+            what, self._rescaled = self._rescaled, ""
+            raise DeviceFault(
+                self._device,
+                what,
+                vendor_code="full scale",
+                fault_class=FaultClass.CONFIGURATION,
+                needs=Remedy.OPERATOR,
+                hint="which other program writes to the motors?",
+            )
         return list(self._newest)
 
     def _all_since(self, start_ns: int) -> bool:
@@ -267,9 +286,13 @@ class MotorBus:
                 queue.popleft()
             fence = self._fences[index]
             under_way = fence in queue and fence is not None and now_ns - fence.t_ns <= self._fence_lost_after_ns
-            if queue and not under_way:
+            is_due = now_ns - self._checked_ns[index] >= _CHECK_NS
+            if (queue or is_due) and not under_way:
                 self._fence_turns[index] += 1
-                register = _FENCES[self._fence_turns[index] % len(_FENCES)]
+                registers = _WATCHED if is_due else _FENCES
+                register = registers[self._fence_turns[index] % len(registers)]
+                if is_due:
+                    self._checked_ns[index] = now_ns
                 fence = self._fences[index] = _Pending(now_ns, register)
                 queue.append(fence)
                 self._put(codec.PARAMETER_ID, codec.read_register(self._addresses[index].esc_id, register))
@@ -352,10 +375,24 @@ class MotorBus:
             return False
         if fence.fence is Register.TIMEOUT:
             self.timeout_ticks[index] = int(reply.value)
+        elif fence.fence in _WATCHED:
+            self._check_scale(index, fence.fence, float(reply.value))
         # All earlier requests have been answered or lost.
         while queue.popleft() is not fence:
             pass
         return True
+
+    def _check_scale(self, index: int, register: Register, value: float) -> None:
+        """Adopt a full scale that another host has changed, so that holding commands are right, and note the change."""
+        ranges = self._ranges[index]
+        if ranges is None or not math.isfinite(value) or value <= 0.0:
+            return
+        names = {Register.PMAX: "position_rad", Register.VMAX: "velocity_rad_s", Register.TMAX: "torque_n_m"}
+        before = getattr(ranges, names[register])
+        # Registers are single precision.
+        if not math.isclose(before, value, rel_tol=1e-6):
+            self._ranges[index] = replace(ranges, **{names[register]: value})
+            self._rescaled = f"{register.name} of motor {self._addresses[index].esc_id} is {value:g}, was {before:g}"
 
     def _take_feedback(self, index: int, data: bytes) -> None:
         ranges = self._ranges[index]

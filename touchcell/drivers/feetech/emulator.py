@@ -165,7 +165,7 @@ class Servo:
         lowest, highest = (int.from_bytes(self.get(r, 2), "little") for r in (Register.MIN_TICKS, Register.MAX_TICKS))
         left = min(max(self.goal, lowest), highest) - self.position
         speed = codec.from_signed_word(self.get(_GOAL_SPEED, 2)) or _FASTEST_TICKS_S
-        pushes = self.torque and not self.status & _OVERLOAD
+        pushes = self.torque and not self.status & _OVERLOAD and any(self.get(Register.TORQUE_LIMIT, 2))
         wanted = float(np.clip(left / _RESPONSE_S, -speed, speed)) if pushes else 0.0
         self.velocity = 0.0 if self.blocked else wanted
         self.encoder += self.velocity * dt_s

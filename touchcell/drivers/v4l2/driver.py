@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,6 +28,7 @@ _FEWEST_BUFFERS = 4
 _SETTINGS_CHECKED_WITHIN_NS = 2_000_000_000
 _RATE_TOLERANCE = 0.01
 _FUTURE_NS = 1_000_000
+_DELAYS = 60
 _CLOCK_TOLERANCE_NS = 1_000_000_000
 _AUTOMATICS = (
     (codec.CID_EXPOSURE_AUTO, "automatic exposure", codec.EXPOSURE_MANUAL),
@@ -72,6 +74,7 @@ class V4l2Camera(Camera):
         self._buffers = 0
         self._overrun = False
         self._previous: codec.Arrival | None = None
+        self._delays_ns: deque[int] = deque(maxlen=_DELAYS)
         self._number = -1
         self._queue_empty_ns = 0
         self._next_check_ns = 0
@@ -120,6 +123,7 @@ class V4l2Camera(Camera):
                     self.name, f"the camera grants {self._buffers} buffers", hint="at least two are needed"
                 )
             self._previous = None
+            self._delays_ns.clear()
             self._overrun = False
             self._queue_empty_ns = self._clock.now_ns()
             self._begin_stream()
@@ -241,6 +245,8 @@ class V4l2Camera(Camera):
         if arrival.monotonic and arrival.stamp_ns > self._clock.now_ns() + _FUTURE_NS:
             self._monitor.count_bad("from_the_future")
             return
+        if arrival.monotonic:
+            self._delays_ns.append(self._clock.now_ns() - arrival.stamp_ns)
         self._previous = arrival
         self._number += step
         self._monitor.count_lost(step - 1, overrun=self._overrun)
@@ -279,6 +285,9 @@ class V4l2Camera(Camera):
             "buffers": self._buffers,
             "stable_name": is_stable_name(self._config.device),
         }
+        if self._delays_ns:
+            # The least of the latest: the others had to wait for this program.
+            readings["delivery_s"] = min(self._delays_ns) * 1e-9
         if self._previous is not None:
             readings["kernel_stamps"] = self._previous.monotonic
             readings["stamp_marks"] = "start of exposure" if self._previous.start_of_exposure else "end of frame"

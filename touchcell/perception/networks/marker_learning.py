@@ -60,6 +60,42 @@ class Learned:
     fields: list[MarkerField]
 
 
+@dataclass(frozen=True)
+class KnownMarkers:
+    """Markers of simulated frames.
+
+    Attributes:
+        reference: (m, 2) px, the lattice out of contact.
+        displacements: (n, m, 2) px from there.
+        seen: (n, m) markers that the frame shows.
+    """
+
+    reference: Array
+    displacements: Array
+    seen: NDArray[np.bool_]
+
+
+def learned_of_known(
+    markers: KnownMarkers, image_size: tuple[int, int], *, modes: int, guess_steps: int, seed: int
+) -> Learned:
+    """Return what ``learn_markers`` would, without fields, from frames whose markers are known.
+
+    Args:
+        markers: of the training frames.
+        image_size: (height, width) px.
+        modes: number of components of the displacement model.
+        guess_steps: of the training of the first guess.
+        seed: of everything random.
+    """
+    model = DisplacementModel.fit(markers.reference, markers.displacements, np.ones_like(markers.seen), modes)
+    coefficients = (markers.displacements.reshape(len(markers.seen), -1) - model.mean) @ model.basis.T
+    guess = train_guess(model, coefficients, markers.seen, noise_px=0.5, scatter=0.05, steps=guess_steps, seed=seed)
+    least_score, most_rms_px = 0.9, 0.2 * model.spacing_px
+    bank = _bank(coefficients)
+    matcher = MarkerMatcher(model, guess, image_size, bank=bank, least_score=least_score, most_rms_px=most_rms_px)
+    return Learned(matcher, guess, bank, least_score, most_rms_px, [])
+
+
 def find_reference(frames: Sequence[Discs], rings: int) -> Array:
     """Return the (m, 2) px lattice of the least deformed frame.
 

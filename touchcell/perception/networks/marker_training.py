@@ -47,8 +47,10 @@ from touchcell.perception.networks.export import write_trained
 from touchcell.perception.networks.marker_learning import (
     GRID,
     GUESS_HIDDEN,
+    KnownMarkers,
     Learned,
     learn_markers,
+    learned_of_known,
     match_all,
     stacked,
 )
@@ -109,10 +111,12 @@ class LabelledDiscs:
     Attributes:
         frames: discs of each image.
         xi: (n, 6) log(T_s_f), m and rad.
+        markers: which disc is which marker, where a simulation knows it; None where it has to be learned.
     """
 
     frames: list[Discs]
     xi: Array
+    markers: KnownMarkers | None = None
 
     def digest(self) -> str:
         """Return the SHA-256 of the content."""
@@ -311,6 +315,12 @@ def _matched(
     def report(what: str) -> Callable[[int, int], None]:
         return lambda done, total: None if observer is None else observer.images(what, done, total)
 
+    if training.markers is not None:
+        learned = learned_of_known(
+            training.markers, image_size, modes=settings.modes, guess_steps=settings.guess_steps, seed=settings.seed
+        )
+        displacements, taught = training.markers.displacements, [True] * len(training.frames)
+        return _as_matched(learned, displacements, taught, validation, report)
     learned = learn_markers(
         training.frames,
         image_size,
@@ -320,15 +330,8 @@ def _matched(
         seed=settings.seed,
         progress=report("matched"),
     )
-    displacements, _ = stacked(learned.fields)
-    fields = match_all(learned.matcher, validation.frames, report("matched, val"))
-    matched = _Matched(
-        tensors=_tensors(learned),
-        frame=np.array([*learned.guess.low, learned.guess.cell_px, learned.least_score, learned.most_rms_px]),
-        training=displacements.reshape(len(displacements), -1).astype(np.float32),
-        validation=stacked(fields)[0].reshape(len(fields), -1).astype(np.float32),
-        taught=np.array([each.score >= _LEAST_SCORE_TAUGHT for each in learned.fields]),
-    )
+    taught = [each.score >= _LEAST_SCORE_TAUGHT for each in learned.fields]
+    matched = _as_matched(learned, stacked(learned.fields)[0], taught, validation, report)
     if cache is not None:
         _save(
             cache / name,
@@ -341,6 +344,23 @@ def _matched(
             },
         )
     return matched
+
+
+def _as_matched(
+    learned: Learned,
+    displacements: Array,
+    taught: list[bool],
+    validation: LabelledDiscs,
+    report: Callable[[str], Callable[[int, int], None]],
+) -> _Matched:
+    fields = match_all(learned.matcher, validation.frames, report("matched, val"))
+    return _Matched(
+        tensors=_tensors(learned),
+        frame=np.array([*learned.guess.low, learned.guess.cell_px, learned.least_score, learned.most_rms_px]),
+        training=displacements.reshape(len(displacements), -1).astype(np.float32),
+        validation=stacked(fields)[0].reshape(len(fields), -1).astype(np.float32),
+        taught=np.array(taught),
+    )
 
 
 def _write_examples(

@@ -280,6 +280,16 @@ static int refine(const Tree *tree, const double *p, int *face, double *weight, 
     return 0;
 }
 
+/* Whether the way to p leaves a corner within 30 deg of its smooth normal, as it does but on creases. */
+static int along_normal(const Tree *tree, const double *p, const Hit *hit, double away)
+{
+    const double *n = &tree->normals[9 * hit->face + 3 * (hit->feature - 4)];
+    double along = 0.0;
+    for (int i = 0; i < 3; i++)
+        along += (p[i] - hit->at[i]) * n[i];
+    return along / away > 0.866;
+}
+
 /* distance, normal, point, both curvatures (NaN on a crease). */
 static void smooth(const Tree *tree, const double *p, double *out)
 {
@@ -306,7 +316,7 @@ static void smooth(const Tree *tree, const double *p, double *out)
         if (hit.feature >= 1 && hit.feature <= 3)
             on_crease = tree->neighbours[3 * face + hit.feature - 1] < 0;
         else if (hit.feature >= 4)
-            on_crease = stopped;
+            on_crease = stopped || !along_normal(tree, p, &hit, away);
         if (on_crease && hit.squared > 1e-18) {
             for (int i = 0; i < 3; i++) {
                 out[1 + i] = (p[i] - hit.at[i]) / away;

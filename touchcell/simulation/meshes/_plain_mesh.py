@@ -39,7 +39,9 @@ class Tree:
         distance = self._signed(p, face, weight)
         inside = weight > 1e-12
         edges = [i for i in range(3) if not inside[(i + 2) % 3]]
-        if abs(distance) > 1e-9 and any(self._neighbours[face, i] < 0 for i in edges):
+        # The way leaves a corner near its smooth normal but on creases.
+        corner = inside.sum() == 1 and (p - at) @ self._normals[face, int(np.argmax(weight))] < 0.866 * distance
+        if abs(distance) > 1e-9 and (corner or any(self._neighbours[face, i] < 0 for i in edges)):
             return (distance, *((p - at) / distance).tolist(), *at.tolist(), np.nan, np.nan)
         normal = weight @ self._normals[face]
         normal /= np.linalg.norm(normal)

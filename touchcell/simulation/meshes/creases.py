@@ -43,7 +43,7 @@ class Polylines:
         self._side = ends - starts
         self._squared = np.maximum(np.einsum("kc,kc->k", self._side, self._side), 1e-300)
         self._normals, self._tangents = normals, tangents
-        self._middle_normals = normals.mean(axis=1)
+        self.middle_normals = normals.mean(axis=1)
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -59,7 +59,7 @@ class Polylines:
         away = off - t[:, None] * self._side
         squared = np.einsum("kc,kc->k", away, away)
         if facing is not None:
-            seen = (self._middle_normals @ facing).max(axis=1) >= _FACING_COS
+            seen = (self.middle_normals @ facing).max(axis=1) >= _FACING_COS
             squared = np.where(seen, squared, np.inf) if seen.any() else squared
         i = int(np.argmin(squared))
         share = t[i]
@@ -76,7 +76,7 @@ class Polylines:
 
     def _outwards_at(self, vertex: Array, facing: Array) -> Array:
         ends = (np.abs(self.starts - vertex).max(axis=1) < _SAME_M) | (np.abs(self.ends - vertex).max(axis=1) < _SAME_M)
-        normals, sides = self._middle_normals[ends], self._side[ends]
+        normals, sides = self.middle_normals[ends], self._side[ends]
         towards = normals @ facing
         over = towards.argmax(axis=1)
         seen = towards.max(axis=1) >= _FACING_COS

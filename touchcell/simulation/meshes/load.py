@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from touchcell.errors import ConfigError
 from touchcell.simulation.meshes.smoothing import Edges, TriangleMesh
@@ -23,6 +24,8 @@ LARGEST_M: Final = 2.0
 MOST_FACES: Final = 1_000_000
 LARGEST_HOLE: Final = 12
 """Edges around a hole that a repair closes."""
+MOST_OPEN: Final = 0.1
+"""Share of its own area that a piece of a mesh may lack to be closed; with larger openings it is a sheet."""
 INSTALL: Final = "pip install 'touchcell[mesh]'"
 
 
@@ -36,12 +39,18 @@ def mesh_library(key: str, value: str) -> Iterator[None]:
         raise ConfigError(reason, key=key, value=value, hint=INSTALL) from None
 
 
-def load_mesh(path: Path, unit: Unit, *, repair: bool) -> TriangleMesh:
+def load_mesh(path: Path, unit: Unit, *, scale: float = 1.0, repair: bool) -> TriangleMesh:
     """Read a mesh file: STL, OBJ or PLY.
 
     Vertices that coincide are merged and faces without an area dropped, always. A mesh that does not enclose a volume
     is refused unless ``repair`` asks for small holes to be closed and faces to be oriented; what stays open is a sheet,
     whose outside is where the normals of its faces point.
+
+    Args:
+        path: the file.
+        unit: of its coordinates.
+        scale: factor on them.
+        repair: see above.
 
     Raises:
         ConfigError: no mesh, of an unlikely size, with too many faces, or open without ``repair``; its ``key`` is the
@@ -70,7 +79,8 @@ def load_mesh(path: Path, unit: Unit, *, repair: bool) -> TriangleMesh:
         )
     if not np.isfinite(loaded.vertices).all():
         raise ConfigError("has a vertex that is not finite", key="file", value=str(path), hint="export it again")
-    _require_likely_size(path, loaded.vertices, unit)
+    _require_likely_size(path, scale * np.asarray(loaded.vertices), unit)
+    loaded.apply_scale(scale)
     loaded.merge_vertices(merge_tex=True, merge_norm=True)
     mesh = _without_empty_faces(_triangles(loaded, unit))
     if repair:
@@ -146,7 +156,7 @@ def _require_likely_size(path: Path, vertices: Any, unit: Unit) -> None:
         f"{path.name} would be {size_m * 1e3:.4g} mm large, which no tip follows",
         key="unit",
         value=unit,
-        hint=f"its size suggests {others}" if others else "export it in millimetres",
+        hint=f"its size suggests {others}" if others else "export it in millimetres, or give its `scale`",
     )
 
 
@@ -169,10 +179,37 @@ def _repaired(mesh: TriangleMesh) -> TriangleMesh:
 
     made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     trimesh.repair.fix_winding(made)
-    mended = _with_holes_closed(_without_empty_faces(_triangles(made, "m")))
-    if not what_is_open(mended) and volume_m3(mended) < 0.0:
-        mended = TriangleMesh(mended.vertices, np.ascontiguousarray(mended.faces[:, ::-1]))
-    return mended
+    return _with_outside_out(_with_holes_closed(_without_empty_faces(_triangles(made, "m"))))
+
+
+def _with_outside_out(mesh: TriangleMesh) -> TriangleMesh:
+    """Turn round each piece that is inside out, but for sheets, which have no inside."""
+    piece = _pieces(Edges.of(mesh.faces))
+    faces, normals = mesh.faces.copy(), mesh.face_normals()
+    for number in np.unique(piece):
+        own = piece == number
+        # The normals of a closed surface, each as long as its face is large, add up to zero.
+        if np.linalg.norm(normals[own].sum(axis=0)) > MOST_OPEN * np.linalg.norm(normals[own], axis=1).sum():
+            continue
+        corners = mesh.vertices[mesh.faces[own]]
+        a, b, c = (corners[:, i] - corners.mean(axis=(0, 1)) for i in range(3))
+        if float(np.einsum("mc,mc->", a, np.cross(b, c))) < 0.0:
+            faces[own] = faces[own][:, ::-1]
+    return TriangleMesh(mesh.vertices, np.ascontiguousarray(faces))
+
+
+def _pieces(edges: Edges) -> NDArray[np.int64]:
+    """Return (m,) a number for each face, the same for faces that edges connect."""
+    face, edge = np.nonzero(edges.other >= 0)
+    other = edges.other[face, edge]
+    label = np.arange(len(edges.other))
+    while True:
+        least = label.copy()
+        np.minimum.at(least, face, label[other])
+        least = least[least]
+        if np.array_equal(least, label):
+            return label
+        label = least
 
 
 def _with_holes_closed(mesh: TriangleMesh) -> TriangleMesh:

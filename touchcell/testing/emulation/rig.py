@@ -107,3 +107,6 @@ class FixtureFactory(Protocol):
 
 RIGS: Final = Registry("touchcell.rigs", "rig", FixtureFactory)
 """Fixtures of all drivers that have an emulator, by the driver's name."""
+
+RIGS_IN_STEP: Final = Registry("touchcell.rigs_in_step", "rig", FixtureFactory)
+"""Fixtures of the drivers that share a simulated time with their emulators, by the driver's name."""

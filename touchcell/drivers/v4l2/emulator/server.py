@@ -35,6 +35,8 @@ _LATE_PERIODS = 10
 _PACKET_BYTES = 512
 _OLDER_FRAMES = 100
 _FOREIGN_CLOCK_NS = 1_000_000_000_000
+# As reported of a first frame (raspberrypi/linux 1984): 131 years.
+_WILD_STAMP_NS = 4_154_505_010_207_436_000
 _EXPOSURE_FOR_FULL_LIGHT = 157
 _GAIN_FOR_DOUBLE_LIGHT = 50
 _LIGHT_STEP = 0.01
@@ -103,6 +105,11 @@ class V4l2Emulator(Emulator):
         "control_errors": "requests for controls fail with this error number",
         "slow_start": "seconds until the first frame of a stream",
         "dark": "the light is off",
+        "stamp_shift": "seconds added to every stamp, as by a driver that computes it wrongly",
+        "wild_stamps": "number of frames with a stamp far from any time",
+        "stuck_stamp": "every frame has the stamp of the one before this began",
+        "stuck_number": "every frame has the number 0",
+        "duplicates": "number of frames that are delivered twice",
         "other_camera": "another camera of the same make, at another socket, has this name",
         "restart": "seconds for which the camera is disconnected before it returns by itself",
     }
@@ -324,11 +331,19 @@ class V4l2Emulator(Emulator):
             stamp_ns -= _OLDER_FRAMES * round(1e9 / self.model.rate_hz)
         if "no_monotonic" in self.active:
             stamp_ns += _FOREIGN_CLOCK_NS
+        stamp_ns += round(1e9 * float(self.active.get("stamp_shift", 0.0)))
+        if "stuck_stamp" in self.active:
+            stamp_ns = self._last_stamp_ns
+        if "stuck_number" in self.active:
+            sequence = 0
+        if self.spend("wild_stamps"):
+            stamp_ns = _WILD_STAMP_NS
         stream, delay_s = self._stream, self._latency_s + float(self.active.get("delay", 0.0))
-        if delay_s > 0.0:
-            asyncio.get_running_loop().call_later(delay_s, self._deliver, stream, data, sequence, stamp_ns, flags)
-        else:
-            self._deliver(stream, data, sequence, stamp_ns, flags)
+        for _ in range(2 if self.spend("duplicates") else 1):
+            if delay_s > 0.0:
+                asyncio.get_running_loop().call_later(delay_s, self._deliver, stream, data, sequence, stamp_ns, flags)
+            else:
+                self._deliver(stream, data, sequence, stamp_ns, flags)
 
     def _deliver(
         self, stream: asyncio.Task[None] | None, data: bytes, sequence: int, stamp_ns: int, flags: int

@@ -1,0 +1,181 @@
+"""The operator's page in a real browser: what it shows, and what its buttons do to a run."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from touchcell.cell.config.true_contact import put_on_true_contact
+from touchcell.paths import CONFIGS
+
+sync_api = pytest.importorskip("playwright.sync_api")
+pytest.importorskip("nicegui")
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+DEADLINE_S = 60.0
+ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with sync_api.sync_playwright() as playwright:
+        options = ["--no-sandbox", "--use-gl=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=options)
+        yield browser
+        browser.close()
+
+
+class Process:
+    """``touchcell ARGUMENTS`` with its output in a file."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self.log = folder / f"{arguments[0]}.log"
+        with self.log.open("wb") as stream:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "touchcell", *arguments],
+                cwd=folder,
+                stdin=subprocess.DEVNULL,
+                stdout=stream,
+                stderr=stream,
+                env=ENVIRONMENT,
+            )
+
+    def address(self) -> str:
+        self.until(lambda: "token=" in self.log.read_text())
+        found = re.search(r"http://\S+", self.log.read_text())
+        assert found is not None
+        return found[0]
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        end_s = time.monotonic() + DEADLINE_S
+        while not condition():
+            assert time.monotonic() < end_s, self.log.read_text()
+            time.sleep(0.05)
+
+    def end(self) -> None:
+        self.process.terminate()
+        self.process.wait(30)
+
+
+def cell(folder: Path, **changes: Any) -> Path:
+    """A cell in real time, with limits that a busy machine keeps."""
+    data = yaml.safe_load((CONFIGS / "surface_follow_sim.yaml").read_text())
+    put_on_true_contact(data)
+    data |= {"time": "real", "rate_hz": 25, **changes}
+    data["interlocks"]["stale_arm"]["limit_ms"] = 900
+    data["interlocks"]["stale_frame"]["limit_ms"] = 900
+    data["interlocks"]["overrun"] = {"kind": "overrun", "limit_ms": 900}
+    data["interlocks"].pop("tracking", None)
+    data["interlocks"].pop("limited", None)
+    data["task"] |= {"speed_mm_s": 3, "max_state_age_ms": 800, "max_frame_age_ms": 800, "stale_timeout_s": 2}
+    path = folder / "cell.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+def test_a_recording_is_shown_and_scrubbed_and_tabs_come_and_go(browser: Any, tmp_path: Path) -> None:
+    out = tmp_path / "runs" / "first"
+    settings = [word for each in ("task.distance_mm=3", "task.retract_mm=5") for word in ("--set", each)]
+    path = tmp_path / "cell.yaml"
+    data = yaml.safe_load((CONFIGS / "surface_follow_sim.yaml").read_text())
+    put_on_true_contact(data)
+    path.write_text(yaml.safe_dump(data))
+    command = [sys.executable, "-m", "touchcell", "run", str(path), "--quiet", "--out", str(out), *settings]
+    subprocess.run(command, check=True, env=ENVIRONMENT, capture_output=True)
+    server = Process(tmp_path, "ui", "--port", "0")
+    try:
+        address = server.address()
+        page = browser.new_page(viewport={"width": 390, "height": 800})
+        page.set_default_timeout(1e3 * DEADLINE_S)
+        errors: list[str] = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(address)
+        assert "token" not in page.url
+        page.get_by_text("first", exact=True).click()
+        page.get_by_text("indentation").first.wait_for()
+        page.locator("canvas").first.wait_for()
+        page.locator("svg .present").first.wait_for(state="attached")
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        before = page.locator(".q-badge").first.inner_text()
+        page.locator(".q-slider").first.click(position={"x": 60, "y": 10})
+        page.wait_for_function("text => document.querySelector('.q-badge').innerText !== text", arg=before)
+        for _ in range(4):
+            tab = browser.new_page()
+            tab.goto(address.replace("/?", "/run/first?"))
+            tab.close()
+        page.reload()
+        page.get_by_text("indentation").first.wait_for()
+        page.close()
+        fresh = browser.new_context().new_page()
+        assert fresh.goto(address.partition("?")[0]).status == 401
+        assert errors == []
+    finally:
+        server.end()
+    assert "Traceback" not in server.log.read_text()
+
+
+def test_stop_at_once_on_the_page_brings_the_arm_to_rest_in_its_declared_time(browser: Any, tmp_path: Path) -> None:
+    out = tmp_path / "runs" / "live"
+    run = Process(tmp_path, "run", str(cell(tmp_path)), "--quiet", "--ui", "--out", str(out))
+    try:
+        page = browser.new_page()
+        page.set_default_timeout(1e3 * DEADLINE_S)
+        page.goto(run.address())
+        page.get_by_text("approach", exact=False).first.wait_for()
+        page.get_by_role("button", name="stop at once").click()
+        run.until(lambda: run.process.poll() is not None)
+    finally:
+        run.end()
+    result = json.loads((out / "result.json").read_text())
+    assert result["outcome"] == "stopped", run.log.read_text()
+    stop = result["stops"]["arm"]
+    assert stop["time_s"] <= stop["declared_s"] + 0.04
+    assert "Traceback" not in run.log.read_text()
+
+
+def test_reset_and_resume_on_the_page(browser: Any, tmp_path: Path) -> None:
+    out = tmp_path / "runs" / "waits"
+    path = cell(tmp_path, on_trip="wait_for_reset")
+    run = Process(tmp_path, "run", str(path), "--quiet", "--ui", "--out", str(out))
+    try:
+        page = browser.new_page()
+        page.set_default_timeout(1e3 * DEADLINE_S)
+        page.goto(run.address())
+        page.get_by_text("prepare → approach", exact=False).first.wait_for()
+        # A loop that hangs trips; when it goes on, the cause has gone.
+        run.process.send_signal(signal.SIGSTOP)
+        time.sleep(1.5)
+        run.process.send_signal(signal.SIGCONT)
+        page.get_by_text("first cause", exact=False).first.wait_for()
+        place = tool_of(page)
+        page.get_by_role("button", name="reset", exact=True).click()
+        page.get_by_role("button", name="yes, reset").click()
+        page.get_by_text("nothing moves until", exact=False).first.wait_for()
+        assert tool_of(page) == place
+        page.get_by_role("button", name="resume", exact=True).click()
+        page.get_by_role("button", name="yes, resume").click()
+        page.get_by_text("starts again", exact=False).first.wait_for()
+        page.get_by_role("button", name="stop", exact=True).click()
+        run.until(lambda: run.process.poll() is not None)
+    finally:
+        run.end()
+    [reset] = json.loads((out / "result.json").read_text())["resets"]
+    assert reset["causes"]
+    assert "Traceback" not in run.log.read_text()
+
+
+def tool_of(page: Any) -> str:
+    """The bar of the workspace, which says where the tool is."""
+    return str(page.get_by_text("inside the workspace", exact=False).first.inner_text())

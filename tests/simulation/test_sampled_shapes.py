@@ -1,0 +1,62 @@
+"""Random contacts with curved surfaces and edges, on which networks are trained."""
+
+import math
+
+import numpy as np
+import pytest
+
+from touchcell.geometry import se3
+from touchcell.simulation.edge_samples import EdgeRanges, edge_contacts
+from touchcell.simulation.meshes.mesh_shape import MeshShape
+from touchcell.simulation.random_parts import random_part
+from touchcell.simulation.samples import SampledContact, Variation
+from touchcell.simulation.shape_samples import shape_contacts
+
+STILL = Variation(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def contacts_mm_deg(samples: list[SampledContact]) -> np.ndarray:
+    return np.array([se3.to_euler_mm_deg(each.T_f_s) for each in samples])
+
+
+def test_edge_contacts_are_the_same_for_the_same_seed_and_within_their_ranges() -> None:
+    ranges = EdgeRanges()
+    one, two = list(edge_contacts(96, 5)), list(edge_contacts(96, 5))
+    for a, b in zip(one, two, strict=True):
+        assert np.array_equal(a.T_f_s, b.T_f_s)
+        assert np.array_equal(a.pixels, b.pixels)
+    found = contacts_mm_deg(one)
+    assert np.abs(found[:, 0]).max() <= ranges.offset_mm
+    assert np.abs(found[:, 1]).max() <= 0.1 + 1e-9
+    assert found[:, 2].min() >= ranges.depth_mm[0]
+    assert found[:, 2].max() <= ranges.depth_mm[1]
+    assert found[:, 5].std() > 10.0
+
+
+def test_surface_contacts_reach_through_depth_tilt_and_shear() -> None:
+    found = contacts_mm_deg(list(shape_contacts(320, 2, depth_mm=(0.0, 6.5))))
+    assert found[:, 2].min() < 0.5
+    assert 6.0 < found[:, 2].max() <= 6.5
+    assert 20.0 < np.hypot(found[:, 3], found[:, 4]).max() < 40.0
+    assert np.hypot(found[:, 0], found[:, 1]).max() > 3.0
+
+
+def test_curvature_changes_what_the_camera_sees_of_the_same_contact() -> None:
+    samples = list(shape_contacts(640, 4, depth_mm=(2.9, 3.1), variation=STILL))
+    # Batches on planes and on bent surfaces see different marker fields at the same depth.
+    spread = np.std([np.linalg.norm(each.markers - samples[0].markers, axis=1).mean() for each in samples])
+    assert spread > 1.0
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_parts_have_an_edge_with_their_face_above_and_a_wall_below(seed: int) -> None:
+    part = random_part(np.random.default_rng(seed))
+    shape = MeshShape(part, math.radians(30.0))
+    edges = shape.edges
+    normals = edges.middle_normals
+    upper = normals[:, :, 2].max(axis=1) > 0.64
+    assert upper.any()
+    i = int(np.flatnonzero(upper)[0])
+    face = normals[i, normals[i, :, 2].argmax()]
+    middle = 0.5 * (edges.starts[i] + edges.ends[i])
+    assert shape.nearest(middle + 0.017 * face).distance_m == pytest.approx(0.017, abs=2e-4)
