@@ -29,6 +29,7 @@ BENCHMARKS = {
     "hil-mutation": "benchmarks.hil_mutation",
     "phantom": "benchmarks.phantom",
     "pushes": "benchmarks.pushes",
+    "recipe": "benchmarks.recipe",
     "kinematics": "benchmarks.kinematics",
     "safety": "tests.fault_injection.safety",
     "safety-against": "benchmarks.safety_against",

@@ -221,3 +221,23 @@ def test_an_arm_is_at_rest_up_to_a_millimetre_and_a_hundredth_of_a_radian_per_se
     supervisor.review(view(depth_m=0.007))
     outcome = supervisor.reset(OperatorToken("ada", 500), view(now_ns=400, measured=np.array(measured, float)))
     assert isinstance(outcome, ResetDone) == at_rest
+
+
+@pytest.mark.parametrize(("creep_mm_s", "at_rest"), [(0.0, True), (0.5, True), (3.0, False)])
+def test_an_arm_whose_speeds_are_noisy_is_at_rest_when_its_positions_are(creep_mm_s: float, at_rest: bool) -> None:
+    supervisor = Supervisor([DEPTH], Latch())
+    noise = np.array([0.006, 0, 0, 0, 0.02, 0])
+
+    def seen(now_ns: int, depth_m: float = 0.003) -> CellView:
+        one = view(now_ns=now_ns, depth_m=depth_m, measured=noise if now_ns // 20_000_000 % 2 else -noise)
+        T = np.eye(4)
+        T[0, 3] = 1e-12 * creep_mm_s * now_ns
+        state = Stamped(TcpState(T, one.arms["arm"].state.value.twist), now_ns, 1)
+        return CellView(now_ns, {"arm": ArmView(state)}, one.sensors)
+
+    supervisor.review(seen(0, depth_m=0.0065))
+    assert isinstance(supervisor.reset(OperatorToken("op", 1), seen(20_000_000)), ResetRefused)
+    for number in range(2, 40):
+        supervisor.review(seen(number * 20_000_000))
+    outcome = supervisor.reset(OperatorToken("op", 40 * 20_000_000), seen(40 * 20_000_000))
+    assert isinstance(outcome, ResetDone) is at_rest

@@ -57,9 +57,10 @@ def test_faults_of_arms_in_every_state(task: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not (MODELS / "sim_gdn.safetensors").exists(), reason="needs the shipped model")
-@pytest.mark.parametrize("task", ["surface_following", "object_tracking", "observe", "data_collection", "steps", "jog"])
+@pytest.mark.parametrize("task", ["surface_following", "object_tracking", "observe", "data_collection", "steps"])
 def test_faults_of_cameras_in_every_state(task: str) -> None:
-    """Those of the pushing tasks take minutes; ``touchcell bench safety`` runs them."""
+    """Those of the pushing tasks take minutes, and ``jog`` has no code for frames: ``touchcell bench safety``
+    runs them."""
     run_all("camera", task)
 
 

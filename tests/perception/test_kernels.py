@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -347,3 +348,52 @@ def test_without_the_extension_images_stay_the_same(monkeypatch: pytest.MonkeyPa
         np.testing.assert_array_equal(found, expected)
     with pytest.raises(KernelsMissing, match="C compiler"):
         kernels.discs(image, 1, 9, 9)
+
+
+def test_mean_shift_moves_to_the_middle_of_a_disc_and_measures_its_light() -> None:
+    v, u = np.mgrid[:40, :50]
+    image = np.rint(255.0 * np.clip(2.5 - np.hypot(u - 20.3, v - 14.8), 0.0, 1.0)).astype(np.uint8)
+    places, levels = kernels.mean_shift(image, np.array([[21.5, 14.0], [45.0, 35.0], [-900.0, 3.0]]), 3.0, 20)
+    assert places[0] == pytest.approx([20.3, 14.8], abs=0.1)
+    assert levels[0] > 100.0
+    assert places[1:].tolist() == [[45.0, 35.0], [-900.0, 3.0]]
+    assert levels[1:].tolist() == [0.0, 0.0]
+
+
+@given(images(40), st.integers(0, 9999), st.floats(0.6, 9.0), st.integers(1, 5))
+@settings(deadline=None)
+def test_compiled_mean_shift_is_that_in_numpy(image: ImageArray, seed: int, radius: float, turns: int) -> None:
+    starts = np.random.default_rng(seed).uniform(-12, 55, (7, 2))
+    compiled, levels = kernels.mean_shift(image, starts, radius, turns)
+    plain, plain_levels = starts.copy(), np.empty(7)
+    kernels._shift_in_numpy(image, plain, plain_levels, radius, turns)
+    assert compiled == pytest.approx(plain, abs=1e-2)
+    assert levels == pytest.approx(plain_levels, abs=1e-2)
+
+
+@given(images(40), st.integers(0, 9999), st.integers(1, 9))
+def test_block_changes_are_the_means_of_each_block(image: ImageArray, seed: int, blocks: int) -> None:
+    blocks = min(blocks, *image.shape)
+    other = np.random.default_rng(seed).integers(0, 256, image.shape).astype(np.uint8)
+    found = kernels.block_changes(image, other, blocks)
+    rows, columns = (np.arange(blocks + 1) * side // blocks for side in image.shape)
+    apart = np.abs(image.astype(int) - other)
+    means = [[apart[a:b, c:d].mean() for c, d in pairwise(columns)] for a, b in pairwise(rows)]
+    assert found == pytest.approx(np.array(means))
+
+
+def test_neighbours_and_sizes_that_do_not_fit_are_refused() -> None:
+    m = 5
+    weight, rest, terms = np.zeros((84, 2 * m), np.float32), np.zeros(2 * m, np.float32), np.zeros(84, np.float32)
+    numbers = {"radius_px": 2.0, "turns": 3, "least_level": 10.0, "stray_px": 2.0}
+    image = np.zeros((20, 20), np.uint8)
+    outside = np.full((m, 2), m, np.int64)
+    with pytest.raises(ArrayError):
+        kernels.Follower(weight, rest, outside, np.ones(2), **numbers)(image, terms)
+    inside = np.zeros((m, 2), np.int64)
+    with pytest.raises(ArrayError):
+        kernels.Follower(weight, rest, inside, np.zeros(2), **numbers)(image, terms)
+    with pytest.raises(ArrayError):
+        kernels.Follower(weight, rest, inside, np.ones(2), **numbers)(image, terms[:80])
+    with pytest.raises(ArrayError):
+        kernels.block_changes(image, image[:10], 4)

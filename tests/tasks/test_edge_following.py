@@ -14,6 +14,7 @@ from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.recording.recorder import Recorder
 from touchcell.cell.runtime.compose import compose
 from touchcell.cell.runtime.loop import RunLoop
+from touchcell.control.curvature import CurvatureEstimator
 from touchcell.errors import ConfigError
 from touchcell.geometry import se3
 from touchcell.paths import CONFIGS
@@ -21,7 +22,6 @@ from touchcell.simulation.closed_forms import Box, Cylinder
 from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.motions import Still
 from touchcell.simulation.surfaces import Plane, Surface
-from touchcell.tasks.bend import Bend
 
 CELL = CONFIGS / "edge_follow_sim.yaml"
 
@@ -134,7 +134,7 @@ def test_surfaces_without_edges_have_none() -> None:
 
 
 def test_the_bend_of_a_circle_is_one_over_its_radius() -> None:
-    bend, radius_m = Bend(0.010), 0.050
+    bend, radius_m = CurvatureEstimator(0.010), 0.050
     for i in range(30):
         angle = i * 0.001 / radius_m
         pose = se3.from_euler_mm_deg(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.degrees(angle)]))

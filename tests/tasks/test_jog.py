@@ -89,15 +89,27 @@ def test_every_motion_and_its_end(tmp_path: Path) -> None:
     assert 17.0 < lowest_mm < 20.5
 
 
-@pytest.mark.parametrize("dies", [False, True])
-def test_letting_go_and_a_dead_input_bring_the_arm_to_rest(tmp_path: Path, dies: bool) -> None:
-    """A key that is let go, and an input that is killed while it is held: both are silence."""
-    last_s = 1.0
-    script = [Held(0.3, 9.0 if dies else last_s, JogRequest("arm", JogMode.FREE, X))]
-    trace = jogged(tmp_path, script, 2.0, dies_s=last_s if dies else math.inf)
-    assert trace.moves_at(last_s - 0.02)
-    dead_man_s, cycle_s = 0.15, 0.01
-    assert not trace.moves_at(last_s + dead_man_s + 2 * cycle_s + trace.resting_s)
+DEAD_MAN_S, CYCLE_S = 0.15, 0.01
+
+
+def test_letting_go_brings_the_arm_to_rest_in_time_whenever_it_happens(tmp_path: Path) -> None:
+    """Twelve times, back and forth, each held for another time."""
+    held, t_s = [], 0.3
+    for k in range(12):
+        axes = tuple((-1.0) ** k * x for x in X)
+        held.append(Held(t_s, t_s + 0.08 + 0.0173 * k, JogRequest("arm", JogMode.FREE, axes)))
+        t_s = held[-1].to_s + 0.5
+    trace = jogged(tmp_path, held, t_s)
+    for each in held:
+        assert trace.moves_at(each.to_s + 0.05)
+        assert not trace.moves_at(each.to_s + DEAD_MAN_S + 2 * CYCLE_S + trace.resting_s)
+    assert trace.result.outcome is Outcome.DONE
+
+
+def test_an_input_that_is_killed_while_it_is_held_brings_the_arm_to_rest_in_time(tmp_path: Path) -> None:
+    trace = jogged(tmp_path, [Held(0.3, 9.0, JogRequest("arm", JogMode.FREE, X))], 1.5, dies_s=0.9)
+    assert trace.moves_at(0.88)
+    assert not trace.moves_at(0.9 + DEAD_MAN_S + 2 * CYCLE_S + trace.resting_s)
     assert trace.result.outcome is Outcome.DONE
 
 

@@ -419,6 +419,26 @@ def test_follows_ramp_and_dome_in_the_simulator(surface, direction_deg):
     assert turned == pytest.approx(30.0 if on_ramp else np.degrees(60.0 / 87.0), abs=1.5)
 
 
+@pytest.mark.parametrize(
+    ("surface", "speed_mm_s"),
+    [(DOMES[0][0], 60.0), ({"kind": "ramp", "bend_radius_mm": 60.0, "incline_deg": 25.0}, 20.0)],
+)
+def test_turns_with_a_surface_that_bends(surface, speed_mm_s):
+    """By feedforward of its curvature; where it could not turn as fast as it goes, it goes slower.
+
+    Of frames without a filter; without the feedforward the tilt is 5.6 and 17 deg.
+    """
+    on_ramp = surface["kind"] == "ramp"
+    loop = SimulatedLoop(
+        surface, (-30.0, 0.0, 40.0, 180.0, 0.0, 0.0) if on_ramp else (0.0, 0.0, 110.0, 180.0, 0.0, 0.0)
+    )
+    task = SPEC.build(SurfaceFollowingConfig(speed_mm_s=speed_mm_s, distance_mm=80.0), loop.context)
+    log = loop.run(task)
+    assert task.succeeded
+    assert log.depth_rms_mm(3.0) < 0.1
+    assert log.tilt_rms_deg() < 1.6
+
+
 def test_meets_the_limits_under_single_frame_noise():
     noise = np.array([0.25e-3, 0.25e-3, 0.06e-3, *np.radians([0.35, 0.35, 0.8])])
     loop = SimulatedLoop(RAMPS[0][0], (-30.0, 0.0, 40.0, 180.0, 0.0, 0.0), noise=noise, latency_s=0.04, seed=1)

@@ -528,4 +528,115 @@ static int32_t keep_discs(Component *components, int32_t count, DiscSize size)
     return kept;
 }
 
+enum { LANES = 8 };
+
+/* Sums over the pixels of LANES columns and some rows: light, and light times its distances across and down. */
+WIDE_VECTORS static void add_lights(const float *restrict row, ptrdiff_t stride, ptrdiff_t rows, float from_u, float from_v,
+                              float inverse, float *restrict sums)
+{
+    float column[LANES] = {0}, down[LANES] = {0}, less[LANES];
+    for (int i = 0; i < LANES; i++)
+        less[i] = (from_u + (float)i) * (from_u + (float)i) * inverse;
+    for (ptrdiff_t y = 0; y < rows; y++, row += stride) {
+        float dv = from_v + (float)y, full = 1.0f - dv * dv * inverse;
+#pragma GCC unroll 1
+        for (int i = 0; i < LANES; i++) {
+            float share = full - less[i], light = (share > 0.0f ? share : 0.0f) * row[i];
+            column[i] += light;
+            down[i] += light * dv;
+        }
+    }
+    for (int i = 0; i < LANES; i++) {
+        sums[0] += column[i];
+        sums[1] += column[i] * (from_u + (float)i);
+        sums[2] += down[i];
+    }
+}
+
+/* Moves each place of an image to the centroid of the brightness around it, again and again until it stays.
+ *
+ * Mean shift (Comaniciu & Meer 2002): a pixel counts by 1 - (distance / radius)^2, and not at all beyond the radius.
+ * `levels` becomes the weighted mean of the grey levels at the last place. Outside of the image everything is black.
+ * 0: out of memory. */
+static int mean_shift(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width,
+                                   double radius, int turns, ptrdiff_t count, double *places, double *levels)
+{
+    ptrdiff_t reach = (ptrdiff_t)radius + 1, rows = 2 * reach + 1, blocks = (rows + LANES - 1) / LANES;
+    ptrdiff_t border = 2 * reach + LANES, stride = width + 2 * border;
+    float *dark = calloc((size_t)((height + 2 * border) * stride), sizeof *dark);
+    if (!dark)
+        return 0;
+    for (ptrdiff_t y = 0; y < height; y++)
+        to_floats(image + y * row_bytes, width, dark + (y + border) * stride + border);
+    const double settled = 0.05, around = 0.5 * 3.14159265358979323846 * radius * radius;
+    const float inverse = (float)(1.0 / (radius * radius));
+    for (ptrdiff_t i = 0; i < count; i++) {
+        double *place = places + 2 * i;
+        levels[i] = 0.0;
+        for (int turn = 0; turn < turns; turn++) {
+            /* Far outside nothing is seen, and what is no number stays where it is. */
+            if (!(place[0] >= -radius && place[1] >= -radius && place[0] <= (double)width + radius &&
+                  place[1] <= (double)height + radius))
+                break;
+            ptrdiff_t middle_u = (ptrdiff_t)(place[0] + (double)border + 0.5), first_u = middle_u - reach;
+            ptrdiff_t middle_v = (ptrdiff_t)(place[1] + (double)border + 0.5), first_v = middle_v - reach;
+            float from_u = (float)((double)(first_u - border) - place[0]);
+            float from_v = (float)((double)(first_v - border) - place[1]);
+            const float *row = dark + first_v * stride + first_u;
+            float sums[3] = {0};
+            for (ptrdiff_t block = 0; block < blocks; block++)
+                add_lights(row + block * LANES, stride, rows, from_u + (float)(block * LANES), from_v, inverse, sums);
+            double sum = sums[0];
+            levels[i] = sum / around;
+            if (sum <= 0.0)
+                break;
+            double step_u = sums[1] / sum, step_v = sums[2] / sum;
+            place[0] += step_u;
+            place[1] += step_v;
+            if (step_u * step_u + step_v * step_v < settled * settled)
+                break;
+        }
+    }
+    free(dark);
+    return 1;
+}
+
+/* Of all grey levels. */
+WIDE_VECTORS static double sum_of(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width)
+{
+    uint64_t sum = 0;
+    for (ptrdiff_t y = 0; y < height; y++) {
+        const uint8_t *row = image + y * row_bytes;
+        uint32_t in_row = 0;
+        for (ptrdiff_t x = 0; x < width; x++)
+            in_row += row[x];
+        sum += in_row;
+    }
+    return (double)sum;
+}
+
+WIDE_VECTORS static uint32_t row_apart(const uint8_t *restrict one, const uint8_t *restrict other, ptrdiff_t width)
+{
+    uint32_t sum = 0;
+    for (ptrdiff_t x = 0; x < width; x++)
+        sum += (uint32_t)(one[x] > other[x] ? one[x] - other[x] : other[x] - one[x]);
+    return sum;
+}
+
+/* Mean absolute difference of two images in each of blocks x blocks parts. */
+static void block_changes(const uint8_t *one, ptrdiff_t one_row, const uint8_t *other, ptrdiff_t other_row,
+                          ptrdiff_t height, ptrdiff_t width, ptrdiff_t blocks, double *means)
+{
+    for (ptrdiff_t i = 0; i < blocks; i++) {
+        ptrdiff_t top = i * height / blocks, bottom = (i + 1) * height / blocks;
+        for (ptrdiff_t j = 0; j < blocks; j++) {
+            ptrdiff_t left = j * width / blocks, right = (j + 1) * width / blocks;
+            uint64_t sum = 0;
+            for (ptrdiff_t y = top; y < bottom; y++)
+                sum += row_apart(one + y * one_row + left, other + y * other_row + left, right - left);
+            means[i * blocks + j] = (double)sum / (double)((bottom - top) * (right - left));
+        }
+    }
+}
+
 #endif

@@ -10,7 +10,7 @@
 #include "_image_kernels.h"
 #include "_matching_kernels.h"
 
-enum { MOST_ARGUMENTS = 8, ANY = -1 };
+enum { MOST_ARGUMENTS = 12, ANY = -1 };
 
 static const double LARGEST = 1e9;
 static const Py_ssize_t MOST = 1 << 24;
@@ -274,6 +274,134 @@ static PyObject *py_pair(PyObject *module, PyObject *const *arguments, Py_ssize_
     return ended(&call, done);
 }
 
+static PyObject *py_mean_shift(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "mean_shift"};
+    Py_buffer *image, *places, *levels;
+    double radius, turns;
+    if (!takes(&call, count, 5) || !(image = take_image(&call, arguments[0])) ||
+        !number(&call, "radius_px", arguments[1], 0.5, 256.0, &radius) ||
+        !number(&call, "turns", arguments[2], 1.0, 1000.0, &turns) ||
+        !(places = take(&call, "places", arguments[3], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, (Py_ssize_t)ANY, (Py_ssize_t)2)) ||
+        !(levels = take(&call, "levels", arguments[4], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1, places->shape[0])))
+        return finish(&call, NULL);
+    int done = mean_shift(image->buf, image->strides[0], image->shape[0], image->shape[1], radius, (int)turns,
+                          places->shape[0], places->buf, levels->buf);
+    return ended(&call, done);
+}
+
+static PyObject *py_block_changes(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "block_changes"};
+    Py_buffer *one, *other, *means;
+    if (!takes(&call, count, 3) || !(one = take_image(&call, arguments[0])) || !(other = take_image(&call, arguments[1])) ||
+        !(means = take(&call, "means", arguments[2], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, (Py_ssize_t)ANY, (Py_ssize_t)ANY)))
+        return finish(&call, NULL);
+    Py_ssize_t blocks = means->shape[0], height = one->shape[0], width = one->shape[1];
+    if (other->shape[0] != height || other->shape[1] != width || means->shape[1] != blocks || blocks < 1 ||
+        blocks > height || blocks > width) {
+        refuse(&call, "means", "or an image has another shape");
+        return finish(&call, NULL);
+    }
+    block_changes(one->buf, one->strides[0], other->buf, other->strides[0], height, width, blocks, means->buf);
+    return ended(&call, 1);
+}
+
+static const float *in_rows_of(Call *call, const char *argument, PyObject *value, Py_ssize_t rows, Py_ssize_t columns)
+{
+    Py_buffer *view = take(call, argument, value, 'f', PyBUF_C_CONTIGUOUS, 2, rows, columns);
+    return view ? view->buf : NULL;
+}
+
+/* Places of the markers that an image shows next to where a polynomial of six numbers and a field put them. */
+static PyObject *py_follow(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    enum { TERMS = 84 };
+    Call call = {.function = "follow"};
+    Py_buffer *image, *terms, *rest, *field, *neighbours, *limits, *expected, *off, *around, *seen;
+    const float *weight;
+    if (!takes(&call, count, 11) || !(image = take_image(&call, arguments[0])) ||
+        !(terms = take(&call, "terms", arguments[1], 'f', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)TERMS)) ||
+        !(field = take_points(&call, "field", arguments[4])) ||
+        !(weight = in_rows_of(&call, "weight", arguments[2], (Py_ssize_t)TERMS, 2 * field->shape[0])) ||
+        !(rest = take(&call, "rest", arguments[3], 'f', PyBUF_C_CONTIGUOUS, 1, 2 * field->shape[0])) ||
+        !(neighbours = take(&call, "neighbours", arguments[5], 'q', PyBUF_C_CONTIGUOUS, 2, field->shape[0], (Py_ssize_t)ANY)) ||
+        !(limits = take(&call, "limits", arguments[6], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)6)) ||
+        !(expected = take(&call, "expected", arguments[7], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, field->shape[0], (Py_ssize_t)2)) ||
+        !(off = take(&call, "off", arguments[8], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, field->shape[0], (Py_ssize_t)2)) ||
+        !(around = take(&call, "around", arguments[9], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 2, field->shape[0], (Py_ssize_t)2)) ||
+        !(seen = take(&call, "seen", arguments[10], '?', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1, field->shape[0])))
+        return finish(&call, NULL);
+    const double *limit = limits->buf;
+    double px[2] = {limit[0], limit[1]}, radius = limit[2], level = limit[4], stray = limit[5];
+    Py_ssize_t m = field->shape[0], each = neighbours->shape[1];
+    const int64_t *other = neighbours->buf;
+    int inside = px[0] > 0.0 && px[1] > 0.0 && radius >= 0.5 && radius <= 256.0 && limit[3] >= 1.0 && limit[3] <= 1000.0;
+    for (Py_ssize_t i = 0; i < m * each && inside; i++)
+        inside = other[i] >= 0 && other[i] < m;
+    if (!inside) {
+        refuse(&call, "limits", "or neighbours are out of range");
+        return finish(&call, NULL);
+    }
+    float *moved = malloc((size_t)(2 * m) * sizeof *moved);
+    double *levels = malloc((size_t)m * sizeof *levels);
+    int done = moved && levels;
+    double at_markers = 0.0, everywhere = 0.0;
+    if (done) {
+        double *place = off->buf, *mean = around->buf, *put = expected->buf;
+        uint8_t *is_seen = seen->buf;
+        affine(weight, rest->buf, terms->buf, TERMS, 2 * m, moved);
+        for (Py_ssize_t i = 0; i < 2 * m; i++) {
+            put[i] = moved[i];
+            place[i] = (put[i] + ((const double *)field->buf)[i] + 0.5) / px[i % 2] - 0.5;
+        }
+        done = mean_shift(image->buf, image->strides[0], image->shape[0], image->shape[1], radius, (int)limit[3], m, place,
+                          levels);
+        for (Py_ssize_t i = 0; i < m; i++) {
+            is_seen[i] = levels[i] >= level;
+            at_markers += is_seen[i] ? levels[i] : 0.0;
+            for (int axis = 0; axis < 2; axis++)
+                place[2 * i + axis] = (place[2 * i + axis] + 0.5) * px[axis] - 0.5 - put[2 * i + axis];
+        }
+        means_of_neighbours(place, is_seen, other, m, each, mean);
+        for (Py_ssize_t i = 0; i < m; i++) {
+            double u = place[2 * i] - mean[2 * i], v = place[2 * i + 1] - mean[2 * i + 1];
+            is_seen[i] = is_seen[i] && u * u + v * v < stray * stray;
+        }
+        everywhere = sum_of(image->buf, image->strides[0], image->shape[0], image->shape[1]);
+    }
+    free(moved);
+    free(levels);
+    return done ? finish(&call, PyFloat_FromDouble(at_markers / (everywhere > 1.0 ? everywhere : 1.0))) : ended(&call, 0);
+}
+
+static PyObject *py_measure_field(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "measure_field"};
+    Py_buffer *off, *mean, *sd, *measured;
+    const float *rows;
+    double strongest;
+    if (!takes(&call, count, 6) || !(off = take_points(&call, "off", arguments[0])) ||
+        !(mean = take(&call, "mean", arguments[1], 'f', PyBUF_C_CONTIGUOUS, 1, 2 * off->shape[0])) ||
+        !(sd = take(&call, "sd", arguments[3], 'd', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)ANY)) ||
+        !number(&call, "strongest", arguments[4], 1.0, 1e6, &strongest) ||
+        !(measured = take(&call, "measured", arguments[5], 'd', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 1, (Py_ssize_t)ANY)))
+        return finish(&call, NULL);
+    Py_ssize_t modes = sd->shape[0], filters = measured->shape[0] - 2, numbers = 2 * off->shape[0];
+    if (modes < 1 || filters < 0) {
+        refuse(&call, "sd", "or measured is too short");
+        return finish(&call, NULL);
+    }
+    if (!(rows = in_rows_of(&call, "rows", arguments[2], numbers, modes + filters)))
+        return finish(&call, NULL);
+    float *room = malloc((size_t)(2 * (modes + filters) + numbers) * sizeof *room);
+    int done = room != NULL;
+    if (done)
+        measure_field(off->buf, mean->buf, numbers, rows, sd->buf, modes, filters, (ptrdiff_t)strongest, room, measured->buf);
+    free(room);
+    return ended(&call, done);
+}
+
 /* The basis as (2 markers, stride), of which the first columns are the modes. */
 static int take_modes(Call *call, PyObject *value, Py_ssize_t modes, Modes *to)
 {
@@ -408,7 +536,7 @@ static PyObject *py_bytes_apart(PyObject *module, PyObject *const *arguments, Py
 #define FAST(name) {#name, (PyCFunction)(void (*)(void))py_##name, METH_FASTCALL, NULL}
 
 static PyMethodDef METHODS[] = {FAST(median_5), FAST(threshold), FAST(shrink),  FAST(area_means),  FAST(discs),  FAST(pair), FAST(fit),
-                                FAST(settle),   FAST(density),   FAST(bytes_apart), FAST(affine), {NULL, NULL, 0, NULL}};
+                                FAST(settle),   FAST(density),   FAST(bytes_apart), FAST(affine), FAST(mean_shift), FAST(follow), FAST(block_changes), FAST(measure_field), {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "touchcell.perception._kernelsc",
                                     "Compiled kernels of touchcell.perception.kernels.", -1, METHODS};

@@ -31,3 +31,28 @@ def settle(
 def density(centres: ArrayLike, weights: ArrayLike, low: ArrayLike, cell_px: float, density: ArrayLike, /) -> None: ...
 def bytes_apart(rows: ArrayLike, one: ArrayLike, apart: ArrayLike, /) -> None: ...
 def affine(weight: ArrayLike, bias: ArrayLike, x: ArrayLike, to: ArrayLike, /) -> None: ...
+def mean_shift(image: ArrayLike, radius_px: float, turns: int, places: ArrayLike, levels: ArrayLike, /) -> None: ...
+def follow(
+    image: ArrayLike,
+    terms: ArrayLike,
+    weight: ArrayLike,
+    rest: ArrayLike,
+    field: ArrayLike,
+    neighbours: ArrayLike,
+    limits: ArrayLike,
+    expected: ArrayLike,
+    off: ArrayLike,
+    around: ArrayLike,
+    seen: ArrayLike,
+    /,
+) -> float: ...
+def measure_field(
+    off: ArrayLike,
+    mean: ArrayLike,
+    rows: ArrayLike,
+    sd: ArrayLike,
+    strongest: int,
+    measured: ArrayLike,
+    /,
+) -> None: ...
+def block_changes(one: ArrayLike, other: ArrayLike, means: ArrayLike, /) -> None: ...

@@ -360,4 +360,51 @@ WIDE_VECTORS static void affine(const float *restrict weight, const float *restr
             to[j] += x[i] * weight[i * outputs + j];
 }
 
+/* The mean of each place's known neighbours' values (u, v), zero where none is known. Neighbours are numbers of places. */
+static void means_of_neighbours(const double *values, const uint8_t *known, const int64_t *neighbours, ptrdiff_t places,
+                                ptrdiff_t each, double *means)
+{
+    for (ptrdiff_t i = 0; i < places; i++, neighbours += each) {
+        double u = 0.0, v = 0.0, count = 0.0;
+        for (ptrdiff_t j = 0; j < each; j++) {
+            int64_t other = neighbours[j];
+            if (!known[other])
+                continue;
+            u += values[2 * other];
+            v += values[2 * other + 1];
+            count += 1.0;
+        }
+        means[2 * i] = u / fmax(count, 1.0);
+        means[2 * i + 1] = v / fmax(count, 1.0);
+    }
+}
+
+/* What an image check measures of markers at `off` (u, v) px from where they are expected: the size of the first modes in
+ * their standard deviations, the roughness that no mode explains, px, and the products with the filters.
+ * `rows` is (2 markers, modes + filters), `room` as many floats; `measured` is 2 + filters. */
+static void measure_field(const double *off, const float *mean, ptrdiff_t numbers, const float *rows, const double *sd,
+                          ptrdiff_t modes, ptrdiff_t filters, ptrdiff_t strongest, float *room, double *measured)
+{
+    float *products = room, *left = room + modes + filters;
+    double whole = 0.0, explained = 0.0, size = 0.0;
+    for (ptrdiff_t i = 0; i < modes + filters; i++)
+        products[i] = 0.0f;
+    for (ptrdiff_t i = 0; i < numbers; i++) {
+        left[i] = (float)(off[i] - (double)mean[i]);
+        whole += (double)left[i] * left[i];
+    }
+    affine(rows, products, left, numbers, modes + filters, left + numbers);
+    products = left + numbers;
+    for (ptrdiff_t i = 0; i < modes; i++) {
+        double product = products[i];
+        explained += product * product;
+        if (i < strongest)
+            size += product * product / (sd[i] * sd[i]);
+    }
+    measured[0] = sqrt(size / (double)(strongest < modes ? strongest : modes));
+    measured[1] = sqrt(fmax(whole - explained, 0.0) / (double)(numbers / 2));
+    for (ptrdiff_t i = 0; i < filters; i++)
+        measured[2 + i] = products[modes + i];
+}
+
 #endif

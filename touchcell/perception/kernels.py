@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from touchcell.perception.errors import KernelsMissing
 
 _COLUMNS = 8
 _MOST_OFFSET = 256.0
+_SETTLED_PX = 0.05
 _FACTORS = (4, 8, 16, 32, 64)
 
 
@@ -103,6 +105,171 @@ def discs(image: ImageArray, smallest_px: int, largest_px: int, longest_side_px:
     found = np.frombuffer(_compiled().discs(_in_rows(image), smallest_px, largest_px, longest_side_px))
     n = len(found) // 3
     return found[: 2 * n].reshape(n, 2), found[2 * n :]
+
+
+def mean_shift(image: ImageArray, places: Array, radius_px: float, turns: int) -> tuple[Array, Array]:
+    """Move places to the centroid of the brightness around them, repeatedly, until they stay within 0.05 px.
+
+    Mean shift (Comaniciu & Meer 2002) with weights 1 - (distance / radius)^2; outside of the image everything is black.
+
+    Args:
+        image: uint8 (height, width).
+        places: (m, 2) px, (u, v).
+        radius_px: distance beyond which nothing counts, 0.5 to 256.
+        turns: largest number of moves.
+
+    Returns:
+        (m, 2) px, and (m,) weighted mean grey levels there.
+    """
+    moved, levels = np.array(places, np.float64, order="C"), np.empty(len(places))
+    if _FOUND is None:
+        _shift_in_numpy(image, moved, levels, radius_px, turns)
+    else:
+        _FOUND.mean_shift(_in_rows(image), radius_px, turns, moved, levels)
+    return moved, levels
+
+
+def _shift_in_numpy(image: ImageArray, moved: Array, levels: Array, radius_px: float, turns: int) -> None:
+    reach = math.ceil(radius_px) + 1
+    dark = np.pad(image, 2 * reach)
+    v, u = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, 1, -1)
+    left = np.arange(len(moved))
+    levels[:] = 0.0
+    inside = ((moved >= -radius_px) & (moved <= np.array(image.shape[::-1]) + radius_px)).all(axis=1)
+    left = left[inside]
+    for _ in range(turns):
+        nearest = np.rint(moved[left]).astype(np.int64)
+        du, dv = u - (moved[left] - nearest)[:, :1], v - (moved[left] - nearest)[:, 1:]
+        weight = np.maximum(1.0 - (du * du + dv * dv) / radius_px**2, 0.0)
+        light = weight * dark[nearest[:, 1:] + v + 2 * reach, nearest[:, :1] + u + 2 * reach]
+        total = light.sum(axis=1)
+        levels[left] = total / (0.5 * np.pi * radius_px**2)
+        step = np.column_stack([(light * du).sum(axis=1), (light * dv).sum(axis=1)]) / np.maximum(total, 1e-9)[:, None]
+        moved[left] += step
+        left = left[np.hypot(*step.T) >= _SETTLED_PX]
+        if not len(left):
+            return
+
+
+def block_changes(one: ImageArray, other: ImageArray, blocks: int) -> Array:
+    """Return (blocks, blocks) mean absolute differences of two grey images of one size, at least ``blocks`` px wide."""
+    means = np.empty((blocks, blocks))
+    if _FOUND is not None:
+        _FOUND.block_changes(_in_rows(one), _in_rows(other), means)
+        return means
+    rows, columns = (np.arange(blocks + 1) * side // blocks for side in one.shape)
+    difference = np.abs(one.astype(np.int16) - other)
+    sums = np.add.reduceat(np.add.reduceat(difference, rows[:-1], axis=0, dtype=np.int64), columns[:-1], axis=1)
+    return np.asarray(sums / np.outer(np.diff(rows), np.diff(columns)))
+
+
+class Followed(NamedTuple):
+    """Markers next to where they are expected.
+
+    Attributes:
+        expected: (m, 2) px of the crop.
+        off: (m, 2) px, distances of the places found from there.
+        around: (m, 2) px, means of the bright neighbours' distances.
+        seen: (m,) whether there is light, and the distance is like the neighbours'.
+        light: share of the image's light at bright places, in units of their mean grey levels.
+    """
+
+    expected: Array
+    off: Array
+    around: Array
+    seen: NDArray[np.bool_]
+    light: float
+
+
+class Follower:
+    """Search for markers where a polynomial of six numbers expects them.
+
+    Args:
+        weight: (84, 2 m) px of the crop, of the terms.
+        rest: (2 m,) px, beside them.
+        neighbours: (m, k) numbers of each marker's neighbours.
+        px: (2,) size along u and v of a pixel of the image, px of the crop.
+        radius_px, turns: of the mean shift, px of the image.
+        least_level: grey level of a place that is bright.
+        stray_px: largest distance from the neighbours' mean, px of the crop.
+    """
+
+    def __init__(
+        self,
+        weight: NDArray[np.float32],
+        rest: NDArray[np.float32],
+        neighbours: NDArray[np.int64],
+        px: Array,
+        *,
+        radius_px: float,
+        turns: int,
+        least_level: float,
+        stray_px: float,
+    ) -> None:
+        self._weight, self._rest, self._neighbours, self._px = weight, rest, neighbours, px
+        self._radius_px, self._turns, self._least_level, self._stray_px = radius_px, turns, least_level, stray_px
+        self._limits = np.array([*px, radius_px, turns, least_level, stray_px], np.float64)
+        self._nothing = np.zeros((len(neighbours), 2))
+
+    def __call__(self, image: ImageArray, terms: NDArray[np.float32], field: Array | None = None) -> Followed:
+        """Search in a uint8 (height, width) image, ``field`` (m, 2) px from where the 84 ``terms`` put the markers."""
+        field = self._nothing if field is None else field
+        if _FOUND is None:
+            return self._in_numpy(image, terms, field)
+        m = len(field)
+        expected, off, around = np.empty((m, 2)), np.empty((m, 2)), np.empty((m, 2))
+        seen = np.empty(m, np.bool_)
+        light = _FOUND.follow(
+            _in_rows(image),
+            terms,
+            self._weight,
+            self._rest,
+            field,
+            self._neighbours,
+            self._limits,
+            expected,
+            off,
+            around,
+            seen,
+        )
+        return Followed(expected, off, around, seen, light)
+
+    def _in_numpy(self, image: ImageArray, terms: NDArray[np.float32], field: Array) -> Followed:
+        expected = affine(self._weight, self._rest, terms).astype(np.float64).reshape(-1, 2)
+        starts = (expected + field + 0.5) / self._px - 0.5
+        places, levels = mean_shift(image, starts, self._radius_px, self._turns)
+        off = (places + 0.5) * self._px - 0.5 - expected
+        bright = levels >= self._least_level
+        count = np.maximum(bright[self._neighbours].sum(axis=1), 1)
+        around: Array = np.where(bright[:, None], off, 0.0)[self._neighbours].sum(axis=1) / count[:, None]
+        seen = bright & (np.square(off - around).sum(axis=1) < self._stray_px**2)
+        light = float(levels[bright].sum()) / max(float(image.sum(dtype=np.int64)), 1.0)
+        return Followed(expected, off, around, seen, light)
+
+
+def measure_field(
+    off: Array, mean: NDArray[np.float32], rows: NDArray[np.float32], sd: Array, strongest: int, filters: int
+) -> Array:
+    """Return size and roughness of a field of distances, then its products with filters: (2 + filters,).
+
+    Args:
+        off: (m, 2) px.
+        mean: (2 m,) px, subtracted first.
+        rows: (2 m, modes + filters), orthonormal modes and filters as columns.
+        sd: (modes,) standard deviations of the modes.
+        strongest: so many modes make the size, in root mean square standard deviations.
+        filters: how many.
+    """
+    if _FOUND is None:
+        left = off.ravel() - mean
+        products = np.einsum("i,ij->j", left, rows)
+        modes = products[: len(sd)]
+        size = np.sqrt(np.square(modes / sd)[:strongest].mean())
+        rough = np.sqrt(max(float(left @ left - modes @ modes), 0.0) / len(off))
+        return np.concatenate([[size, rough], products[len(sd) :]])
+    measured = np.empty(2 + filters)
+    _FOUND.measure_field(off, mean, rows, sd, strongest, measured)
+    return measured
 
 
 def pair(places: Array, points: Array) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
@@ -216,6 +383,8 @@ def bytes_apart(rows: NDArray[np.uint8], one: NDArray[np.uint8]) -> NDArray[np.i
 
 def affine(weight: NDArray[np.float32], bias: NDArray[np.float32], x: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return x W + b computed on the calling thread: (outputs,) of a weight (inputs, outputs)."""
+    if _FOUND is None:
+        return np.asarray(np.einsum("i,ij->j", x, weight) + bias, np.float32)
     result = np.empty(len(bias), np.float32)
-    _compiled().affine(weight, bias, x, result)
+    _FOUND.affine(weight, bias, x, result)
     return result

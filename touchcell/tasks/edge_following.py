@@ -13,10 +13,10 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from pydantic import Field, PositiveFloat
 
+from touchcell.control.curvature import CurvatureEstimator
 from touchcell.control.pid import PidGains
 from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.geometry.types import Array
-from touchcell.tasks.bend import Bend
 from touchcell.tasks.contact_servo import ContactServo, SixGains
 from touchcell.tasks.interface import DEPTH, SPEED, TaskContext, TaskSpec
 from touchcell.tasks.servoing import ARM, SENSOR, ServoConfig, ServoTask
@@ -91,7 +91,8 @@ class FollowEdge:
         self._sign = 1.0 if config.direction == "forward" else -1.0
         self._speed_m_s = 1e-3 * config.speed_mm_s
         self._feedforward = np.zeros(6)
-        self._turn_bend, self._tilt_bend = Bend(1e-3 * config.bend_window_mm), Bend(2e-3 * config.bend_window_mm)
+        self._turn_bend = CurvatureEstimator(1e-3 * config.bend_window_mm)
+        self._tilt_bend = CurvatureEstimator(2e-3 * config.bend_window_mm)
         self._fastest_rad_s = math.radians(config.max_turn_deg_s)
         self._tilts = config.dimensions == 5
         self._distance_m = 1e-3 * config.distance_mm

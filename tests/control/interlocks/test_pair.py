@@ -8,8 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from touchcell.control.interlocks.config import build_interlocks, parse_interlocks
+from touchcell.control.interlocks.pair import Carried
 from touchcell.control.interlocks.planning_scene import PlanningScene
 from touchcell.control.interlocks.snapshot import ArmView, CellView, SensorView
 from touchcell.control.interlocks.timers import InterlockState, TimedInterlock
@@ -404,3 +407,22 @@ def test_what_a_loss_says_of_the_other_sensor() -> None:
     assert found is not None
     assert found.subject == "follower_sensor"
     assert found.reason.startswith("no contact, and leader_sensor still pushes for ")
+
+
+@given(st.integers(0, 10_000))
+def test_the_velocity_of_a_tip_is_that_of_its_point_on_the_tool(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T_world_base, T_base_tcp, T_tcp_sensor = (se3.exp(rng.normal(0.0, 0.5, 6)) for _ in range(3))
+    twist, dt_s = rng.normal(0.0, 0.3, 6), 1e-6
+    carried = Carried("sensor", T_world_base, T_tcp_sensor)
+    sensor = SensorView(0, 0, True, T_s_f=np.eye(4), arm="arm")
+
+    def view_of(T: Array) -> CellView:
+        return CellView(0, {"arm": ArmView(Stamped(TcpState(T, twist), 0, 0))}, {"sensor": sensor}, "run")
+
+    turned = se3.exp(np.concatenate([np.zeros(3), twist[3:] * dt_s]))
+    later = T_base_tcp.copy()
+    later[:3, :3] = turned[:3, :3] @ T_base_tcp[:3, :3]
+    later[:3, 3] += twist[:3] * dt_s
+    moved = carried.pose(view_of(later), sensor)[:3, 3] - carried.pose(view_of(T_base_tcp), sensor)[:3, 3]
+    assert carried.velocity(view_of(T_base_tcp), sensor) == pytest.approx(moved / dt_s, abs=1e-5)

@@ -33,6 +33,7 @@ SETTABLE = {
 FOR_PEOPLE = {
     ROOT / "touchcell" / "cell" / "runtime" / "bench_lock.py",
     ROOT / "touchcell" / "cell" / "runtime" / "run_directory.py",
+    ROOT / "touchcell" / "cell" / "ui" / "runs.py",
     ROOT / "touchcell" / "cell" / "analysis" / "provenance.py",
     ROOT / "touchcell" / "cell" / "cli" / "run_description.py",
 }

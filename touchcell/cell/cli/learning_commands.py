@@ -1,4 +1,4 @@
-"""``train``, ``train-sim``, ``calibrate``, ``calibrate-sim``, ``adapt``, ``evaluate``: estimators and their sensors."""
+"""``train``, ``train-sim``, ``train-check``, ``calibrate``, ``calibrate-sim``, ``adapt``, ``evaluate``: estimators."""
 
 from __future__ import annotations
 
@@ -91,6 +91,17 @@ def _add_training(commands: Subparsers) -> None:
     )
     train_sim.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
     _add_seed(train_sim)
+
+    check = add_command(
+        commands, "train-check", _train_check, "learn which images an image network must refuse; the network stays"
+    )
+    check.add_argument("--model", type=Path, required=True, metavar="FILE", help="model file of a gdn or cnn")
+    _add_out(check, "model file to write (.safetensors)")
+    check.add_argument("--data", type=Path, metavar="DIR", help="its data set (default: images as of train-sim)")
+    check.add_argument(
+        "--samples", type=positive, default=6000, help="simulated images, without --data (default: %(default)s)"
+    )
+    _add_seed(check)
 
 
 def _add_calibration(commands: Subparsers) -> None:
@@ -196,6 +207,13 @@ def _train_sim(options: argparse.Namespace) -> int:
         feature=options.feature,
         feels=options.feels,
     )
+    return EXIT_OK
+
+
+def _train_check(options: argparse.Namespace) -> int:
+    from touchcell.cell.cli.train_check import train_check
+
+    train_check(options.model, options.out, data=options.data, samples=options.samples, seed=options.seed)
     return EXIT_OK
 
 

@@ -61,7 +61,7 @@ class Teacher:
             ConfigError: the file has no place for it, would not pass ``touchcell check`` with it, or cannot be written.
         """
         if self._path.is_relative_to(CONFIGS.resolve()):
-            hint = f"cp {self._path} . and jog the copy"
+            hint = f"`touchcell new cell NAME --from {self._path.name}` makes a copy to jog"
             raise ConfigError("ships with touchcell and is not changed", file=str(self._path), hint=hint)
         if name == CORNER and arm not in self._corners:
             self._require_workspace(arm)

@@ -86,6 +86,7 @@ def _go_when_begun(runs: Runs, started: StartedRun) -> None:
     def look() -> None:
         reason = started.failure()
         if runs.has_begun(started.name):
+            started.has_begun()
             ui.navigate.to(f"/run/{started.name}")
         elif reason:
             ui.notify(reason, type="negative", multi_line=True)

@@ -44,7 +44,11 @@ class StartedRun:
         """Return why the run could not begin; empty while it may, or if it did."""
         if self.process.poll() in (None, 0) or (self.log.with_name(self.name) / RECORDING).exists():
             return ""
-        return self.log.read_text(errors="replace").strip()[-500:] or "it ended without a word"
+        return self.log.read_text(errors="replace").strip()[-500:] or "it ended without a message"
+
+    def has_begun(self) -> None:
+        """Leave the rest to the run folder, which has a log of its own."""
+        self.log.unlink(missing_ok=True)
 
 
 class Runs:

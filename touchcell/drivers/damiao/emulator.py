@@ -12,6 +12,7 @@ import asyncio
 import errno
 import math
 import struct
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,8 @@ import can
 import numpy as np
 
 from touchcell.drivers.core import can_errors
-from touchcell.drivers.damiao import codec
+from touchcell.drivers.damiao import capture, codec
+from touchcell.drivers.damiao.capture_emulator import RecordedArm
 from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain, Tool
 from touchcell.geometry.types import Array
 from touchcell.testing.emulation.base import CommandOnset, Emulator
@@ -480,10 +482,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--models", nargs="+", choices=sorted(MODELS), help="motor model per joint")
     parser.add_argument("--start-deg", type=float, nargs="+", default=[0.0, 40.0, 90.0, 0.0, 50.0, 0.0])
     parser.add_argument("--first-id", type=int, default=1)
+    parser.add_argument(
+        "--from",
+        dest="capture",
+        type=Path,
+        metavar="CAPTURE",
+        help="answer as the motors in this capture did (candump -L), after a report of what in it is not as expected",
+    )
 
 
-def build(arguments: argparse.Namespace) -> DamiaoArm:
-    """Build the emulator from its command-line arguments."""
+def build(arguments: argparse.Namespace) -> Emulator:
+    """Build the emulator from its command-line arguments. Raises ConfigError."""
+    if arguments.capture is not None:
+        recorded = capture.assign(capture.read_frames(arguments.capture))
+        judged = list(capture.judge(recorded, Motor(1, 2, MODELS["4310"]).registers))
+        for line in [*capture.describe(recorded), *(judged or ["nothing contradicts codec or emulator"])]:
+            print(line, file=sys.stderr)
+        return RecordedArm(arguments.path, recorded)
     is_file = Path(arguments.chain).suffix == ".yaml"
     read = ChainDescription.read(Path(arguments.chain)) if is_file else ChainDescription.shipped(arguments.chain)
     tool = Tool.model_validate_json(arguments.tool) if arguments.tool else None

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from touchcell.perception.models.architecture_spec import ArchitectureConfig
@@ -25,48 +23,53 @@ LOG_PRECISION_BOUNDS = (-3.0, 7.0)
 CHECK = "check."
 """Prefix of the tensors of an image check."""
 
+TERMS = 84
+"""Monomials of six means up to the third degree."""
+
 
 class ImageCheckSpec(BaseModel):
-    """A second, smaller network of the same kind that recognises images of the model's own sensor and camera.
-
-    Its first output is the log-odds of an image of this sensor against anything else; its second, of this camera
-    against one that is turned by a multiple of 60 degrees or mirrored, where the two differ at all.
+    """Limits of the check that an image's markers lie where the estimated contact moves them.
 
     Attributes:
-        shrink: side of the squares of pixels that are averaged for its input.
-        channels: features of each block.
-        hidden: units of the hidden layer.
-        least: smallest accepted first output.
-        least_upright: smallest accepted second output; None where the sensor is too regular for it.
+        markers: how many the tip has.
+        radius_px: distance up to which light belongs to a marker, px of the network's input.
+        disc_px: radius of a marker, px of the network's input.
+        least_level: mean grey level around the place of a marker that is seen.
+        least_light: smallest accepted share of the image's light at markers, in units of their mean grey levels.
+        modes: number of components of the field of the markers' distances from where they are expected.
+        limits: largest accepted size of that field, in standard deviations, and roughness, px of the crop, then how
+            much of each change of the camera it may show, in units of that change.
+        changes: what each of these changes is.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
-    shrink: int = Field(default=1, gt=0)
-    channels: Annotated[tuple[Annotated[int, Field(gt=0)], ...], Field(min_length=1)] = (8, 16, 24, 32, 32)
-    hidden: int = Field(default=48, gt=0)
-    least: float = Field(allow_inf_nan=False)
-    least_upright: float | None = Field(default=None, allow_inf_nan=False)
+    markers: int = Field(gt=1)
+    radius_px: float = Field(gt=0.5, allow_inf_nan=False)
+    disc_px: float = Field(gt=0.0, allow_inf_nan=False)
+    least_level: float = Field(gt=0.0, allow_inf_nan=False)
+    least_light: float = Field(ge=0.0, allow_inf_nan=False)
+    modes: int = Field(gt=0)
+    limits: Annotated[tuple[Annotated[float, Field(gt=0.0, allow_inf_nan=False)], ...], Field(min_length=2)]
+    changes: tuple[str, ...]
 
-    def architecture(self, input_size: tuple[int, int]) -> Architecture:
-        """Return the network's architecture for images (height, width)."""
-        height, width = input_size
-        shrunk = height // self.shrink, width // self.shrink
-        return Architecture(kind="cnn", input_size=shrunk, channels=self.channels, hidden=self.hidden)
+    @model_validator(mode="after")
+    def _limited(self) -> ImageCheckSpec:
+        if len(self.limits) != 2 + len(self.changes):
+            raise ValueError(f"{len(self.changes)} changes need {2 + len(self.changes)} limits")
+        return self
 
-
-def shrunk(images: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
-    """Return images (..., height, width) with squares of so many pixels averaged; what remains at the border is cut."""
-    if factor == 1:
-        return images
-    height, width = images.shape[-2] // factor, images.shape[-1] // factor
-    means: NDArray[np.float32] = np.zeros((*images.shape[:-2], height, width), np.float32)
-    # Whole slices: ten times as fast as a mean over axes.
-    for row in range(factor):
-        for column in range(factor):
-            means += images[..., row : height * factor : factor, column : width * factor : factor]
-    means *= np.float32(1.0 / (factor * factor))
-    return means
+    def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return names and shapes of its tensors, without their prefix."""
+        wide = 2 * self.markers
+        return {
+            "rest": (self.markers, 2),
+            "terms": (TERMS, wide),
+            "mean": (wide,),
+            "modes": (self.modes, wide),
+            "sd": (self.modes,),
+            "filters": (len(self.changes), wide),
+        }
 
 
 class Architecture(ArchitectureConfig):
@@ -84,7 +87,7 @@ class Architecture(ArchitectureConfig):
         feature_dropout: rate before the hidden layer.
         mean_dropout: rate before each of the six means.
         precision_dropout: rate before each of the six inverse standard deviations (gdn).
-        check: recognises images of the model's own sensor; None for files without it.
+        check: of images against the estimated contact; None for files without it.
     """
 
     kind: Literal["gdn", "cnn"] = "gdn"
@@ -139,6 +142,5 @@ class Architecture(ArchitectureConfig):
         shapes["output.weight"] = (self.outputs, self.hidden)
         shapes["output.bias"] = (self.outputs,)
         if self.check is not None:
-            own = self.check.architecture(self.input_size).tensor_shapes()
-            shapes |= {f"{CHECK}{name}": shape for name, shape in own.items()}
+            shapes |= {f"{CHECK}{name}": shape for name, shape in self.check.tensor_shapes().items()}
         return shapes

@@ -29,15 +29,6 @@ def onnx_model(model: Model) -> bytes:
     return network_graph(architecture, model.tensors)
 
 
-def check_graph(model: Model) -> bytes | None:
-    """Return the serialised ONNX model of an image network's check, likewise; None where it has none."""
-    architecture = model.header.architecture
-    if not isinstance(architecture, Architecture) or architecture.check is None:
-        return None
-    own = {name.removeprefix(CHECK): each for name, each in model.tensors.items() if name.startswith(CHECK)}
-    return network_graph(architecture.check.architecture(architecture.input_size), own)
-
-
 def network_graph(architecture: Architecture, tensors: Mapping[str, NDArray[np.float32]]) -> bytes:
     """Return the serialised ONNX model of a network with these tensors."""
     constants = {name: each for name, each in tensors.items() if not name.startswith(CHECK)}

@@ -1,272 +1,258 @@
-"""Train the check of an image network: a small network that knows its own sensor's images from anything else.
+"""Learn where an image network's estimates expect the tip's markers: the check of ``markers.image_check``. NumPy only.
 
-It learns from the training images and from what is made of them: torn, rolled, zoomed, shifted and turned images, other
-lattices, noise, checkers, covered halves. A jitter as between sessions, missing pins and dust stay accepted. Whether a
-camera that is turned by a multiple of 60 degrees or mirrored can be told from an upright one depends on how regular
-the pins are: a second output is trained for that, and used where it is right on images that were set aside.
+Nothing but the training images and the trained network is needed. The markers of an image at rest are found as a
+lattice. From there the polynomial from means to places is fitted to more and more images, in the order of how far their
+means are from those at rest: it predicts the next ones well enough for mean shift to find their markers.
+
+Images are then moved, turned and mirrored as a camera might be. Fisher's linear discriminant between the fields of
+changed and of plain images names the change; limits are set on images that none of this was fitted to.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
+import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
-from torch.nn import functional
 
-from touchcell.geometry.types import ImageArray
-from touchcell.perception.models.architecture import CHECK, ImageCheckSpec, shrunk
-from touchcell.perception.models.preprocessing import scale
-from touchcell.perception.networks.contact_network import ContactNetwork
+from touchcell.geometry.types import Array, ImageArray
+from touchcell.perception import kernels
+from touchcell.perception.markers.camera_check import principal
+from touchcell.perception.markers.detection import Discs
+from touchcell.perception.markers.image_check import TURNS, ImageCheck, SeenMarkers, px_of_crop, terms_of
+from touchcell.perception.markers.lattice_fit import fit_lattice
+from touchcell.perception.models.architecture import CHECK, ImageCheckSpec
+from touchcell.perception.models.preprocessing import Preprocessing
 
-STEPS = 1000
+Means = Callable[[ImageArray], NDArray[np.float32]]
+"""From preprocessed images (n, height, width) to a network's means (n, 6)."""
+
 LEAST_IMAGES = 200
-_LEAST_SIDE_PX = 50
-_BATCH = 48
-_LEARNING_RATE = 3e-3
-_SET_ASIDE = 400
-_REJECTED = 0.002
-_MOST_ODDS = -1.0
-_MARKERS_ACROSS = 21.0
-_UPRIGHT_SHARE = 0.98
+_MOST_IMAGES = 3000
+_CANDIDATES, _MOST_RINGS = 60, 16
+_RADIUS = 0.48  # Of the spacing: half way to the next marker.
+_LEVEL = 0.3  # Of the median marker at rest.
+_SHARES = (0.04, 0.055, 0.075, 0.1, 0.135, 0.18, 0.25, 0.33, 0.45, 0.6, 0.8, 1.0, 1.0, 1.0)
+_FIRST_DEGREE_TO, _SECOND_DEGREE_TO = 0.1, 0.5
+_RIDGE = 1e-5
+_MODES, _FILTER_MODES = 40, 80
+_NOISE_PX = 0.5
+_LEAST_SEEN = 0.93
+_CHANGED, _LEAST_ALIKE = 250, 12
+_ACCEPTED, _FOUND = 0.99, 0.02
+_SPARE, _SPARE_LIGHT, _LEAST_LIMIT = 1.1, 0.75, 0.1
+_ZOOM, _TURN_DEG, _SHIFT = 1.05, 2.5, 0.0225  # Of the image's side: 10 px of 445.
+# Of each monomial: at one half it is worth a power of it.
+_DEGREES = np.rint(-np.log2(terms_of(np.full(6, 0.5)))).astype(int)
 
 
-def train_check(
+def learn_image_check(
     images: ImageArray,
-    input_size: tuple[int, int],
+    means_of: Means,
+    preprocessing: Preprocessing,
     *,
-    upright: bool = True,
-    steps: int = STEPS,
+    rest: ImageArray | None = None,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[ImageCheckSpec, dict[str, NDArray[np.float32]]]:
-    """Return the check of an image network and its tensors.
+) -> tuple[ImageCheckSpec, dict[str, NDArray[np.float32]]] | None:
+    """Return the check of an image network and its tensors; None where the markers cannot be followed.
 
     Args:
         images: uint8 (n, height, width), preprocessed, of the sensor's contacts.
-        input_size: (height, width).
-        upright: try to tell turned and mirrored cameras; False for a sensor that is known to be regular.
-        steps: of the training, 48 images each.
-        seed: of everything random.
+        means_of: the trained network.
+        preprocessing: of the model.
+        rest: preprocessed image out of contact; None takes the least deformed one.
+        seed: of the choice of images.
         progress: called with the steps done and their number.
     """
-    spec = ImageCheckSpec(least=0.0, shrink=max(1, min(input_size) // _LEAST_SIDE_PX))
-    images = np.concatenate(
-        [
-            np.rint(255.0 * shrunk(scale(part), spec.shrink)).astype(np.uint8)
-            for part in np.array_split(images, max(1, len(images) // 256))
-        ]
+    if len(images) < LEAST_IMAGES:
+        return None
+    images = images[np.random.default_rng(seed).permutation(len(images))[:_MOST_IMAGES]]
+    found = _rest_markers(images[:_CANDIDATES] if rest is None else rest[None])
+    if found is None:
+        return None
+    which, lattice = found
+    rest = images[which] if rest is None else rest
+    means = means_of(images)
+    # A network knows nothing of an image out of contact: growth begins with the images most like it.
+    unlike = np.abs(images.astype(np.int16) - rest).mean(axis=(1, 2))
+    middle = means[np.argsort(unlike)[: max(8, len(images) // 100)]].mean(axis=0)
+    order = np.argsort(np.linalg.norm(means - middle, axis=1))
+    aside = np.arange(len(order)) % 4 == 3
+    spec, tensors = _at_rest(rest, lattice, preprocessing)
+    taught = order[~aside]
+    for step, share in enumerate(_SHARES):
+        some = taught[: max(min(len(taught), 40), int(share * len(taught)))]
+        degree = 1 + (share > _FIRST_DEGREE_TO) + (share > _SECOND_DEGREE_TO)
+        spec, tensors = _fitted(
+            images[some], means[some], degree, ImageCheck(spec, tensors, preprocessing), spec, tensors
+        )
+        if progress is not None:
+            progress(step + 1, len(_SHARES) + 1)
+    check = ImageCheck(spec, tensors, preprocessing)
+    markers = [check.find(images[i], means[i]) for i in order]
+    if np.quantile([each.seen.mean() for each in markers], _FOUND) < _LEAST_SEEN:
+        return None
+    kept = [each for each, kept in zip(markers, aside, strict=True) if kept]
+    limits = _SPARE * np.quantile([check.measure(each) for each in kept], _ACCEPTED, axis=0)
+    changed = _changed_fields(images[order[:: max(1, len(order) // _CHANGED)]], means_of, check, lattice, limits)
+    fields = np.stack([_field(each) for each, kept in zip(markers, aside, strict=True) if not kept])
+    filters = _filters(fields, {name: each[::2] for name, each in changed.items()})
+    for i, each in enumerate(changed.values()):
+        mean = tensors[f"{CHECK}mean"]
+        plain = [float(filters[i] @ (_field(each) - mean)) for each in kept]
+        limit = _SPARE * float(np.quantile(plain, _ACCEPTED))
+        least = float(np.quantile((each[1::2] - mean) @ filters[i], _FOUND))
+        # A plain change is refused from half way on.
+        limits = np.append(limits, 0.5 * (limit + least) if least > 2.0 * limit else max(limit, _LEAST_LIMIT))
+    tensors |= {f"{CHECK}filters": filters}
+    if progress is not None:
+        progress(len(_SHARES) + 1, len(_SHARES) + 1)
+    light = float(np.quantile([each.light for each in markers], 0.002))
+    limited = {"limits": tuple(limits.tolist()), "changes": tuple(changed), "least_light": _SPARE_LIGHT * light}
+    return spec.model_copy(update=limited), tensors
+
+
+def _rest_markers(images: ImageArray) -> tuple[int, Array] | None:
+    """Return the index of the image that shows a lattice best, and its (m, 2) px markers."""
+    best: tuple[float, int, Array] | None = None
+    for i, image in enumerate(images):
+        centres = _peaks(image)
+        rings = round((math.sqrt(max(12 * len(centres) - 3, 1)) - 3.0) / 6.0)
+        for count in (rings, rings + 1):
+            if not 1 < count <= _MOST_RINGS:
+                continue
+            points, rms = fit_lattice(Discs(centres, np.ones(len(centres))), count)
+            if np.isfinite(rms) and (best is None or rms < best[0]):
+                best = (rms, i, points)
+    return None if best is None else best[1:]
+
+
+def _peaks(image: ImageArray) -> Array:
+    """Return (n, 2) px local maxima of a smoothed image, (u, v)."""
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8)
+    highest = cv2.dilate(smooth, np.ones((3, 3), np.uint8))
+    rows, columns = np.nonzero((smooth >= highest) & (smooth > 0.3 * float(smooth.max())))
+    return np.column_stack([columns, rows]).astype(np.float64)
+
+
+def _at_rest(
+    rest: ImageArray, lattice: Array, preprocessing: Preprocessing
+) -> tuple[ImageCheckSpec, dict[str, NDArray[np.float32]]]:
+    """Return a check that expects the markers where they are at rest, with no limits."""
+    apart = np.linalg.norm(lattice[:, None] - lattice[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    radius = max(_RADIUS * float(np.median(apart.min(axis=1))), 0.75)
+    places, levels = kernels.mean_shift(rest, lattice, radius, TURNS)
+    light = float(rest.sum(dtype=np.int64)) / 255.0 / len(places)
+    spec = ImageCheckSpec(
+        markers=len(places),
+        radius_px=radius,
+        disc_px=math.sqrt(light / np.pi),
+        least_level=max(_LEVEL * float(np.median(levels)), 1.0),
+        least_light=0.0,
+        modes=1,
+        limits=(1.0, 1.0),
+        changes=(),
     )
-    rng = np.random.default_rng(seed)
-    order = rng.permutation(len(images))
-    aside = images[order[: min(_SET_ASIDE, max(1, len(images) // 10))]]
-    taught = images[order[len(aside) :]] if len(images) > 1 else images
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        network = ContactNetwork(spec.architecture(input_size))
-        network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        optimizer = torch.optim.AdamW(network.parameters(), lr=_LEARNING_RATE, weight_decay=0.01)
-        for step in range(steps):
-            for group in optimizer.param_groups:
-                group["lr"] = _LEARNING_RATE * min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / steps))
-            batch = taught[rng.integers(0, len(taught), _BATCH)]
-            inputs, own, straight, weighed = _examples(batch, rng, upright=upright)
-            outputs = network(inputs.contiguous(memory_format=torch.channels_last))[:, :2]
-            loss = functional.binary_cross_entropy_with_logits(outputs[:, 0], own)
-            if upright:
-                each = functional.binary_cross_entropy_with_logits(outputs[:, 1], straight, reduction="none")
-                loss = loss + (each * weighed).sum() / weighed.sum().clamp(min=1.0)
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
-            optimizer.step()
-            if progress is not None:
-                progress(step + 1, steps)
-        network.eval()
-        with torch.inference_mode():
-            kept = network(_exposed(_worn(_kept(_scaled(aside), rng), rng), rng)).numpy()[:, :2]
-            turned = network(_exposed(_symmetric(_scaled(aside), rng), rng)).numpy()[:, 1]
-    least = min(_MOST_ODDS, float(np.quantile(kept[:, 0], _REJECTED)))
-    # Where both classes look the same, the odds do not separate them.
-    limit = min(_MOST_ODDS, float(np.quantile(kept[:, 1], _REJECTED)))
-    knows = upright and float((turned < limit).mean()) > _UPRIGHT_SHARE
-    spec = spec.model_copy(update={"least": least, "least_upright": limit if knows else None})
-    return spec, {f"{CHECK}{name}": each for name, each in network.folded().items()}
+    wide = 2 * len(places)
+    shapes = {"terms": (len(_DEGREES), wide), "mean": (wide,), "modes": (1, wide), "filters": (0, wide)}
+    tensors = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
+    tensors["sd"] = np.ones(1, np.float32)
+    tensors["rest"] = ((places + 0.5) * px_of_crop(preprocessing) - 0.5).astype(np.float32)
+    return spec, {f"{CHECK}{name}": each for name, each in tensors.items()}
 
 
-def _scaled(images: ImageArray) -> Tensor:
-    return torch.from_numpy(scale(images)).unsqueeze(1)
-
-
-def _examples(batch: ImageArray, rng: np.random.Generator, *, upright: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return inputs (n, 1, h, w), whether they are the sensor's own, upright, and which count for the latter."""
-    images = _scaled(batch)
-    n = len(images)
-    parts = [0.38, 0.12, 0.2, 0.2, 0.1] if upright else [0.48, 0.0, 0.21, 0.21, 0.1]
-    ends = np.cumsum(np.round(n * np.array(parts))).astype(int)[:-1]
-    plain, turned, moved, cut, alien = (part for part in torch.tensor_split(images, ends.tolist()))
-    inputs = torch.cat(
-        [
-            _worn(_kept(plain, rng), rng),
-            _symmetric(turned, rng),
-            _moved(moved, rng),
-            _cut(cut, images, rng),
-            _alien(alien, rng),
-        ]
+def _fitted(
+    images: ImageArray,
+    means: NDArray[np.float32],
+    degree: int,
+    check: ImageCheck,
+    spec: ImageCheckSpec,
+    tensors: dict[str, NDArray[np.float32]],
+) -> tuple[ImageCheckSpec, dict[str, NDArray[np.float32]]]:
+    """Return a check whose terms and modes are fitted to the markers that ``check`` finds in images (n, h, w)."""
+    rest = tensors[f"{CHECK}rest"].astype(np.float64)
+    markers = [check.find(image, mean) for image, mean in zip(images, means, strict=True)]
+    off = np.stack([(each.expected + each.off - rest).ravel() for each in markers])
+    used = np.flatnonzero(degree >= _DEGREES)
+    terms = terms_of(means.astype(np.float64))[:, used]
+    coefficients = np.zeros((len(_DEGREES), rest.size))
+    moments = terms.T @ terms + _RIDGE * len(images) * np.eye(len(used))
+    coefficients[used] = np.linalg.solve(moments, terms.T @ off)
+    left = off - terms @ coefficients[used]
+    mean = left.mean(axis=0)
+    modes, sd = principal(left - mean, min(_MODES, len(images) // 4))
+    fitted = {"terms": coefficients, "mean": mean, "modes": modes, "sd": np.maximum(sd, 1e-3)}
+    return (
+        spec.model_copy(update={"modes": len(sd)}),
+        tensors | {f"{CHECK}{name}": each.astype(np.float32) for name, each in fitted.items()},
     )
-    own = torch.zeros(n)
-    own[: len(plain) + len(turned)] = 1.0
-    straight = torch.zeros(n)
-    straight[: len(plain)] = 1.0
-    weighed = torch.zeros(n)
-    weighed[: len(plain) + len(turned)] = 1.0
-    return _exposed(inputs, rng), own, straight, weighed
 
 
-def _warp(
-    images: Tensor,
-    zoom: NDArray[Any],
-    turn_rad: NDArray[Any],
-    shift: NDArray[Any],
-    mirrored: NDArray[np.bool_] | None = None,
-) -> Tensor:
-    """Warp images about their centre; ``shift`` (n, 2) in image widths and heights. Outside is black."""
-    n, _, height, width = images.shape
-    motion = torch.zeros(n, 2, 3)
-    cosine, sine = np.cos(turn_rad) / zoom, np.sin(turn_rad) / zoom
-    flip = np.ones(n) if mirrored is None else np.where(mirrored, -1.0, 1.0)
-    motion[:, 0, 0] = torch.from_numpy(flip * cosine)
-    motion[:, 0, 1] = torch.from_numpy(-flip * sine * height / width)
-    motion[:, 1, 0] = torch.from_numpy(sine * width / height)
-    motion[:, 1, 1] = torch.from_numpy(cosine)
-    motion[:, :, 2] = torch.from_numpy(2.0 * shift)
-    grid = functional.affine_grid(motion, list(images.shape), align_corners=False)
-    return functional.grid_sample(images, grid, mode="bicubic", align_corners=False).clamp(0.0, 1.0)
+def _field(markers: SeenMarkers) -> Array:
+    return markers.off.ravel()
 
 
-def _kept(images: Tensor, rng: np.random.Generator) -> Tensor:
-    """Jitter as between sessions; a third is as it is."""
-    n = len(images)
-    jittered = _warp(images, 1.0 + rng.normal(0, 0.004, n), rng.normal(0, 0.005, n), rng.normal(0, 0.0025, (n, 2)))
-    which = torch.from_numpy(rng.random(n) < 0.67)[:, None, None, None]
-    return torch.where(which, jittered, images)
+def _changed_fields(
+    images: ImageArray, means_of: Means, check: ImageCheck, lattice: Array, limits: Array
+) -> dict[str, Array]:
+    """Return the fields (n, 2 m) px of images as cameras that have moved would take them, by what has happened.
+
+    Only those whose size and roughness are within ``limits`` (2,), and only changes that have some of them.
+    """
+    height, width = images.shape[1:]
+    middle = (width / 2.0 - 0.5, height / 2.0 - 0.5)
+    u, v = lattice.mean(axis=0).tolist()
+    shift = _SHIFT * width
+    changes = {
+        "the camera's image is larger than the model's": _motion(middle, zoom=_ZOOM),
+        "the camera's image is smaller than the model's": _motion(middle, zoom=1.0 / _ZOOM),
+        "the camera's image is shifted to the right": _motion(middle, shift=(shift, 0.0)),
+        "the camera's image is shifted to the left": _motion(middle, shift=(-shift, 0.0)),
+        "the camera's image is shifted downwards": _motion(middle, shift=(0.0, shift)),
+        "the camera's image is shifted upwards": _motion(middle, shift=(0.0, -shift)),
+        "the camera is turned anticlockwise": _motion(middle, turn_deg=_TURN_DEG),
+        "the camera is turned clockwise": _motion(middle, turn_deg=-_TURN_DEG),
+    }
+    for sixths in range(1, 6):
+        changes[f"the camera is turned by about {60 * sixths} deg"] = _motion((u, v), turn_deg=60.0 * sixths)
+    for sixths in range(6):
+        turned = _motion((u, v), turn_deg=60.0 * sixths)
+        mirror = np.array([[-1.0, 0.0, 2.0 * u], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        changes[f"the camera is mirrored, at {30 * sixths} deg"] = turned @ mirror
+    found = {}
+    for name, matrix in changes.items():
+        moved = np.stack(
+            [cv2.warpAffine(each, matrix[:2], (width, height), flags=cv2.INTER_CUBIC) for each in images]
+        ).astype(np.uint8)
+        means = means_of(moved)
+        markers = [check.find(image, mean) for image, mean in zip(moved, means, strict=True)]
+        alike = [_field(each) for each in markers if (check.measure(each)[:2] <= limits).all()]
+        if len(alike) >= _LEAST_ALIKE:
+            found[name] = np.stack(alike)
+    return found
 
 
-def _worn(images: Tensor, rng: np.random.Generator) -> Tensor:
-    """Hide pins and add dust, as wear does."""
-    out = images.clone()
-    n, _, height, width = images.shape
-    v, u = np.mgrid[:height, :width]
-    pin = 0.45 * width / _MARKERS_ACROSS
-    covered = np.zeros((n, 1, height, width), np.float32)
-    for i in range(n):
-        if rng.random() < 0.5:
-            lost = int(rng.uniform(0.0, 0.22) * _MARKERS_ACROSS**2 * 0.78)
-            spots = np.zeros((height, width), np.float32)
-            spots[rng.integers(0, height, lost), rng.integers(0, width, lost)] = 1.0
-            covered[i, 0] = spots
-    reach = max(1, round(pin))
-    hidden = functional.max_pool2d(torch.from_numpy(covered), 2 * reach + 1, stride=1, padding=reach)
-    out = out * (1.0 - hidden)
-    for spot in np.flatnonzero(rng.random(n) < 0.3):
-        cu, cv, radius = rng.uniform(0.2, 0.8) * width, rng.uniform(0.2, 0.8) * height, rng.uniform(0.02, 0.07) * width
-        out[spot, 0][torch.from_numpy((u - cu) ** 2 + (v - cv) ** 2 < radius**2)] = float(rng.random() < 0.2)
-    return out
+def _motion(
+    centre: tuple[float, float], *, zoom: float = 1.0, turn_deg: float = 0.0, shift: tuple[float, float] = (0.0, 0.0)
+) -> Array:
+    matrix = np.eye(3)
+    matrix[:2] = cv2.getRotationMatrix2D(centre, turn_deg, zoom)
+    matrix[:2, 2] += shift
+    return matrix
 
 
-def _exposed(images: Tensor, rng: np.random.Generator) -> Tensor:
-    """Change brightness, sharpness and noise, as focus, light and threshold do."""
-    n = len(images)
-    gain, blur = (
-        torch.from_numpy(rng.uniform(low, high, (n, 1, 1, 1)).astype(np.float32))
-        for low, high in ((0.75, 1.2), (-0.4, 0.6))
-    )
-    smooth = functional.avg_pool2d(images, 3, stride=1, padding=1, count_include_pad=False)
-    noise = torch.from_numpy(rng.normal(0, rng.uniform(0, 0.05, (n, 1, 1, 1)), images.shape).astype(np.float32))
-    return (gain * (images + blur * (smooth - images)) + noise).clamp(0.0, 1.0)
-
-
-def _symmetric(images: Tensor, rng: np.random.Generator) -> Tensor:
-    """Turn by a multiple of 60 degrees, or mirror."""
-    n = len(images)
-    sixths = rng.integers(1, 12, n)
-    jitter = rng.normal(0, 0.002, (n, 2))
-    return _warp(images, np.ones(n), np.pi / 3 * (sixths % 6), jitter, mirrored=sixths >= 6)
-
-
-def _moved(images: Tensor, rng: np.random.Generator) -> Tensor:
-    """Zoom, shift or turn further than a session does, most of them by little."""
-    n = len(images)
-    kind = rng.integers(0, 4, n)
-    sign = rng.choice([-1.0, 1.0], n)
-    zoom = np.where((kind == 0) | (kind == 3), np.exp(sign * rng.exponential(0.05, n) + 0.035 * sign), 1.0)
-    turn = np.where((kind == 1) | (kind == 3), sign * np.radians(3.5 + rng.exponential(5.0, n)), 0.0)
-    angle = rng.uniform(0, 2 * np.pi, n)
-    size = np.where((kind == 2) | (kind == 3), 0.017 + rng.exponential(0.02, n), 0.0)
-    return _warp(images, zoom, turn, size[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]))
-
-
-def _cut(images: Tensor, others: Tensor, rng: np.random.Generator) -> Tensor:
-    """Replace a part by that of another image, roll it, or cover it."""
-    out = images.clone()
-    _, _, height, width = images.shape
-    for i in range(len(images)):
-        edge, where = int(rng.integers(4)), rng.uniform(0.3, 0.7)
-        rows, columns = int(where * height), int(where * width)
-        everything = slice(None)
-        part: tuple[slice, slice] = (
-            (slice(0, rows), everything),
-            (slice(rows, None), everything),
-            (everything, slice(0, columns)),
-            (everything, slice(columns, None)),
-        )[edge]
-        choice = rng.random()
-        if choice < 0.5:
-            out[i, 0][part] = others[rng.integers(len(others)), 0][part]
-        elif choice < 0.65:
-            out[i, 0][part] = torch.roll(images[i, 0][part], int(rng.integers(4, max(5, width // 3))), 1)
-        elif choice < 0.75:
-            out[i, 0] = torch.roll(images[i, 0], int(rng.integers(6, width - 6)), 1)
-        else:
-            out[i, 0][part] = float(rng.choice([0.0, 0.0, 0.5, 1.0]))
-    return out
-
-
-def _alien(images: Tensor, rng: np.random.Generator) -> Tensor:
-    """Replace by images of something else: other lattices, noise, checkers, constants, the inverted image."""
-    out = images.clone()
-    _, _, height, width = images.shape
-    v, u = np.mgrid[:height, :width].astype(np.float32)
-    for i in range(len(images)):
-        choice = rng.random()
-        if choice < 0.6:
-            spacing = width / rng.uniform(10.0, 32.0)
-            shear = rng.choice([0.0, 0.5])
-            turn = rng.uniform(0, np.pi)
-            x = (np.cos(turn) * (u - width / 2) + np.sin(turn) * (v - height / 2)) / spacing + rng.random()
-            y = (np.cos(turn) * (v - height / 2) - np.sin(turn) * (u - width / 2)) / spacing + rng.random()
-            y = y / (np.sqrt(0.75) if shear else 1.0)
-            row = np.round(y)
-            dx = x - shear * row
-            dx = dx - np.round(dx)
-            away = np.hypot(dx, (y - row) * (np.sqrt(0.75) if shear else 1.0)) * spacing
-            dots = np.clip(rng.uniform(0.2, 0.4) * spacing - away + 0.5, 0.0, 1.0)
-            if rng.random() < 0.6:
-                dots = dots * (np.hypot(u - width / 2, v - height / 2) < 0.47 * height)
-            out[i, 0] = torch.from_numpy(dots.astype(np.float32))
-        elif choice < 0.75:
-            coarse = int(rng.integers(1, 4))
-            grain = rng.random((height // coarse + 1, width // coarse + 1)).astype(np.float32)
-            grain = np.kron(grain, np.ones((coarse, coarse), np.float32))[:height, :width]
-            out[i, 0] = torch.from_numpy((grain > rng.uniform(0.2, 0.8)).astype(np.float32))
-        elif choice < 0.85:
-            side = rng.integers(2, 12)
-            out[i, 0] = torch.from_numpy(((u // side + v // side) % 2).astype(np.float32))
-        elif choice < 0.92:
-            out[i] = float(rng.choice([0.0, 0.3, 1.0]))
-        else:
-            out[i] = 1.0 - images[i]
-    return out
+def _filters(plain: Array, changed: dict[str, Array]) -> NDArray[np.float32]:
+    """Return Fisher's discriminants (k, 2 m) of changed fields (n, 2 m) px from plain ones, each one for its change."""
+    mean = plain.mean(axis=0)
+    rows, sd = principal(plain - mean, min(_FILTER_MODES, len(plain) // 4))
+    shares = 1.0 / _NOISE_PX**2 - 1.0 / (sd**2 + _NOISE_PX**2)
+    filters = np.zeros((len(changed), plain.shape[1]), np.float32)
+    for i, fields in enumerate(changed.values()):
+        away = fields.mean(axis=0) - mean
+        toward = away / _NOISE_PX**2 - ((rows @ away) * shares) @ rows
+        filters[i] = toward / max(float(toward @ away), 1e-9)
+    return filters

@@ -41,13 +41,12 @@ from touchcell.perception.networks.contact_network import (
 )
 from touchcell.perception.networks.dataset import LabelledImages, default_cache, label_range, load_reduced
 from touchcell.perception.networks.export import write_trained
-from touchcell.perception.networks.image_check import LEAST_IMAGES, STEPS, train_check
+from touchcell.perception.networks.image_check import learn_image_check
 from touchcell.perception.networks.progress import Observer
 from touchcell.perception.networks.trainer import TrainingJob
 
 _EVALUATION_BATCH = 100
 _SHORT_SIDE_PX = 100
-_CHECK_SHARE = 6
 _LEAST_SIDE_PX = 32
 
 
@@ -218,14 +217,17 @@ def train_on_arrays(
         run.fit(out, recipe, resume=resume)
     mean, sigma = run.predict()
     tensors = run.average.folded()
-    steps = min(STEPS, settings.epochs * len(training) // settings.batch_size // _CHECK_SHARE)
-    if len(training) >= LEAST_IMAGES and steps > 0:
-        report = None if observer is None else partial(observer.images, "check")
-        check, check_tensors = train_check(
-            training.images, preprocessing.output_size, steps=steps, seed=settings.seed, progress=report
-        )
-        architecture = architecture.model_copy(update={"check": check})
-        tensors |= check_tensors
+    check = learn_image_check(
+        training.images,
+        lambda images: run.outputs(images)[:, :6],
+        preprocessing,
+        rest=reference,
+        seed=settings.seed,
+        progress=None if observer is None else partial(observer.images, "check"),
+    )
+    if check is not None:
+        architecture = architecture.model_copy(update={"check": check[0]})
+        tensors |= check[1]
     return write_trained(
         out,
         architecture=architecture,

@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 
 from touchcell.geometry.types import ImageArray
+from touchcell.perception import kernels
 from touchcell.perception.errors import ImageError
 
 BLOCKS = 8
@@ -47,12 +48,7 @@ class ContactGate:
             raise ImageError("kind", f"uint8 (height, width), {BLOCKS} or more px", (reference.dtype, reference.shape))
         if not 0.0 < leave <= enter <= 1.0:
             raise ValueError(f"need 0 < leave <= enter <= 1, got leave {leave} and enter {enter}")
-        self._reference = reference.astype(np.int16)
-        self._rows = np.arange(BLOCKS) * reference.shape[0] // BLOCKS
-        self._columns = np.arange(BLOCKS) * reference.shape[1] // BLOCKS
-        self._block_sizes = np.outer(
-            np.diff(self._rows, append=reference.shape[0]), np.diff(self._columns, append=reference.shape[1])
-        )
+        self._reference = reference.copy()
         self._enter = enter
         self._leave = leave
         self.in_contact = False
@@ -65,7 +61,7 @@ class ContactGate:
             ImageError: the image is not of the reference's size.
         """
         self.compare(reduced)
-        self._reference = reduced.astype(np.int16)
+        self._reference = reduced.copy()
         self.in_contact, self.score = False, 0.0
 
     @classmethod
@@ -96,9 +92,7 @@ class ContactGate:
         """
         if reduced.shape != self._reference.shape or reduced.dtype != np.uint8:
             raise ImageError("size", ("uint8", self._reference.shape), (str(reduced.dtype), reduced.shape))
-        difference = np.abs(reduced - self._reference)
-        sums = np.add.reduceat(np.add.reduceat(difference, self._rows, axis=0, dtype=np.int64), self._columns, axis=1)
-        blocks = np.partition((sums / self._block_sizes).ravel(), -MOST_CHANGED)
+        blocks = np.partition(kernels.block_changes(reduced, self._reference, BLOCKS).ravel(), -MOST_CHANGED)
         return float(blocks[-MOST_CHANGED:].mean() / 255.0)
 
     def update(self, reduced: ImageArray) -> bool:

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.geometry.types import ImageArray
-from touchcell.perception.models.architecture import Architecture, shrunk
-from touchcell.perception.models.graph import IMAGES, OUTPUTS, check_graph, onnx_model
+from touchcell.perception.markers.image_check import ImageCheck
+from touchcell.perception.models.architecture import Architecture
+from touchcell.perception.models.graph import IMAGES, OUTPUTS, onnx_model
 from touchcell.perception.models.model_file import Header, Model, load_model
 from touchcell.perception.models.prediction import RANGE_TOLERANCE, Prediction
 from touchcell.perception.models.preprocessing import scale
@@ -51,8 +52,8 @@ def _session(graph: bytes) -> Runner:
     return run
 
 
+_MENDED, _SETTLED = 3, 0.04
 _OTHER = "the image does not show the model's sensor as its camera would"
-_TURNED = "the camera is turned by a multiple of 60 deg, or mirrored"
 
 
 class ContactModel:
@@ -70,11 +71,11 @@ class ContactModel:
         self.header: Header = model.header
         self.reference: ImageArray | None = model.reference
         self._preprocessing = model.header.preprocessing
-        texture = None if model.reference is None else MarkerTexture(model.reference)
+        architecture = model.header.architecture
+        spec = architecture.check if isinstance(architecture, Architecture) else None
+        self._check = None if spec is None else ImageCheck(spec, model.tensors, model.header.preprocessing)
+        texture = None if spec is not None or model.reference is None else MarkerTexture(model.reference)
         self._texture = texture if texture is not None and texture.usable else None
-        graph, architecture = check_graph(model), model.header.architecture
-        self._check = None if graph is None else _session(graph)
-        self._spec = architecture.check if isinstance(architecture, Architecture) else None
 
     @classmethod
     def load(cls, path: Path) -> ContactModel:
@@ -103,23 +104,25 @@ class ContactModel:
         A gate and a prediction can share the preprocessing. An image that is not of the model's own sensor and camera,
         as far as its file can tell, is not ``in_range``, whatever the network's output.
         """
-        return self._judged(self.decode(self.infer(reduced)), reduced)
+        return self._judged(self.infer(reduced), reduced)
 
-    def _judged(self, prediction: Prediction, reduced: ImageArray) -> Prediction:
-        refusal = self._refusal(reduced)
+    def _judged(self, outputs: NDArray[np.float32], reduced: ImageArray) -> Prediction:
+        refusal = ""
+        if self._check is not None:
+            found = self._check.find(reduced, outputs[:6])
+            for _ in range(_MENDED):
+                mended = self._check.mended(reduced, found)
+                if mended is None:
+                    break
+                before, outputs = outputs, self.infer(mended)
+                found = self._check.find(reduced, outputs[:6])
+                if np.abs(outputs - before)[:6].max() < _SETTLED:
+                    break
+            refusal = self._check.refusal(found)
+        elif self._texture is not None and not self._texture.plausible(reduced):
+            refusal = _OTHER
+        prediction = self.decode(outputs)
         return replace(prediction, in_range=False, refusal=refusal) if refusal else prediction
-
-    def _refusal(self, reduced: ImageArray) -> str:
-        if self._texture is not None and not self._texture.plausible(reduced):
-            return _OTHER
-        if self._check is None or self._spec is None:
-            return ""
-        own, upright = self._check(shrunk(scale(reduced), self._spec.shrink)[None, None])[0, :2].tolist()
-        if own < self._spec.least:
-            return _OTHER
-        if self._spec.least_upright is not None and upright < self._spec.least_upright:
-            return _TURNED
-        return ""
 
     def infer(self, reduced: ImageArray) -> NDArray[np.float32]:
         """First step of ``predict_reduced``: return the network's outputs."""
@@ -132,7 +135,7 @@ class ContactModel:
             return []
         reduced = [self.reduce(image) for image in images]
         rows = self._run(np.stack([scale(each)[None] for each in reduced]))
-        return [self._judged(self.decode(row), each) for row, each in zip(rows, reduced, strict=True)]
+        return [self._judged(row, each) for row, each in zip(rows, reduced, strict=True)]
 
     def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:
         """Apply ``predict`` to a camera's sample; the prediction keeps the stamp, number and quality of the frame."""

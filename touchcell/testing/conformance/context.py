@@ -16,7 +16,7 @@ from touchcell.drivers.core.commands import Sent, TwistCommand, TwistFrame
 from touchcell.drivers.core.device import Device, Lifecycle, OperatorToken
 from touchcell.drivers.core.errors import DeviceError, StaleData
 from touchcell.drivers.core.lease import Lease
-from touchcell.drivers.core.protocols import FrameSource, HealthSource
+from touchcell.drivers.core.protocols import FrameSource, HealthSource, ReadingSource
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.testing.emulation.rig import DeviceFixture, Emulated, FixtureFactory
@@ -368,6 +368,8 @@ class ConformanceContext:
         """Return the newest sample of the device, of any kind."""
         if self.rig.spec.capabilities.kind == "camera":
             return self.camera.latest(max_age_s)
+        if isinstance(self.device, ReadingSource):
+            return self.device.read(max_age_s)
         return self.arm.tcp(max_age_s)
 
     def counters(self) -> dict[str, int]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from touchcell.drivers.core.errors import DeviceError, StaleData
-from touchcell.drivers.core.protocols import JointSource, TcpSource, WrenchSource
+from touchcell.drivers.core.protocols import JointSource, ReadingSource, TcpSource, WrenchSource
 from touchcell.testing.conformance.check import check
 from touchcell.testing.conformance.context import ConformanceContext
 
@@ -105,6 +105,27 @@ def wrench_is_finite_and_fresh(context: ConformanceContext) -> None:
     wrench = device.wrench(max_age_s=0.5).value
     assert wrench.shape == (6,)
     assert np.isfinite(wrench).all()
+
+
+@check(ReadingSource, on_hardware=True)
+def readings_are_stamped_and_numbered(context: ConformanceContext) -> None:
+    """Timestamps are on the injected clock and rise with the numbers; values are finite numbers of constant names."""
+    before_ns = context.clock.now_ns()
+    context.active()
+    samples = []
+    end_ns = context.clock.now_ns() + round(_WINDOW_S * 1e9)
+    while context.clock.now_ns() < end_ns:
+        samples.append(context.read())
+        assert samples[-1].t_ns <= context.clock.now_ns()
+        context.sleep(0.002)
+    assert samples[0].t_ns > before_ns - round(0.1e9)
+    for older, newer in pairwise(samples):
+        assert (newer.seq > older.seq) == (newer.t_ns > older.t_ns)
+        assert newer.seq >= older.seq
+        assert newer.value.keys() == older.value.keys()
+    for sample in samples:
+        assert np.isfinite(list(sample.value.values())).all()
+    _agrees_with_rate(context, samples)
 
 
 @check("truth", "process")

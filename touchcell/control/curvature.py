@@ -1,4 +1,7 @@
-"""How a contact frame turns along the way: the turn that the next millimetres will need, from those just felt."""
+"""Curvature of what is followed: the turn of the contact frame per distance, estimated over the last stretch of it.
+
+It is the feedforward of turning: a servo alone lags behind a surface that bends by speed times curvature over its gain.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +19,8 @@ _CORNER_RAD: Final = math.radians(12.0)
 """From one estimate to the next: no bend but a corner, behind which nothing is known of the bend."""
 
 
-class Bend:
-    """Least-squares rate of turn over the last stretch of the way.
+class CurvatureEstimator:
+    """Least-squares turn per distance over the last stretch of the way.
 
     Args:
         window_m: length of that stretch.

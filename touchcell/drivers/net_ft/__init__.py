@@ -1,0 +1,1 @@
+"""ATI Net F/T force-torque sensors over Raw Data Transfer (UDP)."""
