@@ -37,8 +37,8 @@ from touchcell.cell.experiments.trials import Finished, Perform, Trial
 from touchcell.simulation.objects import TABLES
 
 _TOLERANCE_MM: Final = 5.0
-_OFFSETS_MM: Final = (-30, -20, -10, 0, 10, 20, 30)
-_TURNS_DEG: Final = (-30, -20, -10, 0, 10, 20, 30)
+_OFFSETS_MM: Final = (-20, -10, 0, 10, 20)
+_TURNS_DEG: Final = (-20, -10, 0, 10, 20)
 
 
 @dataclass(frozen=True, slots=True)
