@@ -42,6 +42,8 @@ _NOISE_PX = 0.5
 _LEAST_SEEN = 0.93
 _CHANGED, _LEAST_ALIKE = 250, 12
 _ACCEPTED, _FOUND = 0.99, 0.02
+# Of size and roughness: another tip of the kind deforms a little otherwise, smoothly; what is torn or moved is rough.
+_SPARE_FIELD = np.array([1.6, 1.1])
 _SPARE, _SPARE_LIGHT, _LEAST_LIMIT = 1.1, 0.75, 0.6
 _ZOOM, _TURN_DEG, _SHIFT = 1.05, 2.5, 0.0225  # Of the image's side: 10 px of 445.
 # Of each monomial: at one half it is worth a power of it.
@@ -96,7 +98,7 @@ def learn_image_check(
     if np.quantile([each.seen.mean() for each in markers], _FOUND) < _LEAST_SEEN:
         return None
     kept = [each for each, kept in zip(markers, aside, strict=True) if kept]
-    limits = _SPARE * np.quantile([check.measure(each) for each in kept], _ACCEPTED, axis=0)
+    limits = _SPARE_FIELD * np.quantile([check.measure(each) for each in kept], _ACCEPTED, axis=0)
     changed = _changed_fields(images[order[:: max(1, len(order) // _CHANGED)]], means_of, check, lattice, limits)
     fields = np.stack([_field(each) for each, kept in zip(markers, aside, strict=True) if not kept])
     filters = _filters(fields, {name: each[::2] for name, each in changed.items()})
