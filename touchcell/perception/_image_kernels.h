@@ -639,4 +639,67 @@ static void block_changes(const uint8_t *one, ptrdiff_t one_row, const uint8_t *
     }
 }
 
+/* One row of a 3x3 convolution: `rows` are three padded rows of width + 2. */
+static inline void convolve_row(const float *const rows[3], const float *weight, float bias, ptrdiff_t width,
+                                float *restrict to)
+{
+    const float *r0 = rows[0], *r1 = rows[1], *r2 = rows[2];
+    float a = weight[0], b = weight[1], c = weight[2], d = weight[3], e = weight[4], f = weight[5];
+    float g = weight[6], h = weight[7], i = weight[8];
+    for (ptrdiff_t x = 0; x < width; x++)
+        to[x] = bias + (a * r0[x] + b * r0[x + 1] + c * r0[x + 2]) + (d * r1[x] + e * r1[x + 1] + f * r1[x + 2]) +
+                (g * r2[x] + h * r2[x + 1] + i * r2[x + 2]);
+}
+
+/* The larger of two rows, then of each two neighbours, and of zero. */
+WIDE_VECTORS static void pool_rows(const float *restrict one, const float *restrict other, ptrdiff_t columns,
+                                   float *restrict to)
+{
+    for (ptrdiff_t x = 0; x < columns; x++) {
+        float left = one[2 * x] > other[2 * x] ? one[2 * x] : other[2 * x];
+        float right = one[2 * x + 1] > other[2 * x + 1] ? one[2 * x + 1] : other[2 * x + 1];
+        float larger = left > right ? left : right;
+        to[x] = larger > 0.0f ? larger : 0.0f;
+    }
+}
+
+WIDE_VECTORS static void convolve_two_rows(const float *const rows[4], const float *weight, float bias, ptrdiff_t width,
+                                           float *restrict one, float *restrict other)
+{
+    convolve_row(rows, weight, bias, width, one);
+    convolve_row(rows + 1, weight, bias, width, other);
+}
+
+/* First block of a network: 3x3 convolution of one channel, padded by zeros, 2x2 maximum and ReLU, of which nothing but
+ * the result is stored. `to` is (channels, height / 2, width / 2). 0: out of memory. */
+static int first_block(const uint8_t *image, ptrdiff_t row_bytes, ptrdiff_t height, ptrdiff_t width, const float *weight,
+                       const float *bias, ptrdiff_t channels, float *to)
+{
+    ptrdiff_t padded = width + 2, rows = height / 2, columns = width / 2;
+    float *room = calloc((size_t)(4 * padded + 2 * width), sizeof *room);
+    if (!room)
+        return 0;
+    float *one = room + 4 * padded, *other = one + width;
+    for (ptrdiff_t y = 0; y < rows; y++) {
+        const float *four[4];
+        for (ptrdiff_t i = 0; i < 4; i++) {
+            ptrdiff_t row = 2 * y - 1 + i, slot = (row + 4) % 4;
+            float *values = room + slot * padded;
+            four[i] = values;
+            if (i < 2 && y > 0)
+                continue;
+            if (row < 0 || row >= height)
+                memset(values, 0, (size_t)padded * sizeof *values);
+            else
+                to_floats(image + row * row_bytes, width, values + 1);
+        }
+        for (ptrdiff_t c = 0; c < channels; c++) {
+            convolve_two_rows(four, weight + 9 * c, bias[c], width, one, other);
+            pool_rows(one, other, columns, to + (c * rows + y) * columns);
+        }
+    }
+    free(room);
+    return 1;
+}
+
 #endif

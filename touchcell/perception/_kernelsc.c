@@ -307,6 +307,21 @@ static PyObject *py_block_changes(PyObject *module, PyObject *const *arguments, 
     return ended(&call, 1);
 }
 
+static PyObject *py_first_block(PyObject *module, PyObject *const *arguments, Py_ssize_t count)
+{
+    Call call = {.function = "first_block"};
+    Py_buffer *image, *weight, *bias, *to;
+    if (!takes(&call, count, 4) || !(image = take_image(&call, arguments[0])) ||
+        !(bias = take(&call, "bias", arguments[2], 'f', PyBUF_C_CONTIGUOUS, 1, (Py_ssize_t)ANY)) ||
+        !(weight = take(&call, "weight", arguments[1], 'f', PyBUF_C_CONTIGUOUS, 2, bias->shape[0], (Py_ssize_t)9)) ||
+        !(to = take(&call, "to", arguments[3], 'f', PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE, 3, bias->shape[0],
+                    image->shape[0] / 2, image->shape[1] / 2)))
+        return finish(&call, NULL);
+    int done = first_block(image->buf, image->strides[0], image->shape[0], image->shape[1], weight->buf, bias->buf,
+                           bias->shape[0], to->buf);
+    return ended(&call, done);
+}
+
 static const float *in_rows_of(Call *call, const char *argument, PyObject *value, Py_ssize_t rows, Py_ssize_t columns)
 {
     Py_buffer *view = take(call, argument, value, 'f', PyBUF_C_CONTIGUOUS, 2, rows, columns);
@@ -536,7 +551,7 @@ static PyObject *py_bytes_apart(PyObject *module, PyObject *const *arguments, Py
 #define FAST(name) {#name, (PyCFunction)(void (*)(void))py_##name, METH_FASTCALL, NULL}
 
 static PyMethodDef METHODS[] = {FAST(median_5), FAST(threshold), FAST(shrink),  FAST(area_means),  FAST(discs),  FAST(pair), FAST(fit),
-                                FAST(settle),   FAST(density),   FAST(bytes_apart), FAST(affine), FAST(mean_shift), FAST(follow), FAST(block_changes), FAST(measure_field), {NULL, NULL, 0, NULL}};
+                                FAST(settle),   FAST(density),   FAST(bytes_apart), FAST(affine), FAST(mean_shift), FAST(follow), FAST(first_block), FAST(block_changes), FAST(measure_field), {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef MODULE = {PyModuleDef_HEAD_INIT, "touchcell.perception._kernelsc",
                                     "Compiled kernels of touchcell.perception.kernels.", -1, METHODS};

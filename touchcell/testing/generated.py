@@ -56,6 +56,11 @@ class _World:
     ) -> None:
         self.stack.close()
 
+    def end(self) -> None:
+        """End it; the next call of ``plan`` starts it afresh."""
+        self.stack.close()
+        self.stack, self.started = ExitStack(), None
+
     def plan(self) -> CellPlan:
         """Return the plan; its emulators run and its bench is locked from the first call on."""
         if self.started is None:
@@ -120,7 +125,7 @@ def pytest_pycollect_makeitem(collector: Any, name: str, obj: object) -> pytest.
     from touchcell.testing.hil import rig_in
 
     world = _world(collector.config, collector.path, obj.cell)
-    tests: Any = suite(rig_in(world.file, world.plan, obj.device, _world_name(collector.config)))
+    tests: Any = suite(rig_in(world.file, world.plan, obj.device, _world_name(collector.config), world.end))
     tests.driver, tests.generated_from = obj.device, world.file
     setattr(collector.obj, name, tests)
     collected: pytest.Collector = pytest.Class.from_parent(collector, name=name, obj=tests)

@@ -123,7 +123,9 @@ def _scene_rate_hz(plan: CellPlan, device: DevicePlan) -> float | None:
     return 1e3 / SceneConfig.model_validate(plan.cell.scene).step_ms
 
 
-def rig_in(file: Path, plan: Callable[[], CellPlan], device: str, world: str) -> FixtureFactory:
+def rig_in(
+    file: Path, plan: Callable[[], CellPlan], device: str, world: str, restart: Callable[[], None]
+) -> FixtureFactory:
     """Return the fixture of one device of a cell in a world, without ground truth.
 
     Args:
@@ -131,6 +133,7 @@ def rig_in(file: Path, plan: Callable[[], CellPlan], device: str, world: str) ->
         plan: returns its plan; emulators run and the bench is locked from its first call on.
         device: name of the device.
         world: where it runs.
+        restart: ends the world, so that the next call of ``plan`` starts it afresh.
     """
     from touchcell.cell.config.schema import plan_in_world
 
@@ -144,6 +147,9 @@ def rig_in(file: Path, plan: Callable[[], CellPlan], device: str, world: str) ->
             return _rig_of(started, started.devices[device])(folder, address).build(clock)
 
         def clock() -> Clock:
+            # Called once for each check. An arm without brakes has fallen at the end of the one before.
+            if world == "emulated" and found.spec.capabilities.falls_on_power_loss:
+                restart()
             # The emulators' time begins with them.
             plan()
             return found.clock()

@@ -13,7 +13,7 @@ from touchcell.drivers.core.samples import Frame, Quality, Stamped
 from touchcell.perception.errors import ImageError
 from touchcell.perception.models.architecture import Architecture
 from touchcell.perception.models.model_file import Header, Labels, Model, save_model
-from touchcell.perception.runtime.inference import ContactModel
+from touchcell.perception.runtime.inference import ContactModel, onnx_runtime
 
 IMAGES = [draw(contact) for contact in contacts(8, seed=5)]
 
@@ -36,9 +36,11 @@ def test_agrees_with_torch(kind: str, size: int, channels: tuple[int, ...]) -> N
             normalisation.bias.normal_()
         expected = network.eval()(images).numpy()
     header = make_model().header.model_copy(update={"architecture": architecture, "preprocessing": steps})
-    model = ContactModel(Model(header, network.folded()))
-    outputs = model._run(images.numpy())
-    assert np.abs(outputs - expected).max() < 1e-5
+    stored = Model(header, network.folded())
+    reduced = [steps.reduce(image) for image in IMAGES]
+    for model in (ContactModel(stored), ContactModel(stored, onnx_runtime(stored))):
+        outputs = np.stack([model.infer(each) for each in reduced])
+        assert np.abs(outputs - expected).max() < 1e-5
     assert np.ptp(expected[:, 0]) > 1e-4
 
 
@@ -46,7 +48,8 @@ def test_outputs_stay_bounded_for_any_weights() -> None:
     model = make_model()
     for weights in model.tensors.values():
         weights *= 1e6
-    outputs = ContactModel(model)._run(np.stack([preprocessing().apply(image) for image in IMAGES]))
+    estimator = ContactModel(model)
+    outputs = np.stack([estimator.infer(preprocessing().reduce(image)) for image in IMAGES])
     assert np.isfinite(outputs).all()
     assert np.abs(outputs[:, :6]).max() <= 3.0
     assert outputs[:, 6:].min() >= -3.0

@@ -28,7 +28,7 @@ def plot_felt(trials: Sequence[RunFolder], names: Sequence[str], path: Path) -> 
         cloud = felt_cloud(trial)
         points = 1e3 * cloud.points[::3]
         off = distance_to_scene_mm(trial, cloud.points[::3])
-        shown = axis.scatter(*points.T, c=off, s=2.0, cmap="coolwarm", vmin=-0.3, vmax=0.3)
+        shown = axis.scatter(*points.T, c=off, s=2.0, cmap="coolwarm", vmin=-0.3, vmax=0.3, depthshade=False, zorder=3)
         axis.set_title(name, fontsize=9)
         _frame(axis, points)
     if shown is not None:
@@ -45,8 +45,8 @@ def plot_edges(trials: Sequence[RunFolder], names: Sequence[str], path: Path) ->
         assert series is not None
         T = sensor_poses(trial, "sensor").at(scene_time(trial, series)[during(trial, series)])
         apex = 1e3 * (T[:, :3, 3] + 0.017 * T[:, :3, 2])
-        axis.plot(*apex.T, color=BLUE, lw=1.6)
-        axis.scatter(*apex[:1].T, color=ORANGE, s=18)
+        axis.plot(*apex.T, color=BLUE, lw=1.6, zorder=3)
+        axis.scatter(*apex[:1].T, color=ORANGE, s=18, depthshade=False, zorder=4)
         axis.set_title(name, fontsize=9)
         _frame(axis, apex)
     return save(figure, path)
@@ -55,13 +55,14 @@ def plot_edges(trials: Sequence[RunFolder], names: Sequence[str], path: Path) ->
 def _grid(count: int) -> tuple[Any, Any]:
     rows = max(math.ceil(count / _COLUMNS), 1)
     figure = plt.figure(figsize=(4.0 * _COLUMNS, 3.6 * rows), layout="constrained")
-    axes = [figure.add_subplot(rows, _COLUMNS, i + 1, projection="3d") for i in range(count)]
+    # What was felt lies on the surface, and is drawn over it.
+    axes = [figure.add_subplot(rows, _COLUMNS, i + 1, projection="3d", computed_zorder=False) for i in range(count)]
     return figure, np.array(axes)
 
 
 def _draw_surface(axis: Any, trial: RunFolder) -> None:
     mesh = drawn_surface(surface(trial), 0.0)
-    axis.plot_trisurf(*(1e3 * mesh.vertices.T), triangles=mesh.faces, color=GREY, alpha=0.35, lw=0.0)
+    axis.plot_trisurf(*(1e3 * mesh.vertices.T), triangles=mesh.faces, color=GREY, alpha=0.35, lw=0.0, zorder=1)
 
 
 def _frame(axis: Any, points: Any) -> None:

@@ -181,8 +181,12 @@ class Stopper:
             state = sample.value
             start, speed_m_s = state.T_base_tcp[:3, 3].copy(), math.hypot(*state.twist[:3])
             turn_s = math.hypot(*state.twist[3:]) / limits.rot_accel_rad_s2
-        # An arm that cannot tell its speed is given the time that its fastest motion would need.
-        fastest = limits.speed_m_s if speed_m_s is None else speed_m_s
+        # An arm that cannot tell its speed is given the time that its fastest motion would need; one that can may have
+        # become faster since its state was measured.
+        fastest = limits.speed_m_s
+        if speed_m_s is not None and sample is not None:
+            gained_m_s = limits.accel_m_s2 * max(0, now_ns - sample.t_ns) * 1e-9
+            fastest = max(speed_m_s, min(speed_m_s + gained_m_s, limits.speed_m_s))
         declared_s, declared_m = declared_stop(fastest, limits.accel_m_s2)
         declared_s = max(declared_s, turn_s + STOP_MARGIN_S)
         deadline_ns = now_ns + round(1e9 * declared_s)

@@ -15,10 +15,11 @@ IMAGES = "images"
 OUTPUTS = "outputs"
 
 
-def onnx_model(model: Model) -> bytes:
+def onnx_model(model: Model, *, after_first_block: bool = False) -> bytes:
     """Return a serialised ONNX model: float32 (n, 1, height, width) in [0, 1] to float32 (n, outputs).
 
-    The same function as ``networks.ContactNetwork`` in evaluation, softbound included.
+    The same function as ``networks.ContactNetwork`` in evaluation, softbound included. ``after_first_block`` leaves out
+    the first block, of which the input is the result: float32 (n, features, height / 2, width / 2).
 
     Raises:
         TypeError: the model is not an image network.
@@ -26,12 +27,13 @@ def onnx_model(model: Model) -> bytes:
     architecture = model.header.architecture
     if not isinstance(architecture, Architecture):
         raise TypeError(f"a model of kind {architecture.kind} has no graph")
-    return network_graph(architecture, model.tensors)
+    return network_graph(architecture, model.tensors, first=int(after_first_block))
 
 
-def network_graph(architecture: Architecture, tensors: Mapping[str, NDArray[np.float32]]) -> bytes:
-    """Return the serialised ONNX model of a network with these tensors."""
-    constants = {name: each for name, each in tensors.items() if not name.startswith(CHECK)}
+def network_graph(architecture: Architecture, tensors: Mapping[str, NDArray[np.float32]], *, first: int = 0) -> bytes:
+    """Return the serialised ONNX model of a network with these tensors, from its block ``first`` on."""
+    before = tuple(f"conv{i}." for i in range(first))
+    constants = {name: each for name, each in tensors.items() if not name.startswith((CHECK, *before))}
     nodes: list[bytes] = []
     last = IMAGES
 
@@ -42,7 +44,7 @@ def network_graph(architecture: Architecture, tensors: Mapping[str, NDArray[np.f
         nodes.append(onnx_wire.node(operator, [*first, *others], result, attributes))
         last = result
 
-    for i in range(len(architecture.channels)):
+    for i in range(first, len(architecture.channels)):
         add("Conv", f"conv{i}.weight", f"conv{i}.bias", kernel_shape=[3, 3], pads=[1, 1, 1, 1])
         add("Relu")
         add("MaxPool", kernel_shape=[2, 2], strides=[2, 2])
@@ -63,5 +65,8 @@ def network_graph(architecture: Architecture, tensors: Mapping[str, NDArray[np.f
         add("Log")
         add("Add", "low")
         add("Min", "high", output=OUTPUTS)
-    height, width = architecture.input_size
-    return onnx_wire.model(nodes, constants, {IMAGES: ("n", 1, height, width)}, {OUTPUTS: ("n", architecture.outputs)})
+    height, width = (side >> first for side in architecture.input_size)
+    features = architecture.channels[first - 1] if first else 1
+    return onnx_wire.model(
+        nodes, constants, {IMAGES: ("n", features, height, width)}, {OUTPUTS: ("n", architecture.outputs)}
+    )

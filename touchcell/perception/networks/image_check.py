@@ -42,7 +42,7 @@ _NOISE_PX = 0.5
 _LEAST_SEEN = 0.93
 _CHANGED, _LEAST_ALIKE = 250, 12
 _ACCEPTED, _FOUND = 0.99, 0.02
-_SPARE, _SPARE_LIGHT, _LEAST_LIMIT = 1.1, 0.75, 0.1
+_SPARE, _SPARE_LIGHT, _LEAST_LIMIT = 1.1, 0.75, 0.6
 _ZOOM, _TURN_DEG, _SHIFT = 1.05, 2.5, 0.0225  # Of the image's side: 10 px of 445.
 # Of each monomial: at one half it is worth a power of it.
 _DEGREES = np.rint(-np.log2(terms_of(np.full(6, 0.5)))).astype(int)
@@ -105,8 +105,8 @@ def learn_image_check(
         plain = [float(filters[i] @ (_field(each) - mean)) for each in kept]
         limit = _SPARE * float(np.quantile(plain, _ACCEPTED))
         least = float(np.quantile((each[1::2] - mean) @ filters[i], _FOUND))
-        # A plain change is refused from half way on.
-        limits = np.append(limits, 0.5 * (limit + least) if least > 2.0 * limit else max(limit, _LEAST_LIMIT))
+        # As with marker models, cameras that have moved by less than this estimate well enough.
+        limits = np.append(limits, max(0.5 * (limit + least) if least > 2.0 * limit else limit, _LEAST_LIMIT))
     tensors |= {f"{CHECK}filters": filters}
     if progress is not None:
         progress(len(_SHARES) + 1, len(_SHARES) + 1)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from touchcell.drivers.core.samples import Frame, Stamped
 from touchcell.geometry.types import ImageArray
+from touchcell.perception import kernels
 from touchcell.perception.markers.image_check import ImageCheck
 from touchcell.perception.models.architecture import Architecture
 from touchcell.perception.models.graph import IMAGES, OUTPUTS, onnx_model
@@ -67,6 +68,11 @@ class ContactModel:
     """
 
     def __init__(self, model: Model, runner: Runner | None = None) -> None:
+        self._first: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
+        if runner is None and kernels.compiled():
+            weight, bias = model.tensors["conv0.weight"], model.tensors["conv0.bias"]
+            self._first = np.ascontiguousarray(weight.reshape(len(bias), 9) / np.float32(255.0)), bias
+            runner = _session(onnx_model(model, after_first_block=True))
         self._run = runner or onnx_runtime(model)
         self.header: Header = model.header
         self.reference: ImageArray | None = model.reference
@@ -126,15 +132,18 @@ class ContactModel:
 
     def infer(self, reduced: ImageArray) -> NDArray[np.float32]:
         """First step of ``predict_reduced``: return the network's outputs."""
-        outputs: NDArray[np.float32] = self._run(scale(reduced)[None, None])[0]
+        outputs: NDArray[np.float32] = self._run(self._input(reduced)[None])[0]
         return outputs
+
+    def _input(self, reduced: ImageArray) -> NDArray[np.float32]:
+        return scale(reduced)[None] if self._first is None else kernels.first_block(reduced, *self._first)
 
     def predict_batch(self, images: Sequence[ImageArray]) -> list[Prediction]:
         """Apply ``predict`` to several images in one run; faster per image, and the whole batch is held in memory."""
         if not images:
             return []
         reduced = [self.reduce(image) for image in images]
-        rows = self._run(np.stack([scale(each)[None] for each in reduced]))
+        rows = self._run(np.stack([self._input(each) for each in reduced]))
         return [self._judged(row, each) for row, each in zip(rows, reduced, strict=True)]
 
     def observe(self, sample: Stamped[Frame]) -> Stamped[Prediction]:
