@@ -53,7 +53,7 @@ class Follow:
         self._direction = np.array([np.cos(angle), np.sin(angle), 0.0])
         self._way = _curved_way(config)
         self._left_m = 1e-3 * config.distance_mm
-        self._timeout_s = 3.0 * config.distance_mm / config.speed_mm_s + 1.0
+        self._timeout_s = 6.0 * config.distance_mm / config.speed_mm_s + 5.0
 
     @property
     def feedforward(self) -> Array:
@@ -62,7 +62,7 @@ class Follow:
 
     @property
     def timeout_s(self) -> float:
-        """Three times the nominal duration, for bends, plus one second."""
+        """Six times the nominal duration, for bends, plus five seconds."""
         return self._timeout_s
 
     def update(self, dt_s: float, before: Array, now: Array, T_s_f: Array | None) -> bool:

@@ -102,7 +102,7 @@ def test_inverted_limits(tmp_path: Path) -> None:
 
 
 def test_missing_limit(tmp_path: Path) -> None:
-    error = refused(written(tmp_path, ("{kind: depth, limit_mm: 6}", "{kind: depth}")))
+    error = refused(written(tmp_path, ("{kind: depth, limit_mm: 5}", "{kind: depth}")))
     assert error.key == "interlocks.indentation.limit_mm"
     assert error.reason == "is missing"
 
@@ -145,7 +145,7 @@ def test_the_length_of_the_sensor_swings_further(tmp_path: Path) -> None:
 
 
 def test_a_limit_alone_does_not_bound_a_moving_task(tmp_path: Path) -> None:
-    change = ("{kind: depth, limit_mm: 6}", "{kind: depth, limit_mm: 6, severity: limit}")
+    change = ("{kind: depth, limit_mm: 5}", "{kind: depth, limit_mm: 6, severity: limit}")
     error = refused(written(tmp_path, change))
     assert error.key == "interlocks"
     assert "'depth' that stops" in error.reason
@@ -159,14 +159,14 @@ def test_a_stop_category_that_the_driver_does_not_offer(tmp_path: Path) -> None:
 
 
 def test_a_moving_task_must_be_bounded(tmp_path: Path) -> None:
-    error = refused(written(tmp_path, ("  indentation: {kind: depth, limit_mm: 6}\n", "")))
+    error = refused(written(tmp_path, ("  indentation: {kind: depth, limit_mm: 5}\n", "")))
     assert error.key == "interlocks"
     assert "'depth'" in error.reason
 
 
 @pytest.mark.parametrize("value", [".nan", ".inf", "-5", "0"])
 def test_a_limit_that_is_no_positive_number(tmp_path: Path, value: str) -> None:
-    error = refused(written(tmp_path, ("{kind: depth, limit_mm: 6}", f"{{kind: depth, limit_mm: {value}}}")))
+    error = refused(written(tmp_path, ("{kind: depth, limit_mm: 5}", f"{{kind: depth, limit_mm: {value}}}")))
     assert error.key == "interlocks.indentation.limit_mm"
 
 

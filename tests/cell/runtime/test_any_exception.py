@@ -118,9 +118,11 @@ class Stops:
 
 
 def moving(cell: Cell, loop: RunLoop) -> None:
-    for _ in range(60):
+    for _ in range(600):
         assert loop.step()
-    assert all(arm._body.velocity.any() for arm in cell.arms.values()), "the arms do not move yet"
+        if all(arm._body.velocity.any() for arm in cell.arms.values()):
+            return
+    raise AssertionError("the arms do not move")
 
 
 @pytest.fixture(scope="module")
