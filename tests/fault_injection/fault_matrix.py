@@ -51,7 +51,7 @@ class Fault:
         device: kind of the device; a task without an arm has no faults of one.
         inject: injects it.
         expected: kinds of interlock or error, one of which has to end the run; empty if the run has to end without.
-        unseen: states in which it has no observable effect, and why.
+        unseen: states in which it has no observable effect, or "state, role" where one arm alone has none, and why.
         obeys: True if the arm still stops by its category; if not, it takes twice as long ...
         extra_m_s: ... and moves at this speed in addition.
     """
@@ -103,6 +103,7 @@ _STANDS = {
     "note": "the arm stands still",
     "idle": "the arm stands still",
     "release": "the arm stands still",
+    "settle, follower": "it only touches until the arms are opposite each other",
 }
 _NO_BASELINE = {"prepare": "the first frames are the reference", "wait": "the first frames are the reference"}
 
@@ -338,7 +339,8 @@ def _judged(
     by = "" if result.error is None else type(result.error).__name__
     if first is not None:
         by = kinds.get(first.interlock, first.interlock)
-    expected: frozenset[str] = frozenset() if case.state in fault.unseen else fault.expected
+    unseen = case.state in fault.unseen or f"{case.state}, {case.device}" in fault.unseen
+    expected: frozenset[str] = frozenset() if unseen else fault.expected
     if by not in (expected or {""}):
         problems.append(f"ended by {by or 'nothing'}, expected {' or '.join(sorted(expected)) or 'nothing'}")
     if first is not None and sent.since(first.t_ns):
