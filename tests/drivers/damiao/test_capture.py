@@ -82,7 +82,7 @@ def test_the_driver_runs_on_a_session_as_on_its_motors(session: tuple[Path, np.n
     path, q = session
     hub = tmp_path / "can"
     with Lockstep([bus_arm]) as world:
-        played = emulator_in_step(world, emulator, str(hub), "--from", str(path)).start()
+        played = emulator_in_step(world, "damiao", str(hub), "--from", str(path)).start()
         arm = DamiaoCanArm("arm", config(hub), world)
         activate(arm)
         pause(1.0)

@@ -51,7 +51,6 @@ from touchcell.drivers.ur import codec as ur_codec
 from touchcell.drivers.ur import control, driver
 from touchcell.drivers.ur import state as state_module
 from touchcell.drivers.ur.driver import SPEC, UrArm, UrConfig
-from touchcell.drivers.ur.emulator import server
 from touchcell.drivers.ur.modes import (
     SAFETY_FAULTS,
     RobotMode,
@@ -671,7 +670,7 @@ def test_a_protective_stop_ends_the_program_and_waits_for_a_person(
 def test_a_protective_stop_cannot_be_released_at_once() -> None:
     address = next(ADDRESSES)
     with Lockstep([driver, control, state_module]) as world:
-        emulator = emulator_in_step(world, server, "--host", host_of(address)).start()
+        emulator = emulator_in_step(world, "ur", "--host", host_of(address)).start()
         arm = arm_in_step(config_of(address), world)
         arm.connect()
         arm.configure()

@@ -30,7 +30,7 @@ from touchcell.drivers.core.samples import Frame, Quality, Stamped
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.drivers.v4l2.codec import Arrival
 from touchcell.drivers.v4l2.driver import SPEC, V4l2Camera, V4l2Config
-from touchcell.drivers.v4l2.emulator import picture, server
+from touchcell.drivers.v4l2.emulator import picture
 from touchcell.drivers.v4l2.rig import CallsInStep, rig_in_step
 from touchcell.errors import ConfigError
 from touchcell.testing.emulation.lockstep import EmulatorInStep, emulator_in_step
@@ -531,7 +531,7 @@ def test_a_folder_of_images_is_played_in_order(tmp_path: Path, emulator: Emulato
     images.mkdir()
     for number in range(3):
         cv2.imwrite(str(images / f"{number}.png"), np.full((48, 64), 50 * (number + 1), np.uint8))
-    playing = emulator_in_step(emulator.world, server, "--folder", str(tmp_path), "--images", str(images)).start()
+    playing = emulator_in_step(emulator.world, "v4l2", "--folder", str(tmp_path), "--images", str(images)).start()
     config = V4l2Config(device="/dev/video0", pixel_format="GREY", exposure_us=15700, gain=0)
     with V4l2Camera("tip", CLOCK, config, CallsInStep(tmp_path)) as camera:
         camera.configure()

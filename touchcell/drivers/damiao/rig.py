@@ -9,7 +9,6 @@ from typing import Any
 
 from touchcell.drivers.core import bus_arm
 from touchcell.drivers.damiao import driver as damiao_can
-from touchcell.drivers.damiao import emulator
 from touchcell.testing.emulation.in_cell import EmulatedDriver, start_arguments, tcp_of_joints
 from touchcell.testing.emulation.lockstep import Lockstep, emulator_in_step
 from touchcell.testing.emulation.process import EmulatorProcess
@@ -51,7 +50,7 @@ def rig_in_step(folder: Path, address: int) -> DeviceFixture:
     """Build the same arm on a simulated time, which the emulator shares with the driver."""
     channel = folder / f"can-{address}"
     world = Lockstep([bus_arm])
-    fixture = _fixture(channel, lambda: emulator_in_step(world, emulator, *_arguments(channel)).start())
+    fixture = _fixture(channel, lambda: emulator_in_step(world, "damiao", *_arguments(channel)).start())
     return replace(fixture, world=world, clock=lambda: world, reachable=False)
 
 

@@ -62,7 +62,7 @@ def rig_in_step(folder: Path, address: int) -> DeviceFixture:
     world = Lockstep([bus_arm, bus])
     return replace(
         rig(folder, address),
-        start=lambda: emulator_in_step(world, feetech_emulator, *_arguments(port), build=_build_on_socket).start(),
+        start=lambda: emulator_in_step(world, "feetech", *_arguments(port), build=_build_on_socket).start(),
         build=lambda clock: arm_in_step(port, clock),
         configured=lambda other, clock: arm_in_step(port, clock, other),
         world=world,

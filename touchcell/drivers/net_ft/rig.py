@@ -8,7 +8,7 @@ from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
-from touchcell.drivers.net_ft import codec, driver, emulator
+from touchcell.drivers.net_ft import codec, driver
 from touchcell.drivers.net_ft.driver import SPEC, NetFt, NetFtConfig
 from touchcell.testing.emulation.in_cell import EmulatedDriver, free_host
 from touchcell.testing.emulation.lockstep import Lockstep, emulator_in_step
@@ -49,7 +49,7 @@ def rig_in_step(folder: Path, address: int) -> DeviceFixture:
     world = Lockstep([driver])
     return replace(
         rig(folder, address),
-        start=lambda: emulator_in_step(world, emulator, "--host", host_of(address)).start(),
+        start=lambda: emulator_in_step(world, "net_ft", "--host", host_of(address)).start(),
         world=world,
         clock=lambda: world,
         reachable=False,

@@ -15,7 +15,6 @@ from touchcell.drivers.core.errors import CorruptMessage, DeviceGone, TransportE
 from touchcell.drivers.core.spec import DriverContext
 from touchcell.drivers.ur import control, driver, state
 from touchcell.drivers.ur.driver import SPEC, UrArm, UrConfig
-from touchcell.drivers.ur.emulator import server
 from touchcell.drivers.ur.registers import Registers
 from touchcell.testing.emulation.in_cell import (
     FOR_EVER_PACKETS,
@@ -104,7 +103,7 @@ def rig_in_step(folder: Path, address: int) -> DeviceFixture:
     arguments = ("--host", host_of(address), "--unlock-after", str(UNLOCK_AFTER_S))
     return replace(
         rig(folder, address),
-        start=lambda: emulator_in_step(world, server, *arguments).start(),
+        start=lambda: emulator_in_step(world, "ur", *arguments).start(),
         build=lambda clock: arm_in_step(config_of(address), clock),
         configured=arm_in_step,
         world=world,

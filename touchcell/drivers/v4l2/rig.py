@@ -13,7 +13,6 @@ from touchcell.drivers.core.clock import Clock
 from touchcell.drivers.core.device import Device
 from touchcell.drivers.core.paced_clock import emulated_clock
 from touchcell.drivers.v4l2.driver import SPEC, V4l2Camera, V4l2Config
-from touchcell.drivers.v4l2.emulator import server
 from touchcell.drivers.v4l2.shim import ShimCalls
 from touchcell.testing.emulation.in_cell import EmulatedDriver
 from touchcell.testing.emulation.lockstep import Lockstep, emulator_in_step
@@ -92,7 +91,7 @@ def rig_in_step(folder: Path, address: int) -> DeviceFixture:
 
     return replace(
         fixture,
-        start=lambda: emulator_in_step(world, server, *arguments).start(),
+        start=lambda: emulator_in_step(world, "v4l2", *arguments).start(),
         build=lambda clock: build(cast(V4l2Config, fixture.config), clock),
         configured=build,
         world=world,

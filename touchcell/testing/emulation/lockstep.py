@@ -31,7 +31,7 @@ from touchcell.drivers.core.paced_clock import share_clock
 from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
 from touchcell.testing.emulation.base import Emulator
-from touchcell.testing.emulation.launcher import EmulatorModule
+from touchcell.testing.emulation.launcher import EMULATORS
 
 T = TypeVar("T")
 
@@ -305,20 +305,21 @@ class _WorldLoop(asyncio.SelectorEventLoop):
 
 
 def emulator_in_step(
-    world: Lockstep, module: EmulatorModule, *arguments: str, build: Callable[[Any], Emulator] | None = None
+    world: Lockstep, name: str, *arguments: str, build: Callable[[Any], Emulator] | None = None
 ) -> EmulatorInStep:
-    """Return the emulator of ``module`` with the arguments of its command line; it is not started yet.
+    """Return the emulator ``name`` with the arguments of its command line; it is not started yet.
 
     Args:
         world: the world.
-        module: module of the emulator.
+        name: of the emulator, as for ``touchcell emulate``.
         arguments: its command line.
         build: builds the emulator from these arguments, if not as the module does.
     """
+    module = EMULATORS.load(name)
     parser = argparse.ArgumentParser()
     module.add_arguments(parser)
     options = parser.parse_args(arguments)
-    return EmulatorInStep(world, str(getattr(module, "__name__", module)), lambda: (build or module.build)(options))
+    return EmulatorInStep(world, name, lambda: (build or module.build)(options))
 
 
 class EmulatorInStep:
