@@ -118,3 +118,13 @@ def test_missing_pins_are_no_tear(sensor: tuple[DisplacementModel, Array]) -> No
         within = model.mean + (each - model.mean) @ model.basis.T @ model.basis
         filled = np.where(np.repeat(seen, 2), each, within)
         assert not check(filled, seen).refusal
+
+
+@pytest.mark.parametrize("taught", [24, 60])
+def test_a_check_of_few_contacts_refuses_hardly_any_of_the_sensors_own(taught: int) -> None:
+    """It knows few components, and takes the others for a camera that is turned, mirrored or moved."""
+    model, displacements = _sensor(3, pin_px=0.05)
+    rough = displacements + np.random.default_rng(3).normal(0.0, 2.0, (400, 1)) * displacements[::-1] * 0.3
+    check = _check(model, rough[:taught])
+    refused = [check(each, _everything(each)).refusal for each in rough[taught:]]
+    assert np.mean([bool(each) and "tip" not in each for each in refused]) < 0.05

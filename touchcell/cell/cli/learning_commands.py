@@ -53,7 +53,9 @@ def _add_training(commands: Subparsers) -> None:
         "--seeds", metavar="FIRST..LAST", help="a training for each seed, kind and data set, and a table"
     )
     train.add_argument("--epochs", type=positive, help="passes over the images (default: the kind's own)")
-    train.add_argument("--rings", type=positive, help="of a marker estimator's lattice (default: 10)")
+    train.add_argument(
+        "--rings", type=positive, help="of a marker estimator's lattice (default: counted in the images)"
+    )
     train.add_argument("--networks", type=positive, help="of a marker estimator, whose mixture it gives (default: 2)")
     train.add_argument(
         "--short-side",

@@ -36,6 +36,7 @@ _SPARE, _SPARE_FEW = 0.35, 0.5
 _NOISE_FEW_PX = 0.4
 _STRONG = 6
 _ACCEPTED = 0.997
+_OWN, _SPARE_OWN, _SPARE_OWN_FEW = 0.99, 1.2, 8.0
 _TORN = "the markers do not move as those of one tip"
 _NOISE_PX = 0.2
 
@@ -200,6 +201,34 @@ class _Inverse:
         return product
 
 
+def limited_functionals(
+    functionals: NDArray[np.float32], mean: Array, displacements: Array, spacing_px: float
+) -> NDArray[np.float32]:
+    """Return functionals that accept a sensor's own contacts: what few contacts cannot tell apart refuses none.
+
+    With few contacts many a component of how the skin moves is unknown, and is taken for a change of the camera.
+
+    Args:
+        functionals: (15, 2 m) see ``fit_functionals``.
+        mean: (2 m,) px, mean displacement.
+        displacements: (n, 2 m) px of contacts that they were not learned from.
+        spacing_px: of the lattice.
+    """
+    spare = _SPARE_OWN + _SPARE_OWN_FEW / len(displacements)
+    found = np.abs((displacements - mean) @ functionals.T)
+    shift = np.hypot(found[:, 0], found[:, 1])
+    limited = functionals.copy()
+    for rows, size, most in (
+        (slice(0, 2), shift, _MOST_SHIFT * spacing_px),
+        (slice(2, 3), found[:, 2], _MOST_ZOOM),
+        (slice(3, 4), found[:, 3], _MOST_TURN_RAD),
+    ):
+        limited[rows] *= min(1.0, most / max(spare * float(np.quantile(size, _OWN)), 1e-12))
+    alike = np.quantile((displacements - mean) @ functionals[4:].T, _OWN, axis=0)
+    limited[4:][spare * alike > _LEAST_ALIKE] = 0.0
+    return limited
+
+
 def learn_check(
     model: DisplacementModel, rings: int, displacements: Array
 ) -> tuple[CameraCheckSpec, dict[str, NDArray[np.float32]]]:
@@ -209,6 +238,7 @@ def learn_check(
     learned, others = off[::2], off[1::2]
     rows, sd = principal(learned, min(_COMPONENTS, len(learned) // 10 + 1))
     functionals = fit_functionals(model.reference, rings, model.mean, [(rows, sd)], _NOISE_PX)
+    functionals = limited_functionals(functionals, model.mean, displacements[1::2], model.spacing_px)
     basis = rows.astype(np.float32)
     tensors = {"camera.mean": model.mean.astype(np.float32), "camera.functionals": functionals, "camera.basis": basis}
     return misfit_of(model, others, basis, _SPARE), tensors
@@ -228,6 +258,7 @@ def transferred_check(
     off = displacements - mean
     parts = [(model.basis, model.sd), principal(off, min(_COMPONENTS, len(off) // 2))]
     functionals = fit_functionals(model.reference, rings, mean, parts, _NOISE_FEW_PX)
+    functionals = limited_functionals(functionals, mean, displacements, model.spacing_px)
     basis = model.basis.astype(np.float32)
     tensors = {"camera.mean": mean.astype(np.float32), "camera.functionals": functionals, "camera.basis": basis}
     return misfit_of(model, off, basis, _SPARE_FEW), tensors

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,6 +79,11 @@ def lattice(rings: int) -> Array:
         azimuth = np.arange(6 * k) * (2.0 * np.pi / (6 * k))
         points.append(k * np.column_stack([np.cos(azimuth), np.sin(azimuth)]))
     return np.concatenate(points)
+
+
+def rings_of(markers: int) -> int:
+    """Return the rings of a lattice of about that many markers: k rings have 1 + 3 k (k + 1)."""
+    return round((math.sqrt(max(12 * markers - 3, 9)) - 3.0) / 6.0)
 
 
 def ring_numbers(rings: int) -> Array:

@@ -10,7 +10,6 @@ break of it. Exact inference as in Rasmussen & Williams 2006, chapter 2.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array
-from touchcell.perception.markers.detection import lattice
+from touchcell.perception.markers.detection import lattice, rings_of
 from touchcell.perception.markers.layers import Layers, outputs_of
 from touchcell.perception.models.labels import XI_UNITS
 from touchcell.perception.models.model_file import Labels, Model
@@ -58,7 +57,7 @@ def symmetric_fields(displacements: Array, reference: Array, symmetries: Sequenc
     """Return the symmetric copies (copies, n, 2 m) px of marker displacements (n, 2 m) px from ``reference`` (m, 2)."""
     centre = reference.mean(axis=0)
     place = (reference - centre) @ np.array([1.0, 1.0j])
-    rings = lattice(_rings(len(reference))) @ np.array([1.0, 1.0j])
+    rings = lattice(rings_of(len(reference))) @ np.array([1.0, 1.0j])
     first = np.exp(1j * np.angle(np.vdot(rings, place)))
     position = place + displacements.reshape(len(displacements), -1, 2) @ np.array([1.0, 1.0j])
     copies = np.empty((len(symmetries), *displacements.shape), np.float32)
@@ -264,7 +263,7 @@ class TransferredNetworks:
         self._labels, self._network_labels = header.labels, header.network_labels
         self._layers = layers
         self._reference = reference
-        self._symmetries = lattice_symmetries(_rings(len(reference)))
+        self._symmetries = lattice_symmetries(rings_of(len(reference)))
         self._tensors = {
             name: tensor.astype(np.float64) for name, tensor in model.tensors.items() if name.startswith("transfer.")
         }
@@ -301,8 +300,3 @@ def combined_variance(
         (np.array(network_share) * network) ** 2 + (np.array(process_share) * process) ** 2 + np.square(floor)
     )
     return total
-
-
-def _rings(markers: int) -> int:
-    """Return the rings of a lattice of that many markers, 1 + 3 k (k + 1)."""
-    return round((-3.0 + math.sqrt(9.0 + 12.0 * (markers - 1))) / 6.0)

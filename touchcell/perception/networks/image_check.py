@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception import kernels
 from touchcell.perception.markers.camera_check import principal
-from touchcell.perception.markers.detection import Discs
+from touchcell.perception.markers.detection import Discs, rings_of
 from touchcell.perception.markers.image_check import TURNS, ImageCheck, SeenMarkers, px_of_crop, terms_of
 from touchcell.perception.markers.lattice_fit import fit_lattice
 from touchcell.perception.models.architecture import CHECK, ImageCheckSpec
@@ -122,7 +122,7 @@ def _rest_markers(images: ImageArray) -> tuple[int, Array] | None:
     best: tuple[float, int, Array] | None = None
     for i, image in enumerate(images):
         centres = _peaks(image)
-        rings = round((math.sqrt(max(12 * len(centres) - 3, 1)) - 3.0) / 6.0)
+        rings = rings_of(len(centres))
         for count in (rings, rings + 1):
             if not 1 < count <= _MOST_RINGS:
                 continue

@@ -7,6 +7,7 @@ sensor, which matches the rest.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol, runtime_checkable
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from touchcell.geometry.types import Array
 from touchcell.perception.errors import TrainingError
-from touchcell.perception.markers.detection import Discs
+from touchcell.perception.markers.detection import Discs, rings_of
 from touchcell.perception.markers.lattice_fit import fit_lattice
 from touchcell.perception.markers.matching import (
     DisplacementModel,
@@ -94,6 +95,29 @@ def learned_of_known(
     bank = _bank(coefficients)
     matcher = MarkerMatcher(model, guess, image_size, bank=bank, least_score=least_score, most_rms_px=most_rms_px)
     return Learned(matcher, guess, bank, least_score, most_rms_px, [])
+
+
+def find_rings(frames: Sequence[Discs]) -> int:
+    """Return the rings of the lattice that explains the discs of some frame best.
+
+    Raises:
+        TrainingError: no frame shows a lattice.
+    """
+    best, rings = math.inf, 0
+    for discs in frames[:: max(1, len(frames) // _CANDIDATES)]:
+        about = rings_of(len(discs.centres))
+        for count in range(max(about - 1, 2), about + 2):
+            points, rms = fit_lattice(discs, count)
+            spacing = math.sqrt(float(np.ptp(points, axis=0).prod()) / len(points))
+            unlike = abs(len(discs.centres) - len(points)) / len(points) + rms / spacing
+            if unlike < best:
+                best, rings = unlike, count
+    if not rings:
+        raise TrainingError(
+            "no image shows a lattice of rings of markers",
+            hint="take images of the tip out of contact, check threshold and crop, or give --rings",
+        )
+    return rings
 
 
 def find_reference(frames: Sequence[Discs], rings: int) -> Array:

@@ -10,7 +10,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from touchcell.drivers.replay.dataset import Split, read_rest, read_split
 from touchcell.geometry.types import Array, ImageArray
 from touchcell.perception.errors import TrainingError
 from touchcell.perception.markers.camera_check import learn_check
-from touchcell.perception.markers.detection import Discs, detect_markers, typical_size
+from touchcell.perception.markers.detection import Discs, detect_markers, rings_of, typical_size
 from touchcell.perception.markers.figures import write_markers
 from touchcell.perception.markers.layers import mixed
 from touchcell.perception.markers.matching import DisplacementModel
@@ -49,6 +49,7 @@ from touchcell.perception.networks.marker_learning import (
     GUESS_HIDDEN,
     KnownMarkers,
     Learned,
+    find_rings,
     learn_markers,
     learned_of_known,
     match_all,
@@ -68,7 +69,7 @@ class MarkerSettings:
     Attributes:
         epochs: passes over the training set; over few images, as many passes each as make 16 batches.
         seed: of everything random.
-        rings: of the sensor's lattice.
+        rings: of the sensor's lattice; None counts them in the images.
         modes: number of components of the displacement model.
         guess_steps: of the first guess's training (``marker_learning.learn_markers``).
         hidden: units of each layer of a displacement network.
@@ -83,7 +84,7 @@ class MarkerSettings:
 
     epochs: int = 80
     seed: int = 0
-    rings: int = 10
+    rings: int | None = None
     modes: int = 24
     guess_steps: int = 1200
     hidden: tuple[int, ...] = (384, 512, 512, 256)
@@ -100,7 +101,7 @@ class MarkerSettings:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.learning_rate) and self.learning_rate > 0.0):
             raise TrainingError(f"learning rate {self.learning_rate} is not positive and finite")
-        if min(self.epochs, self.rings, self.modes, self.networks, *self.hidden) < 1 or self.batch_size < 2:
+        if min(self.epochs, self.rings or 1, self.modes, self.networks, *self.hidden) < 1 or self.batch_size < 2:
             raise TrainingError("epochs, rings, modes, networks and units must be 1 or more, the batch size 2 or more")
 
 
@@ -216,16 +217,16 @@ def train_on_discs(
         TrainingError: as ``train_markers``.
     """
     settings = settings or MarkerSettings()
+    rings = settings.rings or _rings_of(training)
+    settings = replace(settings, rings=rings)
     labels = label_range(training.xi, validation.xi)
     training_data = training.digest()
-    matched = _matched(training, validation, preprocessing.output_size, training_data, settings, cache, observer)
-    check, check_tensors = learn_check(
-        matched.model, settings.rings, matched.training[matched.taught].astype(np.float64)
-    )
+    matched = _matched(training, validation, preprocessing.output_size, training_data, settings, rings, cache, observer)
+    check, check_tensors = learn_check(matched.model, rings, matched.training[matched.taught].astype(np.float64))
     architecture = MarkerArchitecture(
         input_size=preprocessing.output_size,
         size=size,
-        rings=settings.rings,
+        rings=rings,
         modes=len(matched.tensors["displacement.sd"]),
         bank=len(matched.tensors["bank"]),
         grid=GRID,
@@ -271,6 +272,10 @@ def train_on_discs(
     return model
 
 
+def _rings_of(training: LabelledDiscs) -> int:
+    return find_rings(training.frames) if training.markers is None else rings_of(len(training.markers.reference))
+
+
 @dataclass(frozen=True)
 class _Matched:
     """Displacements of all images, and the tensors of the matcher that found them.
@@ -301,10 +306,11 @@ def _matched(
     image_size: tuple[int, int],
     training_data: str,
     settings: MarkerSettings,
+    rings: int,
     cache: Path | None,
     observer: Observer | None,
 ) -> _Matched:
-    matching = [_MATCHING, settings.rings, settings.modes, settings.guess_steps, settings.seed]
+    matching = [_MATCHING, rings, settings.modes, settings.guess_steps, settings.seed]
     key = json.dumps([training_data, validation.digest(), *matching])
     name = f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.markers.npz"
     stored = _load(cache / name) if cache is not None else None
@@ -324,7 +330,7 @@ def _matched(
     learned = learn_markers(
         training.frames,
         image_size,
-        rings=settings.rings,
+        rings=rings,
         modes=settings.modes,
         guess_steps=settings.guess_steps,
         seed=settings.seed,

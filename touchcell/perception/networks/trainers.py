@@ -28,11 +28,12 @@ class MarkerTraining(Section):
     Attributes:
         epochs: passes over the images.
         networks: trained side by side; their mixture is the estimate.
-        rings: of the sensor's marker lattice around its centre; ring k holds 6 k markers.
+        rings: of the sensor's marker lattice around its centre; ring k holds 6 k markers;
+            None counts them in the images.
     """
 
     epochs: PositiveInt = 80
-    rings: PositiveInt = 10
+    rings: PositiveInt | None = None
     networks: PositiveInt = 2
 
 
