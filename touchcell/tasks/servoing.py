@@ -78,7 +78,7 @@ class ServoConfig(ContactServoConfig):
     settle_timeout_s: PositiveFloat = 10.0
     retract_mm: PositiveFloat = 20.0
     retract_speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
-    sidestep_speed_mm_s: Annotated[PositiveFloat, SPEED] = 40.0
+    sidestep_speed_mm_s: Annotated[PositiveFloat, SPEED] = 20.0
     return_lift_mm: PositiveFloat | None = None
     max_reapproach: NonNegativeInt = 2
     stale_timeout_s: PositiveFloat = 0.5

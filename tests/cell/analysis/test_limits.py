@@ -42,13 +42,13 @@ def recorded(depth_mm: float, speed_mm_s: float, x_mm: float = 0.0) -> Run:
 
 
 def test_what_came_close_is_named_with_its_limit_and_its_time(plan: CellPlan) -> None:
-    (line,) = close_calls(recorded(depth_mm=5.4, speed_mm_s=20.0), plan)
-    assert line == "close to a limit: depth of sensor 5.4 of 6 mm (90 %, `indentation`, at 0.01 s)"
+    (line,) = close_calls(recorded(depth_mm=4.5, speed_mm_s=20.0), plan)
+    assert line == "close to a limit: depth of sensor 4.5 of 5 mm (90 %, `indentation`, at 0.01 s)"
 
 
 def test_what_came_closest_is_named_where_nothing_came_close(plan: CellPlan) -> None:
-    (line,) = close_calls(recorded(depth_mm=3.0, speed_mm_s=20.0), plan)
-    assert line.startswith("nothing came close to a limit; closest: depth of sensor 3 of 6 mm (50 %")
+    (line,) = close_calls(recorded(depth_mm=2.5, speed_mm_s=20.0), plan)
+    assert line.startswith("nothing came close to a limit; closest: depth of sensor 2.5 of 5 mm (50 %")
 
 
 def test_nothing_is_said_without_anything_recorded(plan: CellPlan) -> None:
@@ -59,7 +59,7 @@ def test_the_quantity_of_a_cause_is_found_by_its_interlock(plan: CellPlan) -> No
     run = recorded(depth_mm=6.5, speed_mm_s=20.0)
     tripped = tripped_quantity(run, plan, {"interlock": "indentation", "subject": "sensor"})
     assert tripped is not None
-    assert (tripped.limit, tripped.values[-1], tripped.unit) == (6.0, 6.5, "mm")
+    assert (tripped.limit, tripped.values[-1], tripped.unit) == (5.0, 6.5, "mm")
     assert tripped_quantity(run, plan, {"interlock": "device", "subject": "arm"}) is None
 
 

@@ -62,7 +62,7 @@ def test_trials_are_measured_kept_and_not_run_again(tmp_path):
     slow, fast = perform_all(perform, TWO)
     assert slow.done
     assert fast.done
-    assert slow.measures["run_s"] == pytest.approx(3 / 20, abs=0.03)
+    assert slow.measures["run_s"] == pytest.approx(3 / 20, abs=0.05)
     assert fast.measures["run_s"] < slow.measures["run_s"]
     assert "never" not in slow.measures
     before = (tmp_path / "slow" / "run.mcap").stat().st_mtime_ns

@@ -50,7 +50,7 @@ def test_every_interlock_has_a_bar_and_those_in_the_recording_a_fraction(view: R
     moment = next(m for m in map(view.moment, np.linspace(0.0, view.end_s or 0.0, 60)) if m and m.state == "run")
     assert [bar.interlock for bar in moment.bars] == list(view.plan.cell.interlocks)
     fractions = {bar.interlock: bar.fraction for bar in moment.bars}
-    assert fractions["indentation"] == pytest.approx(0.5, abs=0.1)
+    assert fractions["indentation"] == pytest.approx(3.0 / 5.0, abs=0.1)
     assert 0.0 < (fractions["tilt"] or 0.0) < 0.3
     assert fractions["limited"] is None
 

@@ -65,9 +65,15 @@ class ContactModel:
     Args:
         model: the trained model.
         runner: evaluates its network; None for ``onnx_runtime``.
+
+    Raises:
+        TypeError: the model is no image network.
     """
 
     def __init__(self, model: Model, runner: Runner | None = None) -> None:
+        architecture = model.header.architecture
+        if not isinstance(architecture, Architecture):
+            raise TypeError(f"{architecture.kind} is no image network")
         self._first: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
         if runner is None and kernels.compiled():
             weight, bias = model.tensors["conv0.weight"], model.tensors["conv0.bias"]
@@ -77,8 +83,7 @@ class ContactModel:
         self.header: Header = model.header
         self.reference: ImageArray | None = model.reference
         self._preprocessing = model.header.preprocessing
-        architecture = model.header.architecture
-        spec = architecture.check if isinstance(architecture, Architecture) else None
+        spec = architecture.check
         self._check = None if spec is None else ImageCheck(spec, model.tensors, model.header.preprocessing)
         texture = None if spec is not None or model.reference is None else MarkerTexture(model.reference)
         self._texture = texture if texture is not None and texture.usable else None
