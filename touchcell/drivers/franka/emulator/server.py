@@ -275,7 +275,10 @@ class FrankaEmulator(Emulator):
 
     def _await_answer(self) -> None:
         """Let the time stand still until a moving client has answered the last state, where that is wished."""
-        if self._patience_s <= 0.0 or self._move_id is None or _LINK_FAULTS & self.active.keys():
+        # Until its first command a client only reads states, for as long as its motion takes to begin.
+        if self._patience_s <= 0.0 or self._move_id is None or not self._first_command_seen:
+            return
+        if _LINK_FAULTS & self.active.keys():
             return
         assert self._udp is not None
         # A client that has missed one answer is waited for no more until it answers again.
