@@ -36,7 +36,12 @@ _TASKS: Final[Mapping[str, Mapping[str, Any]]] = {
     "surface_following": {**_SERVO, "distance_mm": 8, "speed_mm_s": 4},
     "object_tracking": {**_SERVO, "depth_mm": 3, "duration_s": 4},
     "single_arm_pushing": {**_SERVO, "push_speed_mm_s": 3},
-    "dual_arm_pushing": {**_SERVO, "steering": "bearing", "push_speed_mm_s": 3, "follower": {"reference_mm_deg": [0, 0, 2, 0, 0, 0]}},
+    "dual_arm_pushing": {
+        **_SERVO,
+        "steering": "bearing",
+        "push_speed_mm_s": 3,
+        "follower": {"reference_mm_deg": [0, 0, 2, 0, 0, 0]},
+    },
     "data_collection": {
         "samples": 50,
         "depth_mm": [1.0, 2.5],
