@@ -63,12 +63,12 @@ class Playback(Clock):
             self._now_ns = max(self._now_ns, t_ns)
 
 
-class RecordedPoses(Device):
-    """An arm that only reports where it was.
+class _Recorded(Device):
+    """A device that reports what was recorded of it; its subclasses say what else it delivers.
 
     Args:
-        name: of the arm in the cell.
-        role: of the arm in the recording.
+        name: of the device in the cell.
+        role: of the device in the recording.
         playback: time.
     """
 
@@ -76,10 +76,6 @@ class RecordedPoses(Device):
         super().__init__(name, playback)
         self._role = role
         self._playback = playback
-
-    def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
-        """Return the recorded state. Raises StaleData, DeviceError."""
-        return _fresh(self.name, self._playback, self._playback.cycle.states.get(self._role), max_age_s)
 
     def health(self) -> dict[str, float | int | str | bool]:
         """Return what it reported about itself."""
@@ -90,6 +86,20 @@ class RecordedPoses(Device):
 
     def _close(self) -> None:
         """Nothing to close."""
+
+
+class RecordedPoses(_Recorded):
+    """An arm that only reports where it was.
+
+    Args:
+        name: of the arm in the cell.
+        role: of the arm in the recording.
+        playback: time.
+    """
+
+    def tcp(self, max_age_s: float | None = None) -> Stamped[TcpState]:
+        """Return the recorded state. Raises StaleData, DeviceError."""
+        return _fresh(self.name, self._playback, self._playback.cycle.states.get(self._role), max_age_s)
 
 
 class RecordedArm(Arm):
@@ -154,7 +164,7 @@ class RecordedArm(Arm):
         """It stands."""
 
 
-class RecordedCamera(Device):
+class RecordedCamera(_Recorded):
     """A camera that delivers the recorded images, each from the cycle on that used it.
 
     Args:
@@ -165,9 +175,7 @@ class RecordedCamera(Device):
     """
 
     def __init__(self, name: str, role: str, playback: Playback, images: Iterator[RecordedImage]) -> None:
-        super().__init__(name, playback)
-        self._role = role
-        self._playback = playback
+        super().__init__(name, role, playback)
         self._images = images
         self._newest: RecordedImage | None = None
         self._coming: RecordedImage | None = None
@@ -190,10 +198,6 @@ class RecordedCamera(Device):
         """Return the newest image, as ``latest``."""
         return self.latest()
 
-    def health(self) -> dict[str, float | int | str | bool]:
-        """Return what it reported about itself."""
-        return dict(self._playback.cycle.health.get(self.name, {}))
-
     def _advance(self, t_ns: int) -> None:
         """Take images up to the time ``t_ns``."""
         while True:
@@ -203,14 +207,8 @@ class RecordedCamera(Device):
                 return
             self._newest, self._coming = self._coming, None
 
-    def _open(self) -> None:
-        """Nothing to open."""
 
-    def _close(self) -> None:
-        """Nothing to close."""
-
-
-class RecordedDevice(Device):
+class RecordedDevice(_Recorded):
     """Another device, with its recorded readings; settings that it is given have no effect.
 
     Args:
@@ -219,27 +217,12 @@ class RecordedDevice(Device):
         playback: time.
     """
 
-    def __init__(self, name: str, role: str, playback: Playback) -> None:
-        super().__init__(name, playback)
-        self._role = role
-        self._playback = playback
-
     def read(self, max_age_s: float | None = None) -> Stamped[Mapping[str, float]]:
         """Return the recorded reading. Raises StaleData, DeviceError."""
         return _fresh(self.name, self._playback, self._playback.cycle.readings.get(self._role), max_age_s)
 
     def apply(self, setting: Mapping[str, float]) -> None:
         """Do nothing."""
-
-    def health(self) -> dict[str, float | int | str | bool]:
-        """Return what it reported about itself."""
-        return dict(self._playback.cycle.health.get(self.name, {}))
-
-    def _open(self) -> None:
-        """Nothing to open."""
-
-    def _close(self) -> None:
-        """Nothing to close."""
 
 
 class RecordedContacts(ContactSource):

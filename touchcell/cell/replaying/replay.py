@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.config.cell_plan import CellPlan, DevicePlan, RecordingSection
 from touchcell.cell.config.schema import plan_cell
 from touchcell.cell.recording.mcap import RECORDING
@@ -73,7 +72,7 @@ def replay(
         RecordingError: the recording cannot be read, or ``out`` not be written.
         ModelError: the estimator's model is not there any more.
     """
-    plan = plan_cell(folder / "cell.yaml", settings=settings, to_run=False) if settings else RunFolder(folder).plan
+    plan = plan_cell(folder / "cell.yaml", settings=settings, to_run=False)
     recorded = read_run(folder / RECORDING)
     playback = Playback(recorded)
     images = {role: role in recorded.with_images for role in plan.sensor_roles}

@@ -215,16 +215,16 @@ def limited_functionals(
         spacing_px: of the lattice.
     """
     spare = _SPARE_OWN + _SPARE_OWN_FEW / len(displacements)
-    found = np.abs((displacements - mean) @ functionals.T)
+    found = (displacements - mean) @ functionals.T
     shift = np.hypot(found[:, 0], found[:, 1])
     limited = functionals.copy()
     for rows, size, most in (
         (slice(0, 2), shift, _MOST_SHIFT * spacing_px),
-        (slice(2, 3), found[:, 2], _MOST_ZOOM),
-        (slice(3, 4), found[:, 3], _MOST_TURN_RAD),
+        (slice(2, 3), np.abs(found[:, 2]), _MOST_ZOOM),
+        (slice(3, 4), np.abs(found[:, 3]), _MOST_TURN_RAD),
     ):
         limited[rows] *= min(1.0, most / max(spare * float(np.quantile(size, _OWN)), 1e-12))
-    alike = np.quantile((displacements - mean) @ functionals[4:].T, _OWN, axis=0)
+    alike = np.quantile(found[:, 4:], _OWN, axis=0)
     limited[4:][spare * alike > _LEAST_ALIKE] = 0.0
     return limited
 
