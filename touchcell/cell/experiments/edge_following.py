@@ -16,7 +16,7 @@ import numpy as np
 from touchcell.cell.analysis.run_folder import RunFolder, during, rms
 from touchcell.cell.experiments.runner import ExperimentSpec, Scale
 from touchcell.cell.experiments.sample_meshes import FILES, HEIGHTS_MM
-from touchcell.cell.experiments.shape_truth import SAMPLED, sampled_truth
+from touchcell.cell.experiments.shape_truth import shape_rows
 from touchcell.cell.experiments.table import Column
 from touchcell.cell.experiments.trials import Finished, Trial
 from touchcell.geometry.types import Array
@@ -125,12 +125,6 @@ def start_pose_mm_deg(name: str) -> list[float]:
 def trials(scale: Scale) -> list[Trial]:
     """Return trials of all shapes with each estimator, half of them backwards."""
     shapes = _QUICK if scale.quick else SHAPES
-    rows: list[tuple[str, str, dict[str, Any]]] = []
-    for estimator, section in ESTIMATORS.items():
-        chosen = {} if section is None else {f"sensors.{SENSOR}.estimator": section}
-        rows += [(name, estimator, chosen) for name in shapes]
-    truth = {"truth": sampled_truth(SENSOR, "arm")}
-    rows += [(name, f"learned, {SAMPLED}", truth) for name in shapes if name in _SAMPLED]
     return [
         Trial(
             f"{name}_{row.replace(', ', '_').replace(' ', '_')}_{seed}",
@@ -147,7 +141,7 @@ def trials(scale: Scale) -> list[Trial]:
                 "seed": seed,
             },
         )
-        for name, row, changes in rows
+        for name, row, changes in shape_rows(shapes, ESTIMATORS, _SAMPLED, sensor=SENSOR, arm="arm")
         for seed in range(1, scale.repetitions(1) + 1)
     ]
 

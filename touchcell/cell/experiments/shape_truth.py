@@ -1,7 +1,8 @@
-"""Cells of experiments with shapes whose truth is sampled apart from what their controllers are told."""
+"""Rows of experiments with shapes: each with each estimator, some with truth sampled apart from what is told."""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Final
 
 SAMPLED: Final = "truth sampled"
@@ -23,3 +24,27 @@ def sampled_truth(sensor: str, arm: str) -> dict[str, Any]:
         },
         "tip": {"slip_at_1mm_mm": {"uniform": [0.28, 0.4]}},
     }
+
+
+def shape_rows(
+    shapes: Collection[str],
+    estimators: Mapping[str, Mapping[str, Any] | None],
+    sampled: Collection[str],
+    *,
+    sensor: str,
+    arm: str,
+) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Yield shape, row and changes of the cell file, of all shapes with each estimator and then with truth sampled.
+
+    Args:
+        shapes: by name.
+        estimators: name of the row and ``estimator:`` section; None for that of the cell file.
+        sampled: shapes that have a row with truth sampled, with the estimator of the cell file.
+        sensor, arm: names in the cell file.
+    """
+    for estimator, section in estimators.items():
+        for name in shapes:
+            yield name, estimator, {} if section is None else {f"sensors.{sensor}.estimator": section}
+    for name in shapes:
+        if name in sampled:
+            yield name, f"learned, {SAMPLED}", {"truth": sampled_truth(sensor, arm)}

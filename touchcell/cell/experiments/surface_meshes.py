@@ -17,7 +17,7 @@ from touchcell.cell.experiments import surface_following
 from touchcell.cell.experiments.runner import ExperimentSpec, Scale
 from touchcell.cell.experiments.sample_meshes import FILES, HEIGHTS_MM
 from touchcell.cell.experiments.scenes import distance_to_scene_mm
-from touchcell.cell.experiments.shape_truth import SAMPLED, sampled_truth
+from touchcell.cell.experiments.shape_truth import shape_rows
 from touchcell.cell.experiments.table import Column
 from touchcell.cell.experiments.trials import Finished, Trial
 from touchcell.geometry.types import Array
@@ -35,12 +35,6 @@ _RAISED_MM: Final = 25.0
 def trials(scale: Scale) -> list[Trial]:
     """Return trials of all shapes with both estimators."""
     shapes = _QUICK if scale.quick else tuple(HEIGHTS_MM)
-    rows: list[tuple[str, str, dict[str, Any]]] = []
-    for estimator, section in ESTIMATORS.items():
-        chosen = {} if section is None else {f"sensors.{SENSOR}.estimator": section}
-        rows += [(name, estimator, chosen) for name in shapes]
-    truth = {"truth": sampled_truth(SENSOR, "arm")}
-    rows += [(name, f"learned, {SAMPLED}", truth) for name in shapes if name in _SAMPLED]
     return [
         Trial(
             f"{name}_{row.replace(', ', '_').replace(' ', '_')}_{seed}",
@@ -48,7 +42,7 @@ def trials(scale: Scale) -> list[Trial]:
             "surface_mesh_sim.yaml",
             {**_changes(name), **changes, "seed": seed},
         )
-        for name, row, changes in rows
+        for name, row, changes in shape_rows(shapes, ESTIMATORS, _SAMPLED, sensor=SENSOR, arm="arm")
         for seed in range(1, scale.repetitions(1) + 1)
     ]
 
