@@ -73,7 +73,7 @@ def run_steps(folder: Path, library: Path, rate_hz: float, what: str = "sway") -
         pids = [who["task"], who["watchdog"], *who["hosts"].values()]
         # The same file steps all of them.
         problems += [f"process {pid} is not under the shim" for pid in pids if not _has(pid, library)]
-        await_motion(process, states)
+        await_motion(process, states, what)
         stops = {name: int(state.read()["stop_ns"]) for name, state in states.items()}
         for step_s in STEPS_S:
             os.pwrite(setting.fileno(), _seconds(step_s), 0)

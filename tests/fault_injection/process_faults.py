@@ -23,7 +23,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from tests.fault_injection.two_arms import PERIOD_S, pushing_emulators
+from tests.fault_injection.two_arms import PERIOD_S, SPEED_M_S, left_speed_m_s, pushing_emulators
 from touchcell.cell.runtime.watchdog import NOTES
 from touchcell.drivers.core.arm import LimitsConfig
 from touchcell.drivers.hosting.layouts import ARM, RecordReader
@@ -133,7 +133,7 @@ def run_fault(folder: Path, fault: ProcessFault, rate_hz: float, what: str = "sw
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "fault").write_text(fault.inner)
     with running_cell(folder, rate_hz, what) as (process, who, states):
-        await_motion(process, states)
+        await_motion(process, states, what)
         host = next(iter(who["hosts"]))
         victim = {"task": who["task"], "watchdog": who["watchdog"], "host": who["hosts"][host]}[fault.who]
         faulty_arms = set(who["arms"][host]) if fault.who == "host" else set()
@@ -225,8 +225,8 @@ def running_cell(
         yield process, who, states
 
 
-def await_motion(process: subprocess.Popen[bytes], states: Mapping[str, RecordReader]) -> None:
-    """Return when both arms are at work, at full speed."""
+def await_motion(process: subprocess.Popen[bytes], states: Mapping[str, RecordReader], what: str) -> None:
+    """Return when both arms are at work, at full speed, and do not turn soon."""
     assert process.stdout is not None
     if not select.select([process.stdout], [], [], _MOVING_S)[0]:
         raise TooBusy(f"not at work within {_MOVING_S:g} s")
@@ -236,12 +236,24 @@ def await_motion(process: subprocess.Popen[bytes], states: Mapping[str, RecordRe
     while since_s is None or time.monotonic() < since_s + _STEADY_S:
         if process.poll() is not None or time.monotonic() > deadline_s:
             raise TooBusy("it stopped by itself")
-        turning = (time.monotonic() * 2.0 / PERIOD_S) % 1.0 > 0.5
-        if turning or min(speed_m_s(state.read()) for state in states.values()) < _MOVING_M_S:
+        turns_soon = (time.monotonic() * 2.0 / PERIOD_S) % 1.0 > 0.5
+        if turns_soon or not _at_full_speed(states, what):
             since_s = None
         elif since_s is None:
             since_s = time.monotonic()
         time.sleep(0.005)
+
+
+def _at_full_speed(states: Mapping[str, RecordReader], what: str) -> bool:
+    if what == "push":
+        return min(speed_m_s(state.read()) for state in states.values()) > _MOVING_M_S
+    # On a busy machine an arm may still move in the direction before the last turn, and turn at any moment.
+    left_m_s = left_speed_m_s(time.monotonic_ns())
+    wanted_m_s = {"left": left_m_s, "right": -left_m_s}
+    return all(
+        math.isclose(states[name].read()["twist"][0], v_m_s, abs_tol=1e-3 * SPEED_M_S)
+        for name, v_m_s in wanted_m_s.items()
+    )
 
 
 def speed_m_s(record: Any) -> float:

@@ -37,6 +37,14 @@ _INTERLOCKS: Final[Mapping[str, Any]] = {
 }
 
 
+def left_speed_m_s(now_ns: int) -> float:
+    """Return the speed along x that ``Sway`` commands to the left arm.
+
+    A square wave is almost always at full speed, which is the worst moment for a fault.
+    """
+    return math.copysign(SPEED_M_S, math.sin(2.0 * math.pi * now_ns * 1e-9 / PERIOD_S))
+
+
 class Sway:
     """Both arms to and fro along x; finished on an operator's stop, or when the supervisor trips."""
 
@@ -53,9 +61,7 @@ class Sway:
         if observation.operator_stop:
             self.finished = self.succeeded = True
             return Action()
-        # A square wave is almost always at full speed, which is the worst moment for a fault.
-        speed_m_s = math.copysign(SPEED_M_S, math.sin(2.0 * math.pi * now_ns * 1e-9 / PERIOD_S))
-        twist = np.array([speed_m_s, 0.0, 0.0, 0.0, 0.0, 0.0])
+        twist = np.array([left_speed_m_s(now_ns), 0.0, 0.0, 0.0, 0.0, 0.0])
         return Action(
             {
                 role: TwistCommand(sign * twist, TwistFrame.BASE, now_ns, self._ttl_s)
