@@ -165,5 +165,6 @@ SPEC = TaskSpec(
     {ARM: SERVO_ARM},
     frozenset({SENSOR}),
     _build,
+    starts_free=True,
     feature="edge",
 )
