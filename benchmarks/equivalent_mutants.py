@@ -55,6 +55,24 @@ EQUIVALENT: Mapping[tuple[str, str, str], str] = {
         "Mult -> Div",
     ): "a side is 1 or -1",
     ("pair", "leaning = np.array([0.0, 0.0, 0.0, 0.0, -lean_rad, 0.0])", "-x -> +x"): "it leans to the other side",
+    ("collision", "_TINY = 1e-30", "1e-30 -> 2e-30"): "only keeps a division by zero away",
+    ("collision", "if i.size:", "if -> if True"): SHORTCUT,
+    ("collision", "if k.size:", "if -> if True"): SHORTCUT,
+    ("motion", "command = TwistCommand(twist, TwistFrame.BASE, view.now_ns, 0.03)", "0.03 -> 0.06"): (
+        "nothing reads the time-to-live of a fault's command"
+    ),
+    ("motion", "position = arm.state.value.T_base_tcp[:3, 3]", "3 -> 6"): BEYOND,
+    ("always_on", "if not view.sensors.keys() <= past.keys():", "if -> if True"): SHORTCUT,
+    ("always_on", "if not view.sensors.keys() <= past.keys():", "LtE -> Lt"): SHORTCUT,
+    (
+        "always_on",
+        "if self.arms <= view.arms.keys() and self.sensors <= view.sensors.keys():",
+        "if -> if False",
+    ): SHORTCUT,
+    ("always_on", "if self.arms <= view.arms.keys() and self.sensors <= view.sensors.keys():", "LtE -> Lt"): SHORTCUT,
+    ("always_on", "return replace(view, now_ns=view.now_ns + round(1e9 * SILENCE_S))", "Mult -> Div"): "it is 1 s",
+    ("supervisor", "if not names and not self._limiting:", "if -> if False"): SHORTCUT,
+    ("supervisor", "if total_ns or name in names:", "if -> if True"): "an entry that counts nothing is as none",
 }
 """Reason by module, line of source without its indentation, and change."""
 

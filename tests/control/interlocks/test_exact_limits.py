@@ -363,6 +363,26 @@ def test_contact_force_is_a_force_and_no_torque_and_leaves_at_four_fifths() -> N
     assert run.arm(wrench=(0, 0, 0.79 * transient_n, 0, 0, 0)) is None
 
 
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"kind": "wrench", "arm": "arm", "limit_n": 5, "limit_nm": 1},
+        {"kind": "pressure", "arm": "arm", "regions": ["palm_other"], "contact_area_mm2": 100},
+    ],
+)
+def test_a_fault_of_a_force_is_a_wrench_of_six_numbers_after_none(entry: dict[str, Any]) -> None:
+    faults = list(parse_interlocks({"it": entry})["it"].faults(FACTS))  # type: ignore[attr-defined]
+    assert len(faults) > 1
+    for fault in faults:
+        healthy = FACTS.healthy(START_NS, "run")
+        before = fault.before(healthy, -0.1).arms["arm"].wrench
+        assert before is not None
+        assert before.value.shape == (6,)
+        assert not before.value.any()
+        pushed = fault.change(healthy, 0.0).arms["arm"].wrench
+        assert pushed is None or pushed.value.shape == (6,)
+
+
 # --- boxes and cones
 
 BOX = {"kind": "workspace", "arm": "arm", "min_mm": [-100, -100, 0], "max_mm": [100, 100, 300], "margin_mm": 10}
