@@ -227,7 +227,7 @@ class RunView:
 
 
 def _fewer(messages: Iterable[Message]) -> Iterator[Message]:
-    """Leave out images that come sooner than anybody sees. A video's packets build on each other: all are kept."""
+    """Leave out images that come sooner than a person sees. A video's packets build on each other: all are kept."""
     last_ns: dict[str, int] = {}
     for message in messages:
         if message.topic.endswith("/image"):
