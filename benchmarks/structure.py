@@ -2,8 +2,8 @@
 
 A room is a folder with Python files. An arrow leads from one room to another that it imports, also inside functions and
 under TYPE_CHECKING. Two checkouts beside each other: ``python -m benchmarks structure . ../before``. The things added
-are those of the package that the tests install beside touchcell, which no file of touchcell names. Where a checkout has an
-environment (``.venv``), ``touchcell check`` is run in turns with the others, for its CPU time and memory.
+are those of the package that the tests install beside touchcell, which no file of touchcell names. Where a
+checkout has an environment (``.venv``), ``touchcell check`` is run in turns with the others, for CPU time and memory.
 """
 
 from __future__ import annotations
