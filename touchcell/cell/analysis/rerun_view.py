@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import rerun as rr
-import rerun_cli
 import rerun.blueprint as rrb
+import rerun_cli
 
 from touchcell.cell.analysis.run_folder import RunFolder
 from touchcell.cell.recording.mcap import RECORDING, read
