@@ -11,6 +11,7 @@ workers in network namespaces of their own, which do not see the sweep's folder,
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.util
 import json
 import os
@@ -25,6 +26,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.other_load import Usage, cpu_s_of
 from benchmarks.separate_workers import separate_workers
 from benchmarks.sweep_cost import sweep_costs
 from touchcell.cell.analysis.run_folder import RunFolder
@@ -48,17 +50,26 @@ def nothing(item: int) -> int:
     return item
 
 
-def no_op_s(executor: str, items: int, jobs: int) -> tuple[float, float]:
-    """Return the seconds until the first result, and those for each of the others."""
+def no_op(executor: str, items: int, jobs: int) -> dict[str, float]:
+    """Return the time until the first result, and for each of the others wall-clock and CPU time, of all processes."""
     name, _, address = executor.partition(":")
     send_by_value(nothing)
     started = time.perf_counter()
-    first = None
-    for _ in EXECUTORS.load(name).run(nothing, range(items), Workers(jobs, 3600.0, None, address)):
-        first = time.perf_counter() if first is None else first
+    first = ended = None
+    for number, _ in enumerate(EXECUTORS.load(name).run(nothing, range(items), Workers(jobs, 3600.0, None, address))):
+        first = Usage.now() if first is None else first
+        if number == items - 1:
+            ended = Usage.now()
     assert first is not None
-    ended = time.perf_counter()
-    return first - started, (ended - first) / max(items - 1, 1)
+    assert ended is not None
+    used, each = ended - first, 1e3 / max(items - 1, 1)
+    return {
+        "items": items,
+        "start_s": first.wall_s - started,
+        "each_ms": each * used.wall_s,
+        "each_cpu_ms": each * used.ours_s,
+        "others_cores": used.others_cores,
+    }
 
 
 def sweep_command(folder: Path, trials: int, jobs: int) -> list[str]:
@@ -105,9 +116,11 @@ def killed(times: int, trials: int, jobs: int, seed: int) -> dict[str, int]:
                 sweep_command(folder, trials, jobs), stdout=subprocess.DEVNULL, start_new_session=True
             )
             if attempt < times:
-                try:
-                    process.wait(rng.uniform(1.0, 6.0))
-                except subprocess.TimeoutExpired:
+                # A moment by the work done: on a busy machine seconds pass before the first trial begins.
+                at_s = rng.uniform(1.0, 8.0)
+                while process.poll() is None and cpu_s_of(process.pid) < at_s:
+                    time.sleep(0.05)
+                with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
             process.wait()
             now = {
@@ -181,13 +194,22 @@ def run(arguments: list[str], out: Path) -> None:
         print(line, flush=True)
 
     show(f"{found['date']}, commit {found['commit']}, {found['cores']} cores, load {found['load'][0]:.1f}")
-    show("\n".join([f"{'executor':12} {'items':>6} {'start s':>8} {'ms each':>8}", *missing]))
+    show(
+        "\n".join(
+            [
+                f"{'executor':12} {'items':>6} {'start s':>8} {'ms each':>8} {'CPU ms each':>12} {'others, cores':>13}",
+                *missing,
+            ]
+        )
+    )
     for executor in installed:
         # Each Slurm job is a process with an interpreter of its own.
         items = min(options.items, 10) if executor == "slurm:local" else options.items
-        start_s, each_s = no_op_s(executor, items, options.jobs)
-        found["no_op"][executor] = {"items": items, "start_s": start_s, "each_ms": 1e3 * each_s}
-        show(f"{executor:12} {items:6} {start_s:8.2f} {1e3 * each_s:8.2f}")
+        cost = found["no_op"][executor] = no_op(executor, items, options.jobs)
+        show(
+            f"{executor:12} {items:6} {cost['start_s']:8.2f} {cost['each_ms']:8.2f} {cost['each_cpu_ms']:12.2f} "
+            f"{cost['others_cores']:13.2f}"
+        )
     found["same"] = same(installed, 4, options.jobs)
     for executor, equal in found["same"].items():
         show(

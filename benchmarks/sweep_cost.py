@@ -8,13 +8,13 @@ machine that is the wall-clock time times the number of cores.
 from __future__ import annotations
 
 import os
-import resource
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
+
+from benchmarks.other_load import Usage
 
 _SCRIPT = """
 import sys, time
@@ -80,22 +80,22 @@ def sweep_cost(checkout: Path | None, trials: int, jobs: int) -> SweepCost:
         root.mkdir()
         script.write_text(_SCRIPT.format(imports=imports, jobs=options))
         environment = os.environ if checkout is None else {**os.environ, "PYTHONPATH": str(checkout.absolute())}
-        busy, cpu, started = _busy_s(), _children_s(), time.perf_counter()
+        started = Usage.now()
         command = [python, str(script), str(root), str(trials), str(jobs)]
         subprocess.run(command, check=True, cwd=name, env=environment, stdout=subprocess.DEVNULL)
-        wall_s, cpu_s, busy_s = time.perf_counter() - started, _children_s() - cpu, _busy_s() - busy
+        used = Usage.now() - started
         each = [float(path.read_text()) for path in root.glob("*/trial_cpu_s")]
     assert len(each) == trials, f"{len(each)} of {trials} trials"
-    cores, of_trials, others_s = os.cpu_count() or 1, sum(each), busy_s - cpu_s
+    of_trials = sum(each)
     return SweepCost(
         trials,
-        wall_s,
-        cpu_s,
+        used.wall_s,
+        used.ours_s,
         of_trials,
-        others_s / wall_s,
-        cpu_s / of_trials,
-        (wall_s * cores - others_s) / of_trials,
-        wall_s * cores / of_trials,
+        used.others_cores,
+        used.ours_s / of_trials,
+        used.left_s / of_trials,
+        used.wall_s * (os.cpu_count() or 1) / of_trials,
     )
 
 
@@ -106,15 +106,3 @@ def sweep_costs(checkout: Path | None, trials: int, jobs: int, rounds: int) -> d
         for name in found:
             found[name].append(asdict(sweep_cost(None if name == "now" else checkout, trials, jobs)))
     return found
-
-
-def _children_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
-
-
-def _busy_s() -> float:
-    """Return the time in which the machine's cores were not idle, stolen time included."""
-    fields = [int(each) for each in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
-    idle, waiting = fields[3], fields[4]
-    return (sum(fields) - idle - waiting) / os.sysconf("SC_CLK_TCK")
