@@ -162,10 +162,6 @@ def test_every_family_of_commands_works_or_is_refused(emulator: EmulatorProcess,
     higher[2] += 0.02
     assert control.servoC(higher, 0.1, 0.5, 0.0)
     wait_until(lambda: abs(emulator.state()["pose"][2] - higher[2]) < 1e-6, "circular servo")
-    assert control.servoStop()
-
-    control.forceMode([0.0] * 6, [1] * 6, [0.0] * 6, 3, [0.1] * 6)
-    assert "type 3" in emulator.wait_for(runtime_state="STOPPED")["messages"][-1]
     control.disconnect()
     receive.disconnect()
 
