@@ -12,6 +12,8 @@ from nicegui import ui
 
 from touchcell.cell.analysis.trip_report import explain
 from touchcell.cell.runtime.operator_channel import OperatorRequest
+from touchcell.cell.ui.jog_pad import JogPad
+from touchcell.cell.ui.jog_relay import takes_jog
 from touchcell.cell.ui.run_view import Moment, RunView
 from touchcell.cell.ui.runs import Runs, StartedRun, outcome
 from touchcell.errors import TouchcellError
@@ -144,6 +146,10 @@ class RunPage:
             with ui.element("div").classes("w-full grid grid-cols-1 lg:grid-cols-2 gap-2"):
                 with ui.card().classes("w-full min-w-0"):
                     self._scene = self._build_scene()
+                self._jog: JogPad | None = None
+                if self._view.plan.task.name == "jog":
+                    with ui.card().classes("w-full min-w-0") as self._jog_card:
+                        _title("Move by hand")
                 with ui.card().classes("w-full min-w-0"):
                     _title("Interlocks")
                     self._bars = _Bars()
@@ -198,7 +204,7 @@ class RunPage:
         if await _confirmed(question, request.value):
             ui.notify(await background.io_bound(self._runs.ask, self._name, request))
 
-    def _refresh(self) -> None:
+    async def _refresh(self) -> None:
         view = self._view
         if self._ticks % _SLOWLY == 0:
             self._look_at_run()
@@ -213,7 +219,8 @@ class RunPage:
             self._playing = self._slider.value < end_s
         elif end_s is not None and self._ticks % _SLOWLY:
             return
-        moment = view.moment(self._t_s)
+        # In a thread: what an operator holds on this page is passed on meanwhile.
+        moment = await background.io_bound(view.moment, self._t_s)
         if moment is not None:
             self._show(moment)
         elif view.problem:
@@ -223,6 +230,7 @@ class RunPage:
         """Read from the run's folder whether it is in progress, waits, or has tripped."""
         running, waiting = self._view.running, self._view.waiting
         self._controls.visible = running
+        self._show_jog(running and takes_jog(self._view.folder))
         self._reset.set_enabled(waiting)
         self._resume.set_enabled(waiting)
         ended = outcome(self._view.folder)
@@ -232,6 +240,18 @@ class RunPage:
                 ui.timer(0.1, self._explain, once=True)
             else:
                 self._trip.visible = False
+
+    def _show_jog(self, moves: bool) -> None:
+        """Show the buttons that move an arm while the run takes them."""
+        if self._view.plan.task.name != "jog":
+            return
+        self._jog_card.visible = moves
+        if moves and self._jog is None:
+            with self._jog_card:
+                self._jog = JogPad(self._name, list(self._view.plan.arm_roles))
+        elif not moves and self._jog is not None:
+            self._jog.delete()
+            self._jog = None
 
     async def _explain(self) -> None:
         try:
