@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
+from touchcell.cell.recording.mcap import RECORDING
 from touchcell.cell.ui.access import TOKEN, Access, App
 from touchcell.cell.ui.runs import Runs
 from touchcell.errors import ConfigError
@@ -108,8 +109,8 @@ def page_app(runs: Runs) -> App:
     def index() -> None:
         build_list(runs)
 
-    def run(name: str) -> None:
-        build_run(runs, name)
+    def run(name: str, source: str = RECORDING) -> None:
+        build_run(runs, name, source)
 
     # FastAPI reads the type of a parameter from its annotation, which is local here.
     jog.__annotations__["socket"] = WebSocket
@@ -117,6 +118,7 @@ def page_app(runs: Runs) -> App:
     app.add_api_route("/part/{name}/{number}.stl", part)
     ui.page("/", title="touchcell")(index)
     ui.page("/run/{name}", title="touchcell")(run)
+    ui.page("/run/{name}/{source}", title="touchcell")(run)
     ui.run_with(app, show_welcome_message=False, reconnect_timeout=3.0)
     found: App = app
     return found
