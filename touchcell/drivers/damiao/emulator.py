@@ -523,7 +523,7 @@ class DamiaoArm(Emulator):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command-line arguments of ``touchcell emulate damiao``."""
     parser.add_argument("path", type=Path, help="socket of the hub; clients use it as python-can channel")
-    parser.add_argument("--chain", default="generic_6r", help="shipped chain description, or a YAML file")
+    parser.add_argument("--chain", default="generic_6r", help="shipped chain description, or a YAML or URDF file")
     parser.add_argument("--tool", help='tool as JSON, e.g. \'{"origin_mm": [0, 0, 80], "mass_kg": 0.2}\'')
     parser.add_argument("--models", nargs="+", choices=sorted(MODELS), help="motor model per joint")
     parser.add_argument("--start-deg", type=float, nargs="+", default=[0.0, 40.0, 90.0, 0.0, 50.0, 0.0])
@@ -545,10 +545,8 @@ def build(arguments: argparse.Namespace) -> Emulator:
         for line in [*capture.describe(recorded), *(judged or ["nothing contradicts codec or emulator"])]:
             print(line, file=sys.stderr)
         return RecordedArm(arguments.path, recorded)
-    is_file = Path(arguments.chain).suffix == ".yaml"
-    read = ChainDescription.read(Path(arguments.chain)) if is_file else ChainDescription.shipped(arguments.chain)
     tool = Tool.model_validate_json(arguments.tool) if arguments.tool else None
-    chain = SerialChain(read, tool)
+    chain = SerialChain(ChainDescription.named(arguments.chain), tool)
     n = chain.joint_count
     models = arguments.models or ["4340"] * min(3, n) + ["4310"] * max(0, n - 3)
     return DamiaoArm(arguments.path, chain, models, arguments.start_deg, arguments.first_id)

@@ -509,7 +509,7 @@ class FeetechArm(Emulator):
 def add_arguments(parser: Any) -> None:
     """Add the command-line arguments of ``touchcell emulate feetech``."""
     parser.add_argument("--link", type=Path, required=True, help="symbolic link to make; clients open it as a port")
-    parser.add_argument("--chain", default="so101_5r", help="shipped chain description, or a YAML file")
+    parser.add_argument("--chain", default="so101_5r", help="shipped chain description, or a YAML or URDF file")
     parser.add_argument("--tool", help="tool as JSON, e.g. '{\"origin_mm\": [0, 0, 40]}'")
     parser.add_argument("--start-deg", type=float, nargs="+", default=[0.0, 10.0, 90.0, 80.0, 0.0])
     parser.add_argument("--zero-ticks", type=int, nargs="+", help="ticks of each servo at joint angle zero")
@@ -538,10 +538,8 @@ def build_on(line: SerialLine, arguments: Any) -> Emulator:
         for text in [*capture.describe(recorded), *found]:
             print(text, file=sys.stderr)
         return RecordedServos(line, recorded)
-    is_file = Path(arguments.chain).suffix == ".yaml"
-    read = ChainDescription.read(Path(arguments.chain)) if is_file else ChainDescription.shipped(arguments.chain)
     tool = Tool.model_validate_json(arguments.tool) if arguments.tool else None
-    chain = SerialChain(read, tool)
+    chain = SerialChain(ChainDescription.named(arguments.chain), tool)
     n = chain.joint_count
     return FeetechArm(
         line,
