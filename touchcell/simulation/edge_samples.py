@@ -16,7 +16,7 @@ import numpy as np
 
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
-from touchcell.simulation.contact import ContactLaw
+from touchcell.simulation.contact import ContactLaw, about_z
 from touchcell.simulation.edges import nearest_edge
 from touchcell.simulation.meshes.mesh_shape import MeshShape
 from touchcell.simulation.pressed import pressed
@@ -29,6 +29,7 @@ _IMAGES_PER_TIP: Final = 32
 _CREASE_RAD: Final = math.radians(30.0)
 _NEAR_CORNER: Final = 0.3
 _CORNER_RAD: Final = math.radians(15.0)
+_ALONG: Final = 0.5
 _ALONG_MM: Final = 0.1
 """Along the edge nothing is felt: a label within a tenth of a millimetre keeps its scale from being zero."""
 
@@ -42,14 +43,17 @@ class EdgeRanges:
         depth_mm: smallest and largest.
         tilt_deg: largest about either axis.
         turn_deg: largest about the normal.
-        shear_mm: largest, in any direction.
+        shear_mm: the longest way that the tip is dragged, in any direction or, for half the contacts, along the edge.
+            It is longer than the skin holds: a tip that follows an edge always slips.
+        torsion_deg: the largest turn about the normal on that way, likewise: along a bend the skin is always twisted.
     """
 
     offset_mm: float = 8.0
     depth_mm: tuple[float, float] = (0.2, 7.0)
     tilt_deg: float = 12.0
     turn_deg: float = 75.0
-    shear_mm: float = 3.5
+    shear_mm: float = 6.0
+    torsion_deg: float = 8.0
 
     def drawn(self, rng: np.random.Generator) -> Array:
         """Return a random contact (6,) mm and deg."""
@@ -137,8 +141,13 @@ def _with_z(z: Array) -> Array:
 
 
 def _sheared(T_world_e: Array, T_world_s: Array, ranges: EdgeRanges, rng: np.random.Generator) -> Array:
-    """Return from where a contact is dragged to ``T_world_s`` along the face."""
-    angle, length = rng.uniform(0.0, 2.0 * math.pi), 1e-3 * ranges.shear_mm * rng.random()
+    """Return from where a contact is dragged to ``T_world_s`` along the face, and turned about its normal."""
+    along = rng.random() < _ALONG
+    angle = rng.choice([-0.5, 0.5]) * math.pi if along else rng.uniform(0.0, 2.0 * math.pi)
+    length = 1e-3 * ranges.shear_mm * rng.random()
+    torsion = math.radians(ranges.torsion_deg) * rng.uniform(-1.0, 1.0)
+    R = T_world_e[:3, :3]
     T = T_world_s.copy()
-    T[:3, 3] -= T_world_e[:3, :3] @ np.array([length * math.cos(angle), length * math.sin(angle), 0.0])
+    T[:3, :3] = R @ about_z(-torsion) @ R.T @ T_world_s[:3, :3]
+    T[:3, 3] -= R @ np.array([length * math.cos(angle), length * math.sin(angle), 0.0])
     return T

@@ -1,7 +1,7 @@
 """After first contact: a small known motion whose measured answer must agree with it before the arm servos.
 
 A camera that is mounted turned or mirrored, or a model of another sensor, gives estimates that look like any others.
-Servoing on them, the arm runs away: every correction enlarges the error. What tells is motion. The sensor is pressed
+Servoing on them, the arm runs away: every correction enlarges the error. Only motion shows it. The sensor is pressed
 on, then shifted and tilted by amounts that any surface bears, along one axis after the other, and the estimates of
 single frames are regressed on the motion of the arm: answer = a motion + b conj(motion) + c + d t, for shear and tilt
 as complex numbers. A right sensor has a near 1 and b near 0; the angle of a is that of a turned camera; in a mirror b
