@@ -10,17 +10,24 @@ import argparse
 import asyncio
 import contextlib
 import math
+import sys
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
+from touchcell.drivers.core.difference import report
 from touchcell.drivers.core.errors import CorruptMessage
+from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain
+from touchcell.drivers.ur import capture
 from touchcell.drivers.ur import codec as ur_codec
+from touchcell.drivers.ur.capture import Capture
 from touchcell.drivers.ur.codec import IN_USE, NOT_FOUND, Packet, PacketType, Recipe, Value
 from touchcell.drivers.ur.emulator import kinematics as ur_model
 from touchcell.drivers.ur.emulator.controller import HOME_Q, Controller
 from touchcell.drivers.ur.emulator.generation import GENERATIONS
+from touchcell.drivers.ur.emulator.recorded import RecordedController
 from touchcell.drivers.ur.modes import RobotMode, RuntimeState, SafetyMode
 from touchcell.errors import ConfigError
 from touchcell.testing.emulation.base import Emulator
@@ -137,6 +144,7 @@ class UrEmulator(Emulator):
         generation: name of its generation.
         model: arm; None for the usual one of the generation.
         version: its software; None for the usual one of the generation.
+        recorded: recorded traffic that it reports instead of its own state.
 
     Raises:
         ConfigError: the generation does not drive that arm.
@@ -180,8 +188,10 @@ class UrEmulator(Emulator):
         generation: str = "e",
         model: str | None = None,
         version: Sequence[int] | None = None,
+        recorded: Capture | None = None,
     ) -> None:
         super().__init__()
+        self._recorded_types = {} if recorded is None else recorded.types
         self._generation = GENERATIONS[generation]
         self._model = model = model or self._generation.models[0]
         if model not in self._generation.models:
@@ -190,11 +200,15 @@ class UrEmulator(Emulator):
         self._default_version = tuple(version or self._generation.version)
         self._host = host
         self._unlock_after_s = unlock_after_s
-        self._controller = Controller(
-            unlock_after_s,
-            HOME_Q if start_deg is None else np.radians(start_deg),
-            ur_model.MODELS[model],
-            self._generation.period_s,
+        self._controller = (
+            RecordedController(recorded)
+            if recorded is not None
+            else Controller(
+                unlock_after_s,
+                HOME_Q if start_deg is None else np.radians(start_deg),
+                ur_model.MODELS[model],
+                self._generation.period_s,
+            )
         )
         self._servers: list[asyncio.Server] = []
         self._clients: list[_RtdeClient] = []
@@ -453,7 +467,9 @@ class UrEmulator(Emulator):
         rate_hz, names = ur_codec.parse_setup_outputs(payload)
         missing = self.active.get("missing_variable")
         unknown = self._generation.unknown_outputs | ({str(missing)} if missing else set())
-        types = [NOT_FOUND if name in unknown else _output_type(name) for name in names]
+        types = [
+            NOT_FOUND if name in unknown else self._recorded_types.get(name) or _output_type(name) for name in names
+        ]
         if NOT_FOUND not in types:
             client.outputs = Recipe(1, names, tuple(types))
             client.every = max(1, round(1.0 / (rate_hz * self._generation.period_s)))
@@ -610,6 +626,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--generation", choices=sorted(GENERATIONS), default="e", help="CB3, e-Series, or e-Series with PolyScope X"
     )
+    parser.add_argument(
+        "--from",
+        dest="capture",
+        type=Path,
+        metavar="CAPTURE",
+        help="report the states in this capture (pcap of port 30004), after what in it is not as expected",
+    )
     parser.add_argument("--model", choices=sorted(ur_model.MODELS), help="model of the arm")
     parser.add_argument(
         "--version",
@@ -621,12 +644,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def build(arguments: argparse.Namespace) -> UrEmulator:
-    """Build the emulator."""
+    """Build the emulator. Raises ConfigError."""
+    recorded, version = None, arguments.version
+    if arguments.capture is not None:
+        chain = SerialChain(ChainDescription.shipped(arguments.model)) if arguments.model else None
+        recorded = capture.read(arguments.capture, _output_type, chain)
+        version = version or recorded.version
+        found = list(report(recorded.differences)) or ["nothing contradicts codec or emulator"]
+        for line in [*capture.describe(recorded), *found]:
+            print(line, file=sys.stderr)
     return UrEmulator(
         arguments.host,
         arguments.unlock_after,
         arguments.start_deg,
         generation=arguments.generation,
         model=arguments.model,
-        version=arguments.version,
+        version=version,
+        recorded=recorded,
     )
