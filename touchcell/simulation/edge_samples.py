@@ -43,8 +43,8 @@ class EdgeRanges:
         depth_mm: smallest and largest.
         tilt_deg: largest about either axis.
         turn_deg: largest about the normal.
-        shear_mm: the longest way that the tip is dragged, in any direction or, for half of the contacts, along the edge.
-            It is longer than the skin holds: a tip that follows an edge always slips.
+        shear_mm: the longest way that the tip is dragged, in any direction or, for half of them, along the edge
+            alone. It is longer than the skin holds: a tip that follows an edge always slips.
         torsion_deg: the largest turn about the normal on that way, likewise: along a bend the skin is always twisted.
     """
 
