@@ -20,6 +20,7 @@ from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.plugin_section import Section
+from touchcell.simulation.ahead import remark_on_approach
 from touchcell.simulation.bodies import scene_bodies
 from touchcell.simulation.closed_forms import Box, Cylinder, Saddle
 from touchcell.simulation.contact import ContactLaw
@@ -475,11 +476,19 @@ class SceneConfig(Section, SceneSection):
                 key = f"surfaces.{name}.{problem.key}"
                 yield ConfigError(problem.reason, key=key, value=problem.value, hint=problem.hint)
 
-    def remarks(self) -> Iterable[str]:
-        """Yield where the tip does not fit into a surface."""
+    def remarks(self, starts: Mapping[str, Array], reach_m: float | None) -> Iterable[str]:
+        """Yield where the tip does not fit into a surface, and which sensor does not come upon one."""
+        radius_m = 1e-3 * self.tip.radius_mm
         for name, surface in self.surfaces.items():
-            for remark in surface.remarks(1e-3 * self.tip.radius_mm):
+            for remark in surface.remarks(radius_m):
                 yield f"scene.surfaces.{name}: {remark}"
+        # A sensor may be there for a free object, which none of the surfaces is.
+        if reach_m is None or self.objects:
+            return
+        surfaces = {name: surface.build() for name, surface in self.surfaces.items()}
+        for sensor, T_world_s in starts.items():
+            if ahead := remark_on_approach(surfaces, T_world_s, radius_m, reach_m):
+                yield f"sensors.{sensor}: {ahead}"
 
     def _world(self, surfaces: Mapping[str, Surface]) -> World:
         if self.physics == "kinematic":
