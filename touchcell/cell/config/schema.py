@@ -415,6 +415,7 @@ class _Planner:
     def _require_armed(self, plan: CellPlan) -> CellPlan:
         """An interlock that cannot trip, and what moves or feels and nothing guards, is refused."""
         from touchcell.cell.config.armed import cell_facts, not_armed, prove_cell
+        from touchcell.cell.config.healthy_start import trips_when_healthy
 
         try:
             facts = cell_facts(plan)
@@ -422,7 +423,8 @@ class _Planner:
         except ConfigError as error:
             self._add(tuple(error.key.split(".")), error.reason, value=error.value, hint=error.hint)
             raise InvalidCell(self._problems) from None
-        for problem in not_armed(plan, facts, proofs):
+        # What cannot trip is shown nothing that must not trip it.
+        for problem in list(not_armed(plan, facts, proofs)) or trips_when_healthy(plan, facts):
             self._add(problem.path, problem.reason, hint=problem.hint)
         if self._problems:
             raise InvalidCell(self._problems)
