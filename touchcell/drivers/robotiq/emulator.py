@@ -48,6 +48,7 @@ class RobotiqHand(Emulator):
         "unplug": "the adapter or cable is unplugged",
         "object": "an object of this width, mm, is between the fingers",
         "fault": "fault code that it reports",
+        "never_activates": "its activation does not begin",
         "restart": "the gripper loses power for a moment: it is no longer activated",
         "reset": "return to the state at the start of the emulator",
     }
@@ -141,7 +142,7 @@ class RobotiqHand(Emulator):
             self._step(_TICK_S)
 
     def _step(self, dt_s: float) -> None:
-        if self._activation is ActivationStatus.ACTIVATING:
+        if self._activation is ActivationStatus.ACTIVATING and "never_activates" not in self.active:
             self._activate(dt_s)
         elif self._activation is ActivationStatus.ACTIVATED and self._action.go and "fault" not in self.active:
             self._go(dt_s)
