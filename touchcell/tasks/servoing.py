@@ -13,7 +13,7 @@ from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Sidestepping, Six
+from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, NeedsFeature, Sidestepping, Six
 from touchcell.tasks.interface import SPEED, Action, Observation, TaskContext, TaskSpec, TransitionRecord
 from touchcell.tasks.sensor_check import SensorCheck
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
@@ -340,7 +340,9 @@ class ServoTask(MachineTask):
                 self._watch_contact(dt_s)
                 # Every servo processes the cycle, even if another one has already finished.
                 finished = [servo.advance(dt_s) for servo in servos]
-                if any(finished):
+                if astray := next(filter(None, (self._astray(servo, dt_s) for servo in servos)), ""):
+                    self._post("missed", astray)
+                elif any(finished):
                     shortfalls = [servo.run.shortfall() for servo in servos]
                     if missed := next(filter(None, shortfalls), ""):
                         self._post("missed", missed)
@@ -359,6 +361,14 @@ class ServoTask(MachineTask):
             case ServoState.RETRACT:
                 if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in servos):
                     self._post("retracted")
+
+    @staticmethod
+    def _astray(servo: ContactServo, dt_s: float) -> str:
+        """Return why a servo's behavior cannot go on, by what its sensor touches; empty where it can."""
+        if servo.contact is None or not isinstance(servo.run, NeedsFeature):
+            return ""
+        why = servo.run.astray(dt_s, servo.contact.touched)
+        return f"{servo.sensor}: {why}" if why else ""
 
     def _watch_check(self) -> None:
         """Record what the sensors measure, and judge it when all have moved."""

@@ -32,6 +32,7 @@ class Prediction:
         markers: fraction of the markers expected in view that were detected, for a marker model.
         tail_scale: factor of the covariance that makes it the scale of a Student-t with four degrees of freedom, as
             which large errors are likelier; None for a Gaussian.
+        displacements: (m, 2) px of all markers from where they rest, for a marker model.
         refusal: why the image does not show the contact as the model's camera would; empty where it does.
     """
 
@@ -41,6 +42,7 @@ class Prediction:
     markers: float | None = None
     refusal: str = ""
     tail_scale: float | None = None
+    displacements: Array | None = None
 
     @property
     def sigma(self) -> Array:
