@@ -100,7 +100,7 @@ class PushConfig(ContactServoConfig):
     push_accel_mm_s2: PositiveFloat = 200.0
     max_speed_mm_s: PositiveFloat = 140.0
     max_turn_deg_s: PositiveFloat = 25.0
-    arrival_speed_mm_s: PositiveFloat = 8.0
+    arrival_speed_mm_s: PositiveFloat = 5.0
     arrival_tolerance_mm: PositiveFloat = 5.0
     arrival_tolerance_deg: PositiveFloat = 10.0
     max_cross_track_mm: PositiveFloat = 60.0
