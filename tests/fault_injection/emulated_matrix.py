@@ -72,6 +72,8 @@ MORE_FAULTS: Final[Mapping[str, Mapping[str, tuple[Any, str]]]] = {
         "version": (8, "unseen"),
         "other_client": (True, "unseen"),
         "slow_recovery": (1.0, "unseen"),
+        "object": (0.03, "unseen"),
+        "no_hand": (True, "unseen"),
     },
     "damiao_can": {
         "push": ([0, 5.0], "unseen"),

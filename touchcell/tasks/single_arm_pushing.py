@@ -210,8 +210,8 @@ class Push:
 
     @property
     def only_touches(self) -> bool:
-        """False: the pusher turns with the side that it touches."""
-        return False
+        """True until the object is touched where it will be pushed: that contact will be given up."""
+        return self._predictive is not None and self._predictive.must_place
 
     def begin_approach(self, T_base_sensor: Array) -> None:
         """Take note of the direction of the approach, in which the object is expected."""

@@ -10,6 +10,7 @@ from touchcell.cell.bench.catalog import benchmark_names
 from touchcell.cell.experiments.executors import EXECUTORS
 from touchcell.cell.experiments.runner import EXPERIMENTS
 from touchcell.control.interlocks.spec import INTERLOCKS
+from touchcell.drivers.core.jog import HAND_DEVICES
 from touchcell.drivers.core.spec import DRIVERS
 from touchcell.errors import ConfigError
 from touchcell.paths import CONFIGS
@@ -28,6 +29,7 @@ def listing() -> dict[str, list[tuple[str, str]]]:
     """Title -> rows of (name, one line). A third party's broken plug-in is shown as such instead of hiding the rest."""
     return {
         "drivers": _rows(DRIVERS),
+        "input devices": _rows(HAND_DEVICES),
         "tasks": _rows(TASKS),
         "interlocks": [
             ("finite", "every number is finite; always on, checked first"),

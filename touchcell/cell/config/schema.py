@@ -227,7 +227,7 @@ class _Planner:
         return cell.model_copy(update={"scene": self._truth.scene(cell.scene)})
 
     def _with_truth(self, at: tuple[str, str], spec: AnyDriver, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a device's keys with those that are true in place of those that are told."""
+        """Return a device's keys with the true ones in place of the declared ones."""
         true = self._truth.device(*at, given) if at[0] in ("arms", "sensors") else {}
         for key in true.keys() - spec.config.model_fields.keys():
             self._add(("truth", *at, key), f"{spec.name} has no {key!r}", hint="leave it out")

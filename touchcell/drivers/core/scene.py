@@ -111,7 +111,7 @@ class SceneSection(BaseModel):
         raise NotImplementedError
 
     def bodies(self) -> Sequence[SceneBody]:
-        """Return what there is to draw."""
+        """Return the bodies to draw."""
         return ()
 
     def modules(self) -> Mapping[str, tuple[str, str]]:

@@ -57,17 +57,26 @@ class Prediction:
     @property
     def slip_probability(self) -> float:
         """Probability that the skin has slipped: that the shear exceeds ``SLIP_RATIO`` of the depth."""
-        x, y, depth = self.pose_mm_deg[:3]
-        shear = float(np.hypot(x, y))
-        sx, sy, sz = self.sigma_mm_deg[:3]
-        spread = float(np.hypot(np.hypot(sx, sy) / np.sqrt(2.0), SLIP_RATIO * sz))
-        return 0.5 * (1.0 + math.erf((shear - SLIP_RATIO * float(depth)) / (math.sqrt(2.0) * max(spread, 1e-9))))
+        return slip_probability(self.pose_mm_deg[:3], self.sigma_mm_deg[:3])
 
     @property
     def sigma_mm_deg(self) -> Array:
         """(6,) standard deviation of each component of xi, mm and degrees: along and about the sensor's axes."""
         sigma: Array = self.sigma * np.array([1e3] * 3 + [180.0 / np.pi] * 3)
         return sigma
+
+
+def slip_probability(position: Array, sigma: Array) -> float:
+    """Return the probability that the shear of a contact exceeds ``SLIP_RATIO`` of its depth.
+
+    Args:
+        position: (3,) shear x, y and depth.
+        sigma: (3,) their standard deviations, in the same unit.
+    """
+    x, y, depth = position.tolist()
+    sx, sy, sz = sigma.tolist()
+    spread = math.hypot(math.hypot(sx, sy) / math.sqrt(2.0), SLIP_RATIO * sz)
+    return 0.5 * (1.0 + math.erf((math.hypot(x, y) - SLIP_RATIO * depth) / (math.sqrt(2.0) * max(spread, 1e-9))))
 
 
 class ContactEstimator(Protocol):

@@ -92,7 +92,7 @@ def _fit(
             noisy = fields[chosen] + noise_px * torch.randn(_BATCH, fields.shape[1])
             loss = functional.cross_entropy(network(noisy @ projection), classes[chosen])
             optimizer.zero_grad(set_to_none=True)
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]
             optimizer.step()
             schedule.step()
 

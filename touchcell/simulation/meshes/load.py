@@ -123,7 +123,7 @@ def volume_m3(mesh: TriangleMesh) -> float:
 
 
 def _require_whole_stl(path: Path) -> None:
-    """Refuse an STL file that ends before its last triangle: libraries read what is there, or nothing."""
+    """Refuse an STL file that ends before its last triangle: libraries read the rest, or nothing."""
     with path.open("rb") as file:
         head = file.read(1024)
         size = file.seek(0, os.SEEK_END)
