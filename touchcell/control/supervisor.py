@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -11,8 +12,9 @@ import numpy as np
 from touchcell.control.interlocks.basic import Finite
 from touchcell.control.interlocks.errors import SafetyTrip
 from touchcell.control.interlocks.interlock import Interlock
+from touchcell.control.interlocks.level import Level
 from touchcell.control.interlocks.snapshot import CellView
-from touchcell.control.interlocks.timers import NO_MARKS, InterlockState, TimedInterlock
+from touchcell.control.interlocks.timers import NO_MARKS, InterlockState, Levelled, TimedInterlock
 from touchcell.control.interlocks.violation import Severity, Violation
 from touchcell.control.latch import Latch, LatchState, ResetDone, ResetRefused
 from touchcell.control.rest import RestMonitor
@@ -66,6 +68,10 @@ class _Remembered:
         violation, self._past = self._rule.evaluate(view, self._past)
         return violation
 
+    def levels(self, view: CellView, past: InterlockState) -> Iterator[Level]:
+        if isinstance(self._rule, Levelled):
+            yield from self._rule.levels(view, self._past)
+
 
 class Supervisor:
     """Apply the interlocks to each cycle and hold the latch.
@@ -95,6 +101,7 @@ class Supervisor:
         self._rest = RestMonitor(rest_m_s, rest_rad_s)
         self._limiting: dict[str, _Limiting] = {}
         self._reviewed_ns = 0
+        self._view: CellView | None = None
 
     @property
     def latch(self) -> Latch:
@@ -108,6 +115,7 @@ class Supervisor:
             view: snapshot of this cycle.
             alarms: violations from other sources, such as the watchdog; used as they are.
         """
+        self._view = view
         self._rest.note(view)
         violations = (*alarms, *self._violations(view))
         self._latch.update(violations)
@@ -118,6 +126,21 @@ class Supervisor:
             violations=violations,
             trip=None if first is None else first.as_error(),
         )
+
+    def levels(self) -> list[tuple[str, Level]]:
+        """Return what is on its way to the limits of which interlocks, as of the latest review.
+
+        Interlocks that cannot tell, and one that raises, have nothing. Never raises.
+        """
+        found: list[tuple[str, Level]] = []
+        if self._view is None:
+            return found
+        for rule in self._rules:
+            if isinstance(rule, Levelled):
+                # What is only shown disturbs nothing.
+                with suppress(Exception):
+                    found += [(rule.name, level) for level in rule.levels(self._view, NO_MARKS)]
+        return found
 
     def reset(self, token: OperatorToken, view: CellView, alarms: Sequence[Violation] = ()) -> ResetDone | ResetRefused:
         """Clear the latch at an operator's request, judged on the current ``view`` and ``alarms``; nothing moves."""

@@ -21,6 +21,7 @@ from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.plugin_section import Section
+from touchcell.simulation.ahead import remark_on_approach
 from touchcell.simulation.bodies import scene_bodies
 from touchcell.simulation.closed_forms import Box, Cylinder, Saddle
 from touchcell.simulation.contact import ContactLaw
@@ -110,6 +111,7 @@ class Scene:
         step_s: step of the simulation grid.
         surfaces: those of the world, for what only pictures and edges need of them.
         tip_radius_m: of every tip.
+        feels_shape: whether cameras show what curvature and edges change; see ``SceneConfig.feels``.
     """
 
     def __init__(
@@ -119,10 +121,12 @@ class Scene:
         step_s: float = DEFAULT_STEP_S,
         surfaces: Sequence[Surface] = (),
         tip_radius_m: float = 0.020,
+        feels_shape: bool = False,
     ) -> None:
         self.world = world
         self.surfaces = tuple(surfaces)
         self.tip_radius_m = tip_radius_m
+        self.feels_shape = feels_shape
         self.timeline = Timeline(clock, step_s)
         self._start_ns = self.timeline.t_ns
         self._poses: dict[str, Callable[[], Array]] = {}
@@ -415,6 +419,8 @@ class SceneConfig(Section, SceneSection):
         tip: contact law of the simulated tips.
         step_ms: grid on which arms move and contacts are stored.
         physics_step_ms: step of the dynamics, a divisor of ``step_ms``.
+        feels: what the simulated and emulated cameras of real drivers show: ``plane`` or ``shape``, as the key of
+            ``sim_tactip``.
     """
 
     physics: Literal["kinematic", "quasi_static", "dynamic"] = "kinematic"
@@ -424,6 +430,7 @@ class SceneConfig(Section, SceneSection):
     tip: TipLawConfig = TipLawConfig()
     step_ms: float = Field(default=2.0, ge=0.1, le=10.0)
     physics_step_ms: float = Field(default=1.0, ge=0.05, le=5.0)
+    feels: Literal["plane", "shape"] = "plane"
 
     @model_validator(mode="after")
     def _something_to_touch(self) -> SceneConfig:
@@ -448,7 +455,12 @@ class SceneConfig(Section, SceneSection):
         """Build the scene; its motions start now."""
         surfaces = {name: config.build() for name, config in self.surfaces.items()}
         return Scene(
-            self._world(surfaces), clock, self.step_ms * 1e-3, list(surfaces.values()), 1e-3 * self.tip.radius_mm
+            self._world(surfaces),
+            clock,
+            self.step_ms * 1e-3,
+            list(surfaces.values()),
+            1e-3 * self.tip.radius_mm,
+            self.feels == "shape",
         )
 
     def modules(self) -> Mapping[str, tuple[str, str]]:
@@ -480,11 +492,19 @@ class SceneConfig(Section, SceneSection):
         surfaces = [surface.build() for surface in self.surfaces.values()]
         return nearest_edge(surfaces, np.eye(4), 0.0, 1e-3 * self.tip.radius_mm) is not None
 
-    def remarks(self) -> Iterable[str]:
-        """Yield where the tip does not fit into a surface."""
+    def remarks(self, starts: Mapping[str, Array], reach_m: float | None) -> Iterable[str]:
+        """Yield where the tip does not fit into a surface, and which sensor does not come upon one."""
+        radius_m = 1e-3 * self.tip.radius_mm
         for name, surface in self.surfaces.items():
-            for remark in surface.remarks(1e-3 * self.tip.radius_mm):
+            for remark in surface.remarks(radius_m):
                 yield f"scene.surfaces.{name}: {remark}"
+        # A sensor may be there for a free object, which none of the surfaces is.
+        if reach_m is None or self.objects:
+            return
+        surfaces = {name: surface.build() for name, surface in self.surfaces.items()}
+        for sensor, T_world_s in starts.items():
+            if ahead := remark_on_approach(surfaces, T_world_s, radius_m, reach_m):
+                yield f"sensors.{sensor}: {ahead}"
 
     def _world(self, surfaces: Mapping[str, Surface]) -> World:
         if self.physics == "kinematic":

@@ -13,7 +13,7 @@ from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Sidestepping, Six
+from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, NeedsFeature, Sidestepping, Six
 from touchcell.tasks.interface import SPEED, Action, Observation, TaskContext, TaskSpec, TransitionRecord
 from touchcell.tasks.planned_places import PlannedPlace
 from touchcell.tasks.sensor_check import SensorCheck
@@ -146,9 +146,11 @@ def servo_table(
             TransitionDef("contact", s.APPROACH, s.SETTLE),
             TransitionDef("no_contact", s.APPROACH, s.RETRACT),
             TransitionDef("agrees", s.CHECK, s.SETTLE),
+            TransitionDef("missed", s.CHECK, s.RETRACT),
             TransitionDef("lost", s.CHECK, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.CHECK, s.RETRACT),
             TransitionDef("settled", s.SETTLE, s.RUN),
+            TransitionDef("missed", s.SETTLE, s.RETRACT),
             TransitionDef("lost", s.SETTLE, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.SETTLE, s.RETRACT),
             TransitionDef("finished", s.RUN, s.RETRACT),
@@ -330,18 +332,24 @@ class ServoTask(MachineTask):
                     self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
             case ServoState.CHECK:
                 self._watch_contact(dt_s)
+                if astray := self._astray(dt_s):
+                    self._post("missed", astray)
                 self._watch_check()
             case ServoState.SETTLE:
                 self._watch_contact(dt_s)
                 steady = all(servo.only_touches or servo.steady() for servo in servos)
                 self._steady_s = self._steady_s + dt_s if steady else 0.0
-                if steady and self._steady_s >= self._config.settle_time_s:
+                if astray := self._astray(dt_s):
+                    self._post("missed", astray)
+                elif steady and self._steady_s >= self._config.settle_time_s:
                     self._post("settled")
             case ServoState.RUN:
                 self._watch_contact(dt_s)
                 # Every servo processes the cycle, even if another one has already finished.
                 finished = [servo.advance(dt_s) for servo in servos]
-                if any(finished):
+                if astray := self._astray(dt_s):
+                    self._post("missed", astray)
+                elif any(finished):
                     shortfalls = [servo.run.shortfall() for servo in servos]
                     if missed := next(filter(None, shortfalls), ""):
                         self._post("missed", missed)
@@ -360,6 +368,17 @@ class ServoTask(MachineTask):
             case ServoState.RETRACT:
                 if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in servos):
                     self._post("retracted")
+
+    def _astray(self, dt_s: float) -> str:
+        """Return why a behavior cannot go on, by what its sensor touches; empty where all can."""
+        for servo in self._servos:
+            if (
+                servo.contact is not None
+                and isinstance(servo.run, NeedsFeature)
+                and (why := servo.run.astray(dt_s, servo.contact.touched))
+            ):
+                return f"{servo.sensor}: {why}"
+        return ""
 
     def _watch_check(self) -> None:
         """Record what the sensors measure, and judge it when all have moved."""

@@ -101,7 +101,7 @@ class PushConfig(ContactServoConfig):
     push_accel_mm_s2: PositiveFloat = 200.0
     max_speed_mm_s: PositiveFloat = 140.0
     max_turn_deg_s: PositiveFloat = 25.0
-    arrival_speed_mm_s: PositiveFloat = 8.0
+    arrival_speed_mm_s: PositiveFloat = 5.0
     arrival_tolerance_mm: PositiveFloat = 5.0
     arrival_tolerance_deg: PositiveFloat = 10.0
     max_cross_track_mm: PositiveFloat = 60.0
@@ -194,6 +194,8 @@ class Push:
         self._miss_m = self._sigma_m = 0.0
         self._left_m_s = 0.0
         self._y_is_left = 1.0
+        self.depth_m = 0.0
+        """Depth of the contact at the last cycle."""
 
     @property
     def left_m_s(self) -> float:
@@ -217,8 +219,8 @@ class Push:
 
     @property
     def only_touches(self) -> bool:
-        """False: the pusher turns with the side that it touches."""
-        return False
+        """True until the object is touched where it will be pushed: that contact will be given up."""
+        return self._predictive is not None and self._predictive.must_place
 
     def begin_approach(self, T_base_sensor: Array) -> None:
         """Take note of the direction of the approach, in which the object is expected."""
@@ -255,6 +257,7 @@ class Push:
             self._left_m_s = 0.0
             return False
         self._y_is_left = -float(np.sign(now[2, 0]))
+        self.depth_m = max(0.0, -float(T_s_f[:3, 2] @ T_s_f[:3, 3]))
         if self._predictive is not None:
             progress = self._predictive.update(dt_s, now, T_s_f)
             self._aim, self._miss_m, self._sigma_m = _aim_of(progress), progress.miss_m, progress.sigma_m

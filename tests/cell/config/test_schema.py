@@ -256,3 +256,38 @@ def test_a_name_belongs_to_one_device(tmp_path: Path) -> None:
     path = written(tmp_path, ("interlocks:\n", "devices:\n  arm: {driver: replay_camera, data: .}\n\ninterlocks:\n"))
     error = refused(path)
     assert (error.key, error.reason) == ("devices.arm", "another device has this name")
+
+
+def six_joints() -> str:
+    """Return a URDF of an arm with six joints and a gripper's seventh."""
+    links = "".join(f'<link name="link{i}"/>' for i in range(8))
+    joints = "".join(
+        f'<joint name="joint{i}" type="revolute"><parent link="link{i}"/><child link="link{i + 1}"/>'
+        f'<origin xyz="0 0 0.1"/><axis xyz="{int(i % 2 == 0)} 0 {int(i % 2)}"/>'
+        '<limit lower="-2" upper="2" velocity="2" effort="20"/></joint>'
+        for i in range(7)
+    )
+    return f'<robot name="mine">{links}{joints}</robot>'
+
+
+@pytest.mark.parametrize(
+    ("chain", "says"),
+    [
+        ("arm.urdf#link6", ""),
+        ("arm.urdf", "has 7 joints"),
+        ("arm.urdf#link9", "has no link 'link9'"),
+        ("other.urdf#link6", "no such file"),
+    ],
+)
+def test_a_chain_is_found_in_a_urdf_beside_the_cell(chain: str, says: str, tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(six_joints())
+    cell = tmp_path / "cell.yaml"
+    cell.write_text((CONFIGS / "steps_damiao_bench.yaml").read_text().replace("chain: generic_6r", f"chain: {chain}"))
+    if says:
+        with pytest.raises((ConfigError, ExceptionGroup)) as caught:
+            plan_cell(cell)
+        assert says in str(caught.value) + repr(getattr(caught.value, "exceptions", ""))
+    else:
+        found = plan_cell(cell).arms["arm"].config.described_chain()
+        assert found is not None
+        assert found.joint_names[-1] == "joint5"

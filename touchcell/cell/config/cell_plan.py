@@ -257,7 +257,7 @@ class CellFile(_Section):
         task: what the cell does.
         recording: what is recorded of a run besides numbers.
         collect: where a task that labels frames puts them.
-        truth: what the simulated world truly is, where that differs from what this file tells the controllers.
+        truth: what the simulated world truly is, where that differs from what this file declares to the controllers.
         sweep: what ``touchcell sweep`` changes from trial to trial; nothing else reads it.
     """
 

@@ -20,6 +20,7 @@ from touchcell.geometry import se3
 from touchcell.geometry.errors import GeometryError
 from touchcell.geometry.types import Array
 from touchcell.input_file import BUILTIN
+from touchcell.perception.runtime.filter_spec import FILTERS, FilterConfig
 from touchcell.tasks.interface import Demand
 
 if TYPE_CHECKING:
@@ -110,6 +111,15 @@ def _features(file: YamlFile, plan: CellPlan) -> Iterator[ConfigError]:
                 f"{reason} {_a(wanted)}",
                 value=estimator.kind,
                 hint="kind: true_edge in a simulated scene" if wanted == "edge" else "kind: network",
+            )
+        section = getattr(estimator, "filter", None)
+        predicted = FILTERS.load(section.model).feature if isinstance(section, FilterConfig) else estimator.feature
+        if predicted != estimator.feature:
+            yield file.problem(
+                ("sensors", name, "estimator", "filter"),
+                f"it predicts the motion of {_a(predicted)}, and {estimator.kind} estimates {_a(estimator.feature)}",
+                value=section,
+                hint="leave out `filter:`",
             )
 
 

@@ -31,7 +31,7 @@ class StopReport:
 
     Attributes:
         category: by which it was commanded to stop first.
-        speed_m_s: of its tool centre point when it was told; None where it could not be read.
+        speed_m_s: of its tool centre point when it was commanded to; None where it could not be read.
         time_s: until it stood; None if it never did.
         distance_m: farthest way from where it was told; None where it could not be read.
         declared_s, declared_m: what it may take.

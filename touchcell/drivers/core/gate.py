@@ -96,7 +96,7 @@ class TwistGate:
             state: of the arm.
             T_base_tcp: (4, 4) for commands along tool axes.
             follow: asked first what the arm can follow at all.
-            joints: tells where the joints are, asked once the command is found fit; None: they are not limited here.
+            joints: returns the joint positions, called once the command is found fit; None: they are not limited here.
 
         Raises:
             CommandRejected: with the first reason that applies; nothing may be sent.

@@ -111,7 +111,7 @@ class SceneSection(BaseModel):
         raise NotImplementedError
 
     def bodies(self) -> Sequence[SceneBody]:
-        """Return what there is to draw."""
+        """Return the bodies to draw."""
         return ()
 
     def modules(self) -> Mapping[str, tuple[str, str]]:
@@ -134,8 +134,13 @@ class SceneSection(BaseModel):
         """Return whether anything in it has an edge that could be followed."""
         return True
 
-    def remarks(self) -> Iterable[str]:
-        """Return what a sensor cannot follow of it, in a line each."""
+    def remarks(self, starts: Mapping[str, Array], reach_m: float | None) -> Iterable[str]:
+        """Return what a sensor cannot follow of it, in a line each.
+
+        Args:
+            starts: by the name of the sensor, its pose (4, 4) in the world at the start.
+            reach_m: distance along its axis within which the task expects contact; None where it expects none.
+        """
         return ()
 
 
