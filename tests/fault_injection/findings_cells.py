@@ -196,6 +196,8 @@ def safety_example(shipped: Shipped, page: str) -> dict[str, Any]:
         for name, entry in example.get(section, {}).items():
             data[section][name] = data[section].get(name, {}) | entry
     data["obstacles"] = example["obstacles"]
+    for key, value in example.get("task", {}).items():
+        data["task"][key] = data["task"].get(key, {}) | value if isinstance(value, dict) else value
     return data
 
 
