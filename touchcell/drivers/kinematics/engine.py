@@ -4,14 +4,45 @@ from __future__ import annotations
 
 import math
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from touchcell.geometry.types import Array
 
-if TYPE_CHECKING:
-    from touchcell.drivers.kinematics.chain import SerialChain
+
+class ChainGeometry(Protocol):
+    """What the engine takes from a chain; see ``SerialChain``."""
+
+    @property
+    def placements(self) -> Array:
+        """Poses (n, 4, 4) of the joints, each in the frame of the one before."""
+        ...
+
+    @property
+    def axes(self) -> Array:
+        """Axes (n, 3) of the joints."""
+        ...
+
+    @property
+    def masses(self) -> Array:
+        """Masses (n,) kg that they carry."""
+        ...
+
+    @property
+    def centres(self) -> Array:
+        """Centres (n, 3) m of these in their frames."""
+        ...
+
+    @property
+    def T_joint_tcp(self) -> Array:  # noqa: N802
+        """Pose (4, 4) of the tool in the last joint's frame."""
+        ...
+
+    @property
+    def gravity_m_s2(self) -> Array:
+        """Acceleration (3,) of free fall in the base frame."""
+        ...
 
 
 class PinocchioEngine:
@@ -24,7 +55,7 @@ class PinocchioEngine:
         ImportError: pinocchio is not installed.
     """
 
-    def __init__(self, chain: SerialChain) -> None:
+    def __init__(self, chain: ChainGeometry) -> None:
         import pinocchio as pin
 
         self._pin = pin
