@@ -280,7 +280,7 @@ class CellUnderTest:
     def provoke(self, interlock: str, settings: Mapping[str, Any] | None = None) -> Violation:
         """Show an interlock, alone, the first fault that must trip it, until it trips; return the first cause.
 
-        The other interlocks go on seeing the cell as it is, so that what trips is this one. It works in
+        The other interlocks still see the cell as it is, so that what trips is this one. It works in
         every world: a bench stops its real arms.
 
         Args:

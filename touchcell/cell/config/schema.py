@@ -14,6 +14,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+import numpy as np
 from pydantic import BaseModel
 
 from touchcell.cell.config.cell_plan import (
@@ -41,6 +42,8 @@ from touchcell.drivers.core.scene import scene_section
 from touchcell.drivers.core.spec import DRIVERS, AnyDriver, DriverConfig
 from touchcell.drivers.core.stand_in import STAND_INS, Placement
 from touchcell.errors import ConfigError, suggest
+from touchcell.geometry import se3
+from touchcell.geometry.types import Array
 from touchcell.input_file import BUILTIN
 from touchcell.tasks.interface import TASKS, AnyTask, TaskConfig
 
@@ -227,7 +230,7 @@ class _Planner:
         return cell.model_copy(update={"scene": self._truth.scene(cell.scene)})
 
     def _with_truth(self, at: tuple[str, str], spec: AnyDriver, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a device's keys with those that are true in place of those that are told."""
+        """Return a device's keys with the true ones in place of the declared ones."""
         true = self._truth.device(*at, given) if at[0] in ("arms", "sensors") else {}
         for key in true.keys() - spec.config.model_fields.keys():
             self._add(("truth", *at, key), f"{spec.name} has no {key!r}", hint="leave it out")
@@ -415,6 +418,7 @@ class _Planner:
     def _require_armed(self, plan: CellPlan) -> CellPlan:
         """An interlock that cannot trip, and what moves or feels and nothing guards, is refused."""
         from touchcell.cell.config.armed import cell_facts, not_armed, prove_cell
+        from touchcell.cell.config.healthy_start import trips_when_healthy
 
         try:
             facts = cell_facts(plan)
@@ -422,7 +426,8 @@ class _Planner:
         except ConfigError as error:
             self._add(tuple(error.key.split(".")), error.reason, value=error.value, hint=error.hint)
             raise InvalidCell(self._problems) from None
-        for problem in not_armed(plan, facts, proofs):
+        # What cannot trip is shown nothing that must not trip it.
+        for problem in list(not_armed(plan, facts, proofs)) or trips_when_healthy(plan, facts):
             self._add(problem.path, problem.reason, hint=problem.hint)
         if self._problems:
             raise InvalidCell(self._problems)
@@ -617,7 +622,23 @@ class _Planner:
 
 def _remarks(plan: CellPlan) -> tuple[str, ...]:
     scene = plan.cell.scene
-    return () if scene is None else tuple(scene_section().model_validate(scene).remarks())
+    if scene is None:
+        return ()
+    reach_mm = getattr(plan.task_config, "approach_distance_mm", None)
+    reach_m = None if reach_mm is None else 1e-3 * reach_mm
+    return tuple(scene_section().model_validate(scene).remarks(_sensor_starts(plan), reach_m))
+
+
+def _sensor_starts(plan: CellPlan) -> dict[str, Array]:
+    """Return the pose (4, 4) in the world of each of the task's sensors, where its arm has a start pose."""
+    starts = {}
+    for name in plan.sensor_roles.values():
+        section = plan.cell.sensors[name]
+        arm = plan.cell.arms.get(section.mounted_on or "")
+        if arm is not None and arm.start_pose_mm_deg is not None:
+            T_base_tcp = se3.from_euler_mm_deg(np.array(arm.start_pose_mm_deg))
+            starts[name] = arm.T_world_base @ T_base_tcp @ section.T_tcp_sensor
+    return starts
 
 
 def _a(word: str) -> str:

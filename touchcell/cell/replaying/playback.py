@@ -32,7 +32,7 @@ _SIGMA_UNITS = np.array([1e-3] * 3 + [np.pi / 180] * 3)
 
 
 class Playback(Clock):
-    """Clock of a replay: whoever sleeps until the next cycle wakes at the next one that was recorded.
+    """Clock of a replay: a sleep until the next cycle ends at the next recorded one.
 
     Args:
         run: what is replayed.
@@ -54,7 +54,7 @@ class Playback(Clock):
         return self._now_ns
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Go on to the next recorded cycle; behind the last one, to ``t_ns``."""
+        """Advance to the next recorded cycle; behind the last one, to ``t_ns``."""
         if self._index + 1 < len(self._cycles):
             self._index += 1
             self._now_ns = max(self._now_ns, self.cycle.now_ns)
