@@ -23,7 +23,7 @@ _SHARPEST_CURVATURE_PER_M: Final = 30.0
 def random_part(rng: np.random.Generator) -> TriangleMesh:
     """Return a part whose rim is an edge between a face above and a wall below; its face looks towards +z.
 
-    Half of the faces are flat, the others bend both ways with radii down to 33 mm. Half of the walls lean, by up to
+    Half of the faces are flat, the others bend both ways with radii down to 33 mm. Two in five walls lean, by up to
     45 deg. Outlines are circles, waves round a circle, drops with one sharp end and polygons, stars among them; a
     quarter are the rims of holes.
     """
@@ -32,7 +32,7 @@ def random_part(rng: np.random.Generator) -> TriangleMesh:
     curvature = rng.uniform(-_SHARPEST_CURVATURE_PER_M, _SHARPEST_CURVATURE_PER_M, 2) * (rng.random() < 0.5)
     turn = rng.uniform(0.0, math.pi)
     # Walls that lean under the face are as sharp as those of thin plates; blunt ones are those of bowls.
-    lean = rng.uniform(-_BLUNTEST_RAD, _BLUNTEST_RAD) * (rng.random() < 0.5)
+    lean = rng.uniform(-_BLUNTEST_RAD, _BLUNTEST_RAD) * (rng.random() < 0.4)
     length = np.linalg.norm(outline, axis=1, keepdims=True)
     middle = outline[rng.integers(len(outline))]
     if hole:

@@ -6,12 +6,13 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
-from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.clock import Clock, VirtualClock
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import TcpSource
 from touchcell.drivers.core.samples import Stamped
@@ -20,6 +21,7 @@ from touchcell.errors import ConfigError, TouchcellError
 from touchcell.geometry import se3
 from touchcell.geometry.types import Array
 from touchcell.plugin_section import Section
+from touchcell.simulation.ahead import remark_on_approach
 from touchcell.simulation.bodies import scene_bodies
 from touchcell.simulation.closed_forms import Box, Cylinder, Saddle
 from touchcell.simulation.contact import ContactLaw
@@ -475,11 +477,34 @@ class SceneConfig(Section, SceneSection):
                 key = f"surfaces.{name}.{problem.key}"
                 yield ConfigError(problem.reason, key=key, value=problem.value, hint=problem.hint)
 
-    def remarks(self) -> Iterable[str]:
-        """Yield where the tip does not fit into a surface."""
+    def pressed(self, tips: Mapping[str, Array]) -> Mapping[str, float]:
+        """Return how deep each tip is in a surface or an object; {} for dynamic scenes, which take long to build."""
+        if self.physics == "dynamic":
+            return {}
+        scene = self.build(VirtualClock())
+        for sensor, T_world_s in tips.items():
+            scene.mount(sensor, partial(np.asarray, T_world_s))
+        depths_m = {sensor: float(scene.contact(sensor).value.T_f_s[2, 3]) for sensor in tips}
+        return {sensor: depth_m for sensor, depth_m in depths_m.items() if depth_m > 0.0}
+
+    def has_edges(self) -> bool:
+        """Return whether a surface has an edge."""
+        surfaces = [surface.build() for surface in self.surfaces.values()]
+        return nearest_edge(surfaces, np.eye(4), 0.0, 1e-3 * self.tip.radius_mm) is not None
+
+    def remarks(self, starts: Mapping[str, Array], reach_m: float | None) -> Iterable[str]:
+        """Yield where the tip does not fit into a surface, and which sensor does not come upon one."""
+        radius_m = 1e-3 * self.tip.radius_mm
         for name, surface in self.surfaces.items():
-            for remark in surface.remarks(1e-3 * self.tip.radius_mm):
+            for remark in surface.remarks(radius_m):
                 yield f"scene.surfaces.{name}: {remark}"
+        # A sensor may be there for a free object, which none of the surfaces is.
+        if reach_m is None or self.objects:
+            return
+        surfaces = {name: surface.build() for name, surface in self.surfaces.items()}
+        for sensor, T_world_s in starts.items():
+            if ahead := remark_on_approach(surfaces, T_world_s, radius_m, reach_m):
+                yield f"sensors.{sensor}: {ahead}"
 
     def _world(self, surfaces: Mapping[str, Surface]) -> World:
         if self.physics == "kinematic":

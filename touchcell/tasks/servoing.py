@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from enum import Enum, auto
 from typing import Annotated, Final, TypeVar
 
@@ -13,8 +13,9 @@ from touchcell.drivers.core.commands import TwistCommand, TwistFrame
 from touchcell.drivers.core.protocols import SERVO_ARM
 from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
-from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, Sidestepping, Six
+from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, NeedsFeature, Sidestepping, Six
 from touchcell.tasks.interface import SPEED, Action, Observation, TaskContext, TaskSpec, TransitionRecord
+from touchcell.tasks.planned_places import PlannedPlace
 from touchcell.tasks.sensor_check import SensorCheck
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
 from touchcell.tasks.state_machine_task import MachineTask
@@ -340,7 +341,9 @@ class ServoTask(MachineTask):
                 self._watch_contact(dt_s)
                 # Every servo processes the cycle, even if another one has already finished.
                 finished = [servo.advance(dt_s) for servo in servos]
-                if any(finished):
+                if astray := next(filter(None, (self._astray(servo, dt_s) for servo in servos)), ""):
+                    self._post("missed", astray)
+                elif any(finished):
                     shortfalls = [servo.run.shortfall() for servo in servos]
                     if missed := next(filter(None, shortfalls), ""):
                         self._post("missed", missed)
@@ -359,6 +362,14 @@ class ServoTask(MachineTask):
             case ServoState.RETRACT:
                 if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in servos):
                     self._post("retracted")
+
+    @staticmethod
+    def _astray(servo: ContactServo, dt_s: float) -> str:
+        """Return why a servo's behavior cannot go on, by what its sensor touches; empty where it can."""
+        if servo.contact is None or not isinstance(servo.run, NeedsFeature):
+            return ""
+        why = servo.run.astray(dt_s, servo.contact.touched)
+        return f"{servo.sensor}: {why}" if why else ""
 
     def _watch_check(self) -> None:
         """Record what the sensors measure, and judge it when all have moved."""
@@ -521,6 +532,7 @@ def one_arm_task(
     config: type[ServoConfigT],
     behavior: Callable[[ServoConfigT], Behavior],
     reference_mm_deg: Callable[[ServoConfigT], Six],
+    places: Callable[[ServoConfigT, Array | None, Array], Iterable[PlannedPlace]] | None = None,
 ) -> TaskSpec[ServoConfigT]:
     """Return the spec of a task in which ``arm`` holds a contact with ``sensor`` and runs one behavior.
 
@@ -530,10 +542,13 @@ def one_arm_task(
         config: pydantic model of its parameters.
         behavior: creates the behavior from the parameters.
         reference_mm_deg: returns the contact to hold, Euler components of ``T_f_s``.
+        places: of its ``TaskSpec``.
     """
 
     def build(config: ServoConfigT, context: TaskContext) -> ServoTask:
         servo = ContactServo(ARM, SENSOR, config, reference_mm_deg(config), behavior(config), context)
         return ServoTask(name, config, context, servo)
 
-    return TaskSpec(name, summary, config, {ARM: SERVO_ARM}, frozenset({SENSOR}), build)
+    return TaskSpec(
+        name, summary, config, {ARM: SERVO_ARM}, frozenset({SENSOR}), build, starts_free=True, places=places
+    )
