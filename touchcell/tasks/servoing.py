@@ -146,9 +146,11 @@ def servo_table(
             TransitionDef("contact", s.APPROACH, s.SETTLE),
             TransitionDef("no_contact", s.APPROACH, s.RETRACT),
             TransitionDef("agrees", s.CHECK, s.SETTLE),
+            TransitionDef("missed", s.CHECK, s.RETRACT),
             TransitionDef("lost", s.CHECK, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.CHECK, s.RETRACT),
             TransitionDef("settled", s.SETTLE, s.RUN),
+            TransitionDef("missed", s.SETTLE, s.RETRACT),
             TransitionDef("lost", s.SETTLE, s.APPROACH, guard="may_reapproach"),
             TransitionDef("lost", s.SETTLE, s.RETRACT),
             TransitionDef("finished", s.RUN, s.RETRACT),
@@ -330,18 +332,22 @@ class ServoTask(MachineTask):
                     self._post("no_contact", f"none within {self._config.approach_distance_mm:g} mm")
             case ServoState.CHECK:
                 self._watch_contact(dt_s)
+                if astray := self._astray(dt_s):
+                    self._post("missed", astray)
                 self._watch_check()
             case ServoState.SETTLE:
                 self._watch_contact(dt_s)
                 steady = all(servo.only_touches or servo.steady() for servo in servos)
                 self._steady_s = self._steady_s + dt_s if steady else 0.0
-                if steady and self._steady_s >= self._config.settle_time_s:
+                if astray := self._astray(dt_s):
+                    self._post("missed", astray)
+                elif steady and self._steady_s >= self._config.settle_time_s:
                     self._post("settled")
             case ServoState.RUN:
                 self._watch_contact(dt_s)
                 # Every servo processes the cycle, even if another one has already finished.
                 finished = [servo.advance(dt_s) for servo in servos]
-                if astray := next(filter(None, (self._astray(servo, dt_s) for servo in servos)), ""):
+                if astray := self._astray(dt_s):
                     self._post("missed", astray)
                 elif any(finished):
                     shortfalls = [servo.run.shortfall() for servo in servos]
@@ -363,13 +369,16 @@ class ServoTask(MachineTask):
                 if all(servo.travelled_m() >= 1e-3 * self._config.retract_mm for servo in servos):
                     self._post("retracted")
 
-    @staticmethod
-    def _astray(servo: ContactServo, dt_s: float) -> str:
-        """Return why a servo's behavior cannot go on, by what its sensor touches; empty where it can."""
-        if servo.contact is None or not isinstance(servo.run, NeedsFeature):
-            return ""
-        why = servo.run.astray(dt_s, servo.contact.touched)
-        return f"{servo.sensor}: {why}" if why else ""
+    def _astray(self, dt_s: float) -> str:
+        """Return why a behavior cannot go on, by what its sensor touches; empty where all can."""
+        for servo in self._servos:
+            if (
+                servo.contact is not None
+                and isinstance(servo.run, NeedsFeature)
+                and (why := servo.run.astray(dt_s, servo.contact.touched))
+            ):
+                return f"{servo.sensor}: {why}"
+        return ""
 
     def _watch_check(self) -> None:
         """Record what the sensors measure, and judge it when all have moved."""
