@@ -167,12 +167,24 @@ FACE = TouchedFeature(0.0, 0.97, 0.02, 0.01)
 
 def test_no_edge_is_followed_where_there_is_none() -> None:
     behavior = FollowEdge(EdgeFollowingConfig())
-    assert behavior.astray(0.01, FACE) == "touches no edge to follow: surface by 97 %"
+    assert [behavior.astray(0.033, FACE) for _ in range(3)] == [""] * 3
+    assert behavior.astray(0.033, FACE) == "touches no edge to follow: surface by 97 %"
+
+
+def test_the_middle_of_a_plate_is_no_edge(tmp_path: Path) -> None:
+    plate = {"plate": {"kind": "box", "size_mm": [400, 400, 20]}}
+    plan = plan_cell(CELL, settings={"scene.surfaces": plate})
+    cell = compose(plan)
+    with Recorder(tmp_path / "run.mcap") as recorder, cell:
+        result = RunLoop(cell, recorder).run()
+    assert result.outcome.value == "failed"
+    assert "touches no edge to follow: surface" in result.reason
 
 
 def test_an_edge_that_is_lost_ends_the_task_after_a_while_and_corners_are_edges() -> None:
     behavior = FollowEdge(EdgeFollowingConfig(edge_lost_ms=350.0))
     assert behavior.astray(0.01, EDGE) == ""
+    behavior.update(0.01, np.eye(4), np.eye(4), None)
     # A corner of a third of a second that looks like a face, and an edge again.
     assert [behavior.astray(0.1, each) for each in (FACE, FACE, EDGE, FACE, FACE, FACE)] == [""] * 6
     assert behavior.astray(0.1, FACE).startswith("lost the edge after 0 mm")

@@ -36,7 +36,7 @@ _ON_SURFACE_M: Final = 9e-3
 _FARTHEST_M: Final = 18e-3
 _SHARPEST_BEND_COS: Final = math.cos(math.radians(40.0))
 _RANGES: Final = EdgeRanges(depth_mm=(0.8, 6.0), turn_deg=180.0)
-_MOST_TRIES: Final = 200
+_MOST_TRIES: Final = 30
 
 
 def feature_contacts(n: int, seed: int, *, variation: Variation | None = None) -> Iterator[tuple[int, Array]]:
@@ -51,6 +51,8 @@ def feature_contacts(n: int, seed: int, *, variation: Variation | None = None) -
         for _ in range(min(_CONTACTS_PER_TIP, n - start)):
             wanted = int(rng.integers(len(CLASSES)))
             made: Array | None = None
+            if CLASSES[wanted] == "corner" and not len(corners):
+                wanted = CLASSES.index("edge")
             if CLASSES[wanted] == "surface" and rng.random() < 0.5:
                 made = _on_smooth(smooth, tip, law, rng)
             elif CLASSES[wanted] != "none":

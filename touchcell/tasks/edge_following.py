@@ -33,6 +33,8 @@ _AXES: Final = {
 
 _BEND_SHARE: Final = 0.6
 """Of the largest turn that a bend may take, so that corrections have the rest."""
+_NO_EDGE_S: Final = 0.1
+"""Without an edge before anything is followed: three frames, before the controller goes where it seems to be."""
 _FASTEST_TILT_RAD_S: Final = 1.0
 """Of the tilt that is fed forward."""
 
@@ -111,7 +113,6 @@ class FollowEdge:
         self._closed = False
         self._least_edge = 1e-2 * config.least_edge_percent
         self._edge_lost_s = 1e-3 * config.edge_lost_ms
-        self._begun = False
         self._off_edge_s = 0.0
         self._edge = math.nan
 
@@ -153,16 +154,16 @@ class FollowEdge:
         return self._closed or self._travelled_m >= self._distance_m
 
     def astray(self, dt_s: float, touched: TouchedFeature | None) -> str:
-        """Return that there is no edge: at once where the task begins, later once it has been missing for a while."""
-        begun, self._begun = self._begun, True
+        """Return that there is no edge, or none any more, once it has been missing for a while."""
         if touched is None:
             return ""
         self._edge = touched.along_an_edge
         self._off_edge_s = self._off_edge_s + dt_s if self._edge < self._least_edge else 0.0
-        if self._off_edge_s == 0.0 or (begun and self._off_edge_s <= self._edge_lost_s):
+        longest_s = min(self._edge_lost_s, _NO_EDGE_S) if self._start is None else self._edge_lost_s
+        if self._off_edge_s <= longest_s:
             return ""
         what = f"{touched.likeliest} by {100.0 * getattr(touched, touched.likeliest):.0f} %"
-        if not begun:
+        if self._start is None:
             return f"touches no edge to follow: {what}"
         return f"lost the edge after {1e3 * self._travelled_m:.0f} mm: {what}"
 
@@ -192,5 +193,6 @@ SPEC = TaskSpec(
     {ARM: SERVO_ARM},
     frozenset({SENSOR}),
     _build,
+    starts_free=True,
     feature=EDGE.name,
 )
