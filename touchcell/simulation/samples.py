@@ -137,7 +137,7 @@ def scattered(middle: TipParameters, variation: Variation, rng: np.random.Genera
     changed = {
         each.name: getattr(middle, each.name) * (1.0 + rng.normal(0.0, variation.parameters))
         for each in fields(middle)
-        if each.name not in _ADDITIVE | {"rings", "camera_distance_m", "focal_px", "ring_step_rad"}
+        if each.name not in _ADDITIVE | {"rings", "mirrored", "camera_distance_m", "focal_px", "ring_step_rad"}
         and getattr(middle, each.name)
     }
     u, v = middle.centre_px + rng.normal(0.0, variation.shift_px, 2)

@@ -114,7 +114,7 @@ class Guide:
         return self._path.length_m
 
     def direction(self, T_base_sensor: Array) -> Array:
-        """Return the unit vector (3,), along the surface and in the sensor's frame, in which to go on."""
+        """Return the unit vector (3,), along the surface and in the sensor's frame, in which to continue."""
         if self._T_base_plane is None:
             self._T_base_plane = T_base_sensor
         R, origin = self._T_base_plane[:3, :3], self._T_base_plane[:3, 3]

@@ -17,6 +17,7 @@ from touchcell.paths import CONFIGS
 from touchcell.perception.models.architecture_spec import ARCHITECTURES
 from touchcell.perception.networks.trainer import TRAINERS
 from touchcell.perception.runtime.estimator_spec import ESTIMATORS
+from touchcell.perception.runtime.feature_spec import FEATURES
 from touchcell.perception.runtime.filter_spec import FILTERS
 from touchcell.registry import Registry
 from touchcell.simulation.shape_spec import OBJECTS, SURFACES
@@ -39,6 +40,7 @@ def listing() -> dict[str, list[tuple[str, str]]]:
         "architectures": _rows(ARCHITECTURES),
         "trainers": _rows(TRAINERS),
         "filters": _rows(FILTERS),
+        "features": _rows(FEATURES),
         "surfaces": _rows(SURFACES),
         "objects": _rows(OBJECTS),
         "emulators": [(name, "") for name in EMULATORS.names()],

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 import numpy as np
 
@@ -73,6 +73,17 @@ FITTED_VARIATION = Variation(
     slip=0.15,
 )
 """About a real sensor, known better than the kind; ``field`` and ``slip`` are what its simulation cannot say."""
+
+EDGE_SETTINGS: Final[dict[str, Any]] = {
+    "batch_size": 128,
+    "learning_rate": 1.5e-3,
+    "noise": 0.01,
+    "shift_px": 0.1,
+    "turn_rad": 0.0005,
+    "zoom": 0.0003,
+    "details": 120,
+}
+"""How far an edge is off is told by tenths of a pixel (docs/decisions/0051-edges-in-detail.md)."""
 
 PUBLIC_SIZE = (PUBLIC_CROP[3] - PUBLIC_CROP[1], PUBLIC_CROP[2] - PUBLIC_CROP[0])
 PUBLIC_MASK_PX = 216.0
@@ -182,8 +193,10 @@ def _train_markers(
 
     settings = MarkerSettings(seed=seed)
     if imagined.of_shapes:
-        # One network in a file of 4 MB, which can ship.
+        # One network in a file of 4 MB, which can ship. Its sensors scatter already, by what a camera is remounted.
         settings = replace(settings, hidden=(384, 384, 256), networks=1)
+    if imagined.feature == "edge":
+        settings = replace(settings, **EDGE_SETTINGS)
     train_on_discs(
         _discs(imagined, samples, seed),
         _discs(imagined, samples // 5, seed + 1_000_000),

@@ -83,7 +83,7 @@ def run_experiment(
 ) -> TrialsResult:
     """Run missing trials, then write table and figures into ``folder``.
 
-    The table says so if trials that are kept were run by other code.
+    The table marks kept trials that were run by other code.
 
     Args:
         experiment: its spec.

@@ -156,7 +156,7 @@ class Runs:
         return started
 
     def close(self) -> None:
-        """Read nothing more; runs that were started go on."""
+        """Read nothing more; runs that were started continue."""
         for view in self._views.values():
             view.close()
 

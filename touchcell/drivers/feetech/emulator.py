@@ -9,6 +9,7 @@ real brown-out lets an arm sink.
 from __future__ import annotations
 
 import asyncio
+import sys
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from touchcell.drivers.feetech import codec
+from touchcell.drivers.core.difference import report
+from touchcell.drivers.feetech import capture, codec
+from touchcell.drivers.feetech.capture_emulator import RecordedServos
 from touchcell.drivers.feetech.codec import Instruction, Packet, Register
 from touchcell.drivers.kinematics.chain import ChainDescription, SerialChain, Tool
 from touchcell.testing.emulation.base import CommandOnset, Emulator
@@ -506,26 +509,37 @@ class FeetechArm(Emulator):
 def add_arguments(parser: Any) -> None:
     """Add the command-line arguments of ``touchcell emulate feetech``."""
     parser.add_argument("--link", type=Path, required=True, help="symbolic link to make; clients open it as a port")
-    parser.add_argument("--chain", default="so101_5r", help="shipped chain description, or a YAML file")
+    parser.add_argument("--chain", default="so101_5r", help="shipped chain description, or a YAML or URDF file")
     parser.add_argument("--tool", help="tool as JSON, e.g. '{\"origin_mm\": [0, 0, 40]}'")
     parser.add_argument("--start-deg", type=float, nargs="+", default=[0.0, 10.0, 90.0, 80.0, 0.0])
     parser.add_argument("--zero-ticks", type=int, nargs="+", help="ticks of each servo at joint angle zero")
     parser.add_argument("--direction", type=int, nargs="+", help="1 or -1 per servo")
+    parser.add_argument(
+        "--from",
+        dest="capture",
+        type=Path,
+        metavar="CAPTURE",
+        help="answer as the servos in this record did (socat -x), after a report of what in it is not as expected",
+    )
     parser.add_argument("--echo", action="store_true", help="the adapter echoes transmitted bytes")
     parser.add_argument("--protection-time-s", type=float, default=2.0, help="overload time of a servo, up to 2.5 s")
 
 
-def build(arguments: Any) -> FeetechArm:
-    """Build the emulator from its command-line arguments."""
+def build(arguments: Any) -> Emulator:
+    """Build the emulator from its command-line arguments. Raises ConfigError."""
     return build_on(PtyLine(arguments.link), arguments)
 
 
-def build_on(line: SerialLine, arguments: Any) -> FeetechArm:
-    """Build the emulator on ``line`` from its other command-line arguments."""
-    is_file = Path(arguments.chain).suffix == ".yaml"
-    read = ChainDescription.read(Path(arguments.chain)) if is_file else ChainDescription.shipped(arguments.chain)
+def build_on(line: SerialLine, arguments: Any) -> Emulator:
+    """Build the emulator on ``line`` from its other command-line arguments. Raises ConfigError."""
+    if arguments.capture is not None:
+        recorded = capture.judge(capture.read_chunks(arguments.capture))
+        found = list(report(recorded.differences)) or ["nothing contradicts codec or emulator"]
+        for text in [*capture.describe(recorded), *found]:
+            print(text, file=sys.stderr)
+        return RecordedServos(line, recorded)
     tool = Tool.model_validate_json(arguments.tool) if arguments.tool else None
-    chain = SerialChain(read, tool)
+    chain = SerialChain(ChainDescription.named(arguments.chain), tool)
     n = chain.joint_count
     return FeetechArm(
         line,
