@@ -23,6 +23,7 @@ BENCHMARKS = {
     "fuzz-cells": "tests.fault_injection.fuzz_cells",
     "fuzz-recordings": "tests.fault_injection.fuzz_recordings",
     "gdn-vs-cnn": "benchmarks.gdn_vs_cnn",
+    "jog": "benchmarks.jog",
     "keeper": "benchmarks.keeper",
     "live": "benchmarks.live",
     "mutation": "benchmarks.mutation",

@@ -66,3 +66,38 @@ def test_a_side_that_never_ends_is_given_up() -> None:
         at = search.tip(0.0)
         search.touched(Contact(0.0, at.y, 0.0))
     assert search.middle is None
+
+
+@given(st.floats(-0.01, 0.01), st.floats(0.05, 0.12), st.floats(-0.002, 0.002))
+def test_between_both_edges_normals_that_are_misread_and_a_wrong_width_cancel(
+    middle_m: float, width_m: float, wider_m: float
+) -> None:
+    middle = Pose(0.1, 0.0, 0.2).ahead(middle_m, 0.5 * math.pi)
+    first = EdgeSearch(Contact(0.1, 0.0, 0.2), 0.0, width_m + wider_m, RADIUS_M)
+    other = None
+    for search in (first, None):
+        search = search or (other := first.opposite())
+        while search.middle is None and not search.failed:
+            tip = search.tip(CLEAR_M)
+            contact = touch(tip, search.direction_rad, middle, width_m)
+            if contact is None:
+                search.missed()
+                continue
+            # A tilt that is read 8 % too small puts the edge too near to the tip.
+            angle = contact.heading_rad - middle.heading
+            inwards_m = RADIUS_M * (math.sin(abs(angle)) - math.sin(0.92 * abs(angle)))
+            side = math.copysign(1.0, middle.local((contact.x_m, contact.y_m))[1])
+            at = Pose(contact.x_m, contact.y_m, middle.heading).ahead(side * inwards_m, 0.5 * math.pi)
+            search.touched(Contact(at.x, at.y, middle.heading + 0.92 * angle))
+    assert other is not None
+    found = first.between(other)
+    assert found is not None
+    assert abs(middle.local((found.x_m, found.y_m))[1]) < 0.7e-3
+
+
+def test_edges_that_are_not_as_far_apart_as_they_should_have_no_middle() -> None:
+    first = EdgeSearch(Contact(0.0, 0.0, 0.0), 0.0, 0.08, RADIUS_M)
+    first.touched(Contact(0.0, 0.04, -0.3))
+    other = first.opposite()
+    other.touched(Contact(0.0, -0.03, 0.3))
+    assert first.between(other) is None

@@ -106,3 +106,23 @@ def test_two_arms_that_have_not_felt_the_middle_do_not_claim_to_have_arrived(tmp
     assert pushed.path[-1] == ("retract", "retracted", "failed")
     missed = next(each for each in pushed.cell.task.transitions if each.event == "missed")
     assert "it may be beyond the tolerance" in missed.reason
+
+
+def test_the_follower_presses_less_where_the_leader_is_near_what_its_tip_bears(tmp_path):
+    """The table holds 2.6 N, 4.3 mm of a tip of 0.6 N/mm, and the leader pushes what the follower presses, too."""
+    deepest = {}
+    for ease_from_mm in (4.0, 20.0):
+        depths = deepest[ease_from_mm] = []
+
+        def look(cell, depths=depths):
+            if cell.task.state == "run":
+                depths.append([1e3 * cell.scene.contact(role).value.depth_m for role in cell.sensors])
+
+        changes = {"task__follower__ease_from_mm": ease_from_mm, "task__follower__reference_mm_deg": [0, 0, 2, 0, 0, 0]}
+        data = cell_file(CELL, **SHORT | {"task__target_mm": [60, 3]} | changes)
+        data["scene"]["table"]["friction"] = 0.55
+        (folder := tmp_path / str(ease_from_mm)).mkdir()
+        push(data, folder, look)
+    eased, not_eased = (np.array(depths)[-30:].mean(axis=0) for depths in deepest.values())
+    assert eased[1] < not_eased[1] - 0.5
+    assert eased[0] < not_eased[0] - 0.5

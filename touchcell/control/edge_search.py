@@ -1,8 +1,9 @@
-"""Find the middle of an object's flat side by touching one of its edges.
+"""Find the middle of an object's flat side by touching its edges.
 
 A round tip of radius R whose centre is beyond an edge, by less than R, touches the edge itself: the normal turns
 inwards, and the edge is where the tip's surface is, along that normal. With the width of the side it tells where the
-side's middle is, which no touch of the side itself tells.
+side's middle is, which no touch of the side itself tells. Both edges tell it better: what a model misreads of a normal
+at one edge it misreads in the mirror at the other.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ _INWARDS_RAD: Final = math.radians(20.0)
 _APART_M: Final = 0.005
 """Distance of two contacts from which the line through them tells how their side is turned."""
 _MOST_TOUCHES: Final = 6
+_WIDTH_M: Final = 0.004
+"""Largest difference of the width that is felt from the one that is given."""
 
 
 class EdgeSearch:
@@ -34,11 +37,14 @@ class EdgeSearch:
         expected_m: of the side's middle to the left of that contact.
         width_m: of the side.
         tip_radius_m: radius of the tip.
+        left: 1 for the left edge, -1 for the right one; the nearer one without it.
     """
 
-    def __init__(self, side: Contact, expected_m: float, width_m: float, tip_radius_m: float) -> None:
+    def __init__(
+        self, side: Contact, expected_m: float, width_m: float, tip_radius_m: float, *, left: float | None = None
+    ) -> None:
         self._side = Pose(side.x_m, side.y_m, side.heading_rad)
-        self._left = -1.0 if expected_m > 0.0 else 1.0
+        self._left = left or (-1.0 if expected_m > 0.0 else 1.0)
         self._half_m = 0.5 * width_m
         self._tip_radius_m = tip_radius_m
         self._at_m = self._left * expected_m + self._half_m + _BEYOND_M
@@ -46,8 +52,23 @@ class EdgeSearch:
         self._flat_m: float | None = None
         self._missed_m: float | None = None
         self._touches = 0
+        self._edge = self._side
         self.middle: Contact | None = None
         """The side's middle; None until the edge has been found."""
+
+    def opposite(self) -> EdgeSearch:
+        """Return the search for the other edge, after this one has been found."""
+        assert self.middle is not None
+        return EdgeSearch(self.middle, 0.0, 2.0 * self._half_m, self._tip_radius_m, left=-self._left)
+
+    def between(self, other: EdgeSearch) -> Contact | None:
+        """Return the middle between the edges of two searches; None where they are not as far apart as they should."""
+        right, left = (self, other) if other._left > 0.0 else (other, self)
+        dx, dy = left._edge.x - right._edge.x, left._edge.y - right._edge.y
+        if other.middle is None or abs(math.hypot(dx, dy) - 2.0 * self._half_m) > _WIDTH_M:
+            return None
+        x, y = 0.5 * (left._edge.x + right._edge.x), 0.5 * (left._edge.y + right._edge.y)
+        return Contact(x, y, math.atan2(dy, dx) - 0.5 * math.pi)
 
     @property
     def failed(self) -> bool:
@@ -71,11 +92,10 @@ class EdgeSearch:
         if abs(turned) > _EDGE_RAD and self._lies_on_turned_side(contact, turned):
             # The first contact was with the edge, whose normal is not the side's.
             edge, towards = self._side, Pose(contact.x_m, contact.y_m, contact.heading_rad)
-            towards_left = -math.copysign(1.0, towards.local((edge.x, edge.y))[1])
-            self._find(Pose(edge.x, edge.y, towards.heading).ahead(towards_left * self._half_m, 0.5 * math.pi))
+            self._left = math.copysign(1.0, towards.local((edge.x, edge.y))[1])
+            self._find(Pose(edge.x, edge.y, towards.heading))
         elif -self._left * turned > _EDGE_RAD:
-            edge = Pose(contact.x_m, contact.y_m, self._side.heading)
-            self._find(edge.ahead(-self._left * self._half_m, 0.5 * math.pi))
+            self._find(Pose(contact.x_m, contact.y_m, self._side.heading))
         else:
             self._flat_m = self._at_m
             self._step()
@@ -88,7 +108,8 @@ class EdgeSearch:
         direction = math.atan2(-ahead * math.copysign(1.0, left), abs(left))
         return abs(direction - turned) < abs(direction)
 
-    def _find(self, middle: Pose) -> None:
+    def _find(self, edge: Pose) -> None:
+        self._edge, middle = edge, edge.ahead(-self._left * self._half_m, 0.5 * math.pi)
         self.middle = Contact(middle.x, middle.y, middle.heading)
 
     def missed(self) -> None:

@@ -6,12 +6,13 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
-from touchcell.drivers.core.clock import Clock
+from touchcell.drivers.core.clock import Clock, VirtualClock
 from touchcell.drivers.core.errors import DeviceError
 from touchcell.drivers.core.protocols import TcpSource
 from touchcell.drivers.core.samples import Stamped
@@ -475,6 +476,21 @@ class SceneConfig(Section, SceneSection):
             for problem in surface.problems():
                 key = f"surfaces.{name}.{problem.key}"
                 yield ConfigError(problem.reason, key=key, value=problem.value, hint=problem.hint)
+
+    def pressed(self, tips: Mapping[str, Array]) -> Mapping[str, float]:
+        """Return how deep each tip is in a surface or an object; {} for dynamic scenes, which take long to build."""
+        if self.physics == "dynamic":
+            return {}
+        scene = self.build(VirtualClock())
+        for sensor, T_world_s in tips.items():
+            scene.mount(sensor, partial(np.asarray, T_world_s))
+        depths_m = {sensor: float(scene.contact(sensor).value.T_f_s[2, 3]) for sensor in tips}
+        return {sensor: depth_m for sensor, depth_m in depths_m.items() if depth_m > 0.0}
+
+    def has_edges(self) -> bool:
+        """Return whether a surface has an edge."""
+        surfaces = [surface.build() for surface in self.surfaces.values()]
+        return nearest_edge(surfaces, np.eye(4), 0.0, 1e-3 * self.tip.radius_mm) is not None
 
     def remarks(self, starts: Mapping[str, Array], reach_m: float | None) -> Iterable[str]:
         """Yield where the tip does not fit into a surface, and which sensor does not come upon one."""

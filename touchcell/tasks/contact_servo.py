@@ -91,15 +91,25 @@ class Sidestepping(Protocol):
 
 @runtime_checkable
 class NeedsFeature(Protocol):
-    """Behavior that goes on only along what it is made for, such as an edge."""
+    """Behavior that continues only along what it is made for, such as an edge."""
 
     def astray(self, dt_s: float, touched: TouchedFeature | None) -> str:
-        """Return why the behavior cannot go on; empty where it can.
+        """Return why the behavior cannot continue; empty where it can.
 
         Args:
             dt_s: duration of the cycle.
             touched: what a classifier says of the newest frame, or None without one.
         """
+        ...
+
+
+@runtime_checkable
+class Easing(Protocol):
+    """Behavior that may press less than its reference."""
+
+    @property
+    def ease_m(self) -> float:
+        """Depth by which it presses less now."""
         ...
 
 
@@ -446,7 +456,11 @@ class ContactServo:
 
     def servo_step(self, V_ff: Array, *, running: bool = True) -> Array | None:
         """Return the twist (6,) of the tool that holds the contact; None while there is no valid estimate."""
-        V_tcp = self.controller.step(self.T_s_f, 0 if self.contact is None else self.contact.t_ns, V_ff)
+        T_s_f = self.T_s_f
+        if T_s_f is not None and isinstance(self.run, Easing) and (ease_m := self.run.ease_m) > 0.0:
+            # To the controller it is pressed in by as much more.
+            T_s_f = se3.compose(T_s_f, se3.exp([0.0, 0.0, -ease_m, 0.0, 0.0, 0.0]))
+        V_tcp = self.controller.step(T_s_f, 0 if self.contact is None else self.contact.t_ns, V_ff)
         if running and self._running_axes is not None:
             V_tcp = self._Ad_tcp_sensor @ (self._running_axes * np.linalg.solve(self._Ad_tcp_sensor, V_tcp))
         if self.T_s_f is None:

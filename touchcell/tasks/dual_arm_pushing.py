@@ -29,6 +29,8 @@ LEADER_SENSOR: Final = "leader_sensor"
 FOLLOWER_SENSOR: Final = "follower_sensor"
 _CLEAR_M: Final = 0.015
 """Distance by which the follower lets go of an object: a turned one reaches farther while it steps aside."""
+_EASED_PER_M: Final = 0.6
+"""Depth by which the follower presses less, per depth of the leader beyond that from which it eases."""
 
 
 class FollowerConfig(ContactServoConfig):
@@ -39,12 +41,17 @@ class FollowerConfig(ContactServoConfig):
         active: if True, its feedforward also moves it with the object, as fast as the leader drives and turns it, so
             that
             touch only corrects the rest: both arms are active. If False, it only complies, as in the paper.
+        ease_from_mm: depth of the leader from which an active follower presses less: what it presses with the leader
+            has to push, too.
+        ease_to_mm: depth to which it may come down.
         turn_deg_per_mm: rotation of the object per lateral motion of the leader's contact; of an 80 mm square it is
             0.9, a / (a^2 + c^2) with a from its centre to the contact and c its friction radius.
     """
 
     active: bool = True
     turn_deg_per_mm: PositiveFloat = 0.9
+    ease_from_mm: PositiveFloat = 5.0
+    ease_to_mm: PositiveFloat = 0.8
     reference_mm_deg: Annotated[Six, CONTACT_DEPTH] = (0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
     kp_per_s: SixGains = (0.0, 10.0, 10.0, 10.0, 0.0, 0.0)
     ki_per_s2: SixGains = (0.0, 25.0, 25.0, 25.0, 0.0, 0.0)
@@ -82,6 +89,8 @@ class Follow:
         self._T_leader_follower = T_leader_follower
         self._speed_m_s = 1e-3 * config.push_speed_mm_s
         self._middle_m = 1e-3 * config.object_center_offset_mm
+        self._ease_from_m = 1e-3 * config.follower.ease_from_mm
+        self._most_ease_m = max(0.0, 1e-3 * (config.follower.reference_mm_deg[2] - config.follower.ease_to_mm))
         self._turn_per_m = 1e3 * np.radians(config.follower.turn_deg_per_mm)
         self._T_base_sensor: Array | None = None
         self._y_is_left = 1.0
@@ -110,6 +119,13 @@ class Follow:
         heading = heading_of(T[:3, 2])
         cos, sin = math.cos(heading), math.sin(heading)
         return twist_in_sensor(cos * vx + sin * vy, cos * vy - sin * vx, turn, self._y_is_left)
+
+    @property
+    def ease_m(self) -> float:
+        """Depth by which it presses less, because the leader is near the depth that its tip bears."""
+        if not self._active:
+            return 0.0
+        return min(max(_EASED_PER_M * (self._push.depth_m - self._ease_from_m), 0.0), self._most_ease_m)
 
     @property
     def timeout_s(self) -> float:
@@ -190,4 +206,6 @@ SPEC = TaskSpec(
     },
     sensors=frozenset({LEADER_SENSOR, FOLLOWER_SENSOR}),
     build=build,
+    starts_free=True,
+    places=lambda config, start, mount: config.planned_places(LEADER),
 )

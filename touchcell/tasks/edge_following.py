@@ -193,5 +193,6 @@ SPEC = TaskSpec(
     {ARM: SERVO_ARM},
     frozenset({SENSOR}),
     _build,
+    starts_free=True,
     feature=EDGE.name,
 )

@@ -22,6 +22,10 @@ _KNOWN_M: Final = 0.003
 """Standard deviation of the object's centre below which it is known well enough to be acted upon."""
 _EXPLORING_M_S: Final = 0.03
 """Speed until the object's centre is known."""
+_STARTING_M_S: Final = 0.008
+"""Speed until the object moves: a tip that is pressed in fast overshoots, and a follower gives way too early."""
+_MOVED_M: Final = 0.4e-3
+"""Way of the contact from which the object moves; less may be an error of the depth, which grows meanwhile."""
 _MOST_SIDESTEPS: Final = 3
 _EXPECTED_M: Final = 0.012
 """Standard deviation of the centre beside the line of the approach."""
@@ -38,7 +42,9 @@ _DELAY_S: Final = 0.02
 _CLEAR_M: Final = 0.008
 """Distance by which a sensor lets go of an object before it steps aside."""
 _EDGE_SIGMA_M: Final = 0.5e-3
-"""Uncertainty of a side's middle by the touch of an edge."""
+"""Uncertainty of a side's middle by the touch of an edge ..."""
+_EDGES_SIGMA_M: Final = 0.3e-3
+"""... and of both."""
 _ECCENTRIC_M: Final = 0.006
 """Standard deviation of the centre of friction from a middle that is felt ..."""
 _CENTRIC_M: Final = 0.001
@@ -154,6 +160,8 @@ class PredictivePush:
         self._must_place = self._has_edge or settings.followed
         self._approach: float | None = None
         self._contact: Contact | None = None
+        self._resting_at: Contact | None = None
+        self._moves = False
         self._middle: Pose | None = None
         self._resting: tuple[Pose, float] | None = None
         self._steps: Iterator[Goal] = iter(())
@@ -195,8 +203,11 @@ class PredictivePush:
         return min(max(-self._settings.lead_m * math.tan(turned), -reach_m), reach_m)
 
     def velocity_at(self, point: Point) -> tuple[float, float, float]:
-        """Return the planned velocity of the object at a point, m/s along x and y, and its rate of turn, rad/s."""
-        if self._contact is None:
+        """Return the planned velocity of the object at a point, m/s along x and y, and its rate of turn, rad/s.
+
+        It is zero until the object moves.
+        """
+        if self._contact is None or not self._moves:
             return 0.0, 0.0, 0.0
         contact, motion = self._contact, self.motion
         cos, sin = math.cos(contact.heading_rad), math.sin(contact.heading_rad)
@@ -236,6 +247,7 @@ class PredictivePush:
     def begin_sidestep(self, T_base_sensor: Array) -> None:
         """Let go: the object rests where it is until it is touched again."""
         self.pause()
+        self._resting_at, self._moves = None, False
         self.located = None
         assert self._contact is not None
         if self._must_place:
@@ -272,12 +284,30 @@ class PredictivePush:
         yield Goal(placed(T_base_sensor, at.ahead(-self._settings.tip_radius_m - _CLEAR_M)))
 
     def _feel_edge(self, T_base_sensor: Array, side: Contact) -> Iterator[Goal]:
-        """Search for an edge of the side, and then be opposite the middle."""
+        """Search for the edges of the side, and then be opposite the middle."""
         settings = self._settings
         assert settings.side_width_m is not None
         self._searches += 1
         search = EdgeSearch(side, self._estimator.model.middle_m or 0.0, settings.side_width_m, settings.tip_radius_m)
         yield Goal(placed(T_base_sensor, _tip_behind(T_base_sensor, side.heading_rad, _CLEAR_M)))
+        yield from self._feel(T_base_sensor, search)
+        found, sigma_m = search.middle, _EDGE_SIGMA_M
+        if found is not None:
+            other = search.opposite()
+            yield from self._feel(T_base_sensor, other)
+            if (between := search.between(other)) is not None:
+                found, sigma_m = between, _EDGES_SIGMA_M
+        if found is not None:
+            at = Pose(found.x_m, found.y_m, found.heading_rad)
+        else:
+            at = Pose(side.x_m, side.y_m, side.heading_rad).ahead(self._estimator.model.middle_m or 0.0, 0.5 * math.pi)
+            sigma_m = self._estimator.middle_sigma_m
+        middle = at.ahead(self._estimator.model.reach_m)
+        self._resting, self.located = (middle, sigma_m), middle
+        yield Goal(placed(T_base_sensor, at.ahead(-settings.tip_radius_m - _CLEAR_M)))
+
+    def _feel(self, T_base_sensor: Array, search: EdgeSearch) -> Iterator[Goal]:
+        """Touch until the search has found its edge or failed."""
         while search.middle is None and not search.failed:
             clear = search.tip(_CLEAR_M)
             yield Goal(placed(T_base_sensor, clear))
@@ -288,14 +318,6 @@ class PredictivePush:
             else:
                 search.touched(self._felt)
             yield Goal(placed(T_base_sensor, clear))
-        if (found := search.middle) is not None:
-            at, sigma_m = Pose(found.x_m, found.y_m, found.heading_rad), _EDGE_SIGMA_M
-        else:
-            at = Pose(side.x_m, side.y_m, side.heading_rad).ahead(self._estimator.model.middle_m or 0.0, 0.5 * math.pi)
-            sigma_m = self._estimator.middle_sigma_m
-        middle = at.ahead(self._estimator.model.reach_m)
-        self._resting, self.located = (middle, sigma_m), middle
-        yield Goal(placed(T_base_sensor, at.ahead(-settings.tip_radius_m - _CLEAR_M)))
 
     def _touched(self, T_base_sensor: Array, T_s_f: Array) -> Contact:
         """Return the point of the object nearest to the tip's centre, whatever shear there is."""
@@ -381,6 +403,9 @@ class PredictivePush:
         elif self._contact is None and (middle_m := self._expected_offset_m(heading)):
             estimator.move_contact(middle_m, _EXPECTED_M)
         self._contact = Contact(contact.x, contact.y, heading)
+        self._resting_at = self._resting_at or self._contact
+        ahead_m, _ = Pose(self._resting_at.x_m, self._resting_at.y_m, heading).local((contact.x, contact.y))
+        self._moves = self._moves or ahead_m > _MOVED_M
         estimator.update(self._contact)
         model = estimator.model
         ahead = contact.ahead(model.reach_m)
@@ -412,6 +437,8 @@ class PredictivePush:
         settings = self._settings
         braking = math.sqrt(2.0 * settings.accel_m_s2 * max(remaining_m - self._stopping_m(), 0.0))
         fastest = settings.speed_m_s if self._known else min(settings.speed_m_s, _EXPLORING_M_S)
+        if not self._moves:
+            fastest = min(fastest, _STARTING_M_S)
         wanted = min(fastest, max(braking, settings.slowest_m_s))
         self._speed_m_s = min(wanted, self._speed_m_s + settings.accel_m_s2 * dt_s)
 

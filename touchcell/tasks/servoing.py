@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from enum import Enum, auto
 from typing import Annotated, Final, TypeVar
 
@@ -15,6 +15,7 @@ from touchcell.errors import TouchcellError
 from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import Behavior, ContactServo, ContactServoConfig, NeedsFeature, Sidestepping, Six
 from touchcell.tasks.interface import SPEED, Action, Observation, TaskContext, TaskSpec, TransitionRecord
+from touchcell.tasks.planned_places import PlannedPlace
 from touchcell.tasks.sensor_check import SensorCheck
 from touchcell.tasks.state_machine import FAULT, STOP, TRIP, StateDef, Table, TaskMachine, TransitionDef, state_name
 from touchcell.tasks.state_machine_task import MachineTask
@@ -540,6 +541,7 @@ def one_arm_task(
     config: type[ServoConfigT],
     behavior: Callable[[ServoConfigT], Behavior],
     reference_mm_deg: Callable[[ServoConfigT], Six],
+    places: Callable[[ServoConfigT, Array | None, Array], Iterable[PlannedPlace]] | None = None,
 ) -> TaskSpec[ServoConfigT]:
     """Return the spec of a task in which ``arm`` holds a contact with ``sensor`` and runs one behavior.
 
@@ -549,10 +551,13 @@ def one_arm_task(
         config: pydantic model of its parameters.
         behavior: creates the behavior from the parameters.
         reference_mm_deg: returns the contact to hold, Euler components of ``T_f_s``.
+        places: of its ``TaskSpec``.
     """
 
     def build(config: ServoConfigT, context: TaskContext) -> ServoTask:
         servo = ContactServo(ARM, SENSOR, config, reference_mm_deg(config), behavior(config), context)
         return ServoTask(name, config, context, servo)
 
-    return TaskSpec(name, summary, config, {ARM: SERVO_ARM}, frozenset({SENSOR}), build)
+    return TaskSpec(
+        name, summary, config, {ARM: SERVO_ARM}, frozenset({SENSOR}), build, starts_free=True, places=places
+    )

@@ -6,7 +6,7 @@ Either in one direction of the sensor, as in the paper, or along a planned path 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated
 
 import numpy as np
@@ -16,8 +16,14 @@ from touchcell.geometry.types import Array
 from touchcell.tasks.contact_servo import SixGains
 from touchcell.tasks.felt_curvature import CurvedWay
 from touchcell.tasks.interface import DEPTH, DISTANCE, SPEED
-from touchcell.tasks.servoing import ServoConfig, one_arm_task
+from touchcell.tasks.planned_places import PlannedPlace
+from touchcell.tasks.servoing import ARM, ServoConfig, one_arm_task
 from touchcell.tasks.surface_path import Guide, PathConfig
+
+_APPROACH_M = 0.02
+"""The first contact is hardly farther from the start than this."""
+_PATH_BEND, _WAY_BEND = 0.5, 0.7
+"""Shares of a way by which its end may be elsewhere: on a plane tilted by 30 deg, and over half a cylinder."""
 
 
 class SurfaceFollowingConfig(ServoConfig):
@@ -129,10 +135,26 @@ def _behavior(config: SurfaceFollowingConfig) -> Follow | FollowPath:
     return Follow(config) if config.path is None else FollowPath(config, config.path)
 
 
+def _places(config: SurfaceFollowingConfig, T_base_tcp: Array | None, T_tcp_sensor: Array) -> Iterator[PlannedPlace]:
+    """Return the corners of the path, or the end of the straight way, near enough to the plane of the first contact."""
+    if T_base_tcp is None:
+        return
+    direction_rad, distance_m = math.radians(config.direction_deg), 1e-3 * config.distance_mm
+    key, bend, points = "path", _PATH_BEND, [] if config.path is None else config.path.points()
+    if not points:
+        key, bend = "distance_mm", _WAY_BEND
+        points = [(distance_m * math.cos(direction_rad), distance_m * math.sin(direction_rad))]
+    T_base_sensor = T_base_tcp @ T_tcp_sensor
+    for x, y in points:
+        tip_m = T_base_sensor[:3, 3] + T_base_sensor[:3, :2] @ np.array([x, y])
+        yield PlannedPlace((key,), ARM, tip_m=tip_m, slack_m=_APPROACH_M + bend * math.hypot(x, y))
+
+
 SPEC = one_arm_task(
     "surface_following",
     "slide over an unknown surface at constant depth and normal to it",
     SurfaceFollowingConfig,
     _behavior,
     lambda config: (0.0, 0.0, config.depth_mm, 0.0, 0.0, 0.0),
+    _places,
 )

@@ -137,8 +137,8 @@ def test_a_slower_arm_needs_less_margin(tmp_path: Path) -> None:
 
 def test_the_length_of_the_sensor_swings_further(tmp_path: Path) -> None:
     long = ("mounted_on: arm", "mounted_on: arm\n    tcp_to_sensor_mm_deg: [0, 0, 100, 0, 0, 0]")
-    deep = ("min_mm: [-150, -50, 10]", "min_mm: [-150, -50, -90]")
-    plan = plan_cell(written(tmp_path, long, deep, ("margin_mm: 15", "margin_mm: 30")))
+    high = ("[-80, 0, 25,", "[-80, 0, 125,")
+    plan = plan_cell(written(tmp_path, long, high, ("margin_mm: 15", "margin_mm: 30")))
     way = plan.stopping_distances["workspace"]
     assert way.speed_m_s == pytest.approx(0.1 + 0.5 * 0.1)
     assert way.braking_m == pytest.approx(0.01 + 0.5 * 0.05 * 0.5 / 2.5)

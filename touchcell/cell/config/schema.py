@@ -62,6 +62,7 @@ def plan_cell(
     settings: Mapping[str, Any] | None = None,
     world: WorldChanges | None = None,
     to_run: bool = True,
+    prove: bool = True,
 ) -> CellPlan:
     """Read and check a cell file without connecting anything.
 
@@ -70,6 +71,7 @@ def plan_cell(
         overrides: driver keys set from the command line (``--data``), for every device whose driver has such a key.
         model: network model in place of the one that the file names.
         to_run: False for the cell of a run that has been: its files may be gone, and its limits are not judged again.
+        prove: False leaves the proof that every interlock can trip to the activation of the composed cell.
         settings: values in place of the file's own, by dotted key ("task.speed_mm_s", "arms.arm.limits").
         world: what the world that it runs in changes; see ``plan_in_world``.
 
@@ -88,7 +90,7 @@ def plan_cell(
             estimator = sensor.get("estimator") if isinstance(sensor, dict) else None
             if isinstance(estimator, dict) and estimator.get("kind") in ("network", "edge_network"):
                 estimator["model"] = model
-    plan = _Planner(file, overrides, settings or {}, to_run=to_run).plan()
+    plan = _Planner(file, overrides, settings or {}, to_run=to_run, prove=prove).plan()
     return plan if world is None else replace(plan, world_settings=world.settings, notes=(*plan.notes, *world.notes))
 
 
@@ -100,27 +102,28 @@ def plan_in_world(
     model: str | None = None,
     settings: Mapping[str, Any] | None = None,
     more: Mapping[str, Any] | None = None,
+    prove: bool = True,
 ) -> CellPlan:
     """Read and check a cell file for one of its worlds; ``plan_cell`` has the other arguments.
 
     Args:
         path: the YAML file.
         world: where it is to run; None as the file is written.
-        overrides, model, settings: see ``plan_cell``; all go before what the world changes.
+        overrides, model, settings, prove: see ``plan_cell``; all go before what the world changes.
         more: further values that the world puts in place of the file's own, as the addresses of emulators.
 
     Raises:
         ConfigError: see ``plan_cell``; a device that the world has not.
     """
     if world is None:
-        return plan_cell(path, overrides, model=model, settings=settings)
+        return plan_cell(path, overrides, model=model, settings=settings, prove=prove)
     found = _as_written(path, overrides, model, settings)
     if found.cell.world is not None and world != "bench":
         # The file has been through this already, as that of a run folder has.
-        return plan_cell(path, overrides, model=model, settings={**(settings or {}), "world": world})
+        return plan_cell(path, overrides, model=model, settings={**(settings or {}), "world": world}, prove=prove)
     changes = world_changes(found, world)
     changes.settings.update(more or {})
-    return plan_cell(path, overrides, model=model, settings=settings, world=changes)
+    return plan_cell(path, overrides, model=model, settings=settings, world=changes, prove=prove)
 
 
 def _as_written(
@@ -134,10 +137,10 @@ def _as_written(
 
 class _Planner:
     def __init__(
-        self, file: YamlFile, overrides: Mapping[str, Any], settings: Mapping[str, Any], *, to_run: bool
+        self, file: YamlFile, overrides: Mapping[str, Any], settings: Mapping[str, Any], *, to_run: bool, prove: bool
     ) -> None:
         self._file = file
-        self._to_run = to_run
+        self._to_run, self._prove = to_run, prove
         self._overrides = overrides
         self._settings = settings
         self._problems: list[ConfigError] = []
@@ -208,7 +211,7 @@ class _Planner:
             return planned
         if problems := unfeasible(file, planned):
             raise InvalidCell(problems)
-        return replace(self._require_armed(planned), notes=_remarks(planned))
+        return replace(self._require_armed(planned) if self._prove else planned, notes=_remarks(planned))
 
     def _in_truth(self, cell: CellFile) -> CellFile:
         """Return the cell with its scene as it truly is, and keep what is true of its devices."""
@@ -415,6 +418,7 @@ class _Planner:
     def _require_armed(self, plan: CellPlan) -> CellPlan:
         """An interlock that cannot trip, and what moves or feels and nothing guards, is refused."""
         from touchcell.cell.config.armed import cell_facts, not_armed, prove_cell
+        from touchcell.cell.config.healthy_start import trips_when_healthy
 
         try:
             facts = cell_facts(plan)
@@ -422,7 +426,8 @@ class _Planner:
         except ConfigError as error:
             self._add(tuple(error.key.split(".")), error.reason, value=error.value, hint=error.hint)
             raise InvalidCell(self._problems) from None
-        for problem in not_armed(plan, facts, proofs):
+        # What cannot trip is shown nothing that must not trip it.
+        for problem in list(not_armed(plan, facts, proofs)) or trips_when_healthy(plan, facts):
             self._add(problem.path, problem.reason, hint=problem.hint)
         if self._problems:
             raise InvalidCell(self._problems)

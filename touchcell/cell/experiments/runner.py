@@ -79,6 +79,7 @@ def run_experiment(
     executor: str = "local",
     keep_stale: bool = False,
     live: bool = False,
+    as_html: bool = False,
 ) -> TrialsResult:
     """Run missing trials, then write table and figures into ``folder``.
 
@@ -92,9 +93,10 @@ def run_experiment(
         executor: name of what runs the trials, with ``:ADDRESS`` where it takes one.
         keep_stale: keep finished trials of other code, too.
         live: show progress.
+        as_html: also write ``report.html``, whose plots are interactive.
 
     Raises:
-        ConfigError: there is no such executor.
+        ConfigError: there is no such executor, or plotly is missing.
         WorkerDiffers: a worker elsewhere has other code.
         KeyboardInterrupt: every finished trial is kept.
     """
@@ -115,6 +117,10 @@ def run_experiment(
         *(f"  {picture.name}" for picture in pictures),
     ]
     whole = "\n".join(lines)
+    if as_html:
+        from touchcell.cell.experiments.html_report import write_experiment_html
+
+        whole += f"\n  {write_experiment_html(experiment, finished, whole, pictures, folder).name}"
     (folder / "summary.txt").write_text(whole + "\n")
     (folder / "summary.json").write_text(json.dumps(_summary(experiment, scale, rows, finished), indent=1) + "\n")
     return TrialsResult(whole, tuple(finished))

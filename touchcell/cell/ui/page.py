@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Awaitable
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -47,9 +48,15 @@ def build_list(runs: Runs) -> None:
         with ui.card().classes("w-full"):
             ui.label("Start a run on simulated devices").classes("text-lg font-medium")
             cells = runs.cells()
+
+            def chosen_cell() -> Path | None:
+                return cells.get(chosen.value)
+
             with ui.row().classes("w-full items-center"):
                 chosen = ui.select(list(cells), label="cell", with_input=True).classes("grow")
-                ui.button("start", icon="play_arrow", on_click=lambda: _start(runs, cells.get(chosen.value)))
+                ui.button("start", icon="play_arrow", on_click=lambda: _start(runs, chosen_cell()))
+                jog = ui.button("move by hand", icon="open_with")
+                jog.props("outline").on_click(lambda: _start(runs, chosen_cell(), by_hand=True))
         with ui.card().classes("w-full"):
             ui.label(f"Runs in {runs.root}").classes("text-lg font-medium")
             place = ui.column().classes("w-full gap-1")
@@ -76,11 +83,11 @@ def build_list(runs: Runs) -> None:
     ui.timer(1.0, refresh)
 
 
-async def _start(runs: Runs, cell: Any) -> None:
+async def _start(runs: Runs, cell: Path | None, *, by_hand: bool = False) -> None:
     if cell is None:
         ui.notify("choose a cell first")
         return
-    started = runs.start(cell)
+    started = runs.start(cell, by_hand=by_hand)
     if isinstance(started, str):
         ui.notify(started, type="negative")
         return
@@ -177,14 +184,11 @@ class RunPage:
                 with ui.card().classes("w-full min-w-0"):
                     _title("Events")
                     self._events = ui.label().classes("whitespace-pre-wrap font-mono text-xs break-words")
-        with (
-            ui.footer().classes("bg-white text-black px-3 py-1 shadow-2"),
-            ui.row().classes("w-full items-center no-wrap") as self._scrub,
-        ):
+        self._scrub = ui.footer(value=False).classes("bg-white text-black px-3 py-1 shadow-2")
+        with self._scrub, ui.row().classes("w-full items-center no-wrap"):
             ui.button(icon="play_arrow", on_click=self._toggle).props("round dense")
             self._slider = ui.slider(min=0.0, max=1.0, step=0.01, value=0.0, on_change=self._moved).classes("grow")
             self._time = ui.label("0.00 s").classes("w-20 text-right")
-        self._scrub.visible = False
         self._playing = False
 
     def _buttons(self) -> None:
@@ -216,8 +220,8 @@ class RunPage:
             self._look_at_run()
         self._ticks += 1
         end_s = view.end_s
-        if end_s is not None and not self._scrub.visible:
-            self._scrub.visible = True
+        if end_s is not None and not self._scrub.value:
+            self._scrub.show()
             self._slider.props(f"max={end_s:.2f}")
             self._slider.value = self._t_s = end_s
         if self._playing and end_s is not None:

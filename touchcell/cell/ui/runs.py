@@ -130,15 +130,22 @@ class Runs:
         shipped = {f"{path.stem} (ships with touchcell)": path for path in sorted(CONFIGS.glob("*.yaml"))}
         return {**own, **shipped}
 
-    def start(self, cell: Path, more: Sequence[str] = ()) -> StartedRun | str:
-        """Start a run on simulated devices; returns why not where it cannot be started."""
+    def start(self, cell: Path, more: Sequence[str] = (), *, by_hand: bool = False) -> StartedRun | str:
+        """Start a run on simulated devices; returns why not where it cannot be started.
+
+        Args:
+            cell: the cell file.
+            more: arguments of the command.
+            by_hand: whether its arms are moved from the page, in place of its task.
+        """
         self._started = [each for each in self._started if each.process.poll() is None]
         if len(self._started) >= _MOST_STARTED:
             return f"{_MOST_STARTED} runs that were started here are still in progress"
         self.root.mkdir(parents=True, exist_ok=True)
-        name = f"{cell.stem}-{datetime.now(UTC).astimezone():%Y%m%d-%H%M%S}"
+        name = f"{cell.stem}{'-jog' if by_hand else ''}-{datetime.now(UTC).astimezone():%Y%m%d-%H%M%S}"
         log = self.root / f".{name}.log"
-        command = [sys.executable, "-m", "touchcell", "run", str(cell), "--on", "sim", "--quiet"]
+        word = ["jog", str(cell), "--input", "page"] if by_hand else ["run", str(cell), "--quiet"]
+        command = [sys.executable, "-m", "touchcell", *word, "--on", "sim"]
         command += ["--out", str(self.root / name), "--set", "recording.frames=jpeg", *more]
         with log.open("wb") as stream:
             process = subprocess.Popen(

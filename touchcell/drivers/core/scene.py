@@ -122,6 +122,18 @@ class SceneSection(BaseModel):
         """Return what is wrong with the files that it names; ``key`` of each is relative to the section."""
         return ()
 
+    def pressed(self, tips: Mapping[str, Array]) -> Mapping[str, float]:
+        """Return how deep (m) each tip that touches something at the start is in it.
+
+        Args:
+            tips: T_world_s (4, 4) of each sensor.
+        """
+        return {}
+
+    def has_edges(self) -> bool:
+        """Return whether anything in it has an edge that could be followed."""
+        return True
+
     def remarks(self, starts: Mapping[str, Array], reach_m: float | None) -> Iterable[str]:
         """Return what a sensor cannot follow of it, in a line each.
 
